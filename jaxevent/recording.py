@@ -1,0 +1,270 @@
+"""What a hybrid event camera recorded: events, frames, calibration, ground truth, IMU.
+
+Conventions, said once. Time is int64 microseconds on the recording's own clock. `x` is the column
+(to the right), `y` the row (downwards), both from 0; image arrays are [y, x]. Polarity is True for
+ON (brighter), False for OFF. Where a time is asked for, an integer means microseconds and a float
+means seconds, both on the recording's clock.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxevent.camera import PinholeCamera
+from jaxevent.errors import InputError
+
+Times = ArrayLike | int | float
+
+
+def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
+    """Times as int64 microseconds: integers are taken as microseconds, floats as seconds.
+
+    Raises `InputError` for other types and for times that are not finite.
+    """
+    time = np.asarray(time)
+    if time.dtype.kind in "iu":
+        return time.astype(np.int64)
+    if time.dtype.kind != "f":
+        raise InputError(
+            f"{what} are {time.dtype}; give integers (microseconds) or floats (seconds)"
+        )
+    if not np.all(np.isfinite(time)):
+        raise InputError(f"{what} contain a value that is not finite; remove it")
+    return np.asarray(np.rint(time.astype(np.float64) * 1e6), np.int64)
+
+
+@runtime_checkable
+class EventSource(Protocol):
+    """Events that can be read piece by piece; `Events` in memory, or stored in a file."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, rows: slice) -> "Events":
+        """The events of a range of rows, in memory."""
+        ...
+
+    def index(self, time: int) -> int:
+        """The number of events earlier than `time` (us)."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Events:
+    """Events in memory, sorted by time, one array per field, each of shape (events,)."""
+
+    t: NDArray[np.int64]
+    x: NDArray[np.uint16]
+    y: NDArray[np.uint16]
+    p: NDArray[np.bool_]
+
+    @classmethod
+    def empty(cls) -> "Events":
+        none = np.empty(0, np.uint16)
+        return cls(none.astype(np.int64), none, none, none.astype(bool))
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __getitem__(self, rows: slice) -> "Events":
+        return Events(self.t[rows], self.x[rows], self.y[rows], self.p[rows])
+
+    def index(self, time: int) -> int:
+        return int(np.searchsorted(self.t, time))
+
+    def check(self, width: int, height: int, source: str, first_row: int = 0) -> None:
+        """Raise `InputError` unless the events are sorted and inside a width x height sensor.
+
+        `source` and `first_row` say where the events came from in the message.
+        """
+        if not len(self.t) == len(self.x) == len(self.y) == len(self.p):
+            raise InputError(
+                f"{source}: t, x, y and p have {len(self.t)}, {len(self.x)}, {len(self.y)} and "
+                f"{len(self.p)} values; they must be equally long"
+            )
+        # Comparing neighbours is three times faster than np.diff, which writes int64 differences.
+        backwards = self.t[1:] < self.t[:-1]
+        if backwards.any():
+            row = int(np.argmax(backwards)) + 1
+            raise InputError(
+                f"{source}: event {first_row + row} is at {self.t[row]} us, earlier than the one "
+                f"before it at {self.t[row - 1]} us; sort the events by time (stable)"
+            )
+        for name, values, size in (("x", self.x, width), ("y", self.y, height)):
+            if len(values) and int(values.max()) >= size:
+                row = int(np.argmax(values >= size))
+                raise InputError(
+                    f"{source}: event {first_row + row} has {name} = {values[row]} outside the "
+                    f"{width}x{height} sensor; give the sensor's size or remove the event"
+                )
+
+
+@dataclasses.dataclass(frozen=True)
+class Frames:
+    """Grey frames: images (frames, height, width), mid-exposure times and exposure lengths (us).
+
+    Images are uint8 or uint16 grey levels, or floats already in [0, 1]. An exposure of 0 means
+    that its length is not known.
+    """
+
+    t: NDArray[np.int64]
+    images: NDArray
+    exposure: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __getitem__(self, rows: slice | NDArray) -> "Frames":
+        return Frames(self.t[rows], self.images[rows], self.exposure[rows])
+
+    @property
+    def intensity(self) -> NDArray[np.float32]:
+        """The images as float32 grey values in [0, 1]."""
+        if self.images.dtype.kind == "f":
+            return self.images.astype(np.float32)
+        scale = np.iinfo(self.images.dtype).max
+        return np.divide(self.images, scale, dtype=np.float32)
+
+    def check(self, width: int, height: int, source: str) -> None:
+        """Raise `InputError` unless the frames fit the sensor, are in order and hold numbers."""
+        if self.images.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
+            raise InputError(
+                f"{source}: frames are {self.images.dtype}; store uint8, uint16 or floats in [0, 1]"
+            )
+        if self.images.shape != (len(self.t), height, width) or len(self.exposure) != len(self.t):
+            raise InputError(
+                f"{source}: frames have shape {self.images.shape} and {len(self.exposure)} "
+                f"exposures; {len(self.t)} frame times of a {width}x{height} sensor need "
+                f"({len(self.t)}, {height}, {width}) and {len(self.t)}"
+            )
+        late = self.t[1:] <= self.t[:-1]
+        if late.any():
+            row = int(np.argmax(late)) + 1
+            raise InputError(
+                f"{source}: frame {row} at {self.t[row]} us is not later than frame {row - 1} at "
+                f"{self.t[row - 1]} us; sort the frames by time and remove repeated ones"
+            )
+        if (self.exposure < 0).any():
+            row = int(np.argmax(self.exposure < 0))
+            raise InputError(
+                f"{source}: frame {row} has the exposure {self.exposure[row]} us; it must be "
+                "positive, or 0 where unknown"
+            )
+        if self.images.dtype.kind == "f":
+            bad = ~((self.images >= 0) & (self.images <= 1)).all(axis=(1, 2))
+            if bad.any():
+                raise InputError(
+                    f"{source}: frame {int(np.argmax(bad))} holds NaN or values outside [0, 1]; "
+                    "scale float frames to [0, 1] and remove broken ones"
+                )
+
+
+@dataclasses.dataclass(frozen=True)
+class Poses:
+    """Ground-truth camera poses: t (us), position (n, 3) in m, quaternion (n, 4) as x y z w."""
+
+    t: NDArray[np.int64]
+    position: NDArray[np.float64]
+    quaternion: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __getitem__(self, rows: slice) -> "Poses":
+        return Poses(self.t[rows], self.position[rows], self.quaternion[rows])
+
+
+@dataclasses.dataclass(frozen=True)
+class Imu:
+    """Inertial measurements: t (us), gyro (samples, 3) in rad/s, acc (samples, 3) in m/s^2."""
+
+    t: NDArray[np.int64]
+    gyro: NDArray[np.float64]
+    acc: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __getitem__(self, rows: slice) -> "Imu":
+        return Imu(self.t[rows], self.gyro[rows], self.acc[rows])
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """One recording of one sensor; see the module for the conventions.
+
+    `extra` keeps, by name, whatever arrays the file held beyond these fields (a camera response, a
+    contrast threshold, HDR reference images, a known motion).
+    """
+
+    name: str
+    width: int
+    height: int
+    events: EventSource
+    frames: Frames | None = None
+    camera: PinholeCamera | None = None
+    poses: Poses | None = None
+    imu: Imu | None = None
+    extra: Mapping[str, NDArray] = dataclasses.field(default_factory=dict)
+
+    @property
+    def start(self) -> int:
+        """The time of the first event or frame (us); the filters' time zero."""
+        first = [int(self.events[:1].t[0])] if len(self.events) else []
+        return min(first + ([int(self.frames.t[0])] if self.frames else []))
+
+    @property
+    def stop(self) -> int:
+        """The time of the last event or frame (us)."""
+        last = [int(self.events[len(self.events) - 1 :].t[0])] if len(self.events) else []
+        return max(last + ([int(self.frames.t[-1])] if self.frames else []))
+
+    def __getitem__(self, span: slice) -> "Recording":
+        """The part with start <= t < stop; ints are microseconds, floats seconds, of its clock."""
+        if not isinstance(span, slice) or span.step is not None:
+            raise TypeError("slice a recording by two times: recording[t0:t1]")
+        t0 = self.start if span.start is None else int(microseconds(span.start))
+        t1 = self.stop + 1 if span.stop is None else int(microseconds(span.stop))
+
+        def cut(part):
+            if part is None:
+                return None
+            part = part[slice(*np.searchsorted(part.t, [t0, t1]))]
+            return part if len(part) else None
+
+        part = dataclasses.replace(
+            self,
+            events=self.events[self.events.index(t0) : self.events.index(t1)],
+            frames=cut(self.frames),
+            poses=cut(self.poses),
+            imu=cut(self.imu),
+        )
+        if not len(part.events) and part.frames is None:
+            raise InputError(
+                f"{self.name}: no event and no frame between {t0} and {t1} us; the recording "
+                f"reaches from {self.start} to {self.stop} us"
+            )
+        return part
+
+    def with_frames(self, rows: slice | NDArray) -> "Recording":
+        """The same recording with only some of its frames."""
+        frames = self.frames[rows] if self.frames is not None else None
+        return dataclasses.replace(self, frames=frames if frames else None)
+
+    def check(self, source: str | None = None) -> "Recording":
+        """Return self, or raise `InputError` naming what is wrong and where."""
+        source = source or self.name
+        if self.width < 1 or self.height < 1:
+            raise InputError(f"{source}: the sensor size {self.width}x{self.height} is not valid")
+        if not len(self.events) and not self.frames:
+            raise InputError(f"{source}: holds no event and no frame; nothing can be estimated")
+        if isinstance(self.events, Events):
+            self.events.check(self.width, self.height, source)
+        if self.frames is not None:
+            self.frames.check(self.width, self.height, source)
+        for name, part in (("pose", self.poses), ("IMU", self.imu)):
+            if part is not None and (np.diff(part.t) < 0).any():
+                raise InputError(f"{source}: {name} times are not sorted; sort them")
+        return self
