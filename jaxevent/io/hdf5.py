@@ -1,0 +1,302 @@
+"""Recordings as HDF5: jaxevent's own layout, a superset of that of DSEC.
+
+    /                     attributes: format = "jaxevent", version = 1, name, width, height
+    /events/t             (events,) int64 us since /t_offset, sorted
+    /events/x, /events/y  (events,) uint16 column and row, from 0
+    /events/p             (events,) uint8, 1 is ON, 0 is OFF
+    /t_offset             scalar int64 us: the recording's clock at events/t = 0 (its first event)
+    /ms_to_idx            (milliseconds,) uint64: entry m is the first event with t >= 1000 m
+    /frames/t             (frames,) int64 us, mid-exposure
+    /frames/exposure      (frames,) int64 us, 0 where unknown
+    /frames/images        (frames, height, width) uint8, uint16 or floats in [0, 1]
+    /camera               (9,) float64: fx fy cx cy k1 k2 p1 p2 k3
+    /poses/t, position, quaternion   (poses,) int64 us, (poses, 3) m, (poses, 4) x y z w
+    /imu/t, gyro, acc     (samples,) int64 us, (samples, 3) rad/s, (samples, 3) m/s^2
+    /extra/*              further arrays by name
+
+All times but events/t are on the recording's clock. Only /events is required to read a file, so
+DSEC's event files (t uint32, no attributes) can be read too when the sensor's size is given.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError
+from jaxevent.io import checked_events, pinhole, reading, times, vectors
+from jaxevent.io.output import complete
+from jaxevent.recording import Events, EventSource, Frames, Imu, Poses, Recording
+
+VERSION = 1
+_BLOCK = 1 << 20  # events copied at a time: 13 MB
+_CHUNK = 1 << 16  # values compressed together
+_MOST_MS = 10**9  # 11.6 days; a stray timestamp would otherwise fill the disk with ms_to_idx
+
+
+class StoredEvents:
+    """Events left in an HDF5 file, an `EventSource`; pieces are read and checked when sliced.
+
+    The file stays open for as long as this object lives.
+    """
+
+    def __init__(self, file: h5py.File, size: tuple[int, int], source: str):
+        """`size` is (width, height). Raises `InputError` unless the fields fit each other."""
+        self._file = file
+        self._size = size
+        self._source = source
+        self._t, self._x, self._y, self._p = (
+            _dataset(file, f"events/{name}", source) for name in "txyp"
+        )
+        shapes = [field.shape for field in (self._t, self._x, self._y, self._p)]
+        if len(shapes[0]) != 1 or len(set(shapes)) != 1:
+            raise InputError(
+                f"{source}: events/t, x, y and p have shapes {', '.join(map(str, shapes))}; they "
+                "must be equally long lists"
+            )
+        if self._t.dtype.kind not in "iu":
+            raise InputError(f"{source}: events/t is {self._t.dtype}; store integer microseconds")
+        self._offset = 0
+        if "t_offset" in file:
+            with reading(f"{source}: t_offset"):
+                self._offset = int(_dataset(file, "t_offset", source)[()])
+        self._ms_to_idx = _dataset(file, "ms_to_idx", source) if "ms_to_idx" in file else None
+        if self._ms_to_idx is not None and (
+            self._ms_to_idx.ndim != 1 or self._ms_to_idx.dtype.kind not in "iu"
+        ):
+            raise InputError(f"{source}: ms_to_idx must be a list of integers; remove it")
+
+    def __len__(self) -> int:
+        return self._t.shape[0]
+
+    def __getitem__(self, rows: slice) -> Events:
+        """Read the events of a range of rows; `InputError` if one of them is not valid.
+
+        The event before the range is read too, so that pieces read in turn are sorted as a whole.
+        """
+        start, stop, step = rows.indices(len(self))
+        if step != 1:
+            raise ValueError("stored events are read as a range of rows, events[i:j], step 1")
+        if stop <= start:
+            return Events.empty()
+        lead = min(start, 1)
+        part = slice(start - lead, stop)
+        with reading(f"{self._source}: events"):
+            t = self._t[part].astype(np.int64, copy=False)
+            x, y, p = self._x[part], self._y[part], self._p[part]
+        t += self._offset
+        events = checked_events(t, x, y, p, self._size, self._source, first_row=start - lead)
+        return events[lead:] if lead else events
+
+    def index(self, time: int) -> int:
+        """The number of events earlier than `time` (us): a few small reads."""
+        since = int(time) - self._offset
+        with reading(f"{self._source}: ms_to_idx"):
+            low, high = self._millisecond(since // 1000)
+            if 0 <= low <= high <= len(self):
+                # Without the table, or in a dense millisecond, bisect down to one chunk.
+                while high - low > _CHUNK:
+                    middle = (low + high) // 2
+                    if int(self._t[middle]) < since:
+                        low = middle + 1
+                    else:
+                        high = middle
+                row = low + int(np.searchsorted(self._t[low:high].astype(np.int64), since))
+                fits_before = row == 0 or int(self._t[row - 1]) < since
+                fits_after = row == len(self) or int(self._t[row]) >= since
+                if fits_before and fits_after:
+                    return row
+        raise InputError(
+            f"{self._source}: ms_to_idx does not fit events/t at {time} us; load the file in "
+            "memory and save it again"
+        )
+
+    def _millisecond(self, ms: int) -> tuple[int, int]:
+        """Rows between which the first event at or after any time of a millisecond lies."""
+        table = self._ms_to_idx
+        low, high = 0, len(self)
+        if table is not None and len(table):
+            if ms >= 0:
+                low = int(table[min(ms, len(table) - 1)])
+            if ms + 1 < len(table):
+                high = int(table[max(ms + 1, 0)])
+        return low, high
+
+
+def read(path: Path, size: tuple[int, int] | None) -> Recording:
+    """Read a file into memory; `size` is (width, height). Raises `InputError` for bad input."""
+    with _open(path) as file:
+        recording = _recording(file, path, size)
+        return dataclasses.replace(recording, events=recording.events[:])
+
+
+def open_stored(path: Path, size: tuple[int, int] | None) -> Recording:
+    """Read all but the events, which stay in the file as `StoredEvents`."""
+    return _recording(_open(path), path, size)
+
+
+def _open(path: Path) -> h5py.File:
+    with reading(str(path)):
+        return h5py.File(path)
+
+
+def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Recording:
+    source = str(path)
+    with reading(source):
+        attributes: dict[str, Any] = dict(file.attrs)
+    version = attributes.get("version")
+    if attributes.get("format") == "jaxevent" and version != VERSION:
+        raise InputError(
+            f"{path}: has version {version} of the layout but this jaxevent reads version "
+            f"{VERSION}; update jaxevent"
+        )
+    frames = poses = imu = camera = None
+    if isinstance(file.get("frames"), h5py.Group):
+        t, exposure = (_times(file, f"frames/{name}", source) for name in ("t", "exposure"))
+        images = _array(file, "frames/images", source)
+        if len(t):
+            frames = Frames(t, images, exposure)
+    if size is None and "width" in attributes and "height" in attributes:
+        with reading(f"{source}: attributes width and height"):
+            size = (int(attributes["width"]), int(attributes["height"]))
+    if size is None:
+        raise InputError(
+            f"{path}: has no attributes width and height; give size=(width, height) or --size"
+        )
+    if isinstance(file.get("camera"), h5py.Dataset):
+        camera = pinhole(_array(file, "camera", source), f"{path}: camera")
+    if isinstance(file.get("poses"), h5py.Group):
+        t = _times(file, "poses/t", source)
+        position = _vectors(file, "poses/position", (len(t), 3), source)
+        poses = Poses(t, position, _vectors(file, "poses/quaternion", (len(t), 4), source))
+    if isinstance(file.get("imu"), h5py.Group):
+        t = _times(file, "imu/t", source)
+        gyro, acc = (_vectors(file, f"imu/{name}", (len(t), 3), source) for name in ("gyro", "acc"))
+        imu = Imu(t, gyro, acc)
+    name = str(attributes.get("name", path.stem))
+    events = StoredEvents(file, size, source)
+    return Recording(name, *size, events, frames, camera, poses, imu, _extra(file, source))
+
+
+def write(recording: Recording, path: Path, compression: str | None = None) -> None:
+    """Write a recording; `jaxevent.io.save` describes the arguments and errors."""
+    if compression not in (None, "gzip"):
+        raise InputError(f'{path}: compression {compression!r} is unknown; use None or "gzip"')
+    recording.check()
+    with complete(path) as partial, h5py.File(partial, "w") as file:
+        file.attrs.update(
+            format="jaxevent",
+            version=VERSION,
+            name=recording.name,
+            width=recording.width,
+            height=recording.height,
+        )
+        _write_events(file, recording.events, compression, recording.name)
+        for group, part in (
+            ("frames", recording.frames),
+            ("poses", recording.poses),
+            ("imu", recording.imu),
+        ):
+            if part is not None:
+                for name, values in vars(part).items():
+                    _write(file, f"{group}/{name}", values, compression)
+        if (camera := recording.camera) is not None:
+            file["camera"] = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
+        for name, values in recording.extra.items():
+            _write(file, f"extra/{name}", values, compression)
+
+
+def _write_events(
+    file: h5py.File, events: EventSource, compression: str | None, source: str
+) -> None:
+    count = len(events)
+    offset = int(events[:1].t[0]) if count else 0
+    last_ms = (int(events[count - 1 :].t[0]) - offset) // 1000 if count else -1
+    if last_ms >= _MOST_MS:
+        raise InputError(
+            f"{source}: the events span {last_ms / 86_400_000:.0f} days, too long for ms_to_idx; "
+            "remove stray timestamps or cut the recording"
+        )
+    file["t_offset"] = np.int64(offset)
+    options = _options(count, compression)
+    t, x, y, p = (
+        file.create_dataset(f"events/{name}", (count,), dtype, **options)
+        for name, dtype in (("t", "i8"), ("x", "u2"), ("y", "u2"), ("p", "u1"))
+    )
+    ms_to_idx = file.create_dataset(
+        "ms_to_idx", (last_ms + 1,), "u8", **_options(last_ms + 1, compression)
+    )
+    ms = 0
+    for row in range(0, count, _BLOCK):
+        block = events[row : row + _BLOCK]
+        since = block.t - offset
+        rows = slice(row, row + len(block))
+        t[rows], x[rows], y[rows], p[rows] = since, block.x, block.y, block.p
+        # The milliseconds that begin after the last block and not after this one's last event.
+        end = int(since[-1]) // 1000 + 1
+        for first in range(ms, end, _BLOCK):
+            begin = np.arange(first, min(first + _BLOCK, end))
+            ms_to_idx[first : first + len(begin)] = row + np.searchsorted(since, 1000 * begin)
+        ms = end
+
+
+def _write(file: h5py.File, name: str, values: NDArray, compression: str | None) -> None:
+    values = np.asarray(values)
+    dtype = h5py.string_dtype() if values.dtype.kind == "U" else values.dtype
+    options = _options(len(values) if values.size and values.ndim else 0, compression)
+    if options:
+        rows = max(1, _CHUNK // values[0].size)
+        options["chunks"] = (min(rows, len(values)), *values.shape[1:])
+    try:
+        file.create_dataset(name, values.shape, dtype, values.astype(dtype, copy=False), **options)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"{name} ({values.dtype}) cannot be stored in HDF5 ({error}); rename or remove it"
+        ) from error
+
+
+def _options(count: int, compression: str | None) -> dict[str, Any]:
+    if compression is None or count == 0:
+        return {}
+    return {"compression": compression, "shuffle": True, "chunks": (min(count, _CHUNK),)}
+
+
+def _dataset(file: h5py.File, name: str, source: str) -> h5py.Dataset:
+    dataset = file.get(name)
+    if not isinstance(dataset, h5py.Dataset):
+        raise InputError(f"{source}: has no dataset {name}; add it or save the recording again")
+    return dataset
+
+
+def _array(file: h5py.File, name: str, source: str) -> NDArray:
+    with reading(f"{source}: {name}"):
+        return np.asarray(_dataset(file, name, source)[()])
+
+
+def _times(file: h5py.File, name: str, source: str) -> NDArray[np.int64]:
+    return times(_array(file, name, source), f"{source}: {name}", "row")
+
+
+def _vectors(
+    file: h5py.File, name: str, shape: tuple[int, int], source: str
+) -> NDArray[np.float64]:
+    return vectors(_array(file, name, source), shape, source, name)
+
+
+def _extra(file: h5py.File, source: str) -> dict[str, NDArray]:
+    extra: dict[str, NDArray] = {}
+    group = file.get("extra")
+    if isinstance(group, h5py.Group):
+
+        def keep(name: str, item: h5py.Dataset | h5py.Group) -> None:
+            if isinstance(item, h5py.Dataset):
+                text = h5py.check_string_dtype(item.dtype) is not None and item.dtype.kind == "O"
+                values = item.asstr()[()] if text else item[()]
+                extra[name] = np.asarray(values, dtype=np.str_ if text else None)
+
+        with reading(f"{source}: extra"):
+            group.visititems(keep)
+    return extra

@@ -1,0 +1,93 @@
+"""Recordings as NumPy archives (.npz) of these arrays:
+
+    t, x, y, p            events: times, columns, rows, polarity (bool, 0/1 or -1/1)
+    width, height         pixels
+    frames                (frames, height, width) uint8, uint16 or floats in [0, 1]
+    frame_t               mid-exposure times
+    exp_start, exp_end    start and end of the exposures; where present, frame_t is not used
+    imu_t, gyro, acc      (samples,), (samples, 3) rad/s, (samples, 3) m/s^2
+    calib                 fx fy cx cy k1 k2 p1 p2 k3
+
+Times are integers in microseconds or floats in seconds. Only the events are required, and width
+and height where there are no frames. Every other array is kept in `Recording.extra`.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError
+from jaxevent.io import checked_events, pinhole, reading, times, vectors
+from jaxevent.recording import Frames, Imu, Recording
+
+
+def read(path: Path, size: tuple[int, int] | None) -> Recording:
+    """Read an archive; `size` is (width, height). Raises `InputError` for bad input."""
+    arrays: dict[str, NDArray] = {}
+    with reading(str(path)), np.load(path, allow_pickle=False) as archive:
+        names = archive.files
+        for name in names:
+            with reading(f"{path}: {name}"):
+                arrays[name] = archive[name]
+
+    def take(*names: str) -> list[NDArray]:
+        missing = [name for name in names if name not in arrays]
+        if missing:
+            raise InputError(f"{path}: has no {' and no '.join(missing)}; add the arrays")
+        return [arrays.pop(name) for name in names]
+
+    t, x, y, p = take("t", "x", "y", "p")
+    frames = _frames(path, arrays, take) if "frames" in arrays else None
+    stored = [arrays.pop(name) for name in ("width", "height") if name in arrays]
+    if size is None and len(stored) == 2:
+        size = (_pixels(path, "width", stored[0]), _pixels(path, "height", stored[1]))
+    if size is None and frames is not None:
+        size = (frames.images.shape[2], frames.images.shape[1])
+    if size is None:
+        raise InputError(
+            f"{path}: has no width and height and no frames; add them or give "
+            "size=(width, height) or --size"
+        )
+    source = str(path)
+    events = checked_events(times(t, source, "event"), x, y, p, size, source)
+    imu = None
+    if "imu_t" in arrays:
+        imu_t, gyro, acc = take("imu_t", "gyro", "acc")
+        imu_t = times(imu_t, source, "IMU sample")
+        shape = (len(imu_t), 3)
+        imu = Imu(imu_t, vectors(gyro, shape, source, "gyro"), vectors(acc, shape, source, "acc"))
+    camera = pinhole(arrays.pop("calib"), f"{path}: calib") if "calib" in arrays else None
+    return Recording(path.stem, *size, events, frames, camera, imu=imu, extra=arrays)
+
+
+def _frames(path: Path, arrays: dict[str, NDArray], take) -> Frames | None:
+    (images,) = take("frames")
+    if images.ndim != 3:
+        raise InputError(
+            f"{path}: frames has shape {images.shape}; it must be (frames, height, width)"
+        )
+    source = str(path)
+    if "exp_start" in arrays or "exp_end" in arrays:
+        start, end = (times(a, source, "exposure") for a in take("exp_start", "exp_end"))
+        arrays.pop("frame_t", None)
+        if len(start) != len(end):
+            raise InputError(
+                f"{path}: exp_start and exp_end have {len(start)} and {len(end)} values; "
+                "give one of each per frame"
+            )
+        t, exposure = start + (end - start) // 2, end - start
+    elif "frame_t" in arrays:
+        t = times(take("frame_t")[0], source, "frame")
+        exposure = np.zeros_like(t)
+    else:
+        raise InputError(
+            f"{path}: frames have no times; add frame_t (mid-exposure) or exp_start and exp_end"
+        )
+    return Frames(t, images, exposure) if len(images) or len(t) else None
+
+
+def _pixels(path: Path, name: str, value: NDArray) -> int:
+    if value.size != 1 or value.dtype.kind not in "iuf" or not value.item() == value.item() // 1:
+        raise InputError(f"{path}: {name} must be one whole number of pixels")
+    return int(value.item())
