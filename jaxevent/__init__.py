@@ -1,0 +1,77 @@
+"""Differentiable estimators for event cameras: reconstruction of HDR video from events and frames.
+
+recording = jaxevent.load("slider_depth.zip")
+video = jaxevent.akf.reconstruct(recording, jaxevent.akf.Params(c_on=0.08))
+image, variance = video(recording.frames.t)
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jaxevent.errors import InputError
+    from jaxevent.io import load, save
+    from jaxevent.reconstruction import (
+        METHODS,
+        akf,
+        augmented,
+        blend,
+        cf,
+        cf_augmented,
+        edi,
+        high_pass,
+        last_frame,
+    )
+    from jaxevent.reconstruction.pixels import prepare
+    from jaxevent.recording import Events, Frames, Recording
+
+__version__ = "0.1.0"
+
+# Loaded when first used: the readers and the compiled preparation are slow to import.
+_HOME = {
+    "jaxevent.errors": ("InputError",),
+    "jaxevent.io": ("load", "save"),
+    "jaxevent.recording": ("Events", "Frames", "Recording"),
+    "jaxevent.reconstruction.pixels": ("prepare",),
+    "jaxevent.reconstruction": (
+        "METHODS",
+        "akf",
+        "augmented",
+        "blend",
+        "cf",
+        "cf_augmented",
+        "edi",
+        "high_pass",
+        "last_frame",
+    ),
+}
+_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
+
+__all__ = [
+    "METHODS",
+    "Events",
+    "Frames",
+    "InputError",
+    "Recording",
+    "akf",
+    "augmented",
+    "blend",
+    "cf",
+    "cf_augmented",
+    "edi",
+    "high_pass",
+    "last_frame",
+    "load",
+    "prepare",
+    "save",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'jaxevent' has no attribute {name!r}")
+    return getattr(importlib.import_module(_MODULE_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

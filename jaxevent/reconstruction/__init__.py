@@ -1,0 +1,22 @@
+"""Video from events and frames: the asynchronous Kalman filter and its baselines."""
+
+from jaxevent.reconstruction.complementary import cf, cf_augmented, high_pass
+from jaxevent.reconstruction.direct import augmented, blend, edi, last_frame
+from jaxevent.reconstruction.kalman import akf
+
+METHODS = {
+    method.name: method
+    for method in (akf, cf, cf_augmented, high_pass, edi, augmented, blend, last_frame)
+}
+
+__all__ = [
+    "METHODS",
+    "akf",
+    "augmented",
+    "blend",
+    "cf",
+    "cf_augmented",
+    "edi",
+    "high_pass",
+    "last_frame",
+]

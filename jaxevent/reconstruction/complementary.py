@@ -1,0 +1,80 @@
+"""Complementary and high-pass filters (Scheerlinck et al., ACCV 2018): a constant gain.
+
+Their state is log intensity; no variance is estimated. What pulls it is the last frame (the
+original), the augmented frame ("CF with augmentation", AKF supplement section 2), or nothing (the
+high-pass filter: events only, so its images have no absolute brightness).
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxevent.parameters import Positive
+from jaxevent.reconstruction.augment import (
+    Augmented,
+    AugmentParams,
+    FrameParams,
+    Held,
+    Level,
+    Nothing,
+)
+from jaxevent.reconstruction.estimator import Estimator, Event, Observation, Observer, State
+from jaxevent.reconstruction.pixels import FrameFeatures, Points
+
+
+class Params(FrameParams):
+    """Parameters of the complementary and the high-pass filter."""
+
+    alpha = Positive(15.0, "rad/s", "cut-off frequency")
+
+    def __init__(self, **values: Any):
+        super().__init__(**values)
+
+
+class AugmentedParams(AugmentParams):
+    """Parameters of the complementary filter with augmentation."""
+
+    alpha = Positive(15.0, "rad/s", "cut-off frequency")
+
+    def __init__(self, **values: Any):
+        super().__init__(**values)
+
+
+class Pull(Observer):
+    """A model of the log intensity, believed at the rate alpha."""
+
+    level: Level
+    alpha: Float[Array, ""]
+
+    def __call__(self, points: Points) -> Observation:
+        u = self.level(points)
+        return Observation(u, jnp.broadcast_to(self.alpha, u.shape))
+
+
+def initial(params: FrameParams, level: Array) -> State:
+    return State(level, jnp.full_like(level, jnp.nan))
+
+
+def advance(params: FrameParams, state: State, dt: Array, frame: Observation) -> State:
+    """L <- L e^(-alpha dt) + u (1 - e^(-alpha dt))."""
+    decay = jnp.exp(-frame.rate * dt)
+    return State(state.L * decay + frame.level * (1 - decay), state.P)
+
+
+def jump(params: FrameParams, state: State, event: Event) -> State:
+    """L <- L + s c."""
+    change = jnp.where(event.polarity > 0, params.c_on, -params.c_off)
+    return State(state.L + jnp.where(event.polarity == 0, 0, change), state.P)
+
+
+def _filter(name: str, model: type[Level], params: type[FrameParams], **more: Any) -> Estimator:
+    def observe(values: Any, frames: FrameFeatures) -> Pull:
+        return Pull(model(values, frames), values.alpha)
+
+    return Estimator(name, params, observe, initial, advance, jump, **more)
+
+
+cf = _filter("cf", Held, Params)
+cf_augmented = _filter("cf-augmented", Augmented, AugmentedParams)
+high_pass = _filter("high-pass", Nothing, Params, needs_frames=False)

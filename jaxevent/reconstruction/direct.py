@@ -1,0 +1,48 @@
+"""Methods that keep no state: what the frames (and the events between them) say, read directly."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxevent.reconstruction.augment import (
+    Augmented,
+    Blended,
+    EventIntegral,
+    FrameParams,
+    Held,
+    Level,
+)
+from jaxevent.reconstruction.estimator import Estimator, Observation, Observer, State
+from jaxevent.reconstruction.pixels import FrameFeatures, Points
+
+
+class Direct(Observer):
+    """A model of the log intensity, believed at once."""
+
+    level: Level
+
+    def __call__(self, points: Points) -> Observation:
+        u = self.level(points)
+        return Observation(u, jnp.full_like(u, jnp.inf))
+
+
+def initial(params: FrameParams, level: Array) -> State:
+    return State(level, jnp.full_like(level, jnp.nan))
+
+
+def advance(params: FrameParams, state: State, dt: Array, frame: Observation) -> State:
+    return State(frame.level, jnp.broadcast_to(state.P, frame.level.shape))
+
+
+def _direct(name: str, model: type[Level]) -> Estimator:
+    def observe(values: Any, frames: FrameFeatures) -> Direct:
+        return Direct(model(values, frames))
+
+    return Estimator(name, model.Params, observe, initial, advance)
+
+
+edi = _direct("edi", EventIntegral)
+augmented = _direct("augmented", Augmented)
+blend = _direct("blend", Blended)
+last_frame = _direct("last-frame", Held)

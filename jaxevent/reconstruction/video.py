@@ -1,0 +1,164 @@
+"""A reconstruction as a function of time: read images at any times without changing them."""
+
+import functools
+import itertools
+from collections.abc import Iterator
+from typing import Any, Generic
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from jaxevent.errors import InputError
+from jaxevent.reconstruction.estimator import Estimator, P, State, Trajectory
+from jaxevent.reconstruction.pixels import WINDOW_EVENTS, Carry, Features, Reader, ReadOut, Windows
+from jaxevent.recording import Recording, Times, microseconds
+
+BATCH = 8  # images read per call; 8 x 90,000 pixels stay in the second-level cache
+
+
+# jax.jit returns before the result is there; eqx.filter_jit waits for it.
+@functools.partial(jax.jit, static_argnums=0)
+def _start(estimator: Estimator, params, features: Features) -> State:
+    return estimator.start(params, features)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _run(
+    estimator: Estimator, params, features: Features, state: State
+) -> tuple[Trajectory, State]:
+    return estimator.run(params, features, state)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _read(estimator: Estimator, params, trajectory: Trajectory, out: ReadOut):
+    return estimator.read(params, trajectory, out)
+
+
+class Video(Generic[P]):
+    """Images of a reconstruction: `image, variance = video(times)`.
+
+    The recording is filtered in time windows of at most `window_events` events when images in them
+    are asked for; windows before them are filtered first. One window is kept, and the state at
+    every window's start, so memory does not grow with the recording's length. Images do not depend
+    on which other images were asked for, nor on the windows.
+    """
+
+    def __init__(
+        self,
+        estimator: Estimator[P],
+        recording: Recording,
+        params: P,
+        *,
+        window_events: int = WINDOW_EVENTS,
+        progress: bool = False,
+    ):
+        if estimator.needs_frames and recording.frames is None:
+            raise InputError(
+                f"{recording.name}: holds no frames, which the method {estimator.name!r} needs; "
+                "use 'akf' or 'high-pass'"
+            )
+        self.estimator, self.recording, self.params = estimator, recording, params
+        self.progress = progress
+        self._windows = Windows(
+            recording,
+            float(params.clock_offset),
+            filtering=estimator.jump is not None,
+            events=window_events,
+            reuse=True,
+        )
+        self._starts: list[tuple[int | None, Carry, State | None]] = [
+            (None, self._windows.initial(), None)
+        ]
+        self._open: tuple[int, Reader, Trajectory] | None = None
+
+    def __call__(self, times: Times) -> tuple[NDArray, NDArray]:
+        """Intensity and variance of log intensity at `times`, each of shape (T, H, W).
+
+        Times are integers (us) or floats (s) on the recording's clock, in any order. Intensity 0 is
+        black and 1 the frames' white; reconstructed values go beyond. Before the recording's start
+        images show the initial state. The variance is NaN for methods that estimate none. Raises
+        `InputError` for times that are not finite or nowhere near the recording.
+        """
+        times = np.atleast_1d(microseconds(times))
+        order = np.argsort(times, kind="stable")
+        shape = (len(times), self.recording.height, self.recording.width)
+        image, variance = np.empty((2, *shape), self._windows.dtype)
+        done = 0
+        for batch, images, variances in self.batches(times[order]):
+            rows = order[done : done + len(batch)]
+            image[rows], variance[rows] = images, variances
+            done += len(batch)
+        return image, variance
+
+    def batches(
+        self, times: Times
+    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.floating], NDArray[np.floating]]]:
+        """The same, a few images after another for sorted times: `times, image, variance`."""
+        times = np.atleast_1d(microseconds(times))
+        if (times[1:] < times[:-1]).any():
+            raise InputError("times must be sorted to be read in batches; sort them")
+        self._check(times)
+        with tqdm(
+            total=len(times), unit="image", delay=2, disable=not self.progress, leave=False
+        ) as bar:
+            # One batch is computed while the next one is looked up in the events.
+            ahead = None
+            for following in itertools.chain(self._read(times), [None]):
+                if ahead is not None:
+                    batch, images = ahead
+                    shape = (len(batch), self.recording.height, self.recording.width)
+                    image, variance = (np.asarray(v)[: len(batch)].reshape(shape) for v in images)
+                    yield batch, image, variance
+                    bar.update(len(batch))
+                ahead = following
+
+    def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
+        """Batches of images on their way on the device."""
+        done = 0
+        while done < len(times):
+            reader, trajectory = self._window_of(int(times[done]))
+            stop = reader.window.stop
+            end = len(times) if stop is None else int(np.searchsorted(times, stop))
+            for first in range(done, end, BATCH):
+                batch = times[first : min(first + BATCH, end)]
+                yield batch, _read(self.estimator, self.params, trajectory, reader(batch))
+            done = end
+
+    def _check(self, times: NDArray[np.int64]) -> None:
+        start, stop = self.recording.start, self.recording.stop
+        reach = stop - start + 1_000_000
+        if len(times) and (times.min() < start - reach or times.max() > stop + reach):
+            raise InputError(
+                f"{self.recording.name}: times from {times.min()} to {times.max()} us were asked "
+                f"for, but it lasts from {start} to {stop} us; integers are microseconds, floats "
+                "seconds, both on the recording's clock"
+            )
+
+    def _window_of(self, time: int) -> tuple[Reader, Trajectory]:
+        """The filtered window that contains `time`; windows on the way are filtered in order."""
+        k = max(i for i, (start, *_) in enumerate(self._starts) if start is None or start <= time)
+        while True:
+            if self._open is None or self._open[0] != k:
+                self._open = None  # so that two windows are never held at once
+                self._open = (k, *self._filter(k))
+            _, reader, trajectory = self._open
+            if reader.window.stop is None or time < reader.window.stop:
+                return reader, trajectory
+            k += 1
+
+    def _filter(self, k: int) -> tuple[Reader, Trajectory]:
+        start, before, state = self._starts[k]
+        known = k + 1 < len(self._starts)
+        stop = self._starts[k + 1][0] if known else self._windows.next_stop(start)
+        window = self._windows.prepare(start, stop, before)
+        features, window.features = window.features, None  # used once, and large
+        if state is None:
+            state = _start(self.estimator, self.params, features)
+            self._starts[0] = (start, before, state)
+        trajectory, end = _run(self.estimator, self.params, features, state)
+        jax.block_until_ready(trajectory)  # before the next window's tiles overwrite these
+        if window.stop is not None and not known:
+            self._starts.append((window.stop, window.after, end))
+        return window.reader(BATCH, self._windows.dtype), trajectory

@@ -1,0 +1,208 @@
+"""Slow, obvious float64 versions, one pixel and one event at a time, for comparison."""
+
+import math
+
+import numpy as np
+
+
+class Pixel:
+    """One pixel's events (us, +1/-1) and frames; sums of s c are counted from the first event."""
+
+    def __init__(self, t, s, grey, mid, exposure, p):
+        self.t, self.s, self.grey, self.mid, self.p = t, s, grey, mid, p
+        self.T = exposure
+        self.left = [m - T / 2 for m, T in zip(mid, exposure, strict=True)]
+        self.right = [m + T / 2 for m, T in zip(mid, exposure, strict=True)]
+        self.frames = len(mid)
+
+    def c(self, s):
+        return self.p["c_on"] if s > 0 else self.p["c_off"]
+
+    def moved(self, n):
+        """Sum of s c over the first n events."""
+        return sum(s * self.c(s) for s in self.s[:n])
+
+    def before(self, time):
+        """The same over the events earlier than a time."""
+        return sum(s * self.c(s) for t, s in zip(self.t, self.s, strict=True) if t < time)
+
+    def sharp(self, k):
+        """EDI: log intensity at mid-exposure of frame k."""
+        level = math.log(self.grey[k] + self.p["I0"])
+        if self.T[k] == 0:
+            return level
+        inside = [t for t in self.t if self.left[k] <= t < self.right[k]]
+        cuts = sorted({self.left[k], self.mid[k], self.right[k], *inside})
+        m = 0.0
+        for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+            # Constant on (a, b): the events up to and including a have happened.
+            E = self.before(b) - self.before(self.mid[k])
+            m += (b - a) / self.T[k] * math.exp(E)
+        return level - math.log(m)
+
+    def at_left(self, k):
+        return self.sharp(k) + self.before(self.left[k]) - self.before(self.mid[k])
+
+    def at_right(self, k):
+        return self.sharp(k) + self.before(self.right[k]) - self.before(self.mid[k])
+
+    def ratio(self, k):
+        if not 0 <= k < self.frames - 1:
+            return 1.0
+        S = self.before(self.right[k + 1]) - self.before(self.left[k])
+        dL = self.at_right(k + 1) - self.at_left(k)
+        # Sums that cancel exactly in counts must not leave a rounding error to divide by.
+        if abs(S) < 1e-12:
+            return 1.0
+        r = dL / S
+        return r if self.p["ratio_min"] <= r <= self.p["ratio_max"] else 1.0
+
+    def forward(self, k, n):
+        return self.at_left(k) + self.ratio(k) * (self.moved(n) - self.before(self.left[k]))
+
+    def backward(self, k, n):
+        """The backward integration of interval k, from the right edge of frame k + 1."""
+        return self.at_right(k + 1) - self.ratio(k) * (
+            self.before(self.right[k + 1]) - self.moved(n)
+        )
+
+    def seam(self, k):
+        """Where the gap after frame k begins and ends; overlapping exposures share the overlap."""
+        lo, hi = self.mid[k], self.mid[k + 1]
+        ends = sorted([self.right[k], self.left[k + 1]])
+        return [min(max(e, lo), hi) for e in ends]
+
+    def augmented(self, time, n):
+        last = self.frames - 1
+        if last < 0:
+            return math.log(0.5 + self.p["I0"]) + self.moved(n)
+        for k in range(self.frames):
+            begin = self.seam(k - 1)[1] if k else self.left[0]
+            end = self.seam(k)[0] if k < last else self.right[last]
+            if time < begin:  # in the gap before frame k
+                if k == 0:
+                    return self.backward(-1, n)
+                a, b = self.seam(k - 1)
+                u = (time - a) / (b - a)
+                return (1 - u) * self.forward(k - 1, n) + u * self.backward(k - 1, n)
+            if time < end:
+                v = (time - begin) / (end - begin)
+                return (1 - v) * self.backward(k - 1, n) + v * self.forward(k, n)
+        return self.forward(last, n)
+
+    def event_integral(self, time, n):
+        k = -1
+        for f in range(self.frames):
+            begin = self.seam(f - 1)[1] if f else self.left[0]
+            if time >= begin:
+                k = f
+        if k < 0:
+            return self.at_right(0) - self.before(self.right[0]) + self.moved(n)
+        return self.at_left(k) - self.before(self.left[k]) + self.moved(n)
+
+    def linear(self, time, values):
+        if time < self.mid[0]:
+            return values[0]
+        for k in range(self.frames - 1):
+            if time < self.mid[k + 1]:
+                g = (time - self.mid[k]) / (self.mid[k + 1] - self.mid[k])
+                return (1 - g) * values[k] + g * values[k + 1]
+        return values[-1]
+
+    def held(self, time, n):
+        level = [math.log(g + self.p["I0"]) for g in self.grey]
+        return level[max(sum(m <= time for m in self.mid) - 1, 0)]
+
+    def blended(self, time, n):
+        return math.log(self.linear(time, self.grey) + self.p["I0"])
+
+    def rate(self, time):
+        """1 / R."""
+        if not self.frames:
+            return 0.0
+        p = self.p
+        density = [1 / (p["kappa"] * max(4 * g * (1 - g), p["w_min"])) for g in self.grey]
+        return (self.linear(time, self.grey) + p["I0"]) ** 2 / self.linear(time, density)
+
+
+def neighbour_times(t, x, y, start):
+    """Per event, the time of the latest one earlier in the stream within the 3x3 neighbourhood."""
+    out = []
+    for i in range(len(t)):
+        near = [
+            t[j] for j in range(i) if abs(int(x[j]) - int(x[i])) <= 1 >= abs(int(y[j]) - int(y[i]))
+        ]
+        out.append(max(near, default=start))
+    return out
+
+
+def reconstruct(method, recording, p, times):
+    """Image and variance at times (us), as `Estimator.reconstruct` defines them."""
+    start = recording.start
+    e = recording.events
+    t = [int(v) - start for v in e.t]
+    near = neighbour_times(t, e.x, e.y, 0)
+    f = recording.frames
+    mid = [] if f is None else [int(v) - start + p["clock_offset"] * 1e6 for v in f.t]
+    exposure = [] if f is None else [int(v) for v in f.exposure]
+    images = np.empty((2, len(times), recording.height, recording.width))
+    for y in range(recording.height):
+        for x in range(recording.width):
+            rows = [i for i in range(len(t)) if e.x[i] == x and e.y[i] == y]
+            grey = [] if f is None else [float(g) for g in f.intensity[:, y, x].astype(float)]
+            pixel = Pixel(
+                [t[i] for i in rows], [1 if e.p[i] else -1 for i in rows], grey, mid, exposure, p
+            )
+            trace = run(method, pixel, [near[i] for i in rows], p)
+            for j, time in enumerate(times):
+                images[:, j, y, x] = read(method, pixel, trace, int(time) - start, p)
+    return images
+
+
+def reference(method, pixel):
+    return {
+        "akf": pixel.augmented,
+        "cf": pixel.held,
+        "cf-augmented": pixel.augmented,
+        "high-pass": lambda time, n: 0.0,
+        "edi": pixel.event_integral,
+        "augmented": pixel.augmented,
+        "blend": pixel.blended,
+        "last-frame": pixel.held,
+    }[method]
+
+
+def move(method, pixel, L, P, dt, time, n, p):
+    """L and P after dt seconds without events, ending at `time`, when n events have happened."""
+    u = reference(method, pixel)(time, n)
+    if method == "akf":
+        rate = pixel.rate(time)
+        P1 = 1 / (1 / P + dt * rate)  # (18)
+        return (L - u) / P * P1 + u, P1  # (16)
+    if method in ("cf", "cf-augmented", "high-pass"):
+        fade = math.exp(-p["alpha"] * dt)
+        return L * fade + u * (1 - fade), math.nan
+    return u, math.nan
+
+
+def run(method, pixel, near, p):
+    """[(time, L, P)]: the start, then after each event."""
+    L, P, last = reference(method, pixel)(0.0, 0), p.get("P0", math.nan), 0
+    trace = [(last, L, P)]
+    for n, (time, s) in enumerate(zip(pixel.t, pixel.s, strict=True)):
+        gap = (time - last) * 1e-6
+        L, P = move(method, pixel, L, P, gap, time, n, p)
+        L += s * pixel.c(s)  # (14)
+        if method == "akf":
+            P += p["sigma_proc"] ** 2 * gap + p["sigma_iso"] ** 2 * (time - near[n]) * 1e-6  # (19)
+            P += p["sigma_ref"] ** 2 if gap <= p["rho"] else 0
+        last = time
+        trace.append((last, L, P))
+    return trace
+
+
+def read(method, pixel, trace, time, p):
+    n = sum(t <= time for t in pixel.t)
+    last, L, P = trace[n]
+    L, P = move(method, pixel, L, P, max(time - last, 0) * 1e-6, time, n, p)
+    return math.exp(L) - p["I0"], P
