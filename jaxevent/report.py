@@ -1,0 +1,305 @@
+"""What people look at: display images, video files, comparison figures and result tables.
+
+Tone mapping serves the display alone; stored intensities stay linear.
+"""
+
+import contextlib
+import math
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxevent.errors import InputError, require
+from jaxevent.io.output import complete
+from jaxevent.metrics import checked
+
+Tone = Literal["linear", "log", "percentile", "clahe"]
+Kind = Literal["image", "error", "uncertainty"]
+
+# The logarithm shows at most this many halvings below the brightest value (96 dB): pixels that are
+# dark up to rounding, say 1e-9, would otherwise take most of the grey scale.
+OCTAVES = 16
+
+
+def display_limits(images: ArrayLike, how: str = "linear") -> tuple[float, float]:
+    """The intensities shown as black and as white, from a sample (..., height, width) of images.
+
+    "linear" has the limits 0 and 1, whatever the images. The other tones leave out the darkest and
+    the brightest 0.5 % of the values as outliers; "log" and "clahe" look at positive values only.
+    Pass the result to `tone_map` for each frame of a video, so that its brightness does not pump.
+    Raises `InputError` for an unknown tone and for images that are not finite floats.
+    """
+    images, logarithmic = checked(images, "images"), _is_logarithmic(how)
+    if how == "linear":
+        return 0.0, 1.0
+    values = images[images > 0] if logarithmic else images.ravel()
+    if not len(values):
+        return (2.0**-OCTAVES, 1.0) if logarithmic else (0.0, 1.0)
+    low, high = (float(limit) for limit in np.percentile(values.astype(np.float64), [0.5, 99.5]))
+    if logarithmic:
+        low = max(low, high * 2.0**-OCTAVES)
+        return (low, high) if low < high else (low / 2, high * 2)
+    return (low, high) if low < high else (low - 0.5, high + 0.5)
+
+
+def tone_map(
+    images: ArrayLike, how: str = "linear", limits: tuple[float | int, float | int] | None = None
+) -> NDArray[np.uint8]:
+    """Images for the display, uint8, of the same shape (..., height, width) as the float `images`.
+
+    "linear" and "percentile" scale intensity, "log" its base-2 logarithm, from `limits` (black,
+    white; by default `display_limits` of these images) to 0..255 and clip what lies outside.
+    "clahe" equalises the histogram of the result of "log" in tiles of 1/8 of the image with limited
+    contrast, each image by itself. Raises `InputError` for an unknown tone, for images that are not
+    finite floats and for limits that are out of order or, with a logarithm, not positive.
+    """
+    images, logarithmic = checked(images, "images"), _is_logarithmic(how)
+    low, high = limits or display_limits(images, how)
+    if not (-math.inf < low < high < math.inf) or (logarithmic and low <= 0):
+        raise InputError(
+            f"the display limits {low} and {high} do not suit the tone {how!r}; give two finite"
+            f"{' positive' if logarithmic else ''} intensities, black below white"
+        )
+    shown = np.clip(images, low, high)
+    if logarithmic:
+        shown, low, high = np.log2(shown), math.log2(low), math.log2(high)
+    shown = np.clip((shown - low) / (high - low), 0, 1)
+    if how == "clahe":
+        shown = _equalised(shown)
+    return np.rint(shown * 255).astype(np.uint8)
+
+
+def _is_logarithmic(how: str) -> bool:
+    if how not in get_args(Tone):
+        raise InputError(f"there is no tone {how!r}; choose one of {', '.join(get_args(Tone))}")
+    return how in ("log", "clahe")
+
+
+def _equalised(images: NDArray[np.floating]) -> NDArray[np.floating]:
+    from skimage.exposure import equalize_adapthist
+
+    # A constant image has no contrast to equalise, and scikit-image turns it white.
+    flat = images.reshape(-1, *images.shape[-2:])
+    equal = [equalize_adapthist(one) if np.ptp(one) > 0 else one for one in flat]
+    return np.asarray(equal).reshape(images.shape)
+
+
+def write_png(path: str | Path, image: NDArray) -> None:
+    """Write a uint8 image, grey (height, width) or colour (height, width, 3), as a PNG file.
+
+    Raises `InputError` for other arrays.
+    """
+    from PIL import Image
+
+    _check_displayable(path, image)
+    with complete(Path(path)) as temporary:
+        Image.fromarray(np.ascontiguousarray(image)).save(temporary, format="PNG")
+
+
+@contextlib.contextmanager
+def video_writer(path: str | Path, fps: float | int) -> Iterator[Callable[[NDArray], None]]:
+    """Open an MP4 file (H.264, yuv420p) and give the function that appends a frame to it.
+
+        with video_writer("flight.mp4", fps=30) as write:
+            for image in images:
+                write(tone_map(image))
+
+    Frames are uint8, grey (height, width) or colour (height, width, 3), all of one size; an odd
+    size is padded to even, as the format demands, by repeating the last row or column. `fps` is in
+    frames per second. The file appears at the end, complete; an exception leaves none. Raises
+    `InputError` without the extra "video", for unfit frames, for none and if encoding fails.
+    """
+    program = require("imageio_ffmpeg", "video").get_ffmpeg_exe()
+    if not 0 < fps < math.inf:
+        raise InputError(f"{path}: {fps} frames per second are not possible; give a positive rate")
+    shape: tuple[int, ...] = ()
+    ffmpeg: subprocess.Popen[bytes] | None = None
+
+    with complete(Path(path)) as temporary, tempfile.TemporaryFile() as log:
+
+        def start() -> subprocess.Popen[bytes]:
+            height, width = (size + size % 2 for size in shape[:2])
+            pixels = "gray" if len(shape) == 2 else "rgb24"
+            given = f"-f rawvideo -pix_fmt {pixels} -s {width}x{height} -r {fps} -i pipe:0"
+            # Constant rate factor 16 is visually lossless; faststart puts the index first.
+            wanted = "-c:v libx264 -crf 16 -pix_fmt yuv420p -movflags +faststart -f mp4"
+            return subprocess.Popen(
+                [program, "-y", "-v", "error", *given.split(), *wanted.split(), str(temporary)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=log,
+            )
+
+        def failure() -> InputError:
+            log.seek(0)
+            said = " ".join(log.read().decode(errors="replace").split())[-300:]
+            return InputError(f"{path}: ffmpeg failed ({said}); check the free space and the rate")
+
+        def write(image: NDArray) -> None:
+            nonlocal shape, ffmpeg
+            _check_displayable(path, image)
+            if ffmpeg is None:
+                shape = image.shape
+                ffmpeg = start()
+            if image.shape != shape:
+                raise InputError(
+                    f"{path}: a frame has the shape {image.shape} after frames of {shape}; give "
+                    "all frames of a video one size"
+                )
+            odd = [(0, size % 2) for size in shape[:2]] + [(0, 0)] * (len(shape) - 2)
+            assert ffmpeg.stdin is not None
+            try:
+                ffmpeg.stdin.write(np.pad(image, odd, mode="edge").tobytes())
+            except BrokenPipeError:
+                ffmpeg.wait()
+                raise failure() from None
+
+        try:
+            yield write
+            if ffmpeg is None:
+                raise InputError(f"{path}: a video needs at least one frame; write one")
+            ffmpeg.communicate()
+            if ffmpeg.returncode:
+                raise failure()
+        finally:
+            if ffmpeg is not None:
+                ffmpeg.kill()
+                ffmpeg.communicate()
+
+
+def _check_displayable(path: str | Path, image: NDArray) -> None:
+    grey_or_colour = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
+    if image.dtype != np.uint8 or not grey_or_colour or not image.size:
+        raise InputError(
+            f"{path}: cannot show an array of {image.dtype} and shape {image.shape}; give uint8 of "
+            "(height, width) or (height, width, 3), as tone_map does"
+        )
+
+
+def comparison_figure(
+    path: str | Path, panels: Sequence[tuple[str, ArrayLike, str]], title: str = ""
+) -> None:
+    """Draw labelled arrays side by side, up to three in one row, more in two rows; 150 dpi.
+
+    Each panel is (label, array of shape (height, width), kind). An "image" is grey from 0 to 1; an
+    "error" diverges from a white 0; an "uncertainty" runs from dark to bright. Panels of one kind
+    share one scale, shown by colour bars, whose highest 0.5 % are cut off. Values that are not
+    finite stay blank. The suffix of `path` chooses the format (PNG, PDF, SVG). Raises `InputError`
+    without the extra "plot", for no panel, for an unknown kind, array or suffix.
+    """
+    require("matplotlib", "plot")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    if not panels:
+        raise InputError(f"{path}: a comparison needs at least one panel; give one")
+    arrays: list[NDArray] = []
+    for label, array, kind in panels:
+        array = np.asarray(array)
+        if array.ndim != 2 or not array.size or array.dtype.kind not in "fiub":
+            raise InputError(
+                f"{path}: the panel {label!r} is {array.dtype} of shape {array.shape}; give real "
+                "numbers of shape (height, width)"
+            )
+        if kind not in get_args(Kind):
+            raise InputError(
+                f"{path}: the panel {label!r} has the unknown kind {kind!r}; choose one of "
+                f"{', '.join(get_args(Kind))}"
+            )
+        arrays.append(np.where(np.isfinite(array), array, np.nan).astype(np.float64))
+
+    styles = {kind: _style(kind, arrays, panels) for _, _, kind in panels}
+    rows = 1 if len(panels) <= 3 else 2
+    columns = math.ceil(len(panels) / rows)
+    # Inches: a panel is 4 wide, of which a colour bar takes 0.75, and has its label above.
+    width, bars = 4.0, any(kind != "image" for _, _, kind in panels)
+    aspect = float(np.median([array.shape[0] / array.shape[1] for array in arrays]))
+    height = (width - 0.75 * bars) * min(max(aspect, 1 / 3), 3.0) + 0.35
+    figure = Figure(
+        figsize=(columns * width, rows * height + 0.35 * bool(title)), layout="constrained"
+    )
+    formats = FigureCanvasAgg(figure).get_supported_filetypes()
+    suffix = Path(path).suffix.lstrip(".").lower()
+    if suffix not in formats:
+        raise InputError(
+            f"{path}: a figure cannot be stored as {suffix or 'a file without suffix'}; "
+            "end the name in .png, .pdf or .svg"
+        )
+    if title:
+        figure.suptitle(title, fontsize=13, fontweight="bold")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axis in axes[len(panels) :]:
+        axis.set_axis_off()
+    for axis, (label, _, kind), array in zip(axes, panels, arrays, strict=False):
+        shown = axis.imshow(array, **styles[kind])
+        axis.set_title(label, fontsize=11)
+        axis.set(xticks=[], yticks=[])
+        axis.spines[:].set_visible(False)
+        if kind != "image":
+            bar = figure.colorbar(
+                shown,
+                cax=axis.inset_axes((1.02, 0.0, 0.035, 1.0)),
+                extend="both" if kind == "error" else "max",
+            )
+            bar.outline.set_visible(False)
+            bar.ax.tick_params(labelsize=8, length=2)
+    with complete(Path(path)) as temporary:
+        figure.savefig(temporary, format=suffix, dpi=150)
+
+
+def _style(kind: str, arrays: list[NDArray], panels: Sequence[tuple]) -> dict[str, Any]:
+    """The colours and the common scale of all panels of one kind, as `imshow` takes them."""
+    if kind == "image":
+        return {"cmap": "gray", "vmin": 0.0, "vmax": 1.0}
+    same = [a.ravel() for a, panel in zip(arrays, panels, strict=True) if panel[2] == kind]
+    values = np.concatenate(same)
+    values = values[np.isfinite(values)]
+    values = values if len(values) else np.zeros(1)
+    if kind == "error":
+        top = float(np.percentile(np.abs(values), 99.5)) or 1.0
+        return {"cmap": "RdBu_r", "vmin": -top, "vmax": top}
+    low, top = float(values.min()), float(np.percentile(values, 99.5))
+    return {"cmap": "viridis", "vmin": low, "vmax": top if top > low else low + 1.0}
+
+
+def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
+    """The results of an evaluation as a Markdown table, its columns aligned as plain text too.
+
+    Each row has the keys recording, method, mse, ssim, frames and seconds (others are not shown);
+    a number that is None or NaN appears as "-". MSE is multiplied by 100; seconds are those of
+    computing.
+    """
+
+    def number(value: float | int | None, digits: int) -> str:
+        return "-" if value is None or math.isnan(value) else f"{value:.{digits}f}"
+
+    def text(value: str) -> str:
+        return " ".join(value.split()).replace("|", r"\|")
+
+    table = [["recording", "method", "MSE x 1e-2", "SSIM", "frames", "seconds"]]
+    for row in rows:
+        error = row["mse"]
+        table.append(
+            [
+                text(row["recording"]),
+                text(row["method"]),
+                number(None if error is None else 100 * error, 3),
+                number(row["ssim"], 3),
+                number(row["frames"], 0),
+                number(row["seconds"], 2),
+            ]
+        )
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    left = 2  # the names; numbers are aligned to the right
+    rule = ["-" * w if i < left else "-" * (w - 1) + ":" for i, w in enumerate(widths)]
+    table.insert(1, rule)
+    lines = (
+        [cell.ljust(w) if i < left else cell.rjust(w) for i, (cell, w) in cells]
+        for cells in (enumerate(zip(line, widths, strict=True)) for line in table)
+    )
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
