@@ -1,0 +1,395 @@
+"""The command line: what it writes, and that bad input is said in one line and leaves nothing."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from test_evaluate import HEIGHT, ONE, STAMPS, WIDTH, small, write_config
+
+import jaxevent
+from jaxevent import cli
+from jaxevent.recording import Events, Frames
+from jaxevent.report import tone_map
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    jaxevent.save(small(), tmp_path / "small.h5")
+    return tmp_path
+
+
+def arrays(**changed) -> dict:
+    """The arrays of an .npz like `small`; None leaves one out."""
+    recording = small()
+    assert recording.frames is not None and isinstance(recording.events, Events)
+    fields = {name: getattr(recording.events, name) for name in "txyp"}
+    fields.update(width=WIDTH, height=HEIGHT)
+    fields.update(frames=recording.frames.images, frame_t=recording.frames.t)
+    return {name: value for name, value in {**fields, **changed}.items() if value is not None}
+
+
+def fails(capsys, argv: list, *named: object) -> None:
+    """The command says one line that names things, on stderr only, and exits with status 2."""
+    assert cli.main([str(word) for word in argv]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("jaxevent: ") and said.err.count("\n") == 1
+    for name in named:
+        assert str(name) in said.err
+
+
+def decoded(path: Path, height: int, width: int) -> tuple[NDArray, str]:
+    """The grey images (T, H, W) of a video, and what ffmpeg says about it."""
+    # Not by the reader of imageio, which forks; JAX warns that this may deadlock.
+    program = imageio_ffmpeg.get_ffmpeg_exe()
+    decode = [program, "-i", path, "-f", "rawvideo", "-pix_fmt", "gray", "pipe:1"]
+    done = subprocess.run(decode, capture_output=True, check=True)
+    return np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width), done.stderr.decode()
+
+
+def missing(path: Path) -> None:
+    pass
+
+
+def wrong_format(path: Path) -> None:
+    path.write_text("t,x,y,p\n1,2,3,1\n")
+
+
+def unsorted(path: Path) -> None:
+    np.savez(path, **arrays(t=arrays()["t"][::-1]))
+
+
+def unsorted_in_hdf5(path: Path) -> None:
+    jaxevent.save(small(), path.with_name("good.h5"))
+    path.with_name("good.h5").rename(path)
+    with h5py.File(path, "r+") as file:
+        events = file["events/t"]
+        assert isinstance(events, h5py.Dataset)
+        events[200] = 0
+
+
+def outside(path: Path) -> None:
+    np.savez(path, **arrays(width=12, frames=None, frame_t=None))
+
+
+def nan_frames(path: Path) -> None:
+    images = np.full((6, HEIGHT, WIDTH), 0.5)
+    images[3, 2, 1] = np.nan
+    np.savez(path, **arrays(frames=images))
+
+
+def empty(path: Path) -> None:
+    np.savez(path, **arrays(**{name: np.empty(0, int) for name in "txyp"}, frames=None))
+
+
+def disagreeing_sizes(path: Path) -> None:
+    np.savez(path, **arrays(frames=np.zeros((6, 10, 10), np.uint8)))
+
+
+def damaged(path: Path) -> None:
+    np.savez(path, **arrays())
+    path.write_bytes(path.read_bytes()[:3000])
+
+
+BAD = [
+    missing,
+    wrong_format,
+    unsorted,
+    unsorted_in_hdf5,
+    outside,
+    nan_frames,
+    empty,
+    disagreeing_sizes,
+    damaged,
+]
+
+
+@pytest.mark.parametrize("make", BAD)
+def test_bad_recordings(make, tmp_path, capsys):
+    path = tmp_path / "bad.npz"
+    make(path)
+    out, video, table = tmp_path / "out.h5", tmp_path / "images", tmp_path / "results"
+    config = write_config(tmp_path, ONE.replace("small.h5", "bad.npz"))
+    for argv in (
+        ["info", path],
+        ["convert", path, out],
+        ["reconstruct", path, "--method", "blend", "--rate", 200, "--out", out],
+        ["reconstruct", path, "--method", "blend", "--out", video],
+        ["evaluate", config, "--out", table],
+    ):
+        fails(capsys, argv, path)
+    assert {file.name for file in tmp_path.iterdir()} <= {"bad.npz", "run.toml"}
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ('recordingz = ["small.h5"]\n', "recordings"),
+        (ONE + "params = { c_one = 0.1 }\n", "c_on"),
+        (ONE.replace("blend", "blends"), "'blend'"),
+        (ONE + "params = { c_on = \n", "line 4"),
+        (ONE.replace("small", "none-*"), "none-*.h5"),
+    ],
+)
+def test_bad_configurations(text, named, folder, capsys):
+    config = write_config(folder, text)
+    fails(capsys, ["evaluate", config, "--out", folder / "results"], config, named)
+    assert not (folder / "results").exists()
+
+
+def test_unwritable_outputs(folder, capsys):
+    source = folder / "small.h5"
+    config = write_config(folder, ONE)
+    before = sorted(folder.rglob("*"))
+    for parent in (folder / "missing", source):
+        for name in ("a.h5", "a.mp4", "a"):
+            out = parent / name
+            fails(capsys, ["reconstruct", source, "--method", "blend", "--out", out], out)
+        fails(capsys, ["convert", source, parent / "a.h5"], parent / "a.h5")
+        fails(capsys, ["evaluate", config, "--out", parent / "a"], parent / "a")
+        fails(capsys, ["demo", "--out", parent / "a"], parent / "a")
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_bad_ways_to_reconstruct(folder, capsys):
+    path, bare, out = folder / "small.h5", folder / "bare.h5", folder / "out.h5"
+    jaxevent.save(small(frames=None), bare)
+    (folder / "mine.toml").write_text("alpha = 3\n")
+    (folder / "broken.toml").write_text("alpha = \n")
+    before = sorted(folder.rglob("*"))
+    blend = ["--method", "blend", "--out", out]
+    for rate in ("0", "-1", "nan", "inf", "1e7"):
+        fails(capsys, ["reconstruct", path, *blend, f"--rate={rate}"], path, "--rate")
+    fails(capsys, ["reconstruct", bare, *blend], bare, "no frames")
+    fails(capsys, ["reconstruct", bare, "--method", "akf", "--at", "frames", "--out", out], bare)
+    fails(capsys, ["reconstruct", path, *blend, "--tone", "log"], out, "--tone")
+    for name in ("mine.toml", "broken.toml", "none.toml"):
+        fails(capsys, ["reconstruct", path, *blend, "--params", folder / name], folder / name)
+    fails(capsys, ["reconstruct", path, "--method", "afk", "--out", out], "'akf'")
+    for name in ("out.avi", "out.h5.gz"):
+        fails(capsys, ["reconstruct", path, *blend[:2], "--out", folder / name], folder / name)
+    fails(capsys, ["reconstruct", path, *blend[:2], "--out", "."])
+    fails(capsys, ["reconstruct", path, *blend[:2], "--out", folder], folder, "not empty")
+    assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        [],
+        ["unknown"],
+        ["info"],
+        ["info", "a", "--size", "240"],
+        ["reconstruct", "a", "--method", "akf"],
+        ["reconstruct", "a", "--method", "akf", "--out", "b", "--rate", "9", "--at", "frames"],
+        ["convert", "a", "b", "--compression", "best"],
+    ],
+)
+def test_bad_arguments(argv, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(argv)
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.startswith("usage: jaxevent")
+
+
+def test_help_and_version(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"jaxevent {jaxevent.__version__}\n"
+    for command in ("demo", "info", "convert", "reconstruct", "evaluate"):
+        with pytest.raises(SystemExit) as stop:
+            cli.main([command, "--help"])
+        assert stop.value.code == 0
+        assert re.search(rf"\nexamples?:\n  jaxevent {command}", text := capsys.readouterr().out)
+        if command == "reconstruct":
+            assert all(name in text for name in jaxevent.METHODS)
+
+
+def test_as_a_process(tmp_path):
+    root = str(Path(jaxevent.__file__).parents[1])
+    done = subprocess.run(
+        [sys.executable, "-m", "jaxevent.cli", "convert", "none.npz", "out.h5"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": root},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert re.fullmatch(r"jaxevent: none\.npz: .*\n", done.stderr)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt, 130), (BrokenPipeError, 1)])
+def test_interrupted_and_broken_pipe(error, status, monkeypatch, capsys):
+    def info(path, size):
+        raise error
+
+    monkeypatch.setattr(cli, "info", info)
+    assert cli.main(["info", "a"]) == status
+    assert capsys.readouterr().err == ""
+
+
+def test_info(tmp_path, capsys, monkeypatch):
+    """In blocks as at once, of a file whose events can be counted by hand."""
+    t = np.r_[0, 5_000, 5_001, 9_999, 10_000, 100_000]
+    x, y, p = np.r_[3, 4, 4, 4, 3, 1], np.r_[7, 2, 2, 2, 7, 0], np.r_[1, 0, 0, 1, 1, 0]
+    images = np.zeros((2, HEIGHT, WIDTH))
+    images[0, :5], images[1] = 1, 0.5
+    path = tmp_path / "known.npz"
+    np.savez(
+        path,
+        **arrays(t=t, x=x, y=y, p=p, frames=images, frame_t=None),
+        exp_start=np.r_[0, 40_000],
+        exp_end=np.r_[3_000, 44_000],
+        imu_t=np.r_[0, 1_000],
+        gyro=np.zeros((2, 3)),
+        acc=np.zeros((2, 3)),
+        calib=np.arange(9.0),
+        threshold=np.r_[0.1, 0.2],
+    )
+    assert cli.main(["convert", str(path), str(tmp_path / "known.h5")]) == 0
+    assert re.search(r"known\.h5: 6 events, 2 frames, 0\.\d MB\n", capsys.readouterr().out)
+    assert cli.main(["info", str(path)]) == 0
+    first = capsys.readouterr().out
+    monkeypatch.setattr(cli, "BLOCK", 2)
+    assert cli.main(["info", str(tmp_path / "known.h5")]) == 0
+    assert capsys.readouterr().out.splitlines()[1:] == first.splitlines()[1:]
+    lines = dict(re.split(r"  +", line, maxsplit=1) for line in first.splitlines())
+    assert lines == {
+        "file": str(path),
+        "name": "known",
+        "sensor": "24 x 20 pixels",
+        "time": "0.000000 to 0.100000 s (0.100 s)",
+        "events": "6, from 0.000000 to 0.100000 s",
+        "polarity": "50.0 % ON, 50.0 % OFF",
+        "event rate": "mean 60 per s, peak 400 per s in 10 ms",
+        "hottest pixels": "(4, 2) 3 events, 30 per s; (3, 7) 2 events, 20 per s; "
+        "(1, 0) 1 events, 10 per s",
+        "frames": "2 of 24 x 20, float64, 24.7 per s",
+        "exposure": "3.000 to 4.000 ms",
+        "grey levels": "37.5 % dark (< 0.02), 12.5 % saturated (> 0.98)",
+        "calibration": "fx 0.00, fy 1.00, cx 2.00, cy 3.00; distortion 4, 5, 6, 7, 8",
+        "IMU": "2, 1000.0 per s",
+        "extra threshold": "float64 of shape (2,)",
+    }
+
+
+def test_one_event_is_enough(tmp_path, capsys):
+    path = tmp_path / "one.npz"
+    one: dict = {name: np.array([value]) for name, value in zip("txyp", (7, 3, 4, 1), strict=True)}
+    np.savez(path, **one)
+    fails(capsys, ["info", path], path, "--size")
+    size = ["--size", f"{WIDTH},{HEIGHT}"]
+    assert cli.main(["info", str(path), *size]) == 0
+    assert "1, from 0.000007 to 0.000007 s" in capsys.readouterr().out
+    assert cli.main(["convert", str(path), str(tmp_path / "one.h5"), *size]) == 0
+    out = tmp_path / "images.h5"
+    assert cli.main(["reconstruct", str(path), "--method", "akf", "--out", str(out), *size]) == 0
+    with h5py.File(out) as file:
+        assert np.asarray(file["t"]).tolist() == [7]
+        image = np.asarray(file["image"])[0]
+    expected = np.full((HEIGHT, WIDTH), 0.5)  # without frames the AKF begins with mid-grey
+    expected[4, 3] = 1.5 * np.exp(0.1) - 1
+    np.testing.assert_allclose(image, expected, rtol=1e-6)
+
+
+def test_reconstruct_to_hdf5(folder, capsys):
+    (folder / "mine.toml").write_text("c_on = 0.2\nclock_offset = 0.0025\n")
+    contents = []
+    for name in ("a.h5", "b.hdf5"):
+        argv = f"reconstruct {folder}/small.h5 --method akf --params {folder}/mine.toml --out"
+        assert cli.main([*argv.split(), str(folder / name)]) == 0
+        said = capsys.readouterr().out
+        assert said.startswith(f"{folder / name}: 6 images") and said.count("\n") == 1
+        with h5py.File(folder / name) as file:
+            contents.append({key: np.asarray(file[key]) for key in ("t", "image", "variance")})
+            attributes = dict(file.attrs)
+    params = json.loads(str(attributes.pop("params")))
+    assert attributes == {"method": "akf", "recording": "small"}
+    assert (params["c_on"], params["c_off"], params["clock_offset"]) == (0.2, 0.1, 0.0025)
+    assert all(contents[0][key].tobytes() == contents[1][key].tobytes() for key in contents[0])
+
+    params = jaxevent.akf.Params.of({"c_on": 0.2, "clock_offset": 0.0025})
+    video = jaxevent.akf.reconstruct(small(), params)
+    image, variance = video(STAMPS + 2_500)
+    assert contents[0]["t"].dtype == np.int64 and contents[0]["image"].dtype == np.float32
+    np.testing.assert_array_equal(contents[0]["t"], STAMPS + 2_500)
+    np.testing.assert_array_equal(contents[0]["image"], image.astype(np.float32))
+    np.testing.assert_array_equal(contents[0]["variance"], variance.astype(np.float32))
+
+
+def test_reconstruct_to_images(folder):
+    stored = []
+    for name in ("a", "b"):
+        argv = f"reconstruct {folder}/small.h5 --method blend --rate 300 --out {folder}/{name}"
+        assert cli.main(argv.split()) == 0
+        stored.append({file.name: file.read_bytes() for file in (folder / name).iterdir()})
+    assert stored[0] == stored[1]
+    times = np.rint(np.arange(16) / 300 * 1e6).astype(np.int64)  # until 50 of 52 ms
+    names = [f"frame_{number:08d}.png" for number in range(len(times))]
+    assert sorted(stored[0]) == [*names, "images.txt"]
+    lines = [f"{t / 1e6:.6f} {name}\n" for t, name in zip(times, names, strict=True)]
+    assert (folder / "a" / "images.txt").read_text() == "".join(lines)
+    images, _ = jaxevent.blend.reconstruct(small())(times)
+    for name, image in zip(names, tone_map(images), strict=True):
+        with Image.open(folder / "a" / name) as stored_image:
+            np.testing.assert_array_equal(np.asarray(stored_image), image)
+
+
+@pytest.mark.parametrize(
+    ("rate", "fps", "factor"), [("500", 60, "0.12"), ("40", 40, "1")], ids=["slow", "real time"]
+)
+def test_reconstruct_to_video(rate, fps, factor, folder, capsys):
+    ramp = 60 + 2 * np.arange(WIDTH) + 3 * np.arange(6)[:, None, None]  # 60 to 121 of 255
+    images = np.broadcast_to(ramp, (6, HEIGHT, WIDTH)).astype(np.uint8)
+    recording = small(frames=Frames(STAMPS, images, np.zeros_like(STAMPS)))
+    jaxevent.save(recording, folder / "small.h5")
+    path = folder / "out.mp4"
+    argv = f"reconstruct {folder}/small.h5 --method blend --rate {rate} --tone percentile"
+    assert cli.main([*argv.split(), "--out", str(path)]) == 0
+    assert f"played at {fps} per s, {factor} of real time" in capsys.readouterr().out
+    images, about = decoded(path, HEIGHT, WIDTH)
+    times = np.arange(0, 52_001, 1_000_000 // int(rate))
+    assert len(images) == len(times)
+    assert f" {WIDTH}x{HEIGHT}" in about and f" {fps} fps" in about
+    sample = times[np.unique(np.linspace(0, len(times) - 1, 16).round().astype(int))]
+    video = jaxevent.blend.reconstruct(recording)
+    limits = tuple(np.percentile(video(sample)[0], [0.5, 99.5]).tolist())
+    shown = tone_map(video(times)[0], "percentile", limits).astype(float)
+    assert np.abs(images - shown).mean() < 3
+
+
+def test_evaluate(folder, capsys):
+    config = write_config(folder, ONE)
+    assert cli.main(["evaluate", str(config), "--out", str(folder / "results")]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith((folder / "results" / "results.md").read_text())
+    assert str(folder / "results") in said
+    assert "| small.h5  | blend" in said
+
+
+def test_demo(tmp_path, capsys, float32):
+    out = tmp_path / "demo"
+    assert cli.main(["demo", "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith((out / "results.md").read_text()) and str(out) in said
+    rows = json.loads((out / "results.json").read_text())["rows"]
+    errors = {row["method"]: row["mse"] for row in rows}
+    assert list(errors)[: len(jaxevent.METHODS)] == list(jaxevent.METHODS)
+    assert len(errors) == len(jaxevent.METHODS) + 2
+    by_hand = errors["akf, thresholds and clock set by hand"]
+    assert by_hand < errors["akf"] < errors["cf"] < errors["last-frame"]
+    with Image.open(out / "comparison.png") as figure:
+        assert figure.width > 1000
+    images, about = decoded(out / "video.mp4", 360, 480)
+    assert len(images) == 180 and " 30 fps" in about
