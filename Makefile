@@ -1,0 +1,50 @@
+.PHONY: demo test lint bench clean
+.DELETE_ON_ERROR:
+
+bin := .venv/bin
+install := $(bin)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e
+
+demo: .venv/demo.stamp
+	$(bin)/jaxevent demo
+
+test: lint
+	$(bin)/python -m pytest
+
+lint: .venv/test.stamp
+	$(bin)/ruff check
+	$(bin)/ruff format --check
+	$(bin)/pyright --pythonpath $(bin)/python
+
+bench: .venv/bench.stamp
+	$(bin)/python experiments/bench.py
+
+clean:
+	rm -rf .venv build dist jaxevent-demo .pytest_cache .hypothesis .ruff_cache *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+.venv/demo.stamp: pyproject.toml constraints.txt | .venv/made.stamp
+	$(install) '.[plot,video]'
+	@touch $@
+
+.venv/test.stamp: pyproject.toml constraints.txt | .venv/made.stamp
+	$(install) '.[test]'
+	@touch $@
+
+.venv/bench.stamp: pyproject.toml constraints.txt | .venv/made.stamp
+	$(install) '.[bench,plot,video]'
+	@touch $@
+
+# A name on the PATH may not run (a version manager's shim) or may lack venv: take one that works.
+.venv/made.stamp:
+	@for python in $(PYTHON) python3.13 python3.12 python3.11 python3; do \
+	    if $$python -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' \
+	        >/dev/null 2>&1; \
+	    then \
+	        echo "making .venv with $$($$python --version)"; \
+	        $$python -m venv .venv && touch $@; \
+	        exit; \
+	    fi; \
+	done; \
+	echo "No working Python 3.11 or newer with venv was found: install one, or name it with" \
+	    "make PYTHON=/path/to/python3" >&2; \
+	exit 1
