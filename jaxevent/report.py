@@ -186,7 +186,7 @@ def comparison_figure(
 ) -> None:
     """Draw labelled arrays side by side, up to three in one row, more in two rows; 150 dpi.
 
-    Each panel is (label, array of shape (height, width), kind). An "image" is grey from 0 to 1; an
+    Each panel is (label, array of shape (height, width), kind). An "image" is grey from 0; an
     "error" diverges from a white 0; an "uncertainty" runs from dark to bright. Panels of one kind
     share one scale, shown by colour bars, whose highest 0.5 % are cut off. Values that are not
     finite stay blank. The suffix of `path` chooses the format (PNG, PDF, SVG). Raises `InputError`
@@ -254,12 +254,12 @@ def comparison_figure(
 
 def _style(kind: str, arrays: list[NDArray], panels: Sequence[tuple]) -> dict[str, Any]:
     """The colours and the common scale of all panels of one kind, as `imshow` takes them."""
-    if kind == "image":
-        return {"cmap": "gray", "vmin": 0.0, "vmax": 1.0}
     same = [a.ravel() for a, panel in zip(arrays, panels, strict=True) if panel[2] == kind]
     values = np.concatenate(same)
     values = values[np.isfinite(values)]
     values = values if len(values) else np.zeros(1)
+    if kind == "image":
+        return {"cmap": "gray", "vmin": 0.0, "vmax": float(np.percentile(values, 99.9)) or 1.0}
     if kind == "error":
         top = float(np.percentile(np.abs(values), 99.5)) or 1.0
         return {"cmap": "RdBu_r", "vmin": -top, "vmax": top}

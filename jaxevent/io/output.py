@@ -22,7 +22,10 @@ def complete(path: Path, directory: bool = False) -> Iterator[Path]:
             written; also instead of an OSError raised in the block.
     """
     path = Path(path)
-    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.part")
+    name = path.absolute().name
+    if not name:
+        raise InputError(f"{path}: is a folder; give the name of something to write in it")
+    partial = path.absolute().with_name(f".{name}.{uuid.uuid4().hex[:12]}.part")
     try:
         _refuse(path, directory)
         if directory:

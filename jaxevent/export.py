@@ -1,0 +1,108 @@
+"""A reconstruction written to files: HDF5 of exact values, a video, or a folder of images."""
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError
+from jaxevent.evaluate import values_of
+from jaxevent.io.output import complete
+from jaxevent.reconstruction.video import Video
+from jaxevent.recording import Recording
+from jaxevent.report import display_limits, tone_map, video_writer, write_png
+
+
+def evenly(recording: Recording, rate: float | int) -> NDArray[np.int64]:
+    """Times (us) at a rate (1/s) from the recording's start to its stop."""
+    if not 0 < rate <= 1e6:
+        raise InputError(
+            f"{recording.name}: cannot be read at --rate {rate:g}; give a number of images per "
+            "second above 0, up to 1e6"
+        )
+    count = math.floor((recording.stop - recording.start) * rate / 1e6 + 1e-9) + 1
+    return recording.start + np.rint(np.arange(count) * (1e6 / rate)).astype(np.int64)
+
+
+Writer = Callable[[Video, NDArray, Path, str, str], str]
+
+
+def writer(out: Path) -> Writer:
+    """How to write a file of that name: `writer(out)(video, times, out, tone, recording_name)`.
+
+    `times` are sorted, us. HDF5 holds t, image and variance, exact; videos and PNG images are
+    toned for the display. It returns the end of a sentence about what was written. Raises
+    `InputError` for a suffix other than .h5, .hdf5, .mp4 or none.
+    """
+    if not out.name:
+        raise InputError(f"{out}: is a folder in use; give the name of a new file or folder")
+    kinds = {".h5": write_hdf5, ".hdf5": write_hdf5, ".mp4": _write_video, "": _write_images}
+    if out.suffix.lower() not in kinds:
+        raise InputError(
+            f"{out}: images cannot be stored as {out.suffix}; end the name in .h5 or .mp4, or "
+            "leave out the suffix for a folder of PNG images"
+        )
+    return kinds[out.suffix.lower()]
+
+
+def write_hdf5(video: Video, times: NDArray, out: Path, tone: str, name: str) -> str:
+    import h5py
+
+    shape = (len(times), video.recording.height, video.recording.width)
+    with complete(out) as partial, h5py.File(partial, "w") as file:
+        file.attrs["method"] = video.estimator.name
+        file.attrs["params"] = json.dumps(values_of(video.params), allow_nan=False)
+        file.attrs["recording"] = name
+        units = {
+            "t": "us on the recording's clock",
+            "image": "linear intensity: 0 is the frames' black, 1 their white",
+            "variance": "(ln I)^2, of ln(intensity + I0); NaN: not estimated",
+        }
+        file["t"] = times.astype("i8")
+        image, variance = (
+            file.create_dataset(field, shape, "f4", chunks=(1, *shape[1:]))
+            for field in ("image", "variance")
+        )
+        for field, unit in units.items():
+            file[field].attrs["unit"] = unit
+        row = 0
+        for batch, images, variances in video.batches(times):
+            rows = slice(row, row + len(batch))
+            image[rows], variance[rows] = images, variances
+            row += len(batch)
+    return ""
+
+
+def _write_video(video: Video, times: NDArray, out: Path, tone: str, name: str) -> str:
+    rate = (len(times) - 1) / ((times[-1] - times[0]) / 1e6) if len(times) > 1 else 25.0
+    fps = min(rate, 60.0)
+    with video_writer(out, fps) as write:
+        for _, image in shown(video, times, tone):
+            write(image)
+    return f", played at {fps:.4g} per s, {fps / rate:.3g} of real time"
+
+
+def _write_images(video: Video, times: NDArray, out: Path, tone: str, name: str) -> str:
+    with complete(out, directory=True) as partial:
+        lines = []
+        for number, (at, image) in enumerate(shown(video, times, tone)):
+            file = f"frame_{number:08d}.png"
+            write_png(partial / file, image)
+            lines.append(f"{at / 1e6:.6f} {file}\n")
+        (partial / "images.txt").write_text("".join(lines))
+    return ""
+
+
+def shown(video: Video, times: NDArray, tone: str) -> Iterator[tuple[int, NDArray]]:
+    """Each time (us) and its image for the display, of limits common to all."""
+    sample = times[np.unique(np.linspace(0, len(times) - 1, 16).round().astype(int))]
+    if tone == "linear":  # the limits are those of any image
+        sample = sample[:1]
+    limits = display_limits(video(sample)[0], tone)
+    for batch, images, _ in video.batches(times):
+        shown = tone_map(images, tone, limits)
+        for at, image in zip(batch, shown, strict=True):
+            yield int(at), image
