@@ -125,11 +125,11 @@ class Estimator(Generic[P]):
             state = self.initial(params, observer(features.start).level[0])
         if features.tiles is None:
             return Trajectory(observer, state, None), state
-        path = self._scan(params, observer, features.tiles, state)
+        path = self.scan(params, observer, features.tiles, state)
         trajectory = Trajectory(observer, state, path)
         return trajectory, trajectory.at(jnp.asarray(features.last))
 
-    def _scan(self, params: P, observer: Observer, tiles: Tiles, state: State) -> State:
+    def scan(self, params: P, observer: Observer, tiles: Tiles, state: State) -> State:
         """The states after every event, (slots,)."""
         step = jax.vmap(functools.partial(self.step, params))
         widest = max(width for _, width in SHAPES)

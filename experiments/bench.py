@@ -1,0 +1,449 @@
+"""Speed, memory and compilation of reconstruction, as ratios measured in one run.
+
+    python experiments/bench.py [--gate | --bless] [--json FILE] [--skip-memory]
+
+A stream of 5 M events at 346x260 (gamma-distributed pixel rates, 2 s, 25 frames per second) is
+filtered, prepared and read. Beside it run, on one core: the whole filter as a plain numba program
+over events, which is what a C++ program does; its recursion with and without the look-up of
+neighbours; and the Accumulator of dv-processing. `--gate` compares the ratios with
+bench_baseline.json and exits with 1 if one is worse than its tolerance; `--bless` writes them.
+"""
+
+import argparse
+import json
+import os
+import platform
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numba
+import numpy as np
+
+import jaxevent
+from jaxevent.io import load, save
+from jaxevent.reconstruction.estimator import Observation, Observer, State, Trajectory
+from jaxevent.reconstruction.pixels import Windows
+from jaxevent.recording import Events, Frames, Recording
+
+WIDTH, HEIGHT = 346, 260
+BASELINE = Path(__file__).with_name("bench_baseline.json")
+
+# Direction and relative tolerance of what the gate compares; timings share two noisy cores.
+GATED = {
+    "filter / numba program": ("higher", 0.4),
+    "filter / numba loop with neighbour look-up": ("higher", 0.4),
+    "features and packing / numba program": ("higher", 0.4),
+    "complete path / dv-processing Accumulator": ("higher", 0.4),
+    "compilations for a second recording": ("lower", 0.0),
+    "peak memory of 100 M events, GB": ("lower", 0.25),
+}
+
+
+def stream(events: int, seconds: float, seed: int) -> Recording:
+    """Events at gamma-distributed rates per pixel, frames of noise at 25 per second."""
+    rng = np.random.default_rng(seed)
+    rate = rng.gamma(2.0, 1.0, WIDTH * HEIGHT)
+    pixel = rng.choice(WIDTH * HEIGHT, events, p=rate / rate.sum())
+    t = np.sort(rng.integers(0, int(seconds * 1e6), events))
+    y, x = np.divmod(pixel, WIDTH)
+    frames = int(25 * seconds)
+    return Recording(
+        "bench",
+        WIDTH,
+        HEIGHT,
+        Events(t, x.astype(np.uint16), y.astype(np.uint16), rng.random(events) < 0.5),
+        Frames(
+            (np.arange(frames) * 40_000 + 5_000).astype(np.int64),
+            rng.integers(0, 256, (frames, HEIGHT, WIDTH), np.uint8),
+            np.zeros(frames, np.int64),
+        ),
+    )
+
+
+@numba.njit
+def program(t, x, y, p, grey, mid, c, Q_proc, Q_iso, Q_ref, rho, kappa, w_min):
+    """The whole AKF as an event-by-event program: calibration per frame, then event after event.
+
+    Double precision, one core, exposures not known; the arithmetic of the library's filter.
+    """
+    frames, height, width = grey.shape
+    L, P = np.log(grey[0] + 1), np.full((height, width), 0.09)
+    last = np.zeros((height, width), np.int64)
+    density = 1 / (kappa * np.maximum(4 * grey * (1 - grey), w_min))
+    S, total = np.zeros((height, width)), np.zeros((height, width))
+    base, ratio = np.log(grey[0] + 1), np.ones((height, width))
+    end, k = base, -1
+    for i in range(len(t)):
+        while k + 1 < frames and t[i] >= mid[k + 1]:
+            k += 1
+            base, ratio = np.log(grey[k] + 1), np.ones((height, width))
+            S[:] = 0
+            if k + 1 < frames:  # look ahead for the interval's events, (10)
+                end = np.log(grey[k + 1] + 1)
+                total[:] = 0
+                j = i
+                while j < len(t) and t[j] < mid[k + 1]:
+                    total[y[j], x[j]] += c if p[j] else -c
+                    j += 1
+                for row in range(height):
+                    for column in range(width):
+                        if total[row, column] != 0:
+                            r = (end[row, column] - base[row, column]) / total[row, column]
+                            if 0.01 <= r <= 1 / 0.6:
+                                ratio[row, column] = r
+        a, b = np.int64(y[i]), np.int64(x[i])
+        near = np.int64(0)
+        for row in range(max(a - 1, 0), min(a + 2, height)):
+            for column in range(max(b - 1, 0), min(b + 2, width)):
+                near = max(near, last[row, column])
+        if k < 0:
+            u, bright, R = base[a, b] + S[a, b], grey[0, a, b], density[0, a, b]
+        elif k + 1 == frames:
+            u, bright, R = base[a, b] + S[a, b], grey[k, a, b], density[k, a, b]
+        else:
+            v = (t[i] - mid[k]) / (mid[k + 1] - mid[k])
+            forward = base[a, b] + ratio[a, b] * S[a, b]
+            backward = end[a, b] - ratio[a, b] * (total[a, b] - S[a, b])
+            u = (1 - v) * forward + v * backward
+            bright = (1 - v) * grey[k, a, b] + v * grey[k + 1, a, b]
+            R = (1 - v) * density[k, a, b] + v * density[k + 1, a, b]
+        dt = (t[i] - last[a, b]) * 1e-6
+        gain = 1 / (1 + P[a, b] * dt * (bright + 1) ** 2 / R)
+        change = c if p[i] else -c
+        L[a, b] = (L[a, b] - u) * gain + u + change
+        Q = Q_proc * dt + Q_iso * (t[i] - near) * 1e-6 + (Q_ref if dt <= rho else 0.0)
+        P[a, b] = P[a, b] * gain + Q
+        S[a, b] += change
+        last[a, b] = t[i]
+    return L, P
+
+
+@numba.njit
+def event_loop(t, x, y, p, u, rate, near, L, P, last, c, Q_proc, Q_iso, Q_ref, rho, search):
+    """The recursion alone, event after event, what the frames say given; near given or searched."""
+    height, width = L.shape
+    for i in range(len(t)):
+        a, b = np.int64(y[i]), np.int64(x[i])
+        dt = (t[i] - last[a, b]) * np.float32(1e-6)
+        gap = near[i]
+        if search:
+            latest = np.int64(0)
+            for row in range(max(a - 1, 0), min(a + 2, height)):
+                for column in range(max(b - 1, 0), min(b + 2, width)):
+                    latest = max(latest, last[row, column])
+            gap = (t[i] - latest) * np.float32(1e-6)
+        gain = 1 / (1 + P[a, b] * dt * rate[i])
+        L[a, b] = (L[a, b] - u[i]) * gain + u[i] + (c if p[i] else -c)
+        P[a, b] = P[a, b] * gain + Q_proc * dt + Q_iso * gap + (Q_ref if dt <= rho else 0.0)
+        last[a, b] = t[i]
+
+
+class Given(Observer):
+    """Observations that are already there, carried in place of the points' weights."""
+
+    def __call__(self, points):
+        return Observation(points.weight, points.blend)
+
+
+def best(function, repeat: int = 5) -> float:
+    """The least of some times, s; the first call, which compiles, is not counted."""
+    function()
+    times = []
+    for _ in range(repeat):
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def program_seconds(recording: Recording) -> float:
+    e, f = recording.events, recording.frames
+    assert isinstance(e, Events) and f is not None
+    grey = f.intensity.astype(np.float64)
+    numbers = (0.1, 5e-4, 0.03, 0.01, 0.01, 7e5, 0.09)
+    L, P = program(e.t, e.x, e.y, e.p, grey, f.t, *numbers)
+    # The same filter: at the last event of a pixel both must agree.
+    features, out = jaxevent.prepare(recording, [recording.stop + 1_000_000])
+    trajectory, end = jax.jit(jaxevent.akf.run)(jaxevent.akf.Params(), features)
+    assert np.abs(end.L.reshape(L.shape) - L).max() < 1e-3, "the program is another filter"
+    return best(lambda: program(e.t, e.x, e.y, e.p, grey, f.t, *numbers))
+
+
+def loop_seconds(recording: Recording, search: bool) -> float:
+    e = recording.events
+    assert isinstance(e, Events)
+    n = len(e)
+    u, rate, near = (np.full(n, v, np.float32) for v in (0.4, 1e5, 1e-3))
+
+    def run():
+        L, P = np.zeros((HEIGHT, WIDTH), np.float32), np.full((HEIGHT, WIDTH), 0.09, np.float32)
+        last = np.zeros((HEIGHT, WIDTH), np.int64)
+        c, Q_proc, Q_iso, Q_ref, rho = (np.float32(v) for v in (0.1, 5e-4, 0.03, 0.01, 0.01))
+        event_loop(
+            e.t, e.x, e.y, e.p, u, rate, near, L, P, last, c, Q_proc, Q_iso, Q_ref, rho, search
+        )
+
+    return best(run)
+
+
+def filter_seconds(recording: Recording) -> float:
+    """All windows' filters, with what the frames say and the features already on the device."""
+    params = jaxevent.akf.Params()
+    look = jax.jit(lambda observer, tiles: observer(tiles.points))
+    windows = []
+    for window in Windows(recording):
+        assert window.features is not None
+        features = jax.device_put(window.features)
+        observer = jaxevent.akf.observe(params, features.frames)
+        known = look(observer, features.tiles)
+        tiles = eqx.tree_at(
+            lambda t: (t.points.weight, t.points.blend), features.tiles, (known.level, known.rate)
+        )
+        windows.append((tiles, features.last))
+
+    @jax.jit
+    def scan(params, tiles, last, state):
+        path = jaxevent.akf.scan(params, Given(), tiles, state)
+        return Trajectory(Given(), state, path).at(last), path
+
+    pixels = WIDTH * HEIGHT
+    first = State(jax.numpy.zeros(pixels), jax.numpy.full(pixels, 0.09))
+
+    def run():
+        state = first
+        for tiles, last in windows:
+            state, path = scan(params, tiles, last, state)
+            jax.block_until_ready(path)
+
+    return best(run)
+
+
+def prepare_seconds(recording: Recording) -> float:
+    def run():
+        for _ in Windows(recording, reuse=True):
+            pass
+
+    return best(run)
+
+
+def text_seconds(folder: Path, events: Events) -> float:
+    """Reading events.txt of the Event-Camera Dataset."""
+    import pandas
+
+    columns = {"t": events.t * 1e-6, "x": events.x, "y": events.y, "p": events.p.astype(int)}
+    pandas.DataFrame(columns).to_csv(
+        folder / "events.txt", sep=" ", header=False, index=False, float_format="%.9f"
+    )
+    seconds = best(lambda: load(folder, size=(WIDTH, HEIGHT)), 3)
+    (folder / "events.txt").unlink()
+    return seconds
+
+
+def complete_seconds(path: Path) -> tuple[float, float]:
+    """From HDF5 to images at 100 Hz; returns the whole and the reading of the file, s."""
+    params = jaxevent.akf.Params()
+    reading = best(lambda: load(path))
+
+    def run():
+        recording = load(path)
+        times = np.arange(recording.start, recording.stop, 10_000)
+        for _ in jaxevent.akf.reconstruct(recording, params).batches(times):
+            pass
+
+    return best(run, 3), reading
+
+
+def accumulator_seconds(recording: Recording) -> float:
+    """dv-processing's Accumulator at 100 Hz on the same events, which it has in memory."""
+    import dv_processing as dv  # type: ignore[import-not-found]
+
+    e = recording.events
+    assert isinstance(e, Events)
+    slices = []
+    for begin in range(0, recording.stop, 10_000):
+        store = dv.EventStore()
+        part = e[e.index(begin) : e.index(begin + 10_000)]
+        for t, x, y, p in zip(*(v.tolist() for v in (part.t, part.x, part.y, part.p)), strict=True):
+            store.push_back(t, x, y, p)
+        slices.append(store)
+
+    def run():
+        accumulator = dv.Accumulator((WIDTH, HEIGHT))
+        for store in slices:
+            accumulator.accept(store)
+            accumulator.generateFrame()
+
+    return best(run, 3)
+
+
+def compilations() -> int:
+    """How often XLA compiles for a second recording of the same sensor."""
+    heard = []
+
+    def listen(event: str, duration_secs: float, **_: str | int) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            heard.append(event)
+
+    def run(seed: int, events: int) -> None:
+        recording = stream(events, 1.0 + seed, seed)
+        times = np.arange(0, 10**6, 50_000)
+        jaxevent.akf.reconstruct(recording, jaxevent.akf.Params())(times)
+
+    run(0, 300_000)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    run(1, 2_500_000)
+    jax.monitoring.clear_event_listeners()
+    return len(heard)
+
+
+def write_long(path: Path, millions: int) -> None:
+    """A file of many events, written a million at a time in the layout of `jaxevent.io.hdf5`."""
+    import h5py
+
+    n, block = millions * 1_000_000, 1_000_000
+    rng = np.random.default_rng(0)
+    with h5py.File(path, "w") as file:
+        file.attrs.update(width=WIDTH, height=HEIGHT, name="long", format="jaxevent", version=1)
+        kinds = {"t": "i8", "x": "u2", "y": "u2", "p": "u1"}
+        data = {k: file.create_dataset(f"events/{k}", (n,), kind) for k, kind in kinds.items()}
+        file["t_offset"] = 0
+        # Evenly spaced in time, 2.5 M events/s.
+        file["ms_to_idx"] = np.arange(n * 4 // 10_000 + 1, dtype=np.uint64) * 2500
+        for row in range(0, n, block):
+            rows = slice(row, row + block)
+            data["t"][rows] = np.arange(row, row + block) * 4 // 10
+            data["x"][rows] = rng.integers(0, WIDTH, block)
+            data["y"][rows] = rng.integers(0, HEIGHT, block)
+            data["p"][rows] = rng.integers(0, 2, block)
+        seconds = n * 4e-7
+        t = np.arange(0, int(seconds * 25)) * 40_000
+        file["frames/t"] = t
+        file["frames/exposure"] = np.zeros_like(t)
+        images = file.create_dataset("frames/images", (len(t), HEIGHT, WIDTH), "u1")
+        for k in range(len(t)):
+            images[k] = rng.integers(0, 256, (HEIGHT, WIDTH))
+
+
+def reconstruct_long(path: str) -> None:
+    """Run by itself: filter the file in windows, then print the peak memory of the process, GB."""
+    recording = load(path, in_memory=False)
+    start = time.perf_counter()
+    times = np.arange(0, recording.stop, 200_000)
+    for _ in jaxevent.akf.reconstruct(recording, jaxevent.akf.Params()).batches(times):
+        pass
+    seconds = time.perf_counter() - start
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(json.dumps({"GB": peak, "seconds": seconds}))
+
+
+def long_run(folder: Path) -> tuple[float, float]:
+    path = folder / "long.h5"
+    write_long(path, 100)
+    done = subprocess.run(
+        [sys.executable, __file__, "--long", str(path)], capture_output=True, text=True, check=True
+    )
+    answer = json.loads(done.stdout)
+    return answer["GB"], answer["seconds"]
+
+
+def machine() -> str:
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        lines = [v for v in cpuinfo.read_text().splitlines() if v.startswith("model name")]
+        model = lines[0].partition(":")[2].strip() if lines else model
+    return (
+        f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}, jax "
+        f"{jax.__version__}, float32"
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument(
+        "--gate", action="store_true", help="exit with 1 if worse than the baseline"
+    )
+    parser.add_argument("--bless", action="store_true", help="write the baseline")
+    parser.add_argument("--json", type=Path, help="write all numbers")
+    parser.add_argument("--skip-memory", action="store_true", help="leave out the 100 M events")
+    parser.add_argument("--long", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.long:
+        reconstruct_long(arguments.long)
+        return 0
+
+    recording = stream(5_000_000, 2.0, 0)
+    n = len(recording.events) / 1e6
+    speed, ratio = {}, {}
+    print(machine())
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "bench.h5"
+        save(recording, path)
+        whole_program = n / program_seconds(recording)
+        loop = n / loop_seconds(recording, search=True)
+        given = n / loop_seconds(recording, search=False)
+        filtering = n / filter_seconds(recording)
+        preparing = n / prepare_seconds(recording)
+        whole, reading = complete_seconds(path)
+        path.unlink()
+        assert isinstance(recording.events, Events)
+        text = text_seconds(Path(folder), recording.events[:1_000_000])
+        accumulator = n / accumulator_seconds(recording)
+        speed = {
+            "numba program, event by event": whole_program,
+            "numba loop, recursion and neighbour look-up": loop,
+            "numba loop, recursion alone": given,
+            "filter alone": filtering,
+            "features and packing": preparing,
+            "reading text": 1 / text,
+            "reading HDF5": n / reading,
+            "complete path: HDF5 to 100 Hz images": n / whole,
+            "dv-processing Accumulator at 100 Hz, events in memory": accumulator,
+        }
+        ratio = {
+            "filter / numba program": filtering / whole_program,
+            "filter / numba loop with neighbour look-up": filtering / loop,
+            "filter / numba loop of the recursion alone": filtering / given,
+            "features and packing / numba program": preparing / whole_program,
+            "complete path / numba program": n / whole / whole_program,
+            "complete path / dv-processing Accumulator": n / whole / accumulator,
+            "compilations for a second recording": compilations(),
+        }
+        if not arguments.skip_memory:
+            gigabytes, seconds = long_run(Path(folder))
+            ratio["peak memory of 100 M events, GB"] = gigabytes
+            speed["100 M events from HDF5 in windows, 5 Hz images"] = 100 / seconds
+    print("\n| M events/s | |\n|---|---:|")
+    for name, value in speed.items():
+        print(f"| {name} | {value:.1f} |")
+    print("\n| ratio | |\n|---|---:|")
+    for name, value in ratio.items():
+        print(f"| {name} | {value:.2f} |")
+    if arguments.json:
+        text = json.dumps({"machine": machine(), "M events/s": speed, "ratios": ratio}, indent=1)
+        arguments.json.write_text(text + "\n")
+    if arguments.bless:
+        kept = {k: round(v, 3) for k, v in ratio.items()}
+        BASELINE.write_text(json.dumps({"machine": machine(), "ratios": kept}, indent=1) + "\n")
+    if not arguments.gate:
+        return 0
+    worse = []
+    baseline = json.loads(BASELINE.read_text())["ratios"]
+    for name, (direction, tolerance) in GATED.items():
+        if name not in ratio or name not in baseline:
+            continue
+        bound = baseline[name] * (1 - tolerance if direction == "higher" else 1 + tolerance)
+        if ratio[name] < bound if direction == "higher" else ratio[name] > bound:
+            worse.append(f"{name}: {ratio[name]:.2f}, baseline {baseline[name]:.2f}")
+    print("\n" + ("\n".join(["worse than the baseline:", *worse]) if worse else "gate passed"))
+    return 1 if worse else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
