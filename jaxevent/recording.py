@@ -8,7 +8,7 @@ means seconds, both on the recording's clock.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -101,6 +101,21 @@ class Events:
                 )
 
 
+@runtime_checkable
+class ImageSource(Protocol):
+    """Images of shape (frames, height, width) that stay in a file until np.asarray reads them."""
+
+    @property
+    def dtype(self) -> np.dtype: ...
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+
+    def __getitem__(self, rows: Any) -> "ImageSource":
+        """Some of the images, still in the file."""
+        ...
+
+
 @dataclasses.dataclass(frozen=True)
 class Frames:
     """Grey frames: images (frames, height, width), mid-exposure times and exposure lengths (us).
@@ -110,7 +125,7 @@ class Frames:
     """
 
     t: NDArray[np.int64]
-    images: NDArray
+    images: NDArray | ImageSource
     exposure: NDArray[np.int64]
 
     def __len__(self) -> int:
@@ -122,10 +137,10 @@ class Frames:
     @property
     def intensity(self) -> NDArray[np.float32]:
         """The images as float32 grey values in [0, 1]."""
-        if self.images.dtype.kind == "f":
-            return self.images.astype(np.float32)
-        scale = np.iinfo(self.images.dtype).max
-        return np.divide(self.images, scale, dtype=np.float32)
+        images = np.asarray(self.images)
+        if images.dtype.kind == "f":
+            return images.astype(np.float32)
+        return np.divide(images, np.iinfo(images.dtype).max, dtype=np.float32)
 
     def check(self, width: int, height: int, source: str) -> None:
         """Raise `InputError` unless the frames fit the sensor, are in order and hold numbers."""
@@ -153,12 +168,13 @@ class Frames:
                 "positive, or 0 where unknown"
             )
         if self.images.dtype.kind == "f":
-            bad = ~((self.images >= 0) & (self.images <= 1)).all(axis=(1, 2))
-            if bad.any():
-                raise InputError(
-                    f"{source}: frame {int(np.argmax(bad))} holds NaN or values outside [0, 1]; "
-                    "scale float frames to [0, 1] and remove broken ones"
-                )
+            for row in range(len(self)):
+                image = np.asarray(self.images[row : row + 1])
+                if not ((image >= 0) & (image <= 1)).all():
+                    raise InputError(
+                        f"{source}: frame {row} holds NaN or values outside [0, 1]; scale float "
+                        "frames to [0, 1] and remove broken ones"
+                    )
 
 
 @dataclasses.dataclass(frozen=True)

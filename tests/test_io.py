@@ -886,3 +886,23 @@ def test_real_values(data):
     with np.load(data / "davis346_street.npz") as stored:
         np.testing.assert_allclose(street.frames.t, stored["frame_t"] * 1e6, atol=1)
     assert (street.frames.exposure == 500).all()
+
+
+def test_stored_images_are_read_when_asked_for(tmp_path):
+    images = np.arange(7 * 3 * 4, dtype=np.uint8).reshape(7, 3, 4)
+    frames = Frames(np.arange(7) * 1000 + 5, images, np.zeros(7, np.int64))
+    path = tmp_path / "frames.h5"
+    io.save(Recording("r", 4, 3, Events.empty(), frames), path)
+    stored = io.load(path, in_memory=False).frames
+    assert stored is not None and not isinstance(stored.images, np.ndarray)
+    odd = stored[1::2]
+    np.testing.assert_array_equal(np.asarray(odd.images), images[1::2])
+    np.testing.assert_array_equal(np.asarray(odd[1:].images), images[3::2])
+    np.testing.assert_array_equal(np.asarray(stored[::-1].images), images[::-1])
+    chosen = stored[np.array([4, 0, 4])]
+    np.testing.assert_array_equal(chosen.intensity, images[[4, 0, 4]] / np.float32(255))
+    copy = tmp_path / "copy.h5"
+    io.save(io.load(path, in_memory=False), copy, compression="gzip")
+    again = io.load(copy).frames
+    assert again is not None and isinstance(again.images, np.ndarray)
+    np.testing.assert_array_equal(again.images, images)

@@ -19,6 +19,7 @@ DSEC's event files (t uint32, no attributes) can be read too when the sensor's s
 """
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -126,15 +127,52 @@ class StoredEvents:
         return low, high
 
 
+class StoredImages:
+    """Images (frames, height, width) that stay in the file until np.asarray reads them."""
+
+    def __init__(self, dataset: h5py.Dataset, source: str, rows: Sequence[int] | None = None):
+        self._dataset, self._source = dataset, source
+        self._rows = range(len(dataset)) if rows is None else rows
+
+    @property
+    def dtype(self) -> np.dtype:
+        return self._dataset.dtype
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (len(self._rows), *self._dataset.shape[1:])
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, rows: slice | NDArray) -> "StoredImages":
+        if not isinstance(rows, slice):
+            chosen = np.arange(len(self))[rows].tolist()
+            return StoredImages(self._dataset, self._source, [self._rows[i] for i in chosen])
+        return StoredImages(self._dataset, self._source, self._rows[rows])
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
+        rows = self._rows
+        with reading(self._source):
+            if isinstance(rows, range) and rows.step > 0:
+                images = self._dataset[rows.start : rows.stop : rows.step]
+            else:
+                images = np.array([self._dataset[i] for i in rows], self._dataset.dtype)
+        return np.asarray(images, dtype)
+
+
 def read(path: Path, size: tuple[int, int] | None) -> Recording:
     """Read a file into memory; `size` is (width, height). Raises `InputError` for bad input."""
     with _open(path) as file:
         recording = _recording(file, path, size)
-        return dataclasses.replace(recording, events=recording.events[:])
+        frames = recording.frames
+        if frames is not None:
+            frames = dataclasses.replace(frames, images=np.asarray(frames.images))
+        return dataclasses.replace(recording, events=recording.events[:], frames=frames)
 
 
 def open_stored(path: Path, size: tuple[int, int] | None) -> Recording:
-    """Read all but the events, which stay in the file as `StoredEvents`."""
+    """Read all but events and images, which stay in the file: `StoredEvents`, `StoredImages`."""
     return _recording(_open(path), path, size)
 
 
@@ -156,7 +194,10 @@ def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Rec
     frames = poses = imu = camera = None
     if isinstance(file.get("frames"), h5py.Group):
         t, exposure = (_times(file, f"frames/{name}", source) for name in ("t", "exposure"))
-        images = _array(file, "frames/images", source)
+        name = f"{source}: frames/images"
+        images = StoredImages(_dataset(file, "frames/images", source), name)
+        if len(images.shape) != 3:
+            raise InputError(f"{name} has shape {images.shape}; store (frames, height, width)")
         if len(t):
             frames = Frames(t, images, exposure)
     if size is None and "width" in attributes and "height" in attributes:
@@ -243,7 +284,15 @@ def _write_events(
         ms = end
 
 
-def _write(file: h5py.File, name: str, values: NDArray, compression: str | None) -> None:
+def _write(file: h5py.File, name: str, values: Any, compression: str | None) -> None:
+    if isinstance(values, StoredImages) and len(values):
+        options = _options(len(values), compression)
+        if options:
+            options["chunks"] = (1, *values.shape[1:])
+        dataset = file.create_dataset(name, values.shape, values.dtype, **options)
+        for row in range(len(values)):
+            dataset[row : row + 1] = np.asarray(values[row : row + 1])
+        return
     values = np.asarray(values)
     dtype = h5py.string_dtype() if values.dtype.kind == "U" else values.dtype
     options = _options(len(values) if values.size and values.ndim else 0, compression)
