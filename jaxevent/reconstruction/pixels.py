@@ -463,6 +463,11 @@ class Windows:
         """The whole recording as one window, with room from a ladder of powers of two."""
         while self.frames < len(self.clock) + 2:
             self.frames *= 2
+        if (2 * self.frames + 1) * self.pixels >= 2**31:
+            raise InputError(
+                f"{self.recording.name}: {len(self.clock)} frames of {self.pixels} pixels are too "
+                "many to prepare in one piece; cut the recording in time: recording[t0:t1]"
+            )
         self.events = 1 << 15
         while self.events < len(self.recording.events):
             self.events *= 2

@@ -2,8 +2,9 @@
 
 import functools
 import itertools
+import math
 from collections.abc import Iterator
-from typing import Any, Generic
+from typing import Any, Generic, NamedTuple
 
 import jax
 import numpy as np
@@ -15,6 +16,7 @@ from jaxevent.reconstruction.estimator import Estimator, P, State, Trajectory
 from jaxevent.reconstruction.pixels import WINDOW_EVENTS, Carry, Features, Reader, ReadOut, Windows
 from jaxevent.recording import Recording, Times, microseconds
 
+BEGINS = 32  # windows from which filtering can be taken up again
 BATCH = 8  # images read per call; 8 x 90,000 pixels stay in the second-level cache
 
 
@@ -34,6 +36,18 @@ def _run(
 @functools.partial(jax.jit, static_argnums=0)
 def _read(estimator: Estimator, params, trajectory: Trajectory, out: ReadOut):
     return estimator.read(params, trajectory, out)
+
+
+class Begin(NamedTuple):
+    """What filtering from a window's start needs; no state: the recording's beginning."""
+
+    start: int | None
+    before: Carry
+    state: State | None
+
+    @property
+    def time(self) -> float:
+        return -math.inf if self.start is None else float(self.start)
 
 
 class Video(Generic[P]):
@@ -68,10 +82,8 @@ class Video(Generic[P]):
             events=window_events,
             reuse=True,
         )
-        self._starts: list[tuple[int | None, Carry, State | None]] = [
-            (None, self._windows.initial(), None)
-        ]
-        self._open: tuple[int, Reader, Trajectory] | None = None
+        self._begins = [Begin(None, self._windows.initial(), None)]
+        self._open: tuple[Reader, Trajectory] | None = None
 
     def __call__(self, times: Times) -> tuple[NDArray, NDArray]:
         """Intensity and variance of log intensity at `times`, each of shape (T, H, W).
@@ -138,27 +150,32 @@ class Video(Generic[P]):
 
     def _window_of(self, time: int) -> tuple[Reader, Trajectory]:
         """The filtered window that contains `time`; windows on the way are filtered in order."""
-        k = max(i for i, (start, *_) in enumerate(self._starts) if start is None or start <= time)
+        if self._open is not None:
+            reader, trajectory = self._open
+            start, stop = reader.window.start, reader.window.stop
+            if (start is None or start <= time) and (stop is None or time < stop):
+                return self._open
+        begin = [b for b in self._begins if b.time <= time][-1]
         while True:
-            if self._open is None or self._open[0] != k:
-                self._open = None  # so that two windows are never held at once
-                self._open = (k, *self._filter(k))
-            _, reader, trajectory = self._open
-            if reader.window.stop is None or time < reader.window.stop:
-                return reader, trajectory
-            k += 1
+            self._open = None  # so that two windows are never held at once
+            self._open, begin = self._filter(begin)
+            stop = self._open[0].window.stop
+            if stop is None or time < stop:
+                return self._open
 
-    def _filter(self, k: int) -> tuple[Reader, Trajectory]:
-        start, before, state = self._starts[k]
-        known = k + 1 < len(self._starts)
-        stop = self._starts[k + 1][0] if known else self._windows.next_stop(start)
-        window = self._windows.prepare(start, stop, before)
+    def _filter(self, begin: Begin) -> tuple[tuple[Reader, Trajectory], Begin]:
+        """Prepare and filter the window that begins there; and where the next one begins."""
+        stop = self._windows.next_stop(begin.start)
+        window = self._windows.prepare(begin.start, stop, begin.before)
         features, window.features = window.features, None  # used once, and large
+        state = begin.state
         if state is None:
             state = _start(self.estimator, self.params, features)
-            self._starts[0] = (start, before, state)
         trajectory, end = _run(self.estimator, self.params, features, state)
         jax.block_until_ready(trajectory)  # before the next window's tiles overwrite these
-        if window.stop is not None and not known:
-            self._starts.append((window.stop, window.after, end))
-        return window.reader(BATCH, self._windows.dtype), trajectory
+        following = Begin(window.stop, window.after, end)
+        if window.stop is not None and all(b.start != window.stop for b in self._begins):
+            self._begins = sorted([*self._begins, following], key=lambda b: b.time)
+            if len(self._begins) > BEGINS:  # the first one, the last one, and half of the others
+                self._begins = [self._begins[0], *self._begins[1:-1][::2], self._begins[-1]]
+        return (window.reader(BATCH, self._windows.dtype), trajectory), following
