@@ -32,9 +32,9 @@ def display_limits(images: ArrayLike, how: str = "linear") -> tuple[float, float
     "linear" has the limits 0 and 1, whatever the images. The other tones leave out the darkest and
     the brightest 0.5 % of the values as outliers; "log" and "clahe" look at positive values only.
     Pass the result to `tone_map` for each frame of a video, so that its brightness does not pump.
-    Raises `InputError` for an unknown tone and for images that are not finite floats.
+    Raises `InputError` for an unknown tone and for images that are not floats or hold NaN.
     """
-    images, logarithmic = checked(images, "images"), _is_logarithmic(how)
+    images, logarithmic = _bounded(images), _is_logarithmic(how)
     if how == "linear":
         return 0.0, 1.0
     values = images[images > 0] if logarithmic else images.ravel()
@@ -56,9 +56,9 @@ def tone_map(
     white; by default `display_limits` of these images) to 0..255 and clip what lies outside.
     "clahe" equalises the histogram of the result of "log" in tiles of 1/8 of the image with limited
     contrast, each image by itself. Raises `InputError` for an unknown tone, for images that are not
-    finite floats and for limits that are out of order or, with a logarithm, not positive.
+    floats or hold NaN and for limits that are out of order or, with a logarithm, not positive.
     """
-    images, logarithmic = checked(images, "images"), _is_logarithmic(how)
+    images, logarithmic = _bounded(images), _is_logarithmic(how)
     low, high = limits or display_limits(images, how)
     if not (-math.inf < low < high < math.inf) or (logarithmic and low <= 0):
         raise InputError(
@@ -72,6 +72,14 @@ def tone_map(
     if how == "clahe":
         shown = _equalised(shown)
     return np.rint(shown * 255).astype(np.uint8)
+
+
+def _bounded(images: ArrayLike) -> NDArray[np.floating]:
+    """Images whose infinite values (a hot pixel's events add up without end) are only large."""
+    images = np.asarray(images)
+    if images.dtype.kind == "f":
+        images = images.clip(-1e30, 1e30)
+    return checked(images, "images")
 
 
 def _is_logarithmic(how: str) -> bool:

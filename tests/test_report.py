@@ -256,3 +256,16 @@ def test_markdown_table():
         "| a\\|b c    | cf     |          - |     - |     22 |    0.50 |\n"
     )
     assert markdown_table([]).count("\n") == 2
+
+
+@pytest.mark.parametrize("how", ["linear", "log", "percentile", "clahe"])
+def test_pixels_without_bound_are_white_and_change_no_limit(how):
+    """A hot pixel's events add up until exp(L) overflows."""
+    image = np.linspace(0.1, 0.9, 400, dtype=np.float32).reshape(20, 20)
+    hot = image.copy()
+    hot[3, 4] = np.inf
+    assert display_limits(hot, how) == pytest.approx(display_limits(image, how), rel=0.02)
+    shown = tone_map(hot, how)
+    assert shown[3, 4] == shown.max()
+    with pytest.raises(InputError, match="not finite"):
+        tone_map(np.where(np.isinf(hot), np.nan, hot), how)
