@@ -174,8 +174,8 @@ def convert(
 ) -> None:
     from jaxevent.io import load, save
 
-    recording = load(source, size, in_memory=False)
-    save(recording, target, compression)
+    recording = load(source, size, in_memory=False, progress=_progress())
+    save(recording, target, compression, progress=_progress())
     frames = len(recording.frames) if recording.frames else 0
     size_mb = target.stat().st_size / 1e6
     print(f"{target}: {len(recording.events):,} events, {frames} frames, {size_mb:.1f} MB")
@@ -200,7 +200,7 @@ def reconstruct(
         raise InputError(f"{out}: --tone is for images to look at; HDF5 holds linear intensity")
     estimator = find_method(method)
     values = estimator.Params() if params is None else estimator.Params.load(params)
-    recording = load(path, size, in_memory=False)
+    recording = load(path, size, in_memory=False, progress=_progress())
     name = recording.name
     recording = dataclasses.replace(recording, name=str(path))  # for messages
     if at == "frames" and recording.frames is None:
@@ -223,7 +223,8 @@ def info(path: Path, size: tuple[int, int] | None) -> None:
     from jaxevent.describe import describe
     from jaxevent.io import load
 
-    lines = [("file", str(path)), *describe(load(path, size, in_memory=False))]
+    recording = load(path, size, in_memory=False, progress=_progress())
+    lines = [("file", str(path)), *describe(recording, progress=_progress())]
     width = max(len(name) for name, _ in lines)
     for name, text in lines:
         print(f"{name:{width}}  {text}")

@@ -18,7 +18,10 @@ BY_HAND = {"c_on": 0.083, "c_off": 0.059, "clock_offset": 0.0075}
 
 
 def demo(out: Path, progress: bool = False) -> None:
+    """Score every method on the packaged recording; prints the table, writes all to a folder.
 
+    Raises `InputError` if the folder cannot be written or an extra is missing.
+    """
     with resources.as_file(resources.files("jaxevent") / "data/slider_depth_crop.h5") as path:
         recording = load(path)
     by_hand = {name: METHODS[name].Params.of(BY_HAND) for name in ("akf", "augmented", "cf")}
@@ -47,7 +50,6 @@ def demo(out: Path, progress: bool = False) -> None:
 
 def _figure(recording: Recording, params: dict[str, Any], path: Path) -> None:
     """The AKF and a baseline, of equal thresholds, at one hidden frame in the middle."""
-
     given, hidden = held_out(recording)
     middle = hidden[len(hidden) // 2 :][:1]
     (image, variance), (baseline, _) = (
@@ -74,7 +76,6 @@ def _figure(recording: Recording, params: dict[str, Any], path: Path) -> None:
 
 def _video(recording: Recording, params: Any, path: Path, progress: bool) -> float:
     """200 images per second of the recording's time, shown at 30; returns the slow-down."""
-
     rate, fps, longest = 200.0, 30.0, 180
     video = METHODS["akf"].reconstruct(recording, params, progress=progress)
     zoom = 2 if recording.width < 480 else 1

@@ -2,6 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from jaxevent.recording import EventSource, Frames, Recording
 
@@ -9,7 +10,7 @@ BLOCK = 1 << 20  # events looked at together: 13 MB
 BIN = 10_000  # us over which the peak rate is taken
 
 
-def describe(recording: Recording) -> list[tuple[str, str]]:
+def describe(recording: Recording, progress: bool = False) -> list[tuple[str, str]]:
     """What a user wants to know first of a recording, as (name, text); reads events in blocks."""
     lines = [
         ("name", recording.name),
@@ -19,7 +20,7 @@ def describe(recording: Recording) -> list[tuple[str, str]]:
             f"{recording.start / 1e6:.6f} to {recording.stop / 1e6:.6f} s "
             f"({(recording.stop - recording.start) / 1e6:.3f} s)",
         ),
-        *_about_events(recording.events, recording.width, recording.height),
+        *_about_events(recording.events, recording.width, recording.height, progress),
         *_about_frames(recording.frames),
     ]
     if (camera := recording.camera) is not None:
@@ -42,7 +43,9 @@ def _rate_of(t: NDArray[np.int64]) -> str:
     return f", {(len(t) - 1) / ((t[-1] - t[0]) / 1e6):.1f} per s" if t[-1] > t[0] else ""
 
 
-def _about_events(events: EventSource, width: int, height: int) -> list[tuple[str, str]]:
+def _about_events(
+    events: EventSource, width: int, height: int, progress: bool
+) -> list[tuple[str, str]]:
     count = len(events)
     if not count:
         return [("events", "none")]
@@ -50,7 +53,8 @@ def _about_events(events: EventSource, width: int, height: int) -> list[tuple[st
     on = peak = carried = 0
     last_bin = None
     first = last = 0
-    for row in range(0, count, BLOCK):
+    blocks = range(0, count, BLOCK)
+    for row in tqdm(blocks, unit="M events", delay=2, disable=not progress, leave=False):
         block = events[row : row + BLOCK]
         first, last = first if row else int(block.t[0]), int(block.t[-1])
         on += int(block.p.sum())

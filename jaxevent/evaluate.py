@@ -156,7 +156,7 @@ def evaluate(
         write = None if out is None else stack.enter_context(results(Path(out)))
         rows = []
         for given, path in plan.recordings:
-            recording = load(path, plan.size, in_memory=False)
+            recording = load(path, plan.size, in_memory=False, progress=progress)
             recording = dataclasses.replace(recording, name=str(path))  # for messages
             for label, method, params in plan.methods:
                 row = score(recording, method, params, plan.protocol, progress=progress)

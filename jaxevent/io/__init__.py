@@ -6,6 +6,7 @@ every reader accepts the same values and words its errors alike.
 """
 
 import contextlib
+import functools
 import os
 import zipfile
 from collections.abc import Callable, Iterator
@@ -27,7 +28,10 @@ READABLE = (
 
 
 def load(
-    path: str | os.PathLike[str], size: tuple[int, int] | None = None, in_memory: bool = True
+    path: str | os.PathLike[str],
+    size: tuple[int, int] | None = None,
+    in_memory: bool = True,
+    progress: bool = False,
 ) -> Recording:
     """Read and check a recording; its format is told by its content, not by its name.
 
@@ -37,6 +41,7 @@ def load(
             the file does not tell it.
         in_memory: False leaves the events of an HDF5 file on disk, as `hdf5.StoredEvents`; they
             are then read and checked piece by piece. The other formats are always read whole.
+        progress: Show a bar on stderr where reading text takes longer than two seconds.
 
     Raises:
         InputError: The file is missing, damaged or of another format, or what it holds is not a
@@ -45,11 +50,14 @@ def load(
     path = Path(path)
     if size is not None and min(size) < 1:
         raise InputError(f"size = {size} must be two positive numbers of pixels, (width, height)")
-    return _reader(path, in_memory)(path, size).check(str(path))
+    return _reader(path, in_memory, progress)(path, size).check(str(path))
 
 
 def save(
-    recording: Recording, path: str | os.PathLike[str], compression: str | None = None
+    recording: Recording,
+    path: str | os.PathLike[str],
+    compression: str | None = None,
+    progress: bool = False,
 ) -> None:
     """Write a recording as HDF5 in the layout of `jaxevent.io.hdf5`, completely or not at all.
 
@@ -59,16 +67,19 @@ def save(
         recording: What to write; it is checked first.
         path: The file to write; an existing file is replaced once the new one is complete.
         compression: None for the fastest reading, "gzip" for the smallest file.
+        progress: Show a bar on stderr where it takes longer than two seconds.
 
     Raises:
         InputError: The recording is not valid, or the file cannot be written.
     """
     from jaxevent.io import hdf5
 
-    hdf5.write(recording, Path(path), compression)
+    hdf5.write(recording, Path(path), compression, progress)
 
 
-def _reader(path: Path, in_memory: bool) -> Callable[[Path, tuple[int, int] | None], Recording]:
+def _reader(
+    path: Path, in_memory: bool, progress: bool
+) -> Callable[[Path, tuple[int, int] | None], Recording]:
     with reading(str(path)):
         is_folder, exists = path.is_dir(), path.exists()
     if is_folder:
@@ -76,7 +87,7 @@ def _reader(path: Path, in_memory: bool) -> Callable[[Path, tuple[int, int] | No
             raise InputError(f"{path}: the folder holds no events.txt; {READABLE}")
         from jaxevent.io import text
 
-        return text.read
+        return functools.partial(text.read, progress=progress)
     if not exists:
         raise InputError(f"{path}: there is no such file or folder; correct the path")
     with reading(str(path)), path.open("rb") as file:
@@ -89,7 +100,7 @@ def _reader(path: Path, in_memory: bool) -> Callable[[Path, tuple[int, int] | No
         if any(name.rpartition("/")[2] == "events.txt" for name in names):
             from jaxevent.io import text
 
-            return text.read
+            return functools.partial(text.read, progress=progress)
         if names and all(name.endswith(".npy") for name in names):
             from jaxevent.io import npz
 

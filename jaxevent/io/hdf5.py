@@ -26,6 +26,7 @@ from typing import Any
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from jaxevent.errors import InputError
 from jaxevent.io import checked_events, pinhole, reading, times, vectors
@@ -222,7 +223,9 @@ def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Rec
     return Recording(name, *size, events, frames, camera, poses, imu, _extra(file, source))
 
 
-def write(recording: Recording, path: Path, compression: str | None = None) -> None:
+def write(
+    recording: Recording, path: Path, compression: str | None = None, progress: bool = False
+) -> None:
     """Write a recording; `jaxevent.io.save` describes the arguments and errors."""
     if compression not in (None, "gzip"):
         raise InputError(f'{path}: compression {compression!r} is unknown; use None or "gzip"')
@@ -235,7 +238,7 @@ def write(recording: Recording, path: Path, compression: str | None = None) -> N
             width=recording.width,
             height=recording.height,
         )
-        _write_events(file, recording.events, compression, recording.name)
+        _write_events(file, recording.events, compression, recording.name, progress)
         for group, part in (
             ("frames", recording.frames),
             ("poses", recording.poses),
@@ -251,7 +254,11 @@ def write(recording: Recording, path: Path, compression: str | None = None) -> N
 
 
 def _write_events(
-    file: h5py.File, events: EventSource, compression: str | None, source: str
+    file: h5py.File,
+    events: EventSource,
+    compression: str | None,
+    source: str,
+    progress: bool,
 ) -> None:
     count = len(events)
     offset = int(events[:1].t[0]) if count else 0
@@ -271,7 +278,8 @@ def _write_events(
         "ms_to_idx", (last_ms + 1,), "u8", **_options(last_ms + 1, compression)
     )
     ms = 0
-    for row in range(0, count, _BLOCK):
+    blocks = range(0, count, _BLOCK)
+    for row in tqdm(blocks, unit="M events", delay=2, disable=not progress, leave=False):
         block = events[row : row + _BLOCK]
         since = block.t - offset
         rows = slice(row, row + len(block))
