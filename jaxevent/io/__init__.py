@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.recording import Events, Recording
+from jaxevent.recording import Events, Frames, Recording
 
 __all__ = ["load", "save"]
 
@@ -242,6 +242,22 @@ def pinhole(values: NDArray, source: str) -> PinholeCamera:
         )
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(value) for value in values)
     return PinholeCamera(fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+
+
+def sensor_size(
+    *known: tuple[int, int] | None, frames: Frames | None, otherwise: str
+) -> tuple[int, int]:
+    """(width, height): the first size that is known, else that of the frames.
+
+    Raises `InputError` with the text `otherwise` and the remedy if neither tells it.
+    """
+    for size in known:
+        if size is not None:
+            return size
+    if frames is None:
+        raise InputError(f"{otherwise} give size=(width, height) or --size")
+    _, height, width = frames.images.shape
+    return width, height
 
 
 def vectors(values: NDArray, shape: tuple[int, int], source: str, what: str) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.io import checked_events, reading, times
+from jaxevent.io import checked_events, reading, sensor_size, times
 from jaxevent.recording import Events, Frames, Recording
 
 
@@ -62,12 +62,8 @@ def _recording(path: Path, size: tuple[int, int] | None, variables: dict) -> Rec
         )
     columns = arrays.pop("events")
     frames = _frames(path, arrays) if "image" in arrays else None
-    if size is None and frames is not None:
-        size = (frames.images.shape[2], frames.images.shape[1])
-    if size is None:
-        raise InputError(
-            f"{path}: has no image to tell the sensor's size; give size=(width, height) or --size"
-        )
+    otherwise = f"{path}: has no image to tell the sensor's size;"
+    size = sensor_size(size, frames=frames, otherwise=otherwise)
     events = _events(path, columns, size)
     extra = {name: _squeeze(value) for name, value in arrays.items() if name != "HDR_mat"}
     if "HDR_mat" in arrays:

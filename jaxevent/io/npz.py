@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.io import checked_events, pinhole, reading, times, vectors
+from jaxevent.io import checked_events, pinhole, reading, sensor_size, times, vectors
 from jaxevent.recording import Frames, Imu, Recording
 
 
@@ -40,15 +40,11 @@ def read(path: Path, size: tuple[int, int] | None) -> Recording:
     t, x, y, p = take("t", "x", "y", "p")
     frames = _frames(path, arrays, take) if "frames" in arrays else None
     stored = [arrays.pop(name) for name in ("width", "height") if name in arrays]
+    told = None
     if size is None and len(stored) == 2:
-        size = (_pixels(path, "width", stored[0]), _pixels(path, "height", stored[1]))
-    if size is None and frames is not None:
-        size = (frames.images.shape[2], frames.images.shape[1])
-    if size is None:
-        raise InputError(
-            f"{path}: has no width and height and no frames; add them or give "
-            "size=(width, height) or --size"
-        )
+        told = (_pixels(path, "width", stored[0]), _pixels(path, "height", stored[1]))
+    otherwise = f"{path}: has no width and height and no frames; add them or"
+    size = sensor_size(size, told, frames=frames, otherwise=otherwise)
     source = str(path)
     events = checked_events(times(t, source, "event"), x, y, p, size, source)
     imu = None

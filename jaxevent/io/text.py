@@ -22,7 +22,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from jaxevent.errors import InputError
-from jaxevent.io import checked_events, pinhole, reading, times
+from jaxevent.io import checked_events, pinhole, reading, sensor_size, times
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
 
@@ -53,15 +53,10 @@ def _read(
     columns, header = _table(
         root / "events.txt", source, "t x y p", header="width height", progress=progress
     )
-    if size is None and header is not None:
-        size = header
-    if size is None and frames is not None:
-        size = (frames.images.shape[2], frames.images.shape[1])
-    if size is None:
-        raise InputError(
-            f"{source}: neither a first line 'width height' nor an image tells the sensor's size; "
-            "give size=(width, height) or --size"
-        )
+    otherwise = (
+        f"{source}: neither a first line 'width height' nor an image tells the sensor's size;"
+    )
+    size = sensor_size(size, header, frames=frames, otherwise=otherwise)
     t, x, y, p = columns
     events = checked_events(times(t, source, "event"), x, y, p, size, source)
 
