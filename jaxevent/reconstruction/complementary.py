@@ -18,8 +18,16 @@ from jaxevent.reconstruction.augment import (
     Held,
     Level,
     Nothing,
+    brightness,
 )
-from jaxevent.reconstruction.estimator import Estimator, Event, Observation, Observer, State
+from jaxevent.reconstruction.estimator import (
+    Estimator,
+    Event,
+    Observation,
+    Observer,
+    State,
+    without_variance,
+)
 from jaxevent.reconstruction.pixels import FrameFeatures, Points
 
 
@@ -52,10 +60,6 @@ class Pull(Observer):
         return Observation(u, jnp.broadcast_to(self.alpha, u.shape))
 
 
-def initial(params: FrameParams, level: Array) -> State:
-    return State(level, jnp.full_like(level, jnp.nan))
-
-
 def advance(params: FrameParams, state: State, dt: Array, frame: Observation) -> State:
     """L <- L e^(-alpha dt) + u (1 - e^(-alpha dt))."""
     decay = jnp.exp(-frame.rate * dt)
@@ -64,15 +68,14 @@ def advance(params: FrameParams, state: State, dt: Array, frame: Observation) ->
 
 def jump(params: FrameParams, state: State, event: Event) -> State:
     """L <- L + s c."""
-    change = jnp.where(event.polarity > 0, params.c_on, -params.c_off)
-    return State(state.L + jnp.where(event.polarity == 0, 0, change), state.P)
+    return State(state.L + brightness(params, event.polarity > 0, event.polarity < 0), state.P)
 
 
 def _filter(name: str, model: type[Level], params: type[FrameParams], **more: Any) -> Estimator:
     def observe(values: Any, frames: FrameFeatures) -> Pull:
         return Pull(model(values, frames), values.alpha)
 
-    return Estimator(name, params, observe, initial, advance, jump, **more)
+    return Estimator(name, params, observe, without_variance, advance, jump, **more)
 
 
 cf = _filter("cf", Held, Params)

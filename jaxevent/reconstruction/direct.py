@@ -13,7 +13,13 @@ from jaxevent.reconstruction.augment import (
     Held,
     Level,
 )
-from jaxevent.reconstruction.estimator import Estimator, Observation, Observer, State
+from jaxevent.reconstruction.estimator import (
+    Estimator,
+    Observation,
+    Observer,
+    State,
+    without_variance,
+)
 from jaxevent.reconstruction.pixels import FrameFeatures, Points
 
 
@@ -27,10 +33,6 @@ class Direct(Observer):
         return Observation(u, jnp.full_like(u, jnp.inf))
 
 
-def initial(params: FrameParams, level: Array) -> State:
-    return State(level, jnp.full_like(level, jnp.nan))
-
-
 def advance(params: FrameParams, state: State, dt: Array, frame: Observation) -> State:
     return State(frame.level, jnp.broadcast_to(state.P, frame.level.shape))
 
@@ -39,7 +41,7 @@ def _direct(name: str, model: type[Level]) -> Estimator:
     def observe(values: Any, frames: FrameFeatures) -> Direct:
         return Direct(model(values, frames))
 
-    return Estimator(name, model.Params, observe, initial, advance)
+    return Estimator(name, model.Params, observe, without_variance, advance)
 
 
 edi = _direct("edi", EventIntegral)

@@ -42,6 +42,11 @@ class State(eqx.Module):
     P: Float[Numeric, "*pixels"]
 
 
+def without_variance(params: FrameParams, level: Array) -> State:
+    """The initial state of methods that estimate no variance."""
+    return State(level, jnp.full_like(level, jnp.nan))
+
+
 class Observation(eqx.Module):
     """What the frames say at a point: log intensity, and the rate (1/s) at which to believe it."""
 

@@ -10,7 +10,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxevent.parameters import Positive
-from jaxevent.reconstruction.augment import Augmented, AugmentParams, BetweenFrames, intensity
+from jaxevent.reconstruction.augment import (
+    Augmented,
+    AugmentParams,
+    BetweenFrames,
+    brightness,
+    intensity,
+)
 from jaxevent.reconstruction.estimator import Estimator, Event, Observation, Observer, State
 from jaxevent.reconstruction.pixels import FrameFeatures, Points
 
@@ -79,12 +85,8 @@ def noise(params: Params, event: Event) -> Array:
 
 def jump(params: Params, state: State, event: Event) -> State:
     """At an event: L moves by the nominal threshold (14), P grows by Q (19)."""
-    change = jnp.where(event.polarity > 0, params.c_on, -params.c_off)
-    Q = noise(params, event)
-    return State(
-        state.L + jnp.where(event.polarity == 0, 0, change),
-        state.P + jnp.where(event.polarity == 0, 0, Q),
-    )
+    L = state.L + brightness(params, event.polarity > 0, event.polarity < 0)
+    return State(L, state.P + jnp.where(event.polarity == 0, 0, noise(params, event)))
 
 
 akf = Estimator("akf", Params, Augmentation, initial, advance, jump, needs_frames=False)
