@@ -426,3 +426,15 @@ def test_times_must_make_sense():
     with pytest.raises(jaxevent.InputError, match="not finite"):
         video(np.array([np.nan]))
     np.testing.assert_array_equal(video(0.05)[0], video(50_000)[0])
+
+
+def test_stored_recording_gives_the_same_images(tmp_path):
+    """Events and frames read window by window from a file."""
+    recording = random_recording(12, 400, 30, exposure=900)
+    jaxevent.save(recording, tmp_path / "stored.h5")
+    stored = jaxevent.load(tmp_path / "stored.h5", in_memory=False)
+    params = params_of(jaxevent.akf, **PARAMS)
+    times = np.linspace(recording.start, recording.stop, 9).astype(np.int64)
+    expected = jaxevent.akf.reconstruct(recording, params, window_events=90)(times)
+    images = jaxevent.akf.reconstruct(stored, params, window_events=90)(times)
+    np.testing.assert_array_equal(images, expected)

@@ -329,8 +329,7 @@ class Layout:
     counts: NDArray[np.int32]  # events per pixel
     round_tile: NDArray[np.int32]  # per kind and round of ranks: the first tile
     round_first: NDArray[np.int64]  # per kind: where its rounds start in round_tile
-    tiles: int  # used
-    room: int  # ladder
+    room: int  # tiles, from the ladder
     ordinary: bool  # whether the first rung sufficed
 
     @classmethod
@@ -338,7 +337,7 @@ class Layout:
         zeros, kinds = np.zeros(pixels, np.int32), len(SHAPES)
         return cls(
             zeros.astype(np.int8), zeros, [], zeros, np.zeros(kinds, np.int32),
-            np.zeros(kinds, np.int64), 0, 0, True,
+            np.zeros(kinds, np.int64), 0, True,
         )  # fmt: skip
 
     @classmethod
@@ -368,7 +367,7 @@ class Layout:
             room *= 2
         starts = np.cumsum([0] + [len(r) for r in rounds[:-1]])
         first_tile = np.concatenate([*rounds, np.zeros(1, np.int32)])  # never empty
-        return cls(kind, lane, lanes, counts, first_tile, starts, tiles, room, ordinary)
+        return cls(kind, lane, lanes, counts, first_tile, starts, room, ordinary)
 
     def slots(self) -> NDArray[np.int32]:
         """The slot of each pixel's last event, -1 if it has none."""
@@ -420,7 +419,7 @@ class Windows:
     def initial(self) -> Carry:
         return Carry.initial(self.recording)
 
-    def next_stop(self, start: int | None) -> int | None:
+    def _stop(self, start: int | None) -> int | None:
         """Where the window that starts at `start` should end; None: at the recording's end."""
         stops = []
         clock, source = self.clock, self.recording.events
@@ -441,23 +440,28 @@ class Windows:
                 stops.append(stop)
         return min(stops, default=None)
 
-    def prepare(self, start: int | None, stop: int | None, before: Carry) -> Window:
-        """The window start <= t < stop, or a shorter one if its events are very unevenly spread."""
+    def prepare(self, start: int | None, before: Carry) -> Window:
+        """The window that begins at `start`, shorter if its events are very unevenly spread."""
+        stop = self._stop(start)
         source = self.recording.events
+        begin = 0 if start is None else source.index(start)
+        end = len(source) if stop is None else source.index(stop)
+        context, finish = begin, end
+        used = self._used(start, stop)
+        if used.start < used.stop:
+            # Of overlapping exposures, a later one may begin or an earlier one end further out.
+            left, _, right = self._edges(used)
+            context = min(context, source.index(int(left.min())))
+            finish = max(finish, source.index(int(right.max())))
+        around = source[context:finish]
+        events = around[begin - context : end - context]
         while True:
-            rows = (
-                0 if start is None else source.index(start),
-                len(source) if stop is None else source.index(stop),
-            )
-            events = source[rows[0] : rows[1]]
-            if not self.filtering:
-                return self._window(start, stop, events, None, before)
-            counts = _count(events.x, events.y, self.recording.width, self.pixels)
-            layout = Layout.of(counts, self.events)
-            middle = events.t[len(events) // 2] if len(events) else 0
-            if layout.ordinary or len(events) < 2 or middle == events.t[0]:
-                return self._window(start, stop, events, layout, before)
-            stop = int(middle)
+            layout = self._layout(events)
+            middle = int(events.t[len(events) // 2]) if len(events) else 0
+            if layout is None or layout.ordinary or len(events) < 2 or middle == events.t[0]:
+                return self._window(start, stop, around, events, layout, before)
+            stop = middle
+            events = events[: events.index(stop)]
 
     def whole(self) -> Window:
         """The whole recording as one window, with room from a ladder of powers of two."""
@@ -472,55 +476,56 @@ class Windows:
         while self.events < len(self.recording.events):
             self.events *= 2
         events = self.recording.events[:]
-        counts = _count(events.x, events.y, self.recording.width, self.pixels)
-        layout = Layout.of(counts, self.events) if self.filtering else None
-        return self._window(None, None, events, layout, self.initial())
+        return self._window(None, None, events, events, self._layout(events), self.initial())
 
     def __iter__(self) -> Iterator[Window]:
         before, start = self.initial(), None
         while True:
-            window = self.prepare(start, self.next_stop(start), before)
+            window = self.prepare(start, before)
             yield window
             if window.stop is None:
                 return
             before, start = window.after, window.stop
 
+    def _layout(self, events: Events) -> Layout | None:
+        if not self.filtering:
+            return None
+        counts = _count(events.x, events.y, self.recording.width, self.pixels)
+        return Layout.of(counts, self.events)
+
+    def _used(self, start: int | None, stop: int | None) -> slice:
+        """The frames that tell what happens from start to stop, one more on each side."""
+        span = np.array(
+            [
+                -np.inf if start is None else start - self.origin,
+                np.inf if stop is None else stop - self.origin,
+            ]
+        )
+        first, last = self.clock.frame(np.searchsorted(self.clock.breaks, span, "right"))
+        return slice(max(int(first) - 1, 0), min(int(last) + 2, len(self.clock)))
+
+    def _edges(self, used: slice) -> list[NDArray[np.int64]]:
+        """Left edge, middle and right edge of exposures (us): events with t < edge are before it.
+
+        Half microseconds are rounded up, which says the same of whole ones.
+        """
+        edges = (self.clock.left, self.clock.mid, self.clock.right)
+        return [np.ceil(edge[used]).astype(np.int64) + self.origin for edge in edges]
+
     def _window(
         self,
         start: int | None,
         stop: int | None,
+        around: Events,
         events: Events,
         layout: Layout | None,
         before: Carry,
     ) -> Window:
-        clock, origin, n = self.clock, self.origin, len(self.clock)
-        span = np.array(
-            [
-                -np.inf if start is None else start - origin,
-                np.inf if stop is None else stop - origin,
-            ]
-        )
-        pieces = np.searchsorted(clock.breaks, span, "right")
-        first = max(int(clock.frame(pieces[0])) - 1, 0)
-        last = min(int(clock.frame(pieces[1])) + 1, n - 1)
-        used = slice(first, last + 1)
-        # Events with t < edge count as before it; half microseconds are rounded up to say the same.
-        left, mid, right = (
-            np.ceil(edge[used]).astype(np.int64) + origin
-            for edge in (clock.left, clock.mid, clock.right)
-        )
-        source = self.recording.events
-        begin = 0 if start is None else source.index(start)
-        context, finish = begin, begin + len(events)
-        if n:  # of overlapping exposures, a later one may begin or an earlier one end further out
-            context = min(context, source.index(int(left.min())))
-            finish = max(finish, source.index(int(right.max())))
-        around = (
-            events if (context, finish) == (begin, begin + len(events)) else source[context:finish]
-        )
+        """The window of `events`; `around` holds those of all its frames' exposures too."""
+        used = self._used(start, stop)
         opening = np.iinfo(np.int64).min if start is None else start
         edges, where = np.unique(
-            np.concatenate([[opening], left, mid, right]).astype(np.int64), return_inverse=True
+            np.concatenate([[opening], *self._edges(used)]).astype(np.int64), return_inverse=True
         )
         snapshot = _snapshots(around.t, around.x, around.y, around.p, edges, *self._size())
         at_start = snapshot[where[0]]
@@ -538,8 +543,8 @@ class Windows:
             after,
             self.recording.width,
             events,
-            clock,
-            origin,
+            self.clock,
+            self.origin,
             used.start,
             before,
             at_start,
@@ -611,22 +616,14 @@ class Windows:
 
     def _segments(self, used: slice, around: Events) -> Segments:
         clock, parts = self.clock, []
-        for row, k in enumerate(range(used.start, used.stop)):
-            edges = np.array([clock.left[k], clock.mid[k], clock.right[k]])
-            i, m, j = (around.index(int(np.ceil(e)) + self.origin) for e in edges)
+        exact = np.stack([clock.left[used], clock.mid[used], clock.right[used]], axis=1)
+        for row, edges in enumerate(np.stack(self._edges(used), axis=1)):
+            i, m, j = (around.index(int(edge)) for edge in edges)
             if i < j:
                 part = around[i:j]
+                t = part.t - self.origin
                 parts.append(
-                    _exposure(
-                        part.t - self.origin,
-                        part.x,
-                        part.y,
-                        part.p,
-                        m - i,
-                        row,
-                        edges,
-                        *self._size(),
-                    )  # fmt: skip
+                    _exposure(t, part.x, part.y, part.p, m - i, row, exact[row], *self._size())
                 )
         total = sum(len(part[0]) for part in parts)
         room = 1 << 14

@@ -165,8 +165,7 @@ class Video(Generic[P]):
 
     def _filter(self, begin: Begin) -> tuple[tuple[Reader, Trajectory], Begin]:
         """Prepare and filter the window that begins there; and where the next one begins."""
-        stop = self._windows.next_stop(begin.start)
-        window = self._windows.prepare(begin.start, stop, begin.before)
+        window = self._windows.prepare(begin.start, begin.before)
         features, window.features = window.features, None  # used once, and large
         state = begin.state
         if state is None:
