@@ -4,10 +4,11 @@ import abc
 import dataclasses
 
 import equinox as eqx
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.errors import InputError
 
@@ -23,35 +24,109 @@ class PinholeCamera:
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
+# Grey values or intensities of any shape, in JAX or NumPy.
+Values = Float[Array | np.ndarray, "..."] | float
+
+
 class Response(eqx.Module):
-    """A camera response: intensity of a grey value, and how certain the grey value makes it."""
+    """A camera response: grey values of intensities, the inverse, and how certain grey makes it.
+
+    Grey values are in [0, 1], of a uint8 level `level / 255`. Intensity is in units of what the
+    camera resolves. All methods take arrays of any shape and are differentiable.
+    """
 
     @abc.abstractmethod
-    def intensity(self, grey: Float[Array, "..."]) -> Float[Array, "..."]:
+    def grey(self, intensity: Values) -> Float[Array, "..."]:
+        """Grey value in [0, 1] of an intensity, the camera response; clipped at both ends."""
+
+    @abc.abstractmethod
+    def intensity(self, grey: Values) -> Float[Array, "..."]:
         """Intensity in [0, 1] of a grey value in [0, 1]: the inverse camera response."""
 
     @abc.abstractmethod
-    def certainty(self, grey: Float[Array, "..."]) -> Float[Array, "..."]:
+    def certainty(self, grey: Values) -> Float[Array, "..."]:
         """w = dCRF/dE at that grey value, scaled to the maximum 1 (AKF paper section 3.2.1)."""
 
 
 class UnknownResponse(Response):
     """Grey is intensity; certainty 4 I (1 - I): full at mid-grey, none where the sensor clips."""
 
-    def intensity(self, grey: Float[Array, "..."]) -> Float[Array, "..."]:
-        return grey
+    def grey(self, intensity: Values) -> Float[Array, "..."]:
+        return jnp.clip(jnp.asarray(intensity), 0, 1)
 
-    def certainty(self, grey: Float[Array, "..."]) -> Float[Array, "..."]:
+    def intensity(self, grey: Values) -> Float[Array, "..."]:
+        return jnp.asarray(grey)
+
+    def certainty(self, grey: Values) -> Float[Array, "..."]:
+        grey = jnp.asarray(grey)
         return 4 * grey * (1 - grey)
+
+
+class SCurve(Response):
+    """An artificial camera that crops: what it resolves is [0, 1], pressed into an S-shape.
+
+    A normalised logistic of steepness s, E clipped to [0, 1]:
+
+        CRF(E) = 1/2 + tanh(s (E - 1/2) / 2) / (2 tanh(s / 4))
+        CRF^-1(g) = 1/2 + (2 / s) artanh((2 g - 1) tanh(s / 4))
+        w(g) = 1 - ((2 g - 1) tanh(s / 4))^2
+
+    so CRF(0) = 0, CRF(1) = 1 and the certainty at both ends is sech^2(s / 4), 0.07 by default. It
+    makes artificial HDR data of ordinary images (AKF supplement 4.2, which prints no formula): the
+    grey levels from `cut` to `255 - cut` of an image are the camera's [0, 1], see `scene`. Raises
+    `InputError` unless 0 <= cut < 127.5 and 0 < steepness <= 20.
+    """
+
+    cut: Float[Array, ""]
+    steepness: Float[Array, ""]
+
+    def __init__(self, cut: float | int | Array = 50, steepness: float | int | Array = 8):
+        if not isinstance(cut, jax.core.Tracer) and not 0 <= cut < 127.5:
+            raise InputError(f"a camera cannot crop {cut} of 255 levels; give 0 to 127")
+        if not isinstance(steepness, jax.core.Tracer) and not 0 < steepness <= 20:
+            raise InputError(
+                f"the steepness {steepness} of a camera response is not in (0, 20]; 8 is common"
+            )
+        self.cut = jnp.asarray(cut, jnp.result_type(float))
+        self.steepness = jnp.asarray(steepness, jnp.result_type(float))
+
+    def scene(self, level: ArrayLike | int | float) -> Float[Array, "..."]:
+        """Intensity of an original image's level in [0, 255]; beyond [0, 1] the camera clips."""
+        return (jnp.asarray(level) - self.cut) / (255 - 2 * self.cut)
+
+    def level(self, intensity: Values) -> Float[Array, "..."]:
+        """The original image's level, 0 to 255, of an intensity: the inverse of `scene`."""
+        return self.cut + jnp.asarray(intensity) * (255 - 2 * self.cut)
+
+    def grey(self, intensity: Values) -> Float[Array, "..."]:
+        inside = jnp.clip(jnp.asarray(intensity), 0, 1)
+        # The rounding error of tanh may lead an ulp beyond the ends, which float frames may not.
+        grey = 0.5 + jnp.tanh(self.steepness * (inside - 0.5) / 2) / (2 * self._end())
+        return jnp.clip(grey, 0, 1)
+
+    def intensity(self, grey: Values) -> Float[Array, "..."]:
+        return 0.5 + 2 / self.steepness * jnp.arctanh((2 * jnp.asarray(grey) - 1) * self._end())
+
+    def certainty(self, grey: Values) -> Float[Array, "..."]:
+        return 1 - ((2 * jnp.asarray(grey) - 1) * self._end()) ** 2
+
+    def table(self, entries: int = 256) -> Float[Array, " entries"]:
+        """Intensities of `entries` evenly spaced grey values, as `TableResponse` takes them."""
+        return self.intensity(jnp.linspace(0, 1, entries))
+
+    def _end(self) -> Float[Array, ""]:
+        return jnp.tanh(self.steepness / 4)
 
 
 class TableResponse(Response):
     """A monotone table: `levels[i]` is the intensity at grey value i / (len(levels) - 1).
 
     The certainty is `weights`, entry by entry, scaled to the maximum 1; omitted, it is the slope of
-    grey over intensity, by central differences of the table. Tables of the authors' recordings:
-    `TableResponse(jnp.linspace(0, 1, 256), recording.extra["f_Q"])`. Raises `InputError` for a
-    table of fewer than 3 intensities, one that falls, and weights of another length.
+    grey over intensity, by central differences of the table as it was given. Tables of the authors'
+    recordings: `TableResponse(jnp.linspace(0, 1, 256), recording.extra["f_Q"])`. Between entries
+    all is linear; an intensity that several grey values share has the grey value of one of them.
+    Raises `InputError` for a table of fewer than 3 intensities, one that falls, values that are not
+    finite, and weights of another length.
     """
 
     levels: Float[Array, " entries"]
@@ -59,11 +134,13 @@ class TableResponse(Response):
 
     def __init__(self, levels: ArrayLike, weights: ArrayLike | None = None):
         table = np.asarray(levels, float)
-        if table.ndim != 1 or len(table) < 3 or not (np.diff(table) >= 0).all():
+        finite = np.isfinite(table).all()
+        if table.ndim != 1 or len(table) < 3 or not finite or not (np.diff(table) >= 0).all():
             raise InputError("a camera response needs 3 or more intensities that never fall")
         certain = 1 / np.maximum(np.gradient(table), 1e-9) if weights is None else weights
         certain = np.asarray(certain, float)
-        if certain.shape != table.shape or not (certain >= 0).all() or not certain.max() > 0:
+        positive = np.isfinite(certain).all() and (certain >= 0).all() and (certain > 0).any()
+        if certain.shape != table.shape or not positive:
             raise InputError(
                 f"a camera response of {len(table)} intensities needs as many weights, none "
                 "negative and not all 0"
@@ -71,11 +148,182 @@ class TableResponse(Response):
         self.levels = jnp.asarray(table, jnp.result_type(float))
         self.weights = jnp.asarray(certain / certain.max(), jnp.result_type(float))
 
-    def intensity(self, grey: Float[Array, "..."]) -> Float[Array, "..."]:
-        return self._at(self.levels, grey)
+    def grey(self, intensity: Values) -> Float[Array, "..."]:
+        return jnp.interp(jnp.asarray(intensity), self.levels, self._greys())
 
-    def certainty(self, grey: Float[Array, "..."]) -> Float[Array, "..."]:
-        return self._at(self.weights, grey)
+    def intensity(self, grey: Values) -> Float[Array, "..."]:
+        return jnp.interp(jnp.asarray(grey), self._greys(), self.levels)
 
-    def _at(self, table: Float[Array, " entries"], grey: Float[Array, "..."]):
-        return jnp.interp(grey, jnp.linspace(0, 1, table.shape[0]), table)
+    def certainty(self, grey: Values) -> Float[Array, "..."]:
+        return jnp.interp(jnp.asarray(grey), self._greys(), self.weights)
+
+    def _greys(self) -> Float[Array, " entries"]:
+        return jnp.linspace(0, 1, self.levels.shape[0])
+
+
+def estimate_response(
+    images: NDArray,
+    exposures: ArrayLike,
+    *,
+    smoothness: float | int = 20,
+    margin: int = 4,
+    samples: int = 20,
+    seed: int = 0,
+) -> TableResponse:
+    """The camera response from images of one still scene under different exposure times.
+
+    `images` is (N, H, W) uint8, `exposures` (N,) in s, of which only the ratios matter. Debevec and
+    Malik, "Recovering High Dynamic Range Radiance Maps from Photographs", SIGGRAPH 1997: with
+    g(z) = ln CRF^-1 the least squares fit of g(z_ij) = ln E_i + ln t_j, weighted by a hat over the
+    grey levels, and of g'' = 0, weighted by `smoothness`, relative to the data of a grey level. A
+    clipped pixel that noise shows as unclipped says something wrong: levels within `margin` of 0
+    and 255 count as clipped; give 3 to 4 standard deviations of the noise. Of each grey level of
+    each image as many as `samples` pixels are taken, drawn by `seed`, that are unclipped in two
+    images or more.
+
+    The result never falls; grey level 255 has intensity 1. Its certainty is its slope, and 0 at
+    levels that no taken pixel showed, the clipped ones among them: there intensity is extrapolated.
+
+    Raises `InputError` for images and exposures that do not fit together or all have one exposure,
+    for images with too few usable pixels, and for settings outside their range.
+    """
+    stack, times = _stack(images, exposures)
+    if len(np.unique(times)) < 2:
+        raise InputError(
+            f"{len(stack)} images of one exposure time tell no camera response; give images of two "
+            "or more exposure times"
+        )
+    if not smoothness > 0 or not samples > 0 or not 0 <= margin <= 32:
+        raise InputError(
+            f"smoothness {smoothness} and samples {samples} must be positive and margin {margin} "
+            "0 to 32 grey levels"
+        )
+    level = np.arange(256)
+    hat = np.maximum(np.minimum(level, 255 - level) - margin, 0) / (127 - margin)
+    z = _drawn(stack.reshape(len(stack), -1), hat > 0, samples, np.random.default_rng(seed))
+    shown = (np.bincount(z.ravel(), minlength=256) > 0) & (hat > 0)
+    surplus = int((hat[z] > 0).sum()) - z.shape[1]
+    if surplus < 256 or not shown[:48].any() or not shown[208:].any():
+        raise InputError(
+            f"only {z.shape[1]} usable pixels, unclipped in two images, is too few or their grey "
+            "levels too alike to tell a camera response; expose so that many pixels are unclipped "
+            "in two images, from dark to bright"
+        )
+    levels = _debevec(z, np.log(times), hat, smoothness)
+    slope = np.gradient(levels)
+    return TableResponse(levels, np.where(shown & (slope > 0), 1 / np.maximum(slope, 1e-9), 0))
+
+
+def _stack(images: NDArray, exposures: ArrayLike) -> tuple[NDArray, NDArray[np.float64]]:
+    stack, times = np.asarray(images), np.asarray(exposures, float)
+    if stack.dtype != np.uint8 or stack.ndim != 3:
+        raise InputError(
+            f"an exposure stack of shape {stack.shape} and type {stack.dtype} cannot be used; give "
+            "(images, height, width) uint8"
+        )
+    if times.shape != stack.shape[:1] or not len(times):
+        raise InputError(
+            f"{len(stack)} images have exposures of shape {times.shape}; give one exposure time "
+            "for each image"
+        )
+    if not (np.isfinite(times) & (times > 0)).all():
+        raise InputError(f"exposure times must be positive; they are {times.tolist()}")
+    return stack, times
+
+
+def _drawn(z: NDArray, usable: NDArray, samples: int, rng: np.random.Generator) -> NDArray:
+    """Grey levels (images, drawn) of pixels that are usable twice, spread over the levels."""
+    z = z[:, usable[z].sum(0) >= 2]
+    z = z[:, rng.permutation(z.shape[1])]
+    drawn = np.zeros(z.shape[1], bool)
+    for image in z:
+        order = np.argsort(image, kind="stable")
+        level = image[order]
+        rank = np.arange(len(level)) - np.searchsorted(level, level)  # within its grey level
+        drawn[order[(rank < samples) & usable[level]]] = True
+    return z[:, drawn]
+
+
+def _debevec(
+    z: NDArray, log_exposure: NDArray, hat: NDArray, smoothness: float | int
+) -> NDArray[np.float64]:
+    """Intensity of every grey level from the levels z of pixels (images, pixels).
+
+    Pixel i contributes sum_j h_j (g(z_j) - ln t_j - ln E_i)^2, h_j = hat(z_j)^2. Its best ln E_i is
+    the mean of g(z_j) - ln t_j under h. Put in, normal equations of the 256 values of g remain:
+    their matrix is the sum over pixels of diag(v) - v v' / sum v, v = sum_j h_j e_zj.
+    """
+    import scipy.linalg
+    import scipy.optimize
+
+    h = hat[z] ** 2
+    total = h.sum(0)
+    matrix = np.diag(np.bincount(z.ravel(), h.ravel(), 256))
+    for j in range(len(z)):
+        for k in range(len(z)):
+            pair = z[j].astype(np.intp) * 256 + z[k]
+            matrix -= np.bincount(pair, h[j] * h[k] / total, 256 * 256).reshape(256, 256)
+    centred = log_exposure[:, None] - (h * log_exposure[:, None]).sum(0) / total
+    right = np.bincount(z.ravel(), (h * centred).ravel(), 256)
+    scale = np.trace(matrix) / 256
+    level = np.arange(256)
+    full = np.minimum(level, 255 - level) / 127
+    bend = smoothness * full[1:-1, None] * np.diff(np.eye(256), n=2, axis=0)
+    # Data and bends leave a constant open: g(128) = 0.
+    anchor = np.zeros((256, 256))
+    anchor[128, 128] = 1
+    g = scipy.linalg.solve(matrix / scale + bend.T @ bend + anchor, right / scale, assume_a="pos")
+    g = scipy.optimize.isotonic_regression(g, weights=hat + 1e-3).x
+    return np.exp(g - g[-1])
+
+
+def merge_exposures(
+    images: NDArray,
+    exposures: ArrayLike,
+    response: Response,
+    *,
+    reference: float | int | None = None,
+    margin: int = 3,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """An HDR image from images of one still scene under different exposure times.
+
+    `images` is (N, H, W) uint8, `exposures` (N,) in s. Intensity (H, W) is in units of frames with
+    the exposure time `reference`, in s, by default the first image's; the second result, (H, W), is
+    its variance relative to that of such a frame's pixel of certainty 1. The mean of
+    CRF^-1(z_j) t_ref / t_j under the weights w(z_j) (t_j / t_ref)^2, the inverse variances if
+    CRF^-1(z) has the variance 1 / w(z) (AKF paper (4); Robertson et al., ICIP 1999). Levels within
+    `margin` of 0 and 255 count as clipped and have no weight.
+
+    Where all images are clipped the variance is infinite and intensity a bound: that of the
+    shortest saturated exposure, of the longest dark one, or their mean where there are both.
+    Raises `InputError` for images and exposures that do not fit together.
+    """
+    stack, times = _stack(images, exposures)
+    reference = float(times[0]) if reference is None else reference
+    if not 0 < reference < np.inf or not 0 <= margin < 127:
+        raise InputError(
+            f"the reference exposure {reference} must be positive and the margin {margin} 0 to 126"
+        )
+    ratio = times / reference
+    level = np.arange(256)
+    intensity = np.asarray(response.intensity(level / 255), float)
+    certainty = np.asarray(response.certainty(level / 255), float)
+    inside = (level > margin) & (level < 255 - margin)
+    certainty = np.where(inside, np.maximum(certainty, 0), 0)
+
+    # Image by image: memory is that of a few images, however many are merged.
+    shape = stack.shape[1:]
+    total, weighted = np.zeros(shape), np.zeros(shape)
+    dark, bright = np.full(shape, np.nan), np.full(shape, np.nan)
+    for j in np.argsort(ratio, kind="stable"):
+        z = stack[j]
+        weight = certainty[z] * ratio[j] ** 2
+        total += weight
+        weighted += weight * (intensity[z] / ratio[j])
+        bound = intensity[z] / ratio[j]
+        dark = np.where(z < 128, bound, dark)
+        bright = np.where((z >= 128) & np.isnan(bright), bound, bright)
+    bound = np.where(np.isnan(dark), bright, np.where(np.isnan(bright), dark, (dark + bright) / 2))
+    used = total > 0
+    safe = np.where(used, total, 1)
+    return np.where(used, weighted / safe, bound), np.where(used, 1 / safe, np.inf)
