@@ -1,0 +1,240 @@
+"""Colour: chrominance of colour frames on reconstructed luminance, and colour event cameras.
+
+Colours are linear Rec. 709 red, green and blue, in this order, on the last axis. Two cameras: a
+grey event camera whose frames were also taken in colour (`Recording.extra["rgb"]`), whose
+reconstruction gets the frames' chrominance (AKF paper, appendix 3), and a camera with a Bayer
+pattern over events and frames, each colour of which is reconstructed on its own:
+
+    parts = split_channels(recording)
+    videos = {name: akf.reconstruct(part, params) for name, part in parts.items()}
+    image = join_channels({name: video(times)[0] for name, video in videos.items()})
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import scipy.ndimage
+from numpy.typing import ArrayLike, NDArray
+
+from jaxevent.camera import PinholeCamera
+from jaxevent.errors import InputError
+from jaxevent.reconstruction.video import Video
+from jaxevent.recording import Events, Frames, Recording, Times, microseconds
+
+REC709 = (0.2126, 0.7152, 0.0722)  # luminance of linear red, green and blue; the sum is 1
+PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")  # of a 2 x 2 cell, row by row
+_SHOULDER = 0.02  # of white: colours fade to grey over the last 2 % below it
+
+
+def luminance(rgb: ArrayLike) -> NDArray[np.floating]:
+    """Luminance (...) of linear colours (..., 3), Rec. 709: white (1, 1, 1) has 1.
+
+    Raises `InputError` for arrays that are not floats of three channels.
+    """
+    colours = _colours(rgb)
+    return np.asarray(colours @ np.asarray(REC709, colours.dtype))
+
+
+def chrominance(
+    rgb: ArrayLike, *, black: float | int = 0.0, white: float | int = 1.0
+) -> NDArray[np.floating]:
+    """Colours (..., 3) divided by their luminance: what is left has luminance 1; grey is (1, 1, 1).
+
+    A channel that reads `white` is clipped and the ratio means nothing: over the last 2 % below
+    white the colour fades to grey; `white=np.inf` for colours that are nowhere clipped. So it does
+    where the brightest channel is between `black` and 0 and noise makes the ratio; luminance 0 is
+    grey in any case. Raises `InputError` for arrays that are not floats of three channels.
+    """
+    colours = _colours(rgb)
+    y = luminance(colours)[..., None]
+    light = y > 0
+    ratio = np.where(light, colours / np.where(light, y, 1), 1)
+    brightest = colours.max(-1, keepdims=True)
+    trust = np.clip((1 - brightest / white) / _SHOULDER, 0, 1)
+    if black > 0:
+        trust = trust * np.clip(brightest / black, 0, 1)
+    return (1 + trust * (ratio - 1)).astype(colours.dtype)
+
+
+def apply_chrominance(luminance: ArrayLike, chroma: ArrayLike) -> NDArray[np.floating]:
+    """Linear colours (..., 3) of a luminance (...), of any range, and a chrominance (..., 3).
+
+    Hue and saturation are those of the chrominance at every luminance. Raises `InputError` for
+    shapes that do not fit together.
+    """
+    y, ratio = np.asarray(luminance), _colours(chroma)
+    try:
+        return y[..., None] * ratio
+    except ValueError as error:
+        raise InputError(
+            f"a luminance of shape {y.shape} needs a chrominance of shape {(*y.shape, 3)}, not "
+            f"{ratio.shape}"
+        ) from error
+
+
+def _colours(rgb: ArrayLike) -> NDArray[np.floating]:
+    colours = np.asarray(rgb)
+    if colours.dtype.kind != "f" or colours.shape[-1:] != (3,):
+        raise InputError(
+            f"colours of shape {colours.shape} and type {colours.dtype} cannot be used; give "
+            "linear floats (..., 3)"
+        )
+    return colours
+
+
+def colour_video(
+    video: Video[Any], recording: Recording
+) -> Callable[[Times], NDArray[np.floating]]:
+    """A reconstruction in the colours of `recording.extra["rgb"]`: `colour_video(...)(times)`.
+
+    `extra["rgb"]`, (frames, H, W, 3) uint8, holds the colours of every one of `recording.frames`,
+    on the same camera response. Returns a function that gives linear colours (T, H, W, 3) at times
+    as `video` takes them: its image as luminance, with the chrominance of the frames before and
+    after, linear between them and constant outside. Raises `InputError` for a recording without
+    colour frames and for frames of another number, size or type.
+    """
+    name, frames, rgb = recording.name, recording.frames, recording.extra.get("rgb")
+    if frames is None or rgb is None:
+        missing = "no frames" if frames is None else "no colour frames"
+        raise InputError(f"{name}: holds {missing}; add extra['rgb'] of its frames in colour")
+    wanted = (len(frames), recording.height, recording.width, 3)
+    if rgb.shape != wanted or rgb.dtype != np.uint8:
+        raise InputError(
+            f"{name}: extra['rgb'] is {rgb.shape} {rgb.dtype}; {len(frames)} frames need {wanted} "
+            "uint8, so where frames are left out leave out the same of rgb"
+        )
+    own = video.recording
+    if (own.width, own.height) != (recording.width, recording.height):
+        raise InputError(
+            f"{name}: its colours are {recording.width}x{recording.height}, the video "
+            f"{own.width}x{own.height}; give the recording that was reconstructed"
+        )
+    table = np.asarray(recording.response.intensity(np.arange(256) / 255), np.float32)
+    # Levels within 3 of an end may be clipped ones that noise moved.
+    black, white = float(table[3]), float(table[252])
+    frame_t = frames.t + round(float(video.params.clock_offset) * 1e6)
+
+    @functools.lru_cache(maxsize=4)
+    def chroma(frame: int) -> NDArray[np.floating]:
+        return chrominance(table[np.asarray(rgb[frame])], black=black, white=white)
+
+    def colours(times: Times) -> NDArray[np.floating]:
+        image, _ = video(times)
+        t = np.atleast_1d(microseconds(times))
+        place = np.interp(t, frame_t, np.arange(len(frame_t)))
+        out = np.empty((*image.shape, 3), image.dtype)
+        for row in np.argsort(t, kind="stable"):
+            before = int(place[row])
+            after, share = min(before + 1, len(frame_t) - 1), place[row] - before
+            mixed = chroma(before) + np.float32(share) * (chroma(after) - chroma(before))
+            out[row] = apply_chrominance(image[row], mixed)
+        return out
+
+    return colours
+
+
+def _sites(pattern: str) -> dict[str, tuple[int, int]]:
+    """Row and column in the 2 x 2 cell of R, G1, G2 and B; G1 is the first green, row by row."""
+    if pattern not in PATTERNS:
+        raise InputError(
+            f"the colour pattern {pattern!r} is not one of {', '.join(PATTERNS)}; other patterns "
+            "cannot be split"
+        )
+    greens = iter(("G1", "G2"))
+    names = [next(greens) if letter == "G" else letter for letter in pattern]
+    found = {name: divmod(place, 2) for place, name in enumerate(names)}
+    return {name: found[name] for name in ("R", "G1", "G2", "B")}
+
+
+def split_channels(recording: Recording, pattern: str = "RGGB") -> dict[str, Recording]:
+    """The recordings R, G1, G2 and B of the sites of a Bayer pattern, each of half the size.
+
+    `pattern` names the colours of the upper left 2 x 2 pixels, row by row. Events and frames of a
+    channel are those of its sites; its pinhole camera has half the focal lengths and its centre at
+    the sites. Arrays of `extra` whose last two axes are the sensor's are subsampled as frames are,
+    `rgb` is left out, others are kept. Raises `InputError` for other patterns and for a sensor of
+    odd width or height.
+    """
+    sites = _sites(pattern)
+    if recording.width % 2 or recording.height % 2:
+        raise InputError(
+            f"{recording.name}: the {recording.width}x{recording.height} sensor has an odd side, "
+            "which a 2x2 colour pattern does not fill; crop the recording to an even size"
+        )
+    events = recording.events[: len(recording.events)]
+    return {name: _channel(recording, events, name, *site) for name, site in sites.items()}
+
+
+def _channel(recording: Recording, events: Events, name: str, row: int, column: int) -> Recording:
+    here = (events.y % 2 == row) & (events.x % 2 == column)
+    own = Events(events.t[here], events.x[here] // 2, events.y[here] // 2, events.p[here])
+
+    def sampled(images: NDArray) -> NDArray:
+        return np.ascontiguousarray(images[..., row::2, column::2])
+
+    frames, pinhole = recording.frames, recording.camera
+    if frames is not None:
+        frames = Frames(frames.t, sampled(np.asarray(frames.images)), frames.exposure)
+    if pinhole is not None:
+        # Pixel i of the channel is pixel 2 i + column of the sensor, both counted at their centres.
+        pinhole = PinholeCamera(
+            pinhole.fx / 2,
+            pinhole.fy / 2,
+            (pinhole.cx - column) / 2,
+            (pinhole.cy - row) / 2,
+            pinhole.distortion,
+        )
+    size = (recording.height, recording.width)
+    extra = {
+        key: sampled(value) if np.shape(value)[-2:] == size else value
+        for key, value in recording.extra.items()
+        if key != "rgb"
+    }
+    return dataclasses.replace(
+        recording,
+        name=f"{recording.name} {name}",
+        width=recording.width // 2,
+        height=recording.height // 2,
+        events=own,
+        frames=frames,
+        camera=pinhole,
+        extra=extra,
+    )
+
+
+def join_channels(images: Mapping[str, NDArray], pattern: str = "RGGB") -> NDArray[np.floating]:
+    """Colour images (T, 2 h, 2 w, 3) of the channels R, G1, G2 and B, each (T, h, w).
+
+    Bilinear demosaicing: a channel keeps its values at its sites; elsewhere it is the mean of its
+    2 or 4 nearest sites, at the border of those there are. Raises `InputError` for other patterns,
+    missing channels and shapes that differ.
+    """
+    sites = _sites(pattern)
+    missing = [name for name in sites if name not in images]
+    if missing:
+        raise InputError(f"the channel {missing[0]} is missing; give R, G1, G2 and B")
+    channels = {name: np.asarray(images[name]) for name in sites}
+    shapes = [channel.shape for channel in channels.values()]
+    if len(set(shapes)) > 1 or len(shapes[0]) != 3:
+        raise InputError(f"the channels have shapes {shapes}; give all as (times, height, width)")
+    count, height, width = shapes[0]
+    dtype = np.result_type(np.float32, *channels.values())
+    out = np.empty((count, 2 * height, 2 * width, 3), dtype)
+    cross = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]], dtype)
+    square = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], dtype)
+    for axis, (names, kernel) in enumerate(
+        ((("R",), square), (("G1", "G2"), cross), (("B",), square))
+    ):
+        known = np.zeros((2 * height, 2 * width), dtype)
+        mosaic = np.zeros((count, 2 * height, 2 * width), dtype)
+        for name in names:
+            row, column = sites[name]
+            known[row::2, column::2] = 1
+            mosaic[:, row::2, column::2] = channels[name]
+        weights = scipy.ndimage.convolve(known, kernel, mode="constant")
+        total = scipy.ndimage.convolve(mosaic, kernel[None], mode="constant")
+        out[..., axis] = total / weights
+    return out
