@@ -1,0 +1,338 @@
+"""Scenes of high dynamic range and a camera that moves over them, with the truth at any time."""
+
+import dataclasses
+import functools
+import zlib
+from collections.abc import Callable
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter, uniform_filter
+
+from jaxevent.errors import InputError
+
+Speed = Literal["slow", "fast"]
+
+# Pixels per second at the image centre; the speed wanders by a third about it.
+SPEEDS = {"slow": 30.0, "fast": 300.0}
+
+# The lens: a Gaussian point spread (px) and a wide one, its glare, that takes a part of the light.
+_BLUR, _GLARE_BLUR, _GLARE = 1.1, 12.0, 2e-4
+# A second blur, of the logarithm: linear blur alone leaves a step of 10 in ln I 4.5 / px steep.
+_LOG_BLUR = 1.0
+_EDGES: Any = (
+    "reflect",
+    "wrap",
+)  # beyond a panorama's edges: mirrored vertically, round horizontally
+
+
+@runtime_checkable
+class Source(Protocol):
+    """What the simulated sensor looks at."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        ...
+
+    @property
+    def duration(self) -> float | int:
+        """Length in seconds; intensity is defined for 0 <= t <= duration."""
+        ...
+
+    def intensity(self, t: float | int) -> NDArray[np.float64]:
+        """Linear intensity, positive, (height, width), at t seconds; 1 is the frames' white."""
+        ...
+
+
+class _Canvas:
+    """ln intensity being painted; its left and right edges meet.
+
+    Lengths are in pixels of a canvas of height 512, and scale with its height.
+    """
+
+    def __init__(self, size: tuple[int, int], rng: np.random.Generator):
+        self.width, self.height = size
+        self.unit = self.height / 512
+        self.rng = rng
+        self.level = np.zeros((self.height, self.width))
+        self.y, self.x = np.mgrid[: self.height, : self.width] / self.unit
+        self.columns = self.width / self.unit  # in units
+
+    def noise(
+        self, slope: float | int, longest: float | int = 200.0, stretch: float | int = 1.0
+    ) -> NDArray:
+        """Periodic noise of unit variance; its amplitude falls as frequency^-slope.
+
+        Waves longer than `longest` are damped; `stretch` > 1 draws it out horizontally.
+        """
+        fy = np.fft.fftfreq(self.height)[:, None] * self.unit
+        fx = np.fft.rfftfreq(self.width) * self.unit * stretch
+        f = np.hypot(fx, fy)
+        amplitude = (f**2 + longest**-2.0) ** (-slope / 2)
+        amplitude[0, 0] = 0
+        white = np.fft.rfft2(self.rng.normal(size=self.level.shape))
+        noise = np.fft.irfft2(white * amplitude, self.level.shape)
+        return noise / noise.std()
+
+    def away(self, x: float | int, y: float | int) -> tuple[NDArray, NDArray]:
+        """Offsets of every pixel from a point, the short way round."""
+        return (self.x - x + self.columns / 2) % self.columns - self.columns / 2, self.y - y
+
+    def skyline(self, at: float | int, rough: float | int) -> NDArray:
+        """A periodic curve y(x) about `at` with deviation `rough`."""
+        wave = np.cumsum(self.noise(1.2, 300)[0])
+        wave = wave - np.linspace(0, wave[-1], len(wave))
+        return at + rough * (wave - wave.mean()) / wave.std()
+
+    def paint(self, where: NDArray, level: float | NDArray) -> None:
+        self.level = np.where(where, level, self.level)
+
+    def box(
+        self, x: float | int, y: float | int, width: float | int, height: float | int
+    ) -> NDArray:
+        dx, dy = self.away(x, y)
+        return (abs(dx) < width / 2) & (abs(dy) < height / 2)
+
+    def glow(self, x: float | int, y: float | int, radius: float | int, level: float | int) -> None:
+        """Add a lamp: a disc of ln intensity `level` in a halo that falls as 1 / r^2."""
+        dx, dy = self.away(x, y)
+        r = np.hypot(dx, dy) / radius
+        self.level = np.logaddexp(self.level, level - 2 * np.log(np.maximum(r, 1)) * (1 + r / 12))
+
+    def places(self, count: int, low: float | int = 0.0, high: float | int = 512.0):
+        """Points spread over the width, between two heights."""
+        x = (np.arange(count) + self.rng.uniform(0.28, 0.72, count)) * self.columns / count
+        return list(zip(x.tolist(), self.rng.uniform(low, high, count).tolist(), strict=True))
+
+
+def _room(c: _Canvas) -> None:
+    """A living room: windows on bright outdoors, shaded walls, dark furniture, a lamp."""
+    c.level = -2.4 + 0.5 * c.noise(1.7) + 0.9 * np.cos(2 * np.pi * (c.y - 160) / 512)
+    outside = 3.6 + 0.5 * c.noise(1.3, 60)
+    for x, y in c.places(4, 120, 200):
+        c.paint(c.box(x, y, 92, 130), -3.2)
+        for dx, dy in ((-21, -31), (21, -31), (-21, 31), (21, 31)):
+            c.paint(c.box(x + dx, y + dy, 36, 56), outside)
+    wood = -5.6 + 0.4 * c.noise(1.2, 40, 4)
+    for x, y in c.places(5, 360, 440):
+        c.paint(c.box(x, y, c.rng.uniform(50, 90), c.rng.uniform(40, 110)), wood)
+    for x, y in c.places(6, 270, 330):
+        picture = c.rng.uniform(-3, 0) + 0.6 * c.noise(1.6, 20)
+        c.paint(c.box(x, y, 34, 26), picture)
+    for x, y in c.places(2, 250, 300):
+        c.glow(x, y, 6, 3.8)
+
+
+def _forest(c: _Canvas) -> None:
+    """Tree trunks and leaves before a bright sky, spots of sun on dark ground."""
+    c.level = 4.2 - c.y / 90 + 0.4 * c.noise(1.8, 80)
+    c.paint(c.noise(2.3, 110) > c.y / 300 - 0.4, -2.0 + 0.4 * c.noise(1.6, 40))
+    c.paint(c.y > c.skyline(360, 8), -3.6 + 0.5 * c.noise(1.6, 50, 3))
+    bark = -4.2 + 0.4 * c.noise(1.2, 30, 0.3)
+    for x, _ in c.places(8):
+        lean = c.rng.uniform(-0.08, 0.08)
+        dx, _ = c.away(x, 0)
+        wide = c.rng.uniform(4, 17)
+        c.paint(abs(dx - lean * (c.y - 256)) < wide, bark + dx / wide)
+    c.paint((c.y > 365) & (c.noise(1.9, 50, 2) > 1.4), 1.0 + 0.4 * c.noise(1.4, 20))
+
+
+def _mountain(c: _Canvas) -> None:
+    """Sunny sky over ridges and a city, dark grass and a road in front."""
+    x, y = c.places(1, 60, 90)[0]
+    c.level = 3.0 + 0.5 * c.noise(2.0, 150, 2) - 0.3 * np.cos(2 * np.pi * c.y / 512)
+    c.glow(x, y, 14, 6.0)
+    for at, rough, level in ((190, 30, 0.6), (235, 22, -0.4), (275, 12, -1.3)):
+        c.paint(c.y > c.skyline(at, rough), level + 0.35 * c.noise(1.3, 60))
+    for x, y in c.places(40, 268, 310):
+        c.paint(c.box(x, y, c.rng.uniform(4, 14), c.rng.uniform(8, 26)), c.rng.uniform(-1, 1.5))
+    c.paint(c.y > c.skyline(330, 10), -3.9 + 0.6 * c.noise(1.1, 30))
+    road = 400 + 30 * np.sin(2 * np.pi * c.x / c.columns)
+    c.paint(abs(c.y - road) < 22, -3.2 + 0.15 * c.noise(1.0, 20))
+    c.paint((abs(c.y - road) < 1.8) & (c.x % 32 < 18), -1.2)
+
+
+def _lake(c: _Canvas) -> None:
+    """Clouds and their reflection on rippled water, dark trees on the far shore and in front."""
+    cloud = c.noise(1.9, 120, 2)
+    c.level = 1.4 + 1.1 * np.tanh(1.3 * cloud) + 0.2 * c.noise(1.6, 30)
+    trees = c.skyline(210, 14) + 7 * c.noise(1.2, 16)[0]
+    c.paint(c.y > trees, -3.2 + 0.4 * c.noise(1.4, 20))
+    ripple = c.noise(1.7, 40, 6)
+    water = c.level[::-1] - 1.2 + 0.5 * ripple
+    c.paint(c.y > 256, water)
+    glitter = (c.y > 262) & (c.noise(1.7, 24, 5) > 2.2) & (cloud[::-1] > 0)
+    c.paint(glitter, 4.6)
+    for x, _ in c.places(3):
+        dx, _ = c.away(x, 0)
+        crown = (dx / 42) ** 2 + ((c.y - 430) / 70) ** 2 + 0.25 * c.noise(1.8, 24)
+        c.paint((crown < 1) | ((abs(dx) < 5) & (c.y > 430)), -4.4 + 0.4 * c.noise(1.4, 16))
+
+
+def _night(c: _Canvas) -> None:
+    """A street at night: lit windows, lamps and signs between nearly black walls."""
+    c.level = -5.6 + 0.3 * c.noise(1.6, 200)
+    houses = np.linspace(0, c.columns, 9)
+    for left, right in zip(houses[:-1], houses[1:], strict=True):
+        wide, top = right - left, c.rng.uniform(60, 160)
+        wall = c.rng.uniform(-4.4, -3.0) + 0.3 * c.noise(1.2, 30)
+        c.paint((c.x >= left) & (c.x < right) & (c.y > top) & (c.y < 380), wall)
+        for x in np.arange(left + 16, right - 12, 26):
+            for y in np.arange(top + 26, 345, 42):
+                lit = c.rng.uniform() < 0.3
+                level = c.rng.uniform(-0.2, 1.8) if lit else -4.6
+                c.paint(c.box(x, y, 13, 22), level + 0.3 * c.noise(1.4, 10))
+        c.paint(c.box(left + wide / 2, 362, wide * 0.6, 10), c.rng.uniform(0.5, 2.2))
+    c.paint(c.y > 380, -4.0 + 0.5 * c.noise(1.3, 40, 4))
+    for x, y in c.places(6, 300, 330):
+        c.paint(c.box(x, y + 50, 3, 100), -5.5)
+        c.glow(x, y, 4, 4.6)
+        c.glow(x, 440, 6, 1.2)
+
+
+def _tunnel(c: _Canvas) -> None:
+    """The mouth of a tunnel, blinding outdoors, rows of tiles and weak lamps inside."""
+    c.level = -5.0 + 0.35 * c.noise(1.4, 60)
+    joint = ((c.y % 26 < 2.2) | ((c.x + 17 * (c.y // 26)) % 34 < 2.2)) & (c.y < 340)
+    c.paint(joint, c.level - 1.0)
+    for x, y in c.places(2, 210, 240):
+        dx, dy = c.away(x, y)
+        r = np.hypot(dx, np.where(dy > 0, dy * 0.8, dy))
+        c.level = np.logaddexp(c.level, 1.0 - r / 30 + 0.15 * c.noise(1.2, 30))
+        hills = 3.4 - 1.7 * (dy > 12 * c.noise(1.5, 60)[0]) + 0.45 * c.noise(1.2, 30)
+        c.paint(r < 74, hills)
+        c.paint((r >= 74) & (r < 82), -1.0 + 0.3 * c.noise(1.0, 10))
+    c.paint(c.y > 400, -2.4 + 0.5 * c.noise(1.3, 50, 5))
+    for x, y in c.places(10, 100, 104):
+        c.paint(c.box(x, y, 18, 4), 1.6)
+    c.paint(c.box(0, 440, 2 * c.columns, 3) & (c.x % 42 < 22), -0.8)
+
+
+# What is painted, and the part of it that is brighter than the frames' white.
+_SCENES: dict[str, tuple[Callable[[_Canvas], None], float]] = {
+    "room": (_room, 0.10),
+    "forest": (_forest, 0.30),
+    "mountain": (_mountain, 0.32),
+    "lake": (_lake, 0.30),
+    "night": (_night, 0.06),
+    "tunnel": (_tunnel, 0.13),
+}
+SCENES = tuple(_SCENES)
+FITTING, TESTING = SCENES[:2], SCENES[2:]  # for tuning parameters, and for judging them
+
+
+def scene(
+    name: str | int, decades: float | int = 4.5, size: tuple[int, int] = (480, 320)
+) -> NDArray[np.float64]:
+    """A textured panorama of high dynamic range: linear intensity, (height, width).
+
+    `name` is one of `SCENES`, or a whole number, which chooses among them and seeds a variant.
+    `decades` is the range of luminance (base-10 logarithm) between the darkest and the brightest
+    0.1 %. Intensity 1 is the frames' white: a part of the scene that is fixed for each name, 6 to
+    32 %, is brighter. It is band-limited to about 1.5 pixels, for sampling between pixels. Its left
+    and right edges meet. `size` is (width, height), at least 64 each. Deterministic.
+
+    Raises `InputError` for an unknown name and for decades or sizes that are not usable.
+    """
+    if isinstance(name, int):
+        kind, seed = SCENES[name % len(SCENES)], name
+    else:
+        kind, seed = name, zlib.crc32(name.encode())
+    if kind not in _SCENES or seed < 0:
+        raise InputError(
+            f"there is no scene {name!r}; choose {', '.join(SCENES)} or a number from 0"
+        )
+    if not 0.5 <= decades <= 7 or min(size) < 64:
+        raise InputError(
+            f"a scene of {decades} decades and {size[0]}x{size[1]} pixels is not possible; choose "
+            "0.5 to 7 decades and at least 64x64"
+        )
+    draw, bright = _SCENES[kind]
+    canvas = _Canvas(size, np.random.default_rng(seed))
+    draw(canvas)
+    light = np.exp(canvas.level)
+    sharp, glare = (
+        gaussian_filter(light, width, mode=_EDGES) for width in (_BLUR, _GLARE_BLUR * canvas.unit)
+    )
+    level = np.log((1 - _GLARE) * sharp + _GLARE * glare)
+    level = gaussian_filter(level, _LOG_BLUR, mode=_EDGES)
+    darkest, white, brightest = np.quantile(level, [0.001, 1 - bright, 0.999])
+    return np.exp((level - white) * (decades * np.log(10) / (brightest - darkest)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Pan:
+    """A camera that moves over a panorama: a `Source`.
+
+    The heading swings by 2 rad about left or right within 1.6 s and the speed by a third, 20 to
+    40 px/s ("slow") or 200 to 400 px/s ("fast"); the camera rolls by 5 degrees and zooms by 4 %.
+    Of 64 random places it starts where its way is most evenly bright (I > 1), dark (I < 0.05) and
+    between. ln intensity is interpolated by cubic splines; beyond the panorama's edges it is
+    repeated sideways and mirrored up and down. Deterministic in `seed`.
+    Raises `InputError` for a panorama that is not positive or an unknown speed.
+    """
+
+    panorama: NDArray[np.float64]
+    size: tuple[int, int] = (128, 96)  # width, height
+    duration: float | int = 1.5  # s
+    speed: Speed = "slow"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.panorama.ndim != 2 or not (self.panorama > 0).all():
+            raise InputError("a panorama needs positive intensities of shape (height, width)")
+        if self.speed not in get_args(Speed):
+            raise InputError(f"there is no speed {self.speed!r}; choose slow or fast")
+
+    def intensity(self, t: float | int) -> NDArray[np.float64]:
+        width, height = self.size
+        (x, y), roll, zoom = self.pose(t)
+        across = (np.arange(width) - (width - 1) / 2) * zoom
+        down = (np.arange(height)[:, None] - (height - 1) / 2) * zoom
+        cos, sin = np.cos(roll), np.sin(roll)
+        at = np.broadcast_arrays(y + sin * across + cos * down, x + cos * across - sin * down)
+        return np.exp(map_coordinates(self._spline, at, order=3, mode="grid-wrap", prefilter=False))
+
+    def pose(self, t: float | int) -> tuple[NDArray[np.float64], float, float]:
+        """Where the image centre looks (x, y in pixels), roll (rad) and zoom, at t seconds."""
+        sway = 2 * np.pi * t / 2.3 + self._phases[2]
+        return self._path(t), 0.09 * float(np.sin(sway)), 1 + 0.04 * float(np.cos(sway))
+
+    @functools.cached_property
+    def _spline(self) -> NDArray[np.float64]:
+        return spline_filter(np.log(self._round), 3, mode="grid-wrap")
+
+    @functools.cached_property
+    def _phases(self) -> NDArray[np.float64]:
+        return np.random.default_rng(self.seed).uniform(0, 2 * np.pi, 4)
+
+    @functools.cached_property
+    def _path(self) -> Callable[[float], NDArray[np.float64]]:
+        t = np.linspace(0, self.duration, max(8, int(self.duration * 200)))
+        bearing, swing, _, pace = self._phases
+        bearing = 0.0 if bearing < np.pi else np.pi
+        speed = SPEEDS[self.speed] * (1 + np.sin(2 * np.pi * t / 1.1 + pace) / 3)
+        heading = bearing + 2 * np.sin(2 * np.pi * t / 1.6 + swing)
+        velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1)
+        path = CubicSpline(t, velocity).antiderivative()
+        begin = self._begin(path(t[::20]))
+        return lambda time: begin + path(time)
+
+    @functools.cached_property
+    def _round(self) -> NDArray[np.float64]:
+        """The panorama and its mirror image: a torus without a seam."""
+        return np.vstack([self.panorama, self.panorama[::-1]])
+
+    def _begin(self, path: NDArray[np.float64]) -> NDArray[np.float64]:
+        height, width = self._round.shape
+        places = np.random.default_rng([self.seed, 1]).uniform(0, [width, height / 2], (64, 2))
+        x, y = np.rint(places[:, None] + path).astype(int).T
+        view: Any = self.size[::-1]
+        bright, dark = (
+            uniform_filter(part.astype(float), view, mode="wrap")[y % height, x % width].mean(0)
+            for part in (self._round > 1, self._round < 0.05)
+        )
+        return places[np.argmax(np.min([bright, dark, 1 - bright - dark], axis=0))]
