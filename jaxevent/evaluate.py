@@ -1,8 +1,9 @@
 """Reconstructions compared with images they have not seen, for every recording and method.
 
     recordings = ["slider_depth.zip", "more/*.h5"]  # paths or globs; $NAME is expanded
-    protocol = "held-out"                           # the default
+    protocol = "held-out"                           # the default; or "reference"
     size = [240, 180]                               # only for recordings that do not tell it
+    metrics = ["lpips"]                             # further ones, by their names in MEASURES
 
     [[method]]
     name = "akf"                                    # a key of jaxevent.METHODS
@@ -12,6 +13,18 @@
 Paths are relative to the folder of this file. The protocol "held-out" gives the methods frames 0,
 2, 4, ... and asks for images where frames 1, 3, 5, ... are, at their time stamps plus the method's
 `clock_offset`. Images are clipped to [0, 1], the range of the truth, before they are scored.
+
+The protocol "reference" gives the whole recording and compares with HDR images that it keeps in
+`Recording.extra`, float linear intensities of which 1 is the frames' white, without clipping:
+
+    hdr      (T, H, W)  with hdr_t (T,), sorted times (us) on the events' clock
+    HDR_mat  (K, H, W)  of the AKF authors' .mat files, used where there is no hdr: at the time of
+                        each of the K frames plus `clock_offset`; a single (H, W) image: of the last
+    clip     (2,)       what the frames record from and to; absent: 0.01, 1
+
+Pixels that are NaN in hdr have no reference. HDR_mat counts in the frames' grey levels (255 is
+white where they are uint8) and is 0 where it has no reference, as the authors' programs have it. In
+the measures of whole images such pixels count as right; regions and mean errors leave them out.
 """
 
 import contextlib
@@ -28,16 +41,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, require
 from jaxevent.io import load
 from jaxevent.io.output import complete
-from jaxevent.metrics import mse, ssim
+from jaxevent.metrics import (
+    global_ssim,
+    hdr_quality,
+    log_display,
+    log_mse,
+    log_ssim,
+    lpips,
+    lpips_weights,
+    mse,
+    regions,
+    ssim,
+)
 from jaxevent.parameters import nearest, read_toml
 from jaxevent.reconstruction import METHODS
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import Estimator
-from jaxevent.recording import Frames, Recording
+from jaxevent.recording import Frames, Recording, microseconds
 from jaxevent.report import markdown_table
 
 
@@ -52,16 +77,108 @@ def held_out(recording: Recording) -> tuple[Recording, Frames]:
             f"{recording.name}: has {0 if frames is None else len(frames)} frames; hiding every "
             "second one needs at least 3, so choose a recording with more"
         )
+    _need_events(recording)
+    return recording.with_frames(slice(0, None, 2)), frames[1::2]
+
+
+def _need_events(recording: Recording) -> None:
     if not len(recording.events):
         raise InputError(
             f"{recording.name}: holds no events, so there is nothing to reconstruct from; choose "
             "another recording"
         )
-    return recording.with_frames(slice(0, None, 2)), frames[1::2]
+
+
+@dataclasses.dataclass(frozen=True)
+class Reference(Frames):
+    """HDR reference images, float intensities that may exceed 1; the exposure is not known.
+
+    `timed` says that t is on the events' clock. `clip` is what the frames record from and to.
+    `white` is the value of `images` that is intensity 1; None says so of 1, and NaN of pixels
+    without reference, which are 0 otherwise.
+    """
+
+    timed: bool
+    clip: tuple[float, float]
+    white: float | None = None
+
+    def truth(self, row: int) -> NDArray[np.float64]:
+        """One image (height, width) of intensity, NaN where there is no reference."""
+        image = np.asarray(self.images[row], np.float64)
+        return image if self.white is None else np.where(image == 0, np.nan, image / self.white)
+
+
+def reference(recording: Recording) -> tuple[Recording, Reference]:
+    """The recording itself, and the HDR images in its `extra`; the text of this module has more.
+
+    Raises `InputError` for no or unusable images and for no events.
+    """
+    _need_events(recording)
+    extra, name = recording.extra, recording.name
+    size = (recording.height, recording.width)
+    clip = np.asarray(extra.get("clip", (0.01, 1.0)))
+    if clip.shape != (2,) or clip.dtype.kind not in "iuf" or not clip[0] < clip[1]:
+        raise InputError(f"{name}: clip is {clip.tolist()}; store two intensities, low below high")
+    if "hdr" in extra:
+        images, what, white = extra["hdr"], "hdr", None
+        if "hdr_t" not in extra:
+            raise InputError(f"{name}: hdr has no times; add hdr_t, in us on the events' clock")
+        t = np.atleast_1d(microseconds(extra["hdr_t"], f"{name}: hdr_t"))
+        if t.ndim != 1 or (t[1:] <= t[:-1]).any():
+            raise InputError(f"{name}: hdr_t is not sorted; sort hdr by time, each time once")
+    elif "HDR_mat" in extra:
+        images, what, frames = extra["HDR_mat"], "HDR_mat", recording.frames
+        if frames is None:
+            raise InputError(f"{name}: HDR_mat needs frames to tell its times; add frames")
+        images, t = (images[None], frames.t[-1:]) if images.ndim == 2 else (images, frames.t)
+        kind = frames.images.dtype
+        white = 1.0 if kind.kind == "f" else float(np.iinfo(kind).max)
+    else:
+        raise InputError(
+            f"{name}: holds no HDR reference; add hdr (T, H, W) and hdr_t, or choose the protocol "
+            "'held-out'"
+        )
+    if images.shape != (len(t), *size) or not len(t):
+        raise InputError(
+            f"{name}: {what} has the shape {images.shape}; its {len(t)} times and the sensor need "
+            f"({len(t)}, {size[0]}, {size[1]})"
+        )
+    if images.dtype.kind != "f" and white is None:
+        raise InputError(
+            f"{name}: {what} is {images.dtype}; store floats of which 1 is the frames' white"
+        )
+    for row in range(len(images)):
+        if (images[row] < 0).any() or np.isinf(images[row]).any():
+            raise InputError(
+                f"{name}: {what} image {row} holds negative or infinite values; store linear "
+                "intensities, NaN where there is none"
+            )
+    bounds = (float(clip[0]), float(clip[1]))
+    none = np.zeros(len(t), np.int64)
+    return recording, Reference(t, images, none, what == "hdr", bounds, white)
 
 
 Protocol = Callable[[Recording], tuple[Recording, Frames]]
-PROTOCOLS: dict[str, Protocol] = {"held-out": held_out}
+PROTOCOLS: dict[str, Protocol] = {"held-out": held_out, "reference": reference}
+
+# Further measures of an image and the truth, each a number per image. They cost more time, and the
+# first two need an extra.
+MEASURES: dict[str, Callable[..., NDArray[np.float64]]] = {
+    "lpips": lpips,
+    "hdr_quality": hdr_quality,
+    "global_ssim": global_ssim,
+}
+
+
+def _check_measures(names: Iterable[str]) -> None:
+    """Raise `InputError` for unknown measures and for those whose extra is missing."""
+    for name in names:
+        if name not in MEASURES:
+            raise InputError(f"there is no metric {name!r}; {nearest(name, MEASURES)}")
+        if name == "lpips":
+            lpips_weights()
+        if name == "hdr_quality":
+            require("pycvvdp", "hdr")
 
 
 def find_method(name: str) -> Estimator:
@@ -71,14 +188,168 @@ def find_method(name: str) -> Estimator:
     return METHODS[name]
 
 
-def values_of(params: FrameParams) -> dict[str, float | None]:
-    """The physical values as they were given, to 6 digits; None where JSON has no number."""
-    return {name: _finite(float(f"{value:.6g}")) for name, value in params.values().items()}
+def values_of(params: FrameParams) -> dict[str, Any]:
+    """The values as they were given: numbers to 6 digits, lists of them, text, true and false.
+
+    None where JSON has no number.
+    """
+
+    def plain(value: Any) -> Any:
+        if value is None or isinstance(value, str | bool | np.bool_):
+            return bool(value) if isinstance(value, np.bool_) else value
+        if np.ndim(value):
+            return [plain(one) for one in value]
+        return _finite(float(f"{float(value):.6g}"))
+
+    return {name: plain(value) for name, value in params.values().items()}
 
 
 def frame_times(frames: Frames, params: FrameParams) -> np.ndarray:
-    """When the frames were taken (us) on the events' clock: time stamps plus `clock_offset`."""
+    """When the frames were taken (us) on the events' clock: time stamps plus `clock_offset`.
+
+    The times of a `Reference` on that clock as they are.
+    """
+    if isinstance(frames, Reference) and frames.timed:
+        return frames.t
     return frames.t + round(float(params.clock_offset) * 1e6)
+
+
+# The scores of one image; those of its regions are nested under "regions".
+Scores = dict[str, float | dict[str, dict[str, float | int]]]
+
+
+def _measures(image: NDArray, truth: NDArray, names: Iterable[str]) -> Scores:
+    """The scores of a hidden frame; intensities are clipped to [0, 1]."""
+    image = np.clip(image, 0, 1)
+    measures = {"mse": mse, "ssim": ssim, **{name: MEASURES[name] for name in names}}
+    if not np.isfinite(image).all():
+        return dict.fromkeys(measures, math.nan)
+    return {name: float(measure(image, truth)) for name, measure in measures.items()}
+
+
+def _hdr_measures(
+    image: NDArray,
+    variance: NDArray | None,
+    truth: NDArray[np.float64],
+    names: Iterable[str],
+    clip: tuple[float, float],
+    I0: float,
+) -> Scores:
+    """The scores of an image against an HDR reference, NaN where there is none."""
+    known = np.isfinite(truth)
+    covered = np.where(known, truth, 0)
+    masks = {name: mask & known for name, mask in regions(covered, *clip).items()}
+    # A hot pixel's events add up until exp(L) overflows; such a pixel is only very bright.
+    shown = np.where(known, np.clip(image.astype(np.float64), -1e30, 1e30), 0)
+    broken = not np.isfinite(shown).all()
+    if broken:
+        shown = np.zeros_like(shown)
+
+    scores: Scores = {
+        "mse": float(mse(shown, covered, known)),
+        "ssim": float(ssim(shown, covered)),
+        "log_mse": float(log_mse(shown, covered, where=known)),
+        "log_ssim": float(log_ssim(shown, covered)),
+    }
+    for name in names:
+        pair = (shown, covered)
+        if name == "lpips":  # it looks at what a display shows
+            pair = tuple(np.clip(part, 0, 1) for part in log_display(shown, covered))
+        scores[name] = float(MEASURES[name](*pair))
+    parts: dict[str, dict[str, float | int]] = {
+        name: {
+            "pixels": int(mask.sum()),
+            "mse": float(mse(shown, covered, mask)),
+            "log_mse": float(log_mse(shown, covered, where=mask)),
+        }
+        for name, mask in masks.items()
+    }
+    if variance is not None:
+        # L = ln(I + I0) cannot be known better than I is rounded.
+        least = max(float(np.finfo(image.dtype).eps) * I0, 1e-12)
+        L, true_L = (np.log(np.maximum(part + I0, least)) for part in (shown, covered))
+        usable = np.isfinite(variance) & (variance > 0)
+        z2 = (L - true_L) ** 2 / np.where(usable, variance, 1).astype(np.float64)
+
+        def over(mask: NDArray[np.bool_], mean: Callable[[NDArray], Any]) -> float:
+            values = z2[mask & usable]
+            return float(mean(values)) if len(values) else math.nan
+
+        scores["z2"], scores["z2_median"] = over(known, np.mean), over(known, np.median)
+        for name, mask in masks.items():
+            parts[name]["z2"] = over(mask, np.mean)
+    if broken:
+        scores = dict.fromkeys(scores, math.nan)
+        parts = {
+            name: {**dict.fromkeys(part, math.nan), "pixels": part["pixels"]}
+            for name, part in parts.items()
+        }
+    return {**scores, "regions": parts}
+
+
+def _listed(scores: list[Scores]) -> dict[str, Any]:
+    """One list per measure of the values of all images, None for what is not a number."""
+    if not scores:
+        return {}
+
+    def gather(values: list[Any]) -> Any:
+        if isinstance(values[0], dict):
+            return {name: gather([value[name] for value in values]) for name in values[0]}
+        return [_finite(value) for value in values]
+
+    return gather(scores)
+
+
+def _means(per_frame: Mapping[str, Any]) -> dict[str, Any]:
+    """The means over images of what `per_frame` lists; regions' over pixels."""
+
+    def mean(values: list[float | None], weights: list[int] | None = None) -> float | None:
+        numbers = np.array([math.nan if value is None else value for value in values])
+        weight = np.ones(len(values)) if weights is None else np.array(weights)
+        counted = weight > 0
+        if not counted.any():
+            return None
+        return _finite(float(np.average(numbers[counted], weights=weight[counted])))
+
+    means: dict[str, Any] = {}
+    for name, values in per_frame.items():
+        if name == "regions":
+            total = sum(sum(part["pixels"]) for part in values.values())
+            means[name] = {
+                region: {
+                    "share": sum(part["pixels"]) / total if total else None,
+                    **{k: mean(v, part["pixels"]) for k, v in part.items() if k != "pixels"},
+                }
+                for region, part in values.items()
+            }
+        elif name != "t":
+            means[name] = mean(values)
+    return means
+
+
+def subset(row: Mapping[str, Any], frames: ArrayLike) -> dict[str, Any]:
+    """The row of `score` had only some of its images been asked for; nothing is reconstructed.
+
+    `frames` is a mask over the images, bool, or their numbers. `seconds` stays that of all. Raises
+    `InputError` for numbers that there are not and for a mask of another length.
+    """
+    count = len(row["per_frame"]["t"])
+    chosen = np.asarray(frames)
+    try:
+        rows = np.arange(count)[chosen if chosen.size or chosen.dtype == bool else []].ravel()
+    except IndexError as error:
+        raise InputError(
+            f"the images of a row of {count} cannot be chosen by {chosen.dtype} of shape "
+            f"{chosen.shape} ({error}); give a mask of that length or numbers below it"
+        ) from None
+
+    def cut(part: Any) -> Any:
+        if isinstance(part, Mapping):
+            return {name: cut(value) for name, value in part.items()}
+        return [part[i] for i in rows]
+
+    per_frame = cut(row["per_frame"])
+    return {**row, **_means(per_frame), "frames": len(rows), "per_frame": per_frame}
 
 
 def score(
@@ -87,49 +358,63 @@ def score(
     params: FrameParams | None = None,
     protocol: str = "held-out",
     *,
+    metrics: Iterable[str] = (),
     progress: bool = False,
 ) -> dict[str, Any]:
-    """Reconstruct the images that `protocol` hides, and compare: one row of a table of results.
+    """Reconstruct the images that `protocol` asks for, and compare: one row of a table of results.
 
-    Memory does not grow with the recording's length. Intensities are clipped to [0, 1] before they
-    are compared; `mse` and `ssim` are means over the images. `seconds` is the time of
-    reconstructing and reading images, with compilation but without scoring. What is not a number is
-    None. `per_frame` lists t (us, as stamped), mse and ssim of every image.
+    Memory does not grow with the recording's length. With "held-out" intensities are clipped to
+    [0, 1] before they are compared. `mse`, `ssim` and those of `metrics` (names in `MEASURES`) are
+    means over the images. `seconds` is the time of reconstructing and reading images, with
+    compilation but without scoring. What is not a number is None. `per_frame` lists t (us, as
+    stamped) and every measure of every image.
 
-    Raises `InputError` for a recording that the protocol or the method cannot use.
+    Rows of "reference" have also `log_mse` and `log_ssim`; `clip`, the bounds of the `regions`
+    "bright", "dark" and "well"; and of each of those its `share` of all pixels and, over its pixels
+    of all images, `mse` and `log_mse`. Where the method estimates a variance, `z2` is the mean of
+    (error of ln(I + I0))^2 / variance, over all pixels and in each region, 1 for honest variances,
+    and `z2_median` the mean over images of its median, then 0.45 if errors are Gaussian. "lpips" is
+    that of ln(I + 0.003), clipped to the truth's range.
+
+    Raises `InputError` for a recording that the protocol or the method cannot use, for unknown
+    metrics and for those whose extra is missing.
     """
     if protocol not in PROTOCOLS:
         raise InputError(f"there is no protocol {protocol!r}; {nearest(protocol, PROTOCOLS)}")
+    names = list(metrics)
+    _check_measures(names)
     values = params or method.Params()
     given, hidden = PROTOCOLS[protocol](recording)
+    hdr = hidden if isinstance(hidden, Reference) else None
     clock = time.perf_counter()
-    seconds, done = 0.0, 0
-    errors: list[float] = []
-    similarities: list[float] = []
+    seconds, estimated = 0.0, False  # whether the method estimates a variance
+    scores: list[Scores] = []
     video = method.reconstruct(given, values, progress=progress)
-    for _, images, _ in video.batches(frame_times(hidden, values)):
+    for _, images, variances in video.batches(frame_times(hidden, values)):
         seconds += time.perf_counter() - clock
-        truths = hidden[done : done + len(images)].intensity
-        done += len(images)
-        for image, truth in zip(np.clip(images, 0, 1), truths, strict=True):
-            known = bool(np.isfinite(image).all())
-            errors.append(float(mse(image, truth)) if known else math.nan)
-            similarities.append(float(ssim(image, truth)) if known else math.nan)
+        first = len(scores)
+        if hdr is None:
+            truths = hidden[first : first + len(images)].intensity
+            for image, truth in zip(images, truths, strict=True):
+                scores.append(_measures(image, truth, names))
+        else:
+            if not scores:
+                estimated = not np.isnan(variances).all()
+            for row, (image, variance) in enumerate(zip(images, variances, strict=True), first):
+                P, I0 = variance if estimated else None, float(values.I0)
+                scores.append(_hdr_measures(image, P, hdr.truth(row), names, hdr.clip, I0))
         clock = time.perf_counter()
+    per_frame = {"t": [int(t) for t in hidden.t], **_listed(scores)}
     return {
         "recording": recording.name,
         "method": method.name,
-        "mse": _finite(float(np.mean(errors))),
-        "ssim": _finite(float(np.mean(similarities))),
-        "frames": len(errors),
+        **_means(per_frame),
+        **({} if hdr is None else {"clip": list(hdr.clip)}),
+        "frames": len(scores),
         "events": len(recording.events),
         "seconds": seconds,
         "params": values_of(values),
-        "per_frame": {
-            "t": [int(t) for t in hidden.t],
-            "mse": [_finite(value) for value in errors],
-            "ssim": [_finite(value) for value in similarities],
-        },
+        "per_frame": per_frame,
     }
 
 
@@ -159,7 +444,14 @@ def evaluate(
             recording = load(path, plan.size, in_memory=False, progress=progress)
             recording = dataclasses.replace(recording, name=str(path))  # for messages
             for label, method, params in plan.methods:
-                row = score(recording, method, params, plan.protocol, progress=progress)
+                row = score(
+                    recording,
+                    method,
+                    params,
+                    plan.protocol,
+                    metrics=plan.metrics,
+                    progress=progress,
+                )
                 rows.append({**row, "recording": given, "method": label})
         if write is not None:
             write("config.toml", text)
@@ -216,13 +508,14 @@ class Plan:
     methods: list[tuple[str, Estimator, FrameParams]]
     protocol: str
     size: tuple[int, int] | None
+    metrics: tuple[str, ...] = ()
 
 
 def read_plan(config: Path) -> Plan:
     """Read and check a configuration; raises `InputError` naming the file and the setting."""
     table = read_toml(config)
     try:
-        _refuse_unknown(table, ("recordings", "protocol", "size", "method"))
+        _refuse_unknown(table, ("recordings", "protocol", "size", "metrics", "method"))
         protocol = table.get("protocol", "held-out")
         if protocol not in PROTOCOLS:
             near = nearest(str(protocol), PROTOCOLS)
@@ -232,12 +525,17 @@ def read_plan(config: Path) -> Plan:
             isinstance(size, list) and len(size) == 2 and all(type(n) is int for n in size)
         ):
             raise InputError(f"size is {size!r}; give [width, height] in pixels")
+        metrics = table.get("metrics", [])
+        if not (isinstance(metrics, list) and all(isinstance(name, str) for name in metrics)):
+            raise InputError(f'metrics is {metrics!r}; give a list of names, as ["lpips"]')
+        _check_measures(metrics)
         recordings = _recordings(table.get("recordings"), config.parent)
         return Plan(
             recordings,
             _methods(table.get("method"), config.parent),
             protocol,
             None if size is None else (size[0], size[1]),
+            tuple(metrics),
         )
     except InputError as error:
         raise InputError(f"{config}: {error}") from None
@@ -277,7 +575,7 @@ def _methods(given: Any, folder: Path) -> list[tuple[str, Estimator, FrameParams
                 raise InputError('name and label must be text; give name = "akf"')
             method, values = find_method(name), entry.get("params", {})
             if isinstance(values, str):
-                params = method.Params.load(folder / os.path.expandvars(values))
+                params = method.Params.load(folder / os.path.expandvars(values), name)
             elif isinstance(values, dict):
                 params = method.Params.of(values)
             else:
@@ -294,5 +592,5 @@ def _refuse_unknown(table: Mapping[str, Any], known: tuple[str, ...]) -> None:
             raise InputError(f"there is no setting {name!r}; {nearest(name, known)}")
 
 
-def _finite(value: float) -> float | None:
+def _finite(value: float | int) -> float | int | None:
     return value if math.isfinite(value) else None

@@ -278,9 +278,10 @@ def _style(kind: str, arrays: list[NDArray], panels: Sequence[tuple]) -> dict[st
 def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
     """The results of an evaluation as a Markdown table, its columns aligned as plain text too.
 
-    Each row has the keys recording, method, mse, ssim, frames and seconds (others are not shown);
-    a number that is None or NaN appears as "-". MSE is multiplied by 100; seconds are those of
-    computing.
+    Each row has the keys recording, method, mse, ssim, frames and seconds, and may have those of
+    `evaluate.score` against HDR references and of further metrics, which get columns where a row
+    has them; others are not shown. A number that is None, NaN or absent appears as "-". MSE is
+    multiplied by 100 where its column says so; seconds are those of computing.
     """
 
     def number(value: float | int | None, digits: int) -> str:
@@ -289,19 +290,42 @@ def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
     def text(value: str) -> str:
         return " ".join(value.split()).replace("|", r"\|")
 
-    table = [["recording", "method", "MSE x 1e-2", "SSIM", "frames", "seconds"]]
+    def find(row: Mapping[str, Any], path: str) -> Any:
+        value: Any = row
+        for key in path.split("."):
+            if key not in value:
+                return None
+            value = value[key]
+        return value
+
+    always = {"mse", "ssim", "frames", "seconds"}
+    columns = [  # title, place in a row, factor, digits
+        ("MSE x 1e-2", "mse", 100, 3),
+        ("SSIM", "ssim", 1, 3),
+        ("log MSE", "log_mse", 1, 4),
+        ("log SSIM", "log_ssim", 1, 3),
+        ("bright MSE", "regions.bright.mse", 1, 3),
+        ("dark log MSE", "regions.dark.log_mse", 1, 4),
+        ("well MSE x 1e-2", "regions.well.mse", 100, 3),
+        ("LPIPS", "lpips", 1, 3),
+        ("JOD", "hdr_quality", 1, 2),
+        ("global SSIM", "global_ssim", 1, 3),
+        ("frames", "frames", 1, 0),
+        ("seconds", "seconds", 1, 2),
+    ]
+    rows = list(rows)
+    shown = [
+        column
+        for column in columns
+        if column[1] in always or any(find(row, column[1]) is not None for row in rows)
+    ]
+    table = [["recording", "method", *(title for title, _, _, _ in shown)]]
     for row in rows:
-        error = row["mse"]
-        table.append(
-            [
-                text(row["recording"]),
-                text(row["method"]),
-                number(None if error is None else 100 * error, 3),
-                number(row["ssim"], 3),
-                number(row["frames"], 0),
-                number(row["seconds"], 2),
-            ]
-        )
+        cells = [text(row["recording"]), text(row["method"])]
+        for _, place, factor, digits in shown:
+            value = find(row, place)
+            cells.append(number(None if value is None else factor * value, digits))
+        table.append(cells)
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     left = 2  # the names; numbers are aligned to the right
     rule = ["-" * w if i < left else "-" * (w - 1) + ":" for i, w in enumerate(widths)]
