@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from jaxevent.reconstruction import (
         METHODS,
         akf,
+        aks,
         augmented,
         blend,
         cf,
@@ -36,6 +37,7 @@ _HOME = {
     "jaxevent.reconstruction": (
         "METHODS",
         "akf",
+        "aks",
         "augmented",
         "blend",
         "cf",
@@ -54,6 +56,7 @@ __all__ = [
     "InputError",
     "Recording",
     "akf",
+    "aks",
     "augmented",
     "blend",
     "cf",

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from jaxevent.errors import InputError
@@ -19,10 +20,10 @@ class Number:
     """A parameter of a `Parameters` class: its default, unit and meaning.
 
     Reading it from an instance gives the physical value; the instance stores `raw`, on which an
-    optimiser may step anywhere.
+    optimiser may step anywhere. A default of several numbers makes it an array, given as a list.
     """
 
-    def __init__(self, default: float, unit: str, meaning: str):
+    def __init__(self, default: float | tuple[float, ...], unit: str, meaning: str):
         self.default, self.unit, self.meaning = default, unit, meaning
 
     def __set_name__(self, owner: type, name: str):
@@ -38,6 +39,16 @@ class Number:
         return value
 
     def check(self, value: Any) -> None:
+        many = isinstance(self.default, tuple)
+        if many and not (isinstance(value, list | tuple) and value):
+            raise InputError(
+                f"the parameter {self.name} is {str(value)[:40]}; give a list of numbers, as "
+                f"{list(self.default)}"
+            )
+        for one in value if many else [value]:
+            self.check_one(one)
+
+    def check_one(self, value: Any) -> None:
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not number or not abs(value) < 1e38:  # the range of float32
             raise InputError(
@@ -54,30 +65,63 @@ class Positive(Number):
     def unconstrained(self, value: Array) -> Array:
         return jnp.log(value)
 
-    def check(self, value: Any) -> None:
-        super().check(value)
+    def check_one(self, value: Any) -> None:
+        super().check_one(value)
         if value < 0:
             raise InputError(f"the parameter {self.name} is {value}; it must not be negative")
+
+
+class Choice:
+    """A setting of a `Parameters` class that takes one of a few values and is not differentiated."""
+
+    def __init__(self, options: tuple[str | bool, ...], meaning: str):
+        self.options, self.meaning = options, meaning
+        self.default = options[0]
+
+    def __set_name__(self, owner: type, name: str):
+        self.name = name
+
+    def __get__(self, instance: "Parameters", owner: type) -> Any:
+        return dict(instance.chosen)[self.name]
+
+    def check(self, value: Any) -> None:
+        if not any(value is option or value == option for option in self.options) or (
+            isinstance(value, bool) != isinstance(self.default, bool)
+        ):
+            options = " or ".join(
+                str(o).lower() if isinstance(o, bool) else repr(o) for o in self.options
+            )
+            raise InputError(f"the parameter {self.name} is {str(value)[:40]!r}; give {options}")
 
 
 class Parameters(eqx.Module):
     """Base of every estimator's `Params`: `Params(sigma_iso=0.1)`, `params.sigma_iso`.
 
-    `raw` holds one differentiable leaf per number. Raises `InputError` for a name that does not
+    `raw` holds one differentiable leaf per number, `chosen` the choices. A named set of values is a
+    preset: `Params(preset="paper", sigma_iso=0.1)`. Raises `InputError` for a name that does not
     exist and for a value outside its domain.
     """
 
     raw: dict[str, Array]
+    chosen: tuple[tuple[str, str | bool], ...] = eqx.field(static=True)
 
     numbers: ClassVar[Mapping[str, Number]] = {}
+    choices: ClassVar[Mapping[str, Choice]] = {}
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
-        own = {name: entry for name, entry in vars(cls).items() if isinstance(entry, Number)}
-        cls.numbers = {**cls.numbers, **own}
+        own = vars(cls).items()
+        cls.numbers = {**cls.numbers, **{k: v for k, v in own if isinstance(v, Number)}}
+        cls.choices = {**cls.choices, **{k: v for k, v in own if isinstance(v, Choice)}}
 
-    def __init__(self, **values: Any):
-        _refuse_unknown(values, self.numbers)
+    def __init__(self, *, preset: str | None = None, **values: Any):
+        known = {**self.numbers, **self.choices}
+        _refuse_unknown(values, {**known, "preset": None})
+        if preset is not None:
+            if preset not in self.presets:
+                raise InputError(f"there is no preset {preset!r}; {nearest(preset, self.presets)}")
+            values = {**self.presets[preset], **values}
         self.raw = {}
         for name, number in self.numbers.items():
             value = values.get(name, number.default)
@@ -85,22 +129,41 @@ class Parameters(eqx.Module):
                 number.check(value)
             value = jnp.asarray(value, jnp.result_type(float))
             self.raw[name] = number.unconstrained(value)
+        chosen = {name: values.get(name, choice.default) for name, choice in self.choices.items()}
+        for name, value in chosen.items():
+            self.choices[name].check(value)
+        self.chosen = tuple(chosen.items())
 
-    def values(self) -> dict[str, float]:
-        """The physical values by name, as `Params(**values)` takes them."""
-        return {name: float(getattr(self, name)) for name in self.numbers}
+    def values(self) -> dict[str, Any]:
+        """The physical values and the choices by name, as `Params(**values)` takes them."""
+        numbers = {name: np.asarray(getattr(self, name)).tolist() for name in self.numbers}
+        return {**numbers, **dict(self.chosen)}
 
     @classmethod
     def of(cls: type[T], table: Mapping[str, Any]) -> T:
-        """Params from `name = number` settings; raises `InputError` naming the setting."""
-        _refuse_unknown(table, cls.numbers)
+        """Params from `name = value` settings; raises `InputError` naming the setting."""
+        preset = table.get("preset")
+        if preset is not None and not isinstance(preset, str):
+            raise InputError(f"the preset is {preset!r}; give the name of one")
         return cls(**table)
 
     @classmethod
-    def load(cls: type[T], path: str | Path) -> T:
-        """Params from a TOML file of `name = number`; raises `InputError` naming file and key."""
+    def load(cls: type[T], path: str | Path, method: str | None = None) -> T:
+        """Params from a TOML file; raises `InputError` naming file and key.
+
+        The file holds `name = value` settings, or one table of them for each of several methods
+        (as `jaxevent fit` writes); then `method` is the name of the table to take.
+        """
+        table = read_toml(path)
         try:
-            return cls.of(read_toml(path))
+            if table and all(isinstance(part, dict) for part in table.values()):
+                if method is None or method not in table:
+                    raise InputError(
+                        f"holds parameters of {', '.join(table)}, none of {method}; choose one of "
+                        "those methods or give another file"
+                    )
+                table = table[method]
+            return cls.of(table)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
 

@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxevent.camera import PinholeCamera
+from jaxevent.camera import PinholeCamera, Response, TableResponse, UnknownResponse
 from jaxevent.errors import InputError
 
 Times = ArrayLike | int | float
@@ -211,8 +211,9 @@ class Imu:
 class Recording:
     """One recording of one sensor; see the module for the conventions.
 
-    `extra` keeps, by name, whatever arrays the file held beyond these fields (a camera response, a
-    contrast threshold, HDR reference images, a known motion).
+    `extra` keeps, by name, whatever arrays the file held beyond these fields (a contrast threshold,
+    HDR reference images, a known motion). Of these the library reads: the camera response, see
+    `response`; `rgb`, colour frames (frames, height, width, 3) uint8, see `jaxevent.colour`.
     """
 
     name: str
@@ -237,6 +238,44 @@ class Recording:
         last = [int(self.events[len(self.events) - 1 :].t[0])] if len(self.events) else []
         return max(last + ([int(self.frames.t[-1])] if self.frames else []))
 
+    @property
+    def gain(self) -> NDArray[np.float64]:
+        """How much brighter each frame shows the scene than intensity 1 as white: `extra["gain"]`.
+
+        Frames of an automatic exposure: intensity is the response's, divided by the gain. 1 where
+        there is none. Raises `InputError` for gains that are not one positive number per frame.
+        """
+        number = 0 if self.frames is None else len(self.frames)
+        if "gain" not in self.extra:
+            return np.ones(number)
+        gain = np.asarray(self.extra["gain"])
+        if gain.dtype.kind not in "iuf" or gain.shape != (number,) or not (gain > 0).all():
+            raise InputError(
+                f"{self.name}: extra['gain'] is {gain.dtype} of shape {gain.shape}; give one "
+                f"positive number for each of the {number} frames"
+            )
+        return gain.astype(np.float64)
+
+    @property
+    def response(self) -> Response:
+        """The camera response that `extra` carries; `UnknownResponse()` where it carries none.
+
+        `extra["response"]` holds n >= 3 intensities of evenly spaced grey values from 0 to 1 that
+        never fall, `extra["certainty"]`, where present, their n certainties. Recordings of the
+        AKF's authors have `extra["f_Q"]` instead, the certainties of 256 grey levels with which
+        intensity is linear. Raises `InputError` for other shapes and values.
+        """
+        key, levels, weights = "f_Q", np.linspace(0, 1, 256), self.extra.get("f_Q")
+        if "response" in self.extra:
+            key, levels, weights = "response", self.extra["response"], self.extra.get("certainty")
+        elif weights is None:
+            return UnknownResponse()
+        try:
+            return TableResponse(levels, weights)
+        except ValueError as error:
+            also = " with extra['certainty']" if key == "response" and weights is not None else ""
+            raise InputError(f"{self.name}: extra[{key!r}]{also}: {error}") from error
+
     def __getitem__(self, span: slice) -> "Recording":
         """The part with start <= t < stop; ints are microseconds, floats seconds, of its clock."""
         if not isinstance(span, slice) or span.step is not None:
@@ -250,8 +289,12 @@ class Recording:
             part = part[slice(*np.searchsorted(part.t, [t0, t1]))]
             return part if len(part) else None
 
+        rows = None
+        if self.frames is not None:
+            rows = slice(*np.searchsorted(self.frames.t, [t0, t1]))
         part = dataclasses.replace(
             self,
+            extra=self._extra_of(rows),
             events=self.events[self.events.index(t0) : self.events.index(t1)],
             frames=cut(self.frames),
             poses=cut(self.poses),
@@ -267,7 +310,16 @@ class Recording:
     def with_frames(self, rows: slice | NDArray) -> "Recording":
         """The same recording with only some of its frames."""
         frames = self.frames[rows] if self.frames is not None else None
-        return dataclasses.replace(self, frames=frames if frames else None)
+        return dataclasses.replace(
+            self, frames=frames if frames else None, extra=self._extra_of(rows)
+        )
+
+    def _extra_of(self, rows: slice | NDArray | None) -> Mapping[str, NDArray]:
+        """The further arrays, those with one entry per frame ("gain", "rgb") cut like the frames."""
+        if rows is None:
+            return self.extra
+        cut = {name: self.extra[name][rows] for name in ("gain", "rgb") if name in self.extra}
+        return {**self.extra, **cut}
 
     def check(self, source: str | None = None) -> "Recording":
         """Return self, or raise `InputError` naming what is wrong and where."""

@@ -3,6 +3,9 @@
 import math
 
 import numpy as np
+import scipy.interpolate
+import scipy.special
+import scipy.stats
 
 
 class Pixel:
@@ -14,17 +17,23 @@ class Pixel:
         self.left = [m - T / 2 for m, T in zip(mid, exposure, strict=True)]
         self.right = [m + T / 2 for m, T in zip(mid, exposure, strict=True)]
         self.frames = len(mid)
+        # What each event stands for, with a dead time after the one before.
+        dead = p["rho_ref"] * 1e6
+        gaps = [b - a for a, b in zip([0, *t], t, strict=False)]
+        self.weight = [
+            1 if dead == 0 else 3 if gap <= 1.5 * dead else gap / (gap - dead) for gap in gaps
+        ]
 
     def c(self, s):
         return self.p["c_on"] if s > 0 else self.p["c_off"]
 
     def moved(self, n):
         """Sum of s c over the first n events."""
-        return sum(s * self.c(s) for s in self.s[:n])
+        return sum(w * s * self.c(s) for w, s in list(zip(self.weight, self.s, strict=True))[:n])
 
     def before(self, time):
         """The same over the events earlier than a time."""
-        return sum(s * self.c(s) for t, s in zip(self.t, self.s, strict=True) if t < time)
+        return self.moved(sum(t < time for t in self.t))
 
     def sharp(self, k):
         """EDI: log intensity at mid-exposure of frame k."""
@@ -52,7 +61,7 @@ class Pixel:
         S = self.before(self.right[k + 1]) - self.before(self.left[k])
         dL = self.at_right(k + 1) - self.at_left(k)
         # Sums that cancel exactly in counts must not leave a rounding error to divide by.
-        if abs(S) < 1e-12:
+        if abs(S) < 1e-12 or not self.p.get("calibrate", True):
             return 1.0
         r = dL / S
         return r if self.p["ratio_min"] <= r <= self.p["ratio_max"] else 1.0
@@ -84,11 +93,46 @@ class Pixel:
                     return self.backward(-1, n)
                 a, b = self.seam(k - 1)
                 u = (time - a) / (b - a)
+                if self.p["weighting"] == "certainty":
+                    fore, back = (1 - u) * self.trust(k - 1), u * self.trust(k)
+                    u = back / (fore + back)
                 return (1 - u) * self.forward(k - 1, n) + u * self.backward(k - 1, n)
             if time < end:
                 v = (time - begin) / (end - begin)
                 return (1 - v) * self.backward(k - 1, n) + v * self.forward(k, n)
         return self.forward(last, n)
+
+    def clear(self, k):
+        """1 where frame k is not clipped here; the edge is a tenth of a level wide."""
+        if self.p["margin"] == 0:
+            return 1.0
+        level = 255 * min(self.grey[k], 1 - self.grey[k])
+        return 1 / (1 + math.exp(-10 * (level - self.p["margin"])))
+
+    def curve(self, g):
+        """ln of the factor on the certainty."""
+        knots = self.p["certainty"]
+        if len(knots) == 1:
+            return math.log(knots[0])
+        natural = scipy.interpolate.CubicSpline(
+            np.linspace(0, 1, len(knots)), np.log(knots), bc_type="natural"
+        )
+        places = np.linspace(0, 1, 256)  # a table, linear between its entries
+        return math.log(np.interp(g, places, np.exp(natural(places))))
+
+    def sure(self, k):
+        """w but for clipping."""
+        g = self.grey[k]
+        curve = math.exp(self.curve(g))
+        return max(4 * g * (1 - g) * curve, self.p["w_min"])
+
+    def w(self, k):
+        clear = self.clear(k)
+        return clear * self.sure(k) + (1 - clear) * self.p["w_min"]
+
+    def trust(self, k):
+        """1 / R of a frame, but for kappa."""
+        return self.w(k) * (self.grey[k] + self.p["I0"]) ** 2
 
     def event_integral(self, time, n):
         k = -1
@@ -121,7 +165,9 @@ class Pixel:
         if not self.frames:
             return 0.0
         p = self.p
-        density = [1 / (p["kappa"] * max(4 * g * (1 - g), p["w_min"])) for g in self.grey]
+        if p["weighting"] == "certainty":
+            return p["kappa"] * self.linear(time, [self.trust(k) for k in range(self.frames)])
+        density = [1 / (p["kappa"] * self.w(k)) for k in range(self.frames)]
         return (self.linear(time, self.grey) + p["I0"]) ** 2 / self.linear(time, density)
 
 
@@ -136,27 +182,32 @@ def neighbour_times(t, x, y, start):
     return out
 
 
-def reconstruct(method, recording, p, times):
+def reconstruct(method, recording, p, times, likelihood=False):
     """Image and variance at times (us), as `Estimator.reconstruct` defines them."""
+    total = 0.0
     start = recording.start
     e = recording.events
     t = [int(v) - start for v in e.t]
     near = neighbour_times(t, e.x, e.y, 0)
     f = recording.frames
     mid = [] if f is None else [int(v) - start + p["clock_offset"] * 1e6 for v in f.t]
-    exposure = [] if f is None else [int(v) for v in f.exposure]
+    exposure = [] if f is None else [int(v) or p["exposure"] * 1e6 for v in f.exposure]
     images = np.empty((2, len(times), recording.height, recording.width))
     for y in range(recording.height):
         for x in range(recording.width):
             rows = [i for i in range(len(t)) if e.x[i] == x and e.y[i] == y]
-            grey = [] if f is None else [float(g) for g in f.intensity[:, y, x].astype(float)]
+            grey = [] if f is None else [float(g) / 255 for g in f.images[:, y, x]]
             pixel = Pixel(
                 [t[i] for i in rows], [1 if e.p[i] else -1 for i in rows], grey, mid, exposure, p
             )
+            if method == "aks":
+                seen, one = smooth(pixel, [int(time) - start for time in times], p)
+                images[:, :, y, x], total = seen.reshape(2, -1), total + one
+                continue
             trace = run(method, pixel, [near[i] for i in rows], p)
             for j, time in enumerate(times):
                 images[:, j, y, x] = read(method, pixel, trace, int(time) - start, p)
-    return images
+    return (images, total) if likelihood else images
 
 
 def reference(method, pixel):
@@ -188,14 +239,20 @@ def move(method, pixel, L, P, dt, time, n, p):
 def run(method, pixel, near, p):
     """[(time, L, P)]: the start, then after each event."""
     L, P, last = reference(method, pixel)(0.0, 0), p.get("P0", math.nan), 0
+    if method == "akf" and pixel.frames:
+        L += p["beyond"] * (1 if pixel.grey[0] > 0.5 else -1) * (1 - pixel.clear(0))
     trace = [(last, L, P)]
     for n, (time, s) in enumerate(zip(pixel.t, pixel.s, strict=True)):
         gap = (time - last) * 1e-6
         L, P = move(method, pixel, L, P, gap, time, n, p)
-        L += s * pixel.c(s)  # (14)
+        L += pixel.weight[n] * s * pixel.c(s)  # (14)
         if method == "akf":
             P += p["sigma_proc"] ** 2 * gap + p["sigma_iso"] ** 2 * (time - near[n]) * 1e-6  # (19)
-            P += p["sigma_ref"] ** 2 if gap <= p["rho"] else 0
+            if p["rho_width"]:
+                close = 1 / (1 + (max(gap, 1e-7) / p["rho"]) ** (1 / p["rho_width"]))
+            else:
+                close = gap <= p["rho"]
+            P += p["sigma_ref"] ** 2 * close
         last = time
         trace.append((last, L, P))
     return trace
@@ -206,3 +263,77 @@ def read(method, pixel, trace, time, p):
     last, L, P = trace[n]
     L, P = move(method, pixel, L, P, max(time - last, 0) * 1e-6, time, n, p)
     return math.exp(L) - p["I0"], P
+
+
+def half_seen(m, P, bound, sign, floor):
+    """Log mass, mean and variance of N(m, P) times Phi(sign (x - bound) / sqrt(floor)), by a grid.
+
+    The grid spans both factors, so that it holds the product's bulk where they disagree.
+    """
+    spread = 12 * math.sqrt(P + floor)
+    x = np.linspace(min(m, bound) - spread, max(m, bound) + spread, 100_001)
+    log_weight = -0.5 * (x - m) ** 2 / P - 0.5 * math.log(2 * math.pi * P)
+    log_weight += scipy.special.log_ndtr(sign * (x - bound) / math.sqrt(floor))
+    mass = scipy.special.logsumexp(log_weight)
+    weight = np.exp(log_weight - mass)
+    mean = (weight * x).sum()
+    return mass + math.log(x[1] - x[0]), mean, (weight * (x - mean) ** 2).sum()
+
+
+def smooth(pixel, times, p):
+    """Image and variance at times (us from the start), and the log likelihood of the frames.
+
+    The frames become measurements one after the other; then all of them condition the joint
+    Gaussian of the log intensities at frames and times at once.
+    """
+    frames, I0 = range(pixel.frames), p["I0"]
+    done = [sum(t < m for t in pixel.t) for m in pixel.mid]
+    done += [sum(t <= time for t in pixel.t) for time in times]
+    when = [*pixel.mid, *times]
+    origin, first = when[0], done[0]
+
+    def clock(n, time):
+        """Variance between the first frame and a point; negative before it."""
+        steps = [w * pixel.c(s) ** 2 for w, s in zip(pixel.weight, pixel.s, strict=True)]
+        events = sum(steps[first:n]) if n >= first else -sum(steps[n:first])
+        return p["sigma_event"] ** 2 * events + p["sigma_bg"] ** 2 * (time - origin) * 1e-6
+
+    V = np.array([clock(n, time) for n, time in zip(done, when, strict=True)])
+    same = np.sign(V)[:, None] == np.sign(V)[None, :]
+    C = p["P0"] + np.where(same, np.minimum(abs(V)[:, None], abs(V)[None, :]), 0)
+    prior = math.log(p["start"] + I0) + np.array([pixel.moved(n) for n in done])
+    prior -= pixel.moved(first)
+
+    measured = []  # (frame, value, variance)
+
+    def given(i):
+        """Mean and variance of point i given the measurements so far."""
+        rows = [k for k, _, _ in measured]
+        H = C[np.ix_(rows, rows)] + np.diag([r for _, _, r in measured])
+        gain = np.linalg.solve(H, C[rows, i]) if rows else np.zeros(0)
+        error = np.array([z for _, z, _ in measured]) - prior[rows]
+        return prior[i] + gain @ error, C[i, i] - gain @ C[rows, i]
+
+    total = 0.0
+    for k in frames:
+        m, P = given(k)
+        clear = pixel.clear(k)
+        noise = p["sigma_frame"] / pixel.sure(k) / (pixel.grey[k] + I0)
+        r = noise**2 + p["sigma_floor"] ** 2
+        z = pixel.sharp(k)
+        total += clear * scipy.stats.norm.logpdf(z, m, math.sqrt(P + r))
+        if clear < 1 and p["one_sided"]:
+            sign = 1 if pixel.grey[k] > 0.5 else -1
+            end = p["margin"] / 255
+            level = math.log((1 - end if sign > 0 else end) + I0)
+            floor = p["sigma_floor"] ** 2
+            counts = 1 / (1 + math.exp(2 * sign * (m - level) / math.sqrt(P + floor)))
+            counts *= 1 - clear
+            mass, mean, variance = half_seen(m, P, level, sign, floor)
+            total += counts * mass
+            J = 1 / variance - 1 / P
+            if J > 1e-12 / P:
+                measured.append((k, (mean / variance - m / P) / J, 1 / J / counts))
+        measured.append((k, z, r / clear))
+    image = [given(pixel.frames + j) for j in range(len(times))]
+    return np.array([[math.exp(m) - I0, P] for m, P in image]).T, total

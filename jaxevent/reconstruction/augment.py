@@ -6,38 +6,60 @@ Each model makes its tables, [rows, pixels], once per window; called with points
 among the frames, `pixels.Points`) it looks them up.
 """
 
+import functools
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import NDArray
 
-from jaxevent.camera import Response, UnknownResponse
-from jaxevent.parameters import Number, Parameters, Positive
-from jaxevent.reconstruction.pixels import FrameFeatures, Points
+from jaxevent.parameters import Choice, Number, Parameters, Positive
+from jaxevent.reconstruction.pixels import FrameFeatures, Points, Timing
+
+
+# Parameters that act through comparisons with event times: fixed when a recording is prepared.
+PREPARED = Timing._fields
 
 
 class FrameParams(Parameters):
-    """Parameters of every estimator: thresholds and the frames' clock, offset and response."""
-
-    response: Response
+    """Parameters of every estimator: thresholds, dead time, and the frames' clock and offset."""
 
     c_on = Positive(0.1, "ln I", "contrast threshold of ON events")
     c_off = Positive(0.1, "ln I", "contrast threshold of OFF events")
     I0 = Positive(1.0, "intensity", "offset inside the logarithm, L = ln(I + I0)")
     clock_offset = Number(0.0, "s", "added to the frames' time stamps")
+    exposure = Positive(0.0, "s", "exposure of frames whose own is not known")
+    rho_ref = Positive(0.0, "s", "dead time of a pixel after an event, its change made good")
 
-    def __init__(self, *, response: Response | None = None, **values: Any):
+    def __init__(self, **values: Any):
         super().__init__(**values)
-        self.response = UnknownResponse() if response is None else response
 
 
-class AugmentParams(FrameParams):
-    """... and of the per-pixel contrast calibration (10)."""
+class CertaintyParams(FrameParams):
+    """... and of the certainty of frames (4), as far as the camera's response does not tell it."""
 
+    w_min = Positive(0.09, "1", "least certainty w of frames, of dark and saturated pixels")
+    margin = Positive(0.0, "grey / 255", "distance from black and white within which frames clip")
+    certainty = Positive(
+        (1.0,), "1", "factors on the certainty w at evenly spaced greys, a spline in ln w"
+    )
+
+    def __init__(self, **values: Any):
+        super().__init__(**values)
+
+
+class AugmentParams(CertaintyParams):
+    """... and of the augmented frame: calibration of contrasts (10), weights of two frames."""
+
+    calibrate = Choice((True, False), "whether each pixel's threshold is fitted between frames")
     ratio_min = Positive(0.01, "1", "smallest calibrated over nominal threshold that is believed")
     ratio_max = Positive(1 / 0.6, "1", "largest calibrated over nominal threshold believed")
+    weighting = Choice(
+        ("linear", "certainty"), "of two frames between them: by time alone, or by certainty too"
+    )
 
     def __init__(self, **values: Any):
         super().__init__(**values)
@@ -48,8 +70,61 @@ def brightness(params: FrameParams, on: Array, off: Array) -> Array:
     return params.c_on * on - params.c_off * off
 
 
-def intensity(params: FrameParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
-    return params.response.intensity(jnp.asarray(frames.grey))
+def event_change(params: FrameParams, polarity: Array, since: Array) -> Array:
+    """Change of log intensity that one event reports, `since` seconds after its pixel's last.
+
+    With a dead time rho an event stands for dt / (dt - rho) events, at most 3 (`Timing`).
+    """
+    rho = params.rho_ref
+    near = since <= 1.5 * rho
+    events = jnp.where(near, 3, since / jnp.where(near, 1, since - rho))
+    return brightness(params, polarity > 0, polarity < 0) * jnp.where(rho > 0, events, 1)
+
+
+def unclipped(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
+    """1 where a grey value says what the intensity was, 0 where it is black or white.
+
+    A clipped pixel with noise reads a few levels from the end; the edge at `margin` is soft, a
+    tenth of a level wide, so that the margin can be tuned by gradient.
+    """
+    level = 255 * jnp.minimum(frames.grey, 1 - frames.grey)
+    inside = jax.nn.sigmoid(10 * (level - params.margin))
+    return jnp.where(params.margin > 0, inside, 1)
+
+
+def certainty(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
+    """w of every frame and pixel without regard to clipping, at least `w_min`."""
+    w = frames.certainty
+    knots = params.certainty
+    if len(knots) == 1:
+        w = w * knots[0]
+    else:
+        table = jnp.exp(_spline(len(knots)) @ jnp.log(knots))
+        place = jnp.asarray(frames.grey) * (SPLINE - 1)
+        below = jnp.clip(place.astype(int), 0, SPLINE - 2)
+        part = place - below
+        w = w * ((1 - part) * table[below] + part * table[below + 1])
+    return jnp.maximum(w, params.w_min)
+
+
+def belief(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
+    """w of every frame and pixel, at least `w_min`, which is that of clipped ones."""
+    clear = unclipped(params, frames)
+    return clear * certainty(params, frames) + (1 - clear) * params.w_min
+
+
+SPLINE = 256
+
+
+@functools.lru_cache
+def _spline(knots: int) -> NDArray[np.floating]:
+    """The natural cubic spline through evenly spaced knots, at SPLINE places: a matrix."""
+    from scipy.interpolate import CubicSpline
+
+    if knots < 3:
+        return np.linspace([1.0, 0.0], [0.0, 1.0], SPLINE)
+    kind = CubicSpline(np.linspace(0, 1, knots), np.eye(knots), bc_type="natural")
+    return kind(np.linspace(0, 1, SPLINE))
 
 
 def late(params: FrameParams, frames: FrameFeatures) -> Float[Array, ""]:
@@ -66,14 +141,13 @@ def deblurred(
     constant, so the mean is exact: m = 1 + sum over segments of share (exp(E) - 1), and
     l(D) = ln((I + I0) / m).
     """
-    grey = intensity(params, frames)
-    level = jnp.log(grey + params.I0)
+    level = jnp.log(frames.intensity + params.I0)
     if frames.segments is None or frames.head is None or frames.tail is None:
         return level, level
     s = frames.segments
     share = s.share + late(params, frames) * s.edge
     excess = share * jnp.expm1(brightness(params, s.on, s.off))
-    total = jax.ops.segment_sum(excess, s.cell, grey.size).reshape(grey.shape)
+    total = jax.ops.segment_sum(excess, s.cell, level.size).reshape(level.shape)
     level = level - jnp.log1p(total)
     return (
         level - brightness(params, frames.head[0], frames.head[1]),
@@ -85,6 +159,11 @@ def _lagging(lag: Array, here: Array, there: Array) -> tuple[Array, Array]:
     """Ends whose blend with weight w is that of `here` and `there` with weight w - lag."""
     drift = lag * (here - there)
     return here + drift, there + drift
+
+
+def believed_rate(params: AugmentParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
+    """w (I + I0)^2: how well each frame tells the log intensity, in units of kappa."""
+    return belief(params, frames) * (frames.intensity + params.I0) ** 2
 
 
 class Level(eqx.Module):
@@ -104,6 +183,10 @@ class Augmented(Level):
 
     Each piece blends two lines base + ratio S, S the nominal integral of events since the left edge
     of the piece's exposure. The calibrated threshold is `ratio` times the nominal one (10).
+
+    Weighted by certainty, the lines of a gap count by (1 - u) / R_k and u / R_{k+1} instead of
+    1 - u and u, R = 1 / (w (I + I0)^2), so that a clipped frame does not speak against a good one;
+    `tilt` is R_k / R_{k+1}. At the ends of the gap the estimate is the same.
     """
 
     Params = AugmentParams
@@ -112,6 +195,8 @@ class Augmented(Level):
     from_ratio: Float[Array, "pieces pixels"]
     to_base: Float[Array, "pieces pixels"]
     to_ratio: Float[Array, "pieces pixels"]
+    tilt: Float[Array, "pieces pixels"] | None
+    lag: Float[Array, " pieces"]
 
     def __init__(self, params: AugmentParams, frames: FrameFeatures):
         left, right = deblurred(params, frames)
@@ -119,6 +204,7 @@ class Augmented(Level):
         following = jnp.roll(right, -1, axis=0)
         ratio = (following - left) / jnp.where(span == 0, 1, span)
         believed = (span != 0) & (ratio >= params.ratio_min) & (ratio <= params.ratio_max)
+        believed &= params.calibrate
         ratio = jnp.where(believed, ratio, 1)
 
         # Before the first exposure: backwards from its right edge with the nominal threshold.
@@ -141,14 +227,30 @@ class Augmented(Level):
                 for b, e, g in zip(before, inside, gap, strict=True)
             ]
         from_base, from_ratio, to_base, to_ratio = rows
-        lag = late(params, frames) * frames.piece_rate[:, None]
         self.params = params
-        self.from_base, self.to_base = _lagging(lag, from_base, to_base)
-        self.from_ratio, self.to_ratio = _lagging(lag, from_ratio, to_ratio)
+        self.lag = late(params, frames) * frames.piece_rate
+        self.tilt = None
+        if params.weighting == "certainty":
+            trust = believed_rate(params, frames)
+            q = jnp.roll(trust, -1, axis=0) / trust
+            one = jnp.ones_like(q)
+            between = [q] if frames.head is None else [one, q]
+            self.tilt = jnp.concatenate([one[:1], jnp.stack(between, 1).reshape(-1, q.shape[1])])
+            self.from_base, self.to_base = from_base, to_base
+            self.from_ratio, self.to_ratio = from_ratio, to_ratio
+        else:
+            lag = self.lag[:, None]
+            self.from_base, self.to_base = _lagging(lag, from_base, to_base)
+            self.from_ratio, self.to_ratio = _lagging(lag, from_ratio, to_ratio)
 
     def __call__(self, points: Points) -> Float[Array, "*points"]:
         S = brightness(self.params, points.on, points.off)
         u = points.weight
+        if self.tilt is not None:
+            pixels = self.tilt.shape[1]
+            u = u - points.of_piece_alone(self.lag, pixels)
+            toward = u * points.of_piece(self.tilt)
+            u = toward / (1 - u + toward)
         forward = points.of_piece(self.from_base) + points.of_piece(self.from_ratio) * S
         backward = points.of_piece(self.to_base) + points.of_piece(self.to_ratio) * S
         return (1 - u) * forward + u * backward
@@ -177,7 +279,7 @@ class Held(Level):
     level: Float[Array, "frames pixels"]
 
     def __init__(self, params: FrameParams, frames: FrameFeatures):
-        self.level = jnp.log(intensity(params, frames) + params.I0)
+        self.level = jnp.log(frames.intensity + params.I0)
 
     def __call__(self, points: Points) -> Float[Array, "*points"]:
         return points.of_frame(self.level)
@@ -191,7 +293,7 @@ class Blended(Level):
 
     def __init__(self, params: FrameParams, frames: FrameFeatures):
         self.I0 = params.I0
-        self.image = BetweenFrames(params, frames, intensity(params, frames))
+        self.image = BetweenFrames(params, frames, jnp.asarray(frames.intensity))
 
     def __call__(self, points: Points) -> Float[Array, "*points"]:
         return jnp.log(self.image(points) + self.I0)

@@ -18,10 +18,10 @@ from jaxevent.reconstruction.augment import (
     Held,
     Level,
     Nothing,
-    brightness,
+    event_change,
 )
 from jaxevent.reconstruction.estimator import (
-    Estimator,
+    Filter,
     Event,
     Observation,
     Observer,
@@ -68,14 +68,14 @@ def advance(params: FrameParams, state: State, dt: Array, frame: Observation) ->
 
 def jump(params: FrameParams, state: State, event: Event) -> State:
     """L <- L + s c."""
-    return State(state.L + brightness(params, event.polarity > 0, event.polarity < 0), state.P)
+    return State(state.L + event_change(params, event.polarity, event.since), state.P)
 
 
-def _filter(name: str, model: type[Level], params: type[FrameParams], **more: Any) -> Estimator:
+def _filter(name: str, model: type[Level], params: type[FrameParams], **more: Any) -> Filter:
     def observe(values: Any, frames: FrameFeatures) -> Pull:
         return Pull(model(values, frames), values.alpha)
 
-    return Estimator(name, params, observe, without_variance, advance, jump, **more)
+    return Filter(name, params, observe, without_variance, advance, jump, **more)
 
 
 cf = _filter("cf", Held, Params)

@@ -14,7 +14,7 @@ from jaxevent.reconstruction.augment import (
     Level,
 )
 from jaxevent.reconstruction.estimator import (
-    Estimator,
+    Filter,
     Observation,
     Observer,
     State,
@@ -37,11 +37,11 @@ def advance(params: FrameParams, state: State, dt: Array, frame: Observation) ->
     return State(frame.level, jnp.broadcast_to(state.P, frame.level.shape))
 
 
-def _direct(name: str, model: type[Level]) -> Estimator:
+def _direct(name: str, model: type[Level]) -> Filter:
     def observe(values: Any, frames: FrameFeatures) -> Direct:
         return Direct(model(values, frames))
 
-    return Estimator(name, model.Params, observe, without_variance, advance)
+    return Filter(name, model.Params, observe, without_variance, advance)
 
 
 edi = _direct("edi", EventIntegral)

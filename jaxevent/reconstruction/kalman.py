@@ -6,31 +6,37 @@ add noise Q; between events the augmented frame L^A, believed with variance dens
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxevent.parameters import Positive
+from jaxevent.parameters import Number, Positive
 from jaxevent.reconstruction.augment import (
     Augmented,
     AugmentParams,
     BetweenFrames,
-    brightness,
-    intensity,
+    belief,
+    believed_rate,
+    event_change,
+    unclipped,
 )
-from jaxevent.reconstruction.estimator import Estimator, Event, Observation, Observer, State
+from jaxevent.reconstruction.estimator import Filter, Event, Observation, Observer, State
 from jaxevent.reconstruction.pixels import FrameFeatures, Points
 
 
 class Params(AugmentParams):
-    """Parameters of the AKF; defaults of the paper, section 6."""
+    """Parameters of the AKF."""
 
     sigma_proc = Positive(5e-4**0.5, "ln I / sqrt(s)", "process noise, per time since last event")
     sigma_iso = Positive(0.03**0.5, "ln I / sqrt(s)", "isolated noise, per time since neighbours")
     sigma_ref = Positive(0.01**0.5, "ln I", "noise of events within rho of the last one")
     rho = Positive(0.01, "s", "bound on the refractory period")
+    rho_width = Positive(0.0, "1", "width in ln time of the step at rho; 0: a sharp step")
     kappa = Positive(7e5, "1 / (intensity^2 s)", "certainty of frames: 7e5 DAVIS, 7e7 FLIR")
-    w_min = Positive(0.09, "1", "least certainty, of dark and saturated pixels, as part of kappa")
     P0 = Positive(0.09, "(ln I)^2", "variance at the start")
+    beyond = Number(0.0, "ln I", "how far beyond the clip clipped pixels start")
+
+    presets = {"paper": {}}
 
     def __init__(self, **values: Any):
         super().__init__(**values)
@@ -41,25 +47,39 @@ class Augmentation(Observer):
 
     Paper (4) writes sigma_im^2 = 7e5 as a multiplier; it is the reciprocal of the density.
     Paper (7) prints a factor 2 in the denominator; Var ln(I + I0) = Var I / (I + I0)^2.
+    Weighted by certainty, 1/R is linear between frames: where one frame is clipped, the other one's
+    certainty fades over the gap instead of vanishing at its beginning.
     """
 
     level: Augmented
-    image: BetweenFrames
+    image: BetweenFrames | None
     density: BetweenFrames
     I0: Float[Array, ""]
     present: Float[Array, ""]
+    begin: Float[Array, " pixels"]
 
     def __init__(self, params: Params, frames: FrameFeatures):
-        w = params.response.certainty(jnp.asarray(frames.grey))
-        Rbar = 1 / (params.kappa * jnp.maximum(w, params.w_min))
         self.level = Augmented(params, frames)
-        self.image = BetweenFrames(params, frames, intensity(params, frames))
-        self.density = BetweenFrames(params, frames, Rbar)
         self.I0, self.present = params.I0, jnp.asarray(frames.present)
+        if params.weighting == "certainty":
+            self.image = None
+            trust = params.kappa * believed_rate(params, frames)
+            self.density = BetweenFrames(params, frames, trust)
+        else:
+            Rbar = 1 / (params.kappa * belief(params, frames))
+            self.image = BetweenFrames(params, frames, jnp.asarray(frames.intensity))
+            self.density = BetweenFrames(params, frames, Rbar)
+        side = jnp.where(frames.grey[0] > 0.5, 1, -1) * (1 - unclipped(params, frames)[0])
+        self.begin = params.beyond * side
 
     def __call__(self, points: Points) -> Observation:
+        if self.image is None:
+            return Observation(self.level(points), self.present * self.density(points))
         rate = self.present * (self.image(points) + self.I0) ** 2 / self.density(points)
         return Observation(self.level(points), rate)
+
+    def outset(self, points: Points) -> Array:
+        return self.level(points) + self.begin
 
 
 def initial(params: Params, level: Array) -> State:
@@ -79,14 +99,25 @@ def noise(params: Params, event: Event) -> Array:
     """Q of an event (2): process, isolated-pixel and refractory-period noise."""
     Q_proc = params.sigma_proc**2 * event.since
     Q_iso = params.sigma_iso**2 * event.near
-    Q_ref = jnp.where(event.since <= params.rho, params.sigma_ref**2, 0)
-    return Q_proc + Q_iso + Q_ref
+    return Q_proc + Q_iso + params.sigma_ref**2 * within(params, event.since)
+
+
+def within(params: Params, since: Array) -> Array:
+    """1 within the bound rho on the refractory period, 0 after it.
+
+    The comparison has no derivative by rho; with a width the step is relaxed to
+    1 / (1 + (dt / rho)^(1 / width)), which has.
+    """
+    sharp = params.rho_width == 0
+    steepness = 1 / jnp.where(sharp, 1, params.rho_width)
+    soft = jax.nn.sigmoid(steepness * (jnp.log(params.rho) - jnp.log(jnp.maximum(since, 1e-7))))
+    return jnp.where(sharp, jnp.where(since <= params.rho, 1.0, 0.0), soft)
 
 
 def jump(params: Params, state: State, event: Event) -> State:
     """At an event: L moves by the nominal threshold (14), P grows by Q (19)."""
-    L = state.L + brightness(params, event.polarity > 0, event.polarity < 0)
+    L = state.L + event_change(params, event.polarity, event.since)
     return State(L, state.P + jnp.where(event.polarity == 0, 0, noise(params, event)))
 
 
-akf = Estimator("akf", Params, Augmentation, initial, advance, jump, needs_frames=False)
+akf = Filter("akf", Params, Augmentation, initial, advance, jump, needs_frames=False)

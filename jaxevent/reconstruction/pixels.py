@@ -26,7 +26,7 @@ import math
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -59,8 +59,8 @@ class Points(eqx.Module):
 
     weight: Float[Numeric, "*#points"]  # position in the piece, 0 to 1
     blend: Float[Numeric, "*#points"]  # position between the mid-exposures of two frames, 0 to 1
-    on: Int[Numeric, "*points"]  # ON events since the left edge of the piece's exposure
-    off: Int[Numeric, "*points"]
+    on: Float[Numeric, "*points"]  # ON events since the left edge of the piece's exposure
+    off: Float[Numeric, "*points"]
 
     @abc.abstractmethod
     def of_piece(self, table: Float[Array, "pieces pixels"]) -> Float[Array, "..."]:
@@ -69,6 +69,10 @@ class Points(eqx.Module):
     @abc.abstractmethod
     def of_frame(self, table: Float[Array, "frames pixels"]) -> Float[Array, "..."]:
         """The table's entries for the frames before the points."""
+
+    @abc.abstractmethod
+    def of_piece_alone(self, values: Float[Array, " pieces"], pixels: int) -> Float[Array, "..."]:
+        """The values of the points' pieces, equal for all pixels."""
 
 
 class EventPoints(Points):
@@ -83,18 +87,25 @@ class EventPoints(Points):
     def of_frame(self, table: Float[Array, "frames pixels"]) -> Float[Array, "..."]:
         return table.reshape(-1).at[self.level].get(mode="clip")
 
+    def of_piece_alone(self, values: Float[Array, " pieces"], pixels: int) -> Float[Array, "..."]:
+        return values.at[self.cell // pixels].get(mode="clip")
+
 
 class ImagePoints(Points):
     """All pixels at a few times; weights are (times, 1)."""
 
     piece: Int[Numeric, " times"]
     level: Int[Numeric, " times"]
+    elapsed: Float[Numeric, " times"]  # s since mid-exposure of the frame before; negative: none is
 
     def of_piece(self, table: Float[Array, "pieces pixels"]) -> Float[Array, "..."]:
         return table.at[self.piece].get(mode="clip")
 
     def of_frame(self, table: Float[Array, "frames pixels"]) -> Float[Array, "..."]:
         return table.at[self.level].get(mode="clip")
+
+    def of_piece_alone(self, values: Float[Array, " pieces"], pixels: int) -> Float[Array, "..."]:
+        return values.at[self.piece].get(mode="clip")[:, None]
 
 
 class Tiles(eqx.Module):
@@ -115,8 +126,8 @@ class Segments(eqx.Module):
     cell: Int[Numeric, " segments"]  # frame * pixels + pixel
     share: Float[Numeric, " segments"]  # of the exposure that the segment fills
     edge: Float[Numeric, " segments"]  # growth of `share` per second of later frame clock
-    on: Int[Numeric, " segments"]  # ON events between mid-exposure and the segment, negative before
-    off: Int[Numeric, " segments"]
+    on: Float[Numeric, " segments"]  # ON events from mid-exposure to the segment, negative before
+    off: Float[Numeric, " segments"]
 
 
 class FrameFeatures(eqx.Module):
@@ -127,16 +138,31 @@ class FrameFeatures(eqx.Module):
     from the window's start to the first right edge.
     """
 
-    grey: Float[Numeric, "frames pixels"]
-    span: Int[Numeric, "2 frames pixels"]  # ON, OFF
-    before: Int[Numeric, "2 pixels"]
-    head: Int[Numeric, "2 frames pixels"] | None  # None where no exposure is known
-    tail: Int[Numeric, "2 frames pixels"] | None
+    grey: Float[Numeric, "frames pixels"]  # in [0, 1], as the camera gave it
+    intensity: Float[Numeric, "frames pixels"]  # the grey values through the inverse response
+    certainty: Float[Numeric, "frames pixels"]  # w of the response, at most 1
+    response: Float[Numeric, " 256"]  # intensities of evenly spaced grey values
+    gain: Float[Numeric, " frames"]  # the frames' exposure relative to the common one
+    span: Float[Numeric, "2 frames pixels"]  # ON, OFF
+    before: Float[Numeric, "2 pixels"]
+    head: Float[Numeric, "2 frames pixels"] | None  # None where no exposure is known
+    tail: Float[Numeric, "2 frames pixels"] | None
     segments: Segments | None
     piece_rate: Float[Numeric, " pieces"]  # d weight / dt of each piece, 1/s
     level_rate: Float[Numeric, " frames"]  # d blend / dt after each frame, 1/s
     present: Float[Numeric, ""]  # 1, or 0 if the recording has no frames
+    rows: Int[Numeric, " 3"]  # number of frames; rows of the last one before, of the next's first
     clock_offset: Float[Numeric, ""]  # s, for which the positions were prepared
+
+
+class Growth(eqx.Module):
+    """Derivatives of event counts with respect to the dead time `rho_ref` (1/s), array by array.
+
+    Counts are made for one dead time; around it they are continued linearly.
+    """
+
+    counts: list[Float[Numeric, "..."]]
+    rho_ref: Float[Numeric, ""]  # s, for which the counts were made
 
 
 class Features(eqx.Module):
@@ -146,6 +172,18 @@ class Features(eqx.Module):
     tiles: Tiles | None  # None where the estimator does not filter
     start: ImagePoints  # every pixel at the recording's start
     last: Int[Numeric, " pixels"]  # the slot of each pixel's last event, -1 if it has none
+    growth: Growth | None = None
+
+    def counts(self) -> list[Any]:
+        """The arrays that count events."""
+        f, s = self.frames, self.frames.segments
+        tiles = [] if self.tiles is None else [self.tiles.points.on, self.tiles.points.off]
+        exposed = [] if s is None else [f.head, f.tail, s.on, s.off]
+        return [f.span, f.before, *exposed, *tiles]
+
+    def at(self, rho_ref: Array) -> "Features":
+        """The features for a dead time near the one that they were made for."""
+        return _grown(self, rho_ref)
 
 
 class ReadOut(eqx.Module):
@@ -154,6 +192,45 @@ class ReadOut(eqx.Module):
     points: ImagePoints
     slot: Int[Numeric, "times pixels"]  # of the pixel's last event in the window, -1 if none
     since: Float[Numeric, "times pixels"]  # s since the pixel's last event
+    growth: Growth | None = None
+
+    def counts(self) -> list[Any]:
+        """The arrays that count events."""
+        return [self.points.on, self.points.off]
+
+    def at(self, rho_ref: Array) -> "ReadOut":
+        """The read-out for a dead time near the one that it was made for."""
+        return _grown(self, rho_ref)
+
+
+Counting = TypeVar("Counting", Features, ReadOut)
+
+
+def _grown(counting: Counting, rho_ref: Array) -> Counting:
+    growth = counting.growth
+    if growth is None:
+        return counting
+    change = rho_ref - growth.rho_ref
+    moved = [n + change * g for n, g in zip(counting.counts(), growth.counts, strict=True)]
+    return eqx.tree_at(lambda c: c.counts(), counting, moved)
+
+
+class Timing(NamedTuple):
+    """What preparation compares event times with (s); parameters of that name of every estimator.
+
+    `clock_offset` is added to the frames' time stamps, `exposure` is that of frames whose own is
+    not known, `rho_ref` a pixel's dead time after an event. An event after the gap dt at its pixel
+    stands for min(dt / (dt - rho_ref), 3) events: what happened in the dead time is lost.
+    """
+
+    clock_offset: float = 0.0
+    exposure: float = 0.0
+    rho_ref: float = 0.0
+
+    @classmethod
+    def of(cls, params: Any) -> "Timing":
+        """From an estimator's parameters, rounded to 10 ns: 7.5 ms is 7500 us in float32 too."""
+        return cls(*(round(float(getattr(params, name)), 8) for name in cls._fields))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,16 +250,17 @@ class Clock:
     offset: float  # s
 
     @classmethod
-    def of(cls, recording: Recording, clock_offset: float) -> "Clock":
-        # Rounded to 10 ns, so that 7.5 ms means 7500 us in float32 too.
-        offset = round(clock_offset * 1e8) / 100
+    def of(cls, recording: Recording, timing: Timing) -> "Clock":
+        offset = round(timing.clock_offset * 1e8) / 100
         frames = recording.frames
         if frames is None:
             none = np.empty(0)
             return cls(none, none, none, none, False, offset * 1e-6)
         mid = (frames.t - recording.start) + offset
-        left, right = mid - frames.exposure / 2, mid + frames.exposure / 2
-        exposed = bool((frames.exposure > 0).any())
+        unknown = round(timing.exposure * 1e8) / 100
+        exposure = np.where(frames.exposure > 0, frames.exposure, unknown)
+        left, right = mid - exposure / 2, mid + exposure / 2
+        exposed = bool((exposure > 0).any())
         breaks = mid
         if exposed:
             gap = np.sort([right[:-1], left[1:]], axis=0).clip(mid[:-1], mid[1:])
@@ -207,6 +285,10 @@ class Clock:
             _position(self.mid, level, time),
         )
 
+    def elapsed(self, time: NDArray, level: NDArray) -> NDArray:
+        """Seconds from the middle of the frames `level` to times in us; 0 without frames."""
+        return (time - self.mid[level]) * 1e-6 if len(self) else np.zeros(len(time))
+
 
 def _position(breaks: NDArray, i: NDArray, time: NDArray) -> NDArray:
     """How far `time` lies between breaks i and i + 1, 0 outside the first and last."""
@@ -223,15 +305,22 @@ class Carry:
 
     last: NDArray[np.int64]  # at each pixel
     near: NDArray[np.int64]  # in each pixel's neighbourhood, with a border of one pixel
+    # The first event of which the frames tell, and `last` before it; kept where events are weighted
+    # by the gap to the one before.
+    context: int = 0
+    last_then: NDArray[np.int64] | None = None
+    frames: int = 1  # how many frames of the recording windows have used
 
     @classmethod
-    def initial(cls, recording: Recording) -> "Carry":
+    def initial(cls, recording: Recording, weighted: bool = False) -> "Carry":
         pixels = recording.width * recording.height
         border = (recording.width + 2) * (recording.height + 2)
-        return cls(np.full(pixels, recording.start), np.full(border, recording.start))
+        last = np.full(pixels, recording.start)
+        then = last.copy() if weighted else None
+        return cls(last, np.full(border, recording.start), 0, then)
 
     def copy(self) -> "Carry":
-        return Carry(self.last.copy(), self.near.copy())
+        return Carry(self.last.copy(), self.near.copy(), self.context, self.last_then, self.frames)
 
 
 @dataclasses.dataclass
@@ -248,6 +337,7 @@ class Window:
     _origin: int
     _first_frame: int
     _before: Carry
+    _rho: float  # us, the dead time
     _counts: NDArray  # [2, pixels] ON and OFF at the window's start
     _reference: NDArray  # [frames, 2, pixels] ON and OFF at the left edge of each exposure
     _layout: "Layout | None"
@@ -270,7 +360,7 @@ class Reader:
         self._layout = window._layout or Layout.none(pixels)
         self._shapes = np.array(SHAPES)
         self._buffers = [
-            (*(_room((room, pixels), np.int32) for _ in range(3)), _room((room, pixels), dtype))
+            (_room((room, pixels), np.int32), *(_room((room, pixels), dtype) for _ in range(3)))
             for _ in range(2)
         ]
         self._dtype, self._pixels = dtype, pixels
@@ -282,10 +372,11 @@ class Reader:
         self._count, self._last = window._counts.copy(), window._before.last.copy()
         self._at, self._rank = np.full(pixels, -1, np.int32), np.zeros(pixels, np.int32)
 
-    def __call__(self, times: NDArray[np.int64]) -> ReadOut:
+    def __call__(self, times: NDArray[np.int64], growth: bool = False) -> ReadOut:
         """Images at sorted times (us) inside the window, padded to `room`.
 
-        The arrays are overwritten by the call after the next.
+        With `growth` counts are derivatives with respect to the dead time. The arrays are
+        overwritten by the call after the next.
         """
         window = self.window
         clock, layout, events = window._clock, self._layout, window._events
@@ -299,7 +390,7 @@ class Reader:
             window._layout is not None, times, clock.frame(piece) - window._first_frame,
             window._reference, window._counts, self._count, self._last, self._at, self._rank,
             layout.kind, layout.lane, layout.round_tile, layout.round_first, self._shapes,
-            slot, since, on, off,
+            window._rho, growth, slot, since, on, off,
         )  # fmt: skip
         self._time = times[-1] if len(times) else self._time
 
@@ -315,6 +406,7 @@ class Reader:
             off,
             row(piece, np.int32, _first_piece(clock, window._first_frame)),
             row(level, np.int32, window._first_frame),
+            row(clock.elapsed(times - window._origin, level), self._dtype),
         )
         return ReadOut(points, slot, since)
 
@@ -383,8 +475,8 @@ class Layout:
 class Windows:
     """Cuts a recording into time windows and prepares them.
 
-    `clock_offset` (s) is added to the frames' time stamps. `events` bounds a window's events;
-    `filtering=False` prepares what reading frames and event counts needs, without tiles. With
+    `events` bounds a window's events; `filtering=False` prepares what reading frames and event
+    counts needs, without tiles; with `growth` counts are derivatives by the dead time. With
     `reuse` a window's tiles are written over the last one's: fresh memory costs 0.5 ms per MB here,
     a third of the preparation. Only for who is done with one window before asking for the next.
     """
@@ -392,32 +484,38 @@ class Windows:
     def __init__(
         self,
         recording: Recording,
-        clock_offset: float = 0.0,
+        timing: Timing = Timing(),  # noqa: B008
         *,
         filtering: bool = True,
         events: int = WINDOW_EVENTS,
         reuse: bool = False,
+        growth: bool = False,
     ):
         self.recording, self.filtering, self.events = recording, filtering, events
-        self.clock = Clock.of(recording, clock_offset)
+        self.clock = Clock.of(recording, timing)
+        self.rho, self.growth = round(timing.rho_ref * 1e8) / 100, growth
+        # Whole events are counted in integers, weighted ones in double precision.
+        self.count_dtype = np.dtype(np.float64 if self.rho else np.int32)
         self.pixels = recording.width * recording.height
         # Room for frames depends on the sensor only, to compile once: 16 frames of tables are
         # 60 MB at 346x260; larger sensors get fewer.
         self.frames = max(6, min(16, 6_000_000 // self.pixels))
         self.dtype = np.dtype(jnp.result_type(float))
         self.origin = recording.start
+        response, self._gain = recording.response, recording.gain
+        self._tables = (lambda grey: grey, response.intensity, response.certainty)
         self._memory: dict[str, NDArray] | None = {} if reuse else None
 
     def _tile_room(self, name: str, shape: tuple[int, ...], dtype: Any) -> NDArray:
-        """Memory for one field of the tiles, not cleared."""
+        """Memory for one field of the tiles, cleared unless it is used again."""
         if self._memory is None:
-            return _room(shape, dtype, empty=True)
+            return _room(shape, dtype)
         if name not in self._memory or self._memory[name].shape != shape:
             self._memory[name] = _room(shape, dtype, empty=True)
         return self._memory[name]
 
     def initial(self) -> Carry:
-        return Carry.initial(self.recording)
+        return Carry.initial(self.recording, self.rho > 0)
 
     def _stop(self, start: int | None) -> int | None:
         """Where the window that starts at `start` should end; None: at the recording's end."""
@@ -446,14 +544,10 @@ class Windows:
         source = self.recording.events
         begin = 0 if start is None else source.index(start)
         end = len(source) if stop is None else source.index(stop)
-        context, finish = begin, end
-        used = self._used(start, stop)
-        if used.start < used.stop:
-            # Of overlapping exposures, a later one may begin or an earlier one end further out.
-            left, _, right = self._edges(used)
-            context = min(context, source.index(int(left.min())))
-            finish = max(finish, source.index(int(right.max())))
+        context, finish = self._context(self._used(start, stop), begin, end)
         around = source[context:finish]
+        if before.last_then is not None:
+            before = self._moved(before, context)
         events = around[begin - context : end - context]
         while True:
             layout = self._layout(events)
@@ -463,10 +557,34 @@ class Windows:
             stop = middle
             events = events[: events.index(stop)]
 
+    def _context(self, used: slice, begin: int, end: int) -> tuple[int, int]:
+        """The rows of the events in the frames' exposures and from begin to end."""
+        if used.start < used.stop:
+            # Of overlapping exposures, a later one may begin or an earlier one end further out.
+            left, _, right = self._edges(used)
+            source = self.recording.events
+            begin = min(begin, source.index(int(left.min())))
+            end = max(end, source.index(int(right.max())))
+        return begin, end
+
+    def _moved(self, carry: Carry, context: int) -> Carry:
+        """The same, with each pixel's last event before the row `context`."""
+        last, row = carry.last_then, carry.context
+        assert last is not None
+        if row > context:
+            first = self.initial()
+            last, row = first.last, 0
+        last = last.copy()
+        while row < context:
+            part = self.recording.events[row : min(row + WINDOW_EVENTS, context)]
+            _latest(part.t, part.x, part.y, self.recording.width, last)
+            row += len(part)
+        return Carry(carry.last, carry.near, context, last, carry.frames)
+
     def whole(self) -> Window:
-        """The whole recording as one window, with room from a ladder of powers of two."""
+        """The whole recording as one window, with room from a ladder of steps by a quarter."""
         while self.frames < len(self.clock) + 2:
-            self.frames *= 2
+            self.frames += -(-self.frames // 4)
         if (2 * self.frames + 1) * self.pixels >= 2**31:
             raise InputError(
                 f"{self.recording.name}: {len(self.clock)} frames of {self.pixels} pixels are too "
@@ -474,7 +592,7 @@ class Windows:
             )
         self.events = 1 << 15
         while self.events < len(self.recording.events):
-            self.events *= 2
+            self.events += self.events // 4
         events = self.recording.events[:]
         return self._window(None, None, events, events, self._layout(events), self.initial())
 
@@ -524,18 +642,32 @@ class Windows:
         """The window of `events`; `around` holds those of all its frames' exposures too."""
         used = self._used(start, stop)
         opening = np.iinfo(np.int64).min if start is None else start
+        weight = np.ones(len(around), np.int8)
+        if before.last_then is not None:
+            weight = _weights(
+                around.t, around.x, around.y, self.recording.width, before.last_then.copy(),
+                self.rho, self.growth,
+            )  # fmt: skip
         edges, where = np.unique(
             np.concatenate([[opening], *self._edges(used)]).astype(np.int64), return_inverse=True
         )
-        snapshot = _snapshots(around.t, around.x, around.y, around.p, edges, *self._size())
+        snapshot = _snapshots(
+            around.t, around.x, around.y, around.p, weight, edges, self.recording.width,
+            np.zeros((2, self.pixels), self.count_dtype),
+        )  # fmt: skip
         at_start = snapshot[where[0]]
         at_left, at_mid, at_right = (snapshot[w] for w in np.split(where[1:], 3))
 
-        frames = self._frames(used, around, at_left, at_mid, at_right, at_start)
-        after, tiles, ends = before, None, np.full(self.pixels, -1, np.int32)
+        frames = self._frames(used, around, weight, at_left, at_mid, at_right, at_start)
+        onward = used.stop if stop is None else self._used(stop, stop).start
+        frames.rows[1:] = np.maximum([before.frames - 1 - used.start, onward - used.start], 0)
+        after, tiles, ends = before.copy(), None, np.full(self.pixels, -1, np.int32)
+        after.frames = max(used.stop, 1)
         if layout is not None:
-            after, ends = before.copy(), layout.slots()
+            ends = layout.slots()
             tiles = self._tiles(events, layout, after, used.start, at_left, at_start)
+        else:
+            _latest(events.t, events.x, events.y, self.recording.width, after.last)
         return Window(
             start,
             stop,
@@ -547,27 +679,27 @@ class Windows:
             self.origin,
             used.start,
             before,
+            self.rho,
             at_start,
             at_left,
             layout,
         )
 
-    def _size(self) -> tuple[int, int]:
-        return self.recording.width, self.pixels
-
     def _start(self) -> ImagePoints:
         """The recording's start, where no event has happened; only the first window uses it."""
         piece, level, weight, blend = self.clock.locate(np.zeros(1))
-        counts = np.zeros((1, self.pixels), np.int32)
+        counts = np.zeros((1, self.pixels), self.dtype)
         return ImagePoints(
             weight[:, None].astype(self.dtype), blend[:, None].astype(self.dtype), counts, counts,
             piece.astype(np.int32), level.astype(np.int32),
+            self.clock.elapsed(np.zeros(1), level).astype(self.dtype),
         )  # fmt: skip
 
     def _frames(
         self,
         used: slice,
         around: Events,
+        weight: NDArray,
         at_left: NDArray,
         at_mid: NDArray,
         at_right: NDArray,
@@ -575,24 +707,35 @@ class Windows:
     ) -> FrameFeatures:
         clock, room, pixels, dtype = self.clock, self.frames, self.pixels, self.dtype
         n = len(at_left)
-        grey = _room((room, pixels), dtype)
-        grey[:] = 0.5
-        span = _room((2, room, pixels), np.int32)
-        before = np.zeros((2, pixels), np.int32)
+        grey, intensity, certainty = (_room((room, pixels), dtype) for _ in range(3))
+        grey[:], intensity[:] = 0.5, 0.5
+        gain = np.ones(room, dtype)
+        span = _room((2, room, pixels), dtype)
+        before = np.zeros((2, pixels), dtype)
         if n:
             assert self.recording.frames is not None
-            images = self.recording.frames[used].intensity.reshape(n, pixels)
-            grey[:n], grey[n:] = images, images[-1]
+            images = np.asarray(self.recording.frames[used].images).reshape(n, pixels)
+            for table, out in zip(self._tables, (grey, intensity, certainty), strict=True):
+                if images.dtype.kind == "f":
+                    out[:n] = table(jnp.asarray(images))
+                else:
+                    levels = np.arange(np.iinfo(images.dtype).max + 1)
+                    entries = table(jnp.asarray(levels / levels[-1]))
+                    np.take(np.asarray(entries, dtype), images, out=out[:n])
+                out[n:] = out[n - 1]
+            gain[:n] = self._gain[used]
+            intensity[:n] /= gain[:n, None]
+            intensity[n:] = intensity[n - 1]
             span[:, : n - 1] = (at_right[1:] - at_left[:-1]).swapaxes(0, 1)
             before[:] = at_right[0] - (at_start if used.start == 0 else 0)
         head = tail = segments = None
         pieces = room + 1
         if clock.exposed:
             pieces = 2 * room + 1
-            head, tail = (_room((2, room, pixels), np.int32) for _ in range(2))
+            head, tail = (_room((2, room, pixels), dtype) for _ in range(2))
             head[:, :n] = (at_mid - at_left).swapaxes(0, 1)
             tail[:, :n] = (at_right - at_mid).swapaxes(0, 1)
-            segments = self._segments(used, around)
+            segments = self._segments(used, around, weight)
         breaks = clock.breaks[_first_piece(clock, used.start) :]
 
         def rates(times: NDArray, size: int, first: int) -> NDArray:
@@ -603,6 +746,10 @@ class Windows:
 
         return FrameFeatures(
             grey,
+            intensity,
+            certainty,
+            np.asarray(self._tables[1](jnp.linspace(0, 1, 256)), dtype),
+            gain,
             span,
             before,
             head,
@@ -611,10 +758,11 @@ class Windows:
             rates(breaks, pieces, 1),
             rates(clock.mid[used], room, 0),
             np.asarray(float(n > 0), dtype),
+            np.array([n, 0, 0], np.int32),
             np.asarray(clock.offset, dtype),
         )
 
-    def _segments(self, used: slice, around: Events) -> Segments:
+    def _segments(self, used: slice, around: Events, weight: NDArray) -> Segments:
         clock, parts = self.clock, []
         exact = np.stack([clock.left[used], clock.mid[used], clock.right[used]], axis=1)
         for row, edges in enumerate(np.stack(self._edges(used), axis=1)):
@@ -623,13 +771,16 @@ class Windows:
                 part = around[i:j]
                 t = part.t - self.origin
                 parts.append(
-                    _exposure(t, part.x, part.y, part.p, m - i, row, exact[row], *self._size())
+                    _exposure(
+                        t, part.x, part.y, part.p, weight[i:j], m - i, row, exact[row],
+                        self.recording.width, np.zeros((2, self.pixels), self.count_dtype),
+                    )  # fmt: skip
                 )
         total = sum(len(part[0]) for part in parts)
         room = 1 << 14
         while room < total:
             room *= 8
-        kinds = (np.int32, self.dtype, self.dtype, np.int32, np.int32)
+        kinds = (np.int32, self.dtype, self.dtype, self.dtype, self.dtype)
         fields = []
         for f, kind in enumerate(kinds):
             field = _room((room,), kind)
@@ -658,9 +809,11 @@ class Windows:
         room = (max(len(events), self.events),)
         key, near = self._tile_room("key", room, np.int64), self._tile_room("near", room, dtype)
         shape = (layout.room, SLOTS)
-        # Not cleared: `_fill` clears what used tiles leave empty, unused tiles are skipped.
+        # `_fill` clears what used tiles leave empty, unused tiles are skipped. (Derivatives are taken
+        # of all tiles, where nothing but numbers may lie: then the memory is fresh, so cleared.)
         floats = [self._tile_room(f"float {i}", shape, dtype) for i in range(4)]
-        counts = [self._tile_room(f"int {i}", shape, np.int32) for i in range(4)]
+        places = [self._tile_room(f"int {i}", shape, np.int32) for i in range(2)]
+        counts = [self._tile_room(f"count {i}", shape, dtype) for i in range(2)]
         polarity = self._tile_room("polarity", shape, np.int8)
         kind = np.full(layout.room, len(SHAPES), np.int32)
         lane = np.zeros(layout.room, np.int32)
@@ -671,8 +824,8 @@ class Windows:
         begins = clock.left[first_frame:]
         # Where a piece begins with its exposure, the counts at its begin are those of the stream.
         aligned = begins == (breaks[::2] if clock.exposed else breaks)
-        places = (
-            self.origin, carry.last, at_start, reference, breaks, _rate(breaks),
+        known = (
+            self.origin, self.rho, self.growth, carry.last, at_start, reference, breaks, _rate(breaks),
             clock.mid[first_frame:], _rate(clock.mid[first_frame:]), aligned, clock.exposed,
         )  # fmt: skip
         with ThreadPoolExecutor(WORKERS) as pool:
@@ -693,7 +846,7 @@ class Windows:
                 rounds = layout.round_tile[layout.round_first[k] :]
                 part = (
                     ranks, across, mine, first[begin : begin + len(mine) + 1], rounds, k, offset,
-                    kind, lane, key, near, *places, *floats, *counts, polarity,
+                    kind, lane, key, near, *known, *floats, *places, *counts, polarity,
                 )  # fmt: skip
 
                 def fill(job: int, jobs: int = blocks * across // 64, part: tuple = part) -> None:
@@ -703,7 +856,7 @@ class Windows:
                 begin += len(mine)
                 offset += -(-pixels // across) * across
         since, gap, weight, blend = floats
-        cell, level, on, off = counts
+        (cell, level), (on, off) = places, counts
         points = EventPoints(weight, blend, on, off, cell, level)
         return Tiles(lanes, kind, lane, points, since, gap, polarity)
 
@@ -715,14 +868,23 @@ def _rate(breaks: NDArray) -> NDArray:
 
 
 def prepare(
-    recording: Recording, times: Times, clock_offset: float = 0.0
+    recording: Recording,
+    times: Times,
+    clock_offset: float | int = 0.0,
+    exposure: float | int = 0.0,
+    rho_ref: float | int = 0.0,
+    *,
+    filtering: bool = True,
 ) -> tuple[Features, ReadOut]:
     """A whole recording on the device, for `run`, and points of images at `times`, for `read`.
 
-    `times` are sorted, integers in us or floats in s on the recording's clock. `clock_offset` (s)
-    is added to the frames' time stamps; the estimators' parameter of that name may then move away
-    from it, and derivatives with respect to it hold between the instants at which an edge of an
-    exposure passes an event. Raises `InputError` for times that are not sorted.
+    `times` are sorted, integers in us or floats in s on the recording's clock. `clock_offset`,
+    `exposure` and `rho_ref` (s, see `Timing`) must be those of the parameters to run with;
+    `method.prepare(recording, times, params)` takes them from there. Derivatives with respect to
+    `clock_offset` hold between the instants at which an edge of an exposure passes an event, those
+    by a positive `rho_ref` are exact, those by `exposure` are 0. Without `filtering` the features
+    serve methods that do not pass over single events. Raises `InputError` for times that are not
+    sorted.
 
         features, out = prepare(recording, times)
         trajectory, _ = akf.run(params, features)
@@ -731,10 +893,24 @@ def prepare(
     times = np.atleast_1d(microseconds(times))
     if (times[1:] < times[:-1]).any():
         raise InputError("the times of images to prepare are not sorted; sort them")
-    windows = Windows(recording, clock_offset)
-    window = windows.whole()
-    out = window.reader(len(times), windows.dtype)(times)
-    return jax.device_put((window.features, out))
+    timing = Timing(*(round(float(v), 8) for v in (clock_offset, exposure, rho_ref)))
+
+    def made(growth: bool) -> tuple[Features, ReadOut]:
+        windows = Windows(recording, timing, filtering=filtering, growth=growth)
+        window = windows.whole()
+        assert window.features is not None
+        return window.features, window.reader(len(times), windows.dtype)(times, growth)
+
+    features, out = made(False)
+    if timing.rho_ref:
+        rho = np.asarray(timing.rho_ref, features.frames.grey.dtype)
+        features, out = (
+            eqx.tree_at(
+                lambda v: v.growth, value, Growth(by.counts(), rho), is_leaf=lambda v: v is None
+            )
+            for value, by in zip((features, out), made(True), strict=True)
+        )
+    return jax.device_put((features, out))
 
 
 def _compiled(function: Callable) -> Any:
@@ -768,32 +944,58 @@ def _busiest_first(counts):
 
 
 @_compiled
-def _snapshots(t, x, y, p, edges, width, pixels):
+def _stands_for(gap, rho, growth):
+    """How many events one after the gap (us) at its pixel stands for; `growth`: d / d rho, 1/s."""
+    if rho == 0:
+        return 1.0
+    if gap <= 1.5 * rho:
+        return 0.0 if growth else 3.0
+    rest = gap - rho
+    return 1e6 * gap / (rest * rest) if growth else gap / rest
+
+
+@_compiled
+def _latest(t, x, y, width, last):
+    for i in range(len(t)):
+        last[np.int64(y[i]) * width + x[i]] = t[i]
+
+
+@_compiled
+def _weights(t, x, y, width, last, rho, growth):
+    """What each event stands for; `last` holds the times of the events before, at each pixel."""
+    out = np.empty(len(t), np.float64)
+    for i in range(len(t)):
+        pixel = np.int64(y[i]) * width + x[i]
+        out[i] = _stands_for(t[i] - last[pixel], rho, growth)
+        last[pixel] = t[i]
+    return out
+
+
+@_compiled
+def _snapshots(t, x, y, p, weight, edges, width, now):
     """ON and OFF events of each pixel earlier than each edge: [edges, 2, pixels]."""
-    out = np.zeros((len(edges), 2, pixels), np.int32)
+    out = np.zeros((len(edges), 2, now.shape[1]), now.dtype)
     if len(edges) == 0:
         return out
-    now = np.zeros((2, pixels), np.int32)
     i = 0
     for e in range(len(edges)):
         while i < len(t) and t[i] < edges[e]:
-            now[0 if p[i] else 1, np.int64(y[i]) * width + x[i]] += 1
+            now[0 if p[i] else 1, np.int64(y[i]) * width + x[i]] += weight[i]
             i += 1
         out[e] = now
     return out
 
 
 @_compiled
-def _exposure(t, x, y, p, middle, row, edges, width, pixels):
+def _exposure(t, x, y, p, weight, middle, row, edges, width, count):
     """Segments of constant brightness within one exposure; events `middle` on lie after its mid."""
-    n = len(t)
+    n, pixels = len(t), count.shape[1]
     length = edges[2] - edges[0]
     cell = np.empty(n, np.int64)
     share, edge = np.zeros(n), np.zeros(n)
-    on, off = np.zeros(n, np.int32), np.zeros(n, np.int32)
+    on, off = np.zeros(n), np.zeros(n)
     for i in range(n):
         cell[i] = row * pixels + np.int64(y[i]) * width + x[i]
-    count = np.zeros((2, pixels), np.int32)
     bound = np.full(pixels, edges[0])
     for i in range(middle):  # from the previous event to this one
         pixel = cell[i] - row * pixels
@@ -803,7 +1005,7 @@ def _exposure(t, x, y, p, middle, row, edges, width, pixels):
         bound[pixel] = t[i]
     for i in range(middle - 1, -1, -1):
         pixel = cell[i] - row * pixels
-        count[0 if p[i] else 1, pixel] -= 1
+        count[0 if p[i] else 1, pixel] -= weight[i]
         on[i], off[i] = count[0, pixel], count[1, pixel]
     count[:] = 0
     bound[:] = edges[2]
@@ -815,7 +1017,7 @@ def _exposure(t, x, y, p, middle, row, edges, width, pixels):
         bound[pixel] = t[i]
     for i in range(middle, n):
         pixel = cell[i] - row * pixels
-        count[0 if p[i] else 1, pixel] += 1
+        count[0 if p[i] else 1, pixel] += weight[i]
         on[i], off[i] = count[0, pixel], count[1, pixel]
     return cell, share, edge, on, off
 
@@ -850,7 +1052,7 @@ def _sort(t, x, y, p, width, top, bottom, origin, cursor, latest, key, near):
 @_compiled
 def _fill(
     first_job, step, jobs, ranks, width, lanes, first, round_tile, shape, offset, kind, lane_of,
-    key, gap, origin, last, at_start, reference, breaks, piece_rate, mids, level_rate, aligned,
+    key, gap, origin, rho, growth, last, at_start, reference, breaks, piece_rate, mids, level_rate, aligned,
     exposed, since, near, weight, blend, cell, level, on, off, polarity,
 ):  # fmt: skip
     """Write the slots of 64 lanes at a time: 64 sequential streams in, whole cache lines out."""
@@ -858,8 +1060,8 @@ def _fill(
     pixels = at_start.shape[1]
     piece_at = np.empty(64, np.int64)
     level_at = np.empty(64, np.int64)
-    count_on, count_off = np.empty(64, np.int32), np.empty(64, np.int32)
-    own_on, own_off = np.empty(64, np.int32), np.empty(64, np.int32)
+    count_on, count_off = np.empty(64, at_start.dtype), np.empty(64, at_start.dtype)
+    own_on, own_off = np.empty(64, at_start.dtype), np.empty(64, at_start.dtype)
     before = np.empty(64, np.int64)
     pieces, frames = len(breaks), len(mids)
     for job in range(first_job, jobs, step):
@@ -913,6 +1115,7 @@ def _fill(
                     frame += 1
                 level_at[k] = frame
                 since[tile, slot] = (now - before[k]) * 1e-6
+                events = _stands_for(now - before[k], rho, growth)
                 before[k] = now
                 near[tile, slot] = gap[event]
                 w = 0.0
@@ -928,9 +1131,9 @@ def _fill(
                 on[tile, slot] = count_on[k] - own_on[k]
                 off[tile, slot] = count_off[k] - own_off[k]
                 if up:
-                    count_on[k] += 1
+                    count_on[k] += events
                 else:
-                    count_off[k] += 1
+                    count_off[k] += events
                 polarity[tile, slot] = 2 * up - 1
         for k in range(min(64, lane_count - lane0)):
             last[lanes[lane0 + k]] = before[k] + origin
@@ -939,14 +1142,14 @@ def _fill(
 @_compiled
 def _read(
     t, x, y, p, width, row, filtering, times, frame, reference, at_start, count, last, at, rank,
-    kind, lane, round_tile, round_first, shapes, slot, since, on, off,
+    kind, lane, round_tile, round_first, shapes, rho, growth, slot, since, on, off,
 ):  # fmt: skip
     """At each time, every pixel's last slot, the time since, and its counts in the piece."""
     pixels = len(last)
     for j in range(len(times)):
         while row < len(t) and t[row] <= times[j]:
             pixel = np.int64(y[row]) * width + x[row]
-            count[0 if p[row] else 1, pixel] += 1
+            count[0 if p[row] else 1, pixel] += _stands_for(t[row] - last[pixel], rho, growth)
             last[pixel] = t[row]
             if filtering:
                 k = kind[pixel]

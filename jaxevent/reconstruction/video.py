@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from jaxevent.errors import InputError
-from jaxevent.reconstruction.estimator import Estimator, P, State, Trajectory
-from jaxevent.reconstruction.pixels import WINDOW_EVENTS, Carry, Features, Reader, ReadOut, Windows
+from jaxevent.reconstruction.estimator import Estimator, P
+from jaxevent.reconstruction.pixels import WINDOW_EVENTS, Carry, Features, Reader, ReadOut, Timing, Windows
 from jaxevent.recording import Recording, Times, microseconds
 
 BEGINS = 32  # windows from which filtering can be taken up again
@@ -22,19 +22,17 @@ BATCH = 8  # images read per call; 8 x 90,000 pixels stay in the second-level ca
 
 # jax.jit returns before the result is there; eqx.filter_jit waits for it.
 @functools.partial(jax.jit, static_argnums=0)
-def _start(estimator: Estimator, params, features: Features) -> State:
+def _start(estimator: Estimator, params, features: Features):
     return estimator.start(params, features)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _run(
-    estimator: Estimator, params, features: Features, state: State
-) -> tuple[Trajectory, State]:
-    return estimator.run(params, features, state)
+def _run(estimator: Estimator, params, features: Features, state, future):
+    return estimator.run(params, features, state, future)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _read(estimator: Estimator, params, trajectory: Trajectory, out: ReadOut):
+def _read(estimator: Estimator, params, trajectory, out: ReadOut):
     return estimator.read(params, trajectory, out)
 
 
@@ -43,7 +41,7 @@ class Begin(NamedTuple):
 
     start: int | None
     before: Carry
-    state: State | None
+    state: Any
 
     @property
     def time(self) -> float:
@@ -77,13 +75,14 @@ class Video(Generic[P]):
         self.progress = progress
         self._windows = Windows(
             recording,
-            float(params.clock_offset),
-            filtering=estimator.jump is not None,
+            Timing.of(params),
+            filtering=estimator.filters,
             events=window_events,
             reuse=True,
         )
         self._begins = [Begin(None, self._windows.initial(), None)]
-        self._open: tuple[Reader, Trajectory] | None = None
+        self._open: tuple[Reader, Any] | None = None
+        self._future: dict[int | None, Any] | None = None  # by the start of the window
 
     def __call__(self, times: Times) -> tuple[NDArray, NDArray]:
         """Intensity and variance of log intensity at `times`, each of shape (T, H, W).
@@ -148,13 +147,15 @@ class Video(Generic[P]):
                 "seconds, both on the recording's clock"
             )
 
-    def _window_of(self, time: int) -> tuple[Reader, Trajectory]:
+    def _window_of(self, time: int) -> tuple[Reader, Any]:
         """The filtered window that contains `time`; windows on the way are filtered in order."""
         if self._open is not None:
             reader, trajectory = self._open
             start, stop = reader.window.start, reader.window.stop
             if (start is None or start <= time) and (stop is None or time < stop):
                 return self._open
+        if self.estimator.looks_ahead and self._future is None:
+            self._look_ahead()
         begin = [b for b in self._begins if b.time <= time][-1]
         while True:
             self._open = None  # so that two windows are never held at once
@@ -163,14 +164,35 @@ class Video(Generic[P]):
             if stop is None or time < stop:
                 return self._open
 
-    def _filter(self, begin: Begin) -> tuple[tuple[Reader, Trajectory], Begin]:
+    def _look_ahead(self) -> None:
+        """Pass over all windows once, to know at each what later ones say."""
+        begin, starts, links = self._begins[0], [], []
+        with tqdm(
+            total=len(self.recording.events), unit="event", unit_scale=True, delay=2,
+            disable=not self.progress, leave=False,
+        ) as bar:  # fmt: skip
+            while True:
+                starts.append(begin.start)
+                (reader, trajectory), begin = self._filter(begin)
+                links.append((trajectory.link, trajectory.last))
+                bar.update(len(reader.window._events))
+                if reader.window.stop is None:
+                    break
+        message, future = links[-1][1], {starts[-1]: None}
+        for place in range(len(starts) - 1, 0, -1):
+            message = links[place][0].before(message)
+            future[starts[place - 1]] = message
+        self._future = future
+
+    def _filter(self, begin: Begin) -> tuple[tuple[Reader, Any], Begin]:
         """Prepare and filter the window that begins there; and where the next one begins."""
         window = self._windows.prepare(begin.start, begin.before)
         features, window.features = window.features, None  # used once, and large
         state = begin.state
         if state is None:
             state = _start(self.estimator, self.params, features)
-        trajectory, end = _run(self.estimator, self.params, features, state)
+        future = None if self._future is None else self._future[begin.start]
+        trajectory, end = _run(self.estimator, self.params, features, state, future)
         jax.block_until_ready(trajectory)  # before the next window's tiles overwrite these
         following = Begin(window.stop, window.after, end)
         if window.stop is not None and all(b.start != window.stop for b in self._begins):

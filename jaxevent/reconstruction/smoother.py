@@ -1,0 +1,316 @@
+"""The smoother: what all frames and events of a recording say about a pixel, before and after.
+
+A pixel's log intensity L is a random walk with known steps: an event moves it by s c and adds the
+variance (sigma_event c)^2, time adds sigma_bg^2 per second. Each frame measures it, deblurred, at
+mid-exposure, with variance r = (sigma_frame / w)^2 / (I + I0)^2 + sigma_floor^2. A clipped pixel of
+a frame is no measurement; it says only that L lies beyond the clip (one-sided evidence, a truncated
+Gaussian whose first two moments are kept).
+
+Between frames nothing but sums over events matters, so the recursions pass over frames, not events.
+Forward (Kalman filter) it carries mean and variance (m, P); backward (information filter) what
+later frames say, h and J: exp(h L - J L^2 / 2). Both together give mean and variance at any time,
+and the innovations of the forward pass the exact marginal likelihood of the frames, which needs no
+reference: all parameters can be fitted with it.
+"""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+from jax.scipy.special import log_ndtr
+
+from jaxevent.parameters import Choice, Positive
+from jaxevent.reconstruction.augment import (
+    CertaintyParams,
+    brightness,
+    certainty,
+    deblurred,
+    late,
+    unclipped,
+)
+from jaxevent.reconstruction.estimator import Estimator
+from jaxevent.reconstruction.pixels import Features, FrameFeatures, Numeric, ReadOut
+
+
+class Params(CertaintyParams):
+    """Parameters of the smoother."""
+
+    sigma_event = Positive(0.05, "c", "noise of an event's step, as part of its threshold")
+    sigma_bg = Positive(0.07, "ln I / sqrt(s)", "drift without events")
+    sigma_frame = Positive(0.01, "intensity", "noise of frames where the certainty w is 1")
+    sigma_floor = Positive(0.02, "ln I", "noise of frames in log intensity, however certain")
+    start = Positive(0.5, "intensity", "mean before the first frame")
+    P0 = Positive(4.0, "(ln I)^2", "variance before the first frame")
+    one_sided = Choice((True, False), "whether clipped frames tell that L lies beyond the clip")
+
+    def __init__(self, **values: Any):
+        super().__init__(**values)
+
+
+class Gaussian(eqx.Module):
+    """Mean and variance of the log intensity of pixels."""
+
+    m: Float[Numeric, "*pixels"]
+    P: Float[Numeric, "*pixels"]
+
+
+class Message(eqx.Module):
+    """What later frames say about the log intensity L of pixels: exp(h L - J L^2 / 2)."""
+
+    h: Float[Numeric, "*pixels"]
+    J: Float[Numeric, "*pixels"]
+
+    def earlier(self, S: Array, q: Array) -> "Message":
+        """The same about L before it moved by S with variance q."""
+        fade = 1 / (1 + q * self.J)
+        return Message((self.h - self.J * S) * fade, self.J * fade)
+
+    def __add__(self, other: "Message") -> "Message":
+        return Message(self.h + other.h, self.J + other.J)
+
+
+class Link(eqx.Module):
+    """How a message after several frames becomes one before them (Sarkka & Garcia-Fernandez 2021).
+
+    h' = h + A (h_later - J_later b) / (1 + C J_later), J' = J + A^2 J_later / (1 + C J_later).
+    """
+
+    A: Float[Numeric, "*pixels"]
+    b: Float[Numeric, "*pixels"]
+    C: Float[Numeric, "*pixels"]
+    h: Float[Numeric, "*pixels"]
+    J: Float[Numeric, "*pixels"]
+
+    def then(self, after: "Link") -> "Link":
+        """Both links in one, this one being the earlier."""
+        D = 1 + self.C * after.J
+        return Link(
+            self.A * after.A / D,
+            after.A * (self.b + self.C * after.h) / D + after.b,
+            after.A**2 * self.C / D + after.C,
+            self.A * (after.h - after.J * self.b) / D + self.h,
+            self.A**2 * after.J / D + self.J,
+        )
+
+    def before(self, later: Message) -> Message:
+        D = 1 + self.C * later.J
+        return Message(
+            self.h + self.A * (later.h - later.J * self.b) / D, self.J + self.A**2 * later.J / D
+        )
+
+
+class Rows(eqx.Module):
+    """The frames of a window as measurements, and the steps from each to the next."""
+
+    z: Float[Array, "frames pixels"]  # deblurred log intensity
+    r: Float[Array, "frames pixels"]  # its variance
+    clear: Float[Array, "frames pixels"]  # 1: a measurement; 0: none
+    side: Float[Array, "frames pixels"]  # +1, -1: L lies above, below `bound`; 0: nothing known
+    bound: Float[Array, "frames pixels"]
+    S: Float[Array, "frames pixels"]  # sum of s c until the next frame
+    q: Float[Array, "frames pixels"]  # variance that is added until then
+
+
+class Passage(eqx.Module):
+    """A smoothed window: enough to read an image at any time inside it."""
+
+    past: Gaussian  # [frames, pixels], after the frame
+    future: Message  # [frames, pixels], at the next frame, of that and all later ones
+    first: Message  # (pixels,), at the first frame, of everything
+    events: Float[Array, "2 frames pixels"]  # ON, OFF, from the frame to the next
+    frames: FrameFeatures
+    link: Link  # from the last frame of this window to the last one of the window before
+    last: Message  # (pixels,), of the last frame and all later ones
+    log_likelihood: Float[Array, " frames"]  # of the frames, a sum over pixels
+
+
+def rows_of(params: Params, frames: FrameFeatures) -> tuple[Rows, Float[Array, "2 frames pixels"]]:
+    """Measurements and steps; and the counts of ON and OFF events between mid-exposures."""
+    level = jnp.log(frames.intensity + params.I0)
+    z, counts = level, frames.span
+    if frames.head is not None and frames.tail is not None:
+        left, _ = deblurred(params, frames)
+        z = left + brightness(params, frames.head[0], frames.head[1])
+        counts = frames.span - frames.head - jnp.roll(frames.tail, -1, axis=1)
+    rate = jnp.asarray(frames.level_rate)
+    follows = (rate > 0)[:, None]  # another frame follows
+    exists = jnp.concatenate([jnp.asarray(frames.present)[None], (rate > 0)[:-1]])[:, None]
+    counts = jnp.where(follows, counts, 0)
+    gap = jnp.where(follows, 1 / jnp.where(follows, rate[:, None], 1), 0)
+    q = added(params, counts[0], counts[1], gap)
+    noise = params.sigma_frame / certainty(params, frames) / (frames.intensity + params.I0)
+    clear = unclipped(params, frames)
+    side = jnp.where(jnp.asarray(frames.grey) > 0.5, 1.0, -1.0) * (1 - clear) * params.one_sided
+    measured = Rows(
+        z,
+        noise**2 + params.sigma_floor**2,
+        clear * exists,
+        side * exists,
+        jnp.broadcast_to(bound_of(params, frames), z.shape),
+        brightness(params, counts[0], counts[1]),
+        jnp.broadcast_to(q, z.shape),
+    )
+    return measured, counts
+
+
+def bound_of(params: Params, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
+    """The log intensity at which pixels begin to clip: that of a grey `margin` from the end."""
+    place = jnp.clip(params.margin, 0, 127)
+    below = place.astype(int)
+    part = place - below
+    response = jnp.asarray(frames.response)
+    dark = (1 - part) * response[below] + part * response[below + 1]
+    bright = (1 - part) * response[255 - below] + part * response[254 - below]
+    bound = jnp.where(jnp.asarray(frames.grey) > 0.5, bright, dark)
+    return jnp.log(bound / jnp.asarray(frames.gain)[:, None] + params.I0)
+
+
+def added(params: Params, on: Array, off: Array, seconds: Array) -> Array:
+    """Variance that a stretch of time adds."""
+    events = params.c_on**2 * on + params.c_off**2 * off
+    return params.sigma_event**2 * events + params.sigma_bg**2 * seconds
+
+
+def beyond(state: Gaussian, row: Rows, floor: Array) -> tuple[Message, Array]:
+    """One-sided evidence as the message that keeps the first two moments; its log likelihood.
+
+    L is above the bound (side 1) with probability Phi(d), d = (m - bound) / sqrt(P + floor). The
+    moments of the truncated Gaussian are m + P lam / s and P - P^2 lam (lam + d) / s^2,
+    lam = phi(d) / Phi(d), s^2 = P + floor.
+
+    A Gaussian grows back the tail that a truncation took. A pixel that stays clipped would be
+    truncated again at every frame and drift away from the bound without end; so the evidence counts
+    by the sigmoid of -2 d: fully where the state contradicts it, not where it is known.
+    """
+    sign = jnp.sign(row.side)
+    s2 = state.P + floor
+    s = jnp.sqrt(s2)
+    d = jnp.clip(jnp.where(sign < 0, -1, 1) * (state.m - row.bound) / s, -100, 100)
+    log_Phi = log_ndtr(d)
+    lam = jnp.exp(-0.5 * d**2 - 0.9189385332046727 - log_Phi)
+    m = state.m + sign * state.P / s * lam
+    P = state.P * (1 - state.P / s2 * jnp.clip(lam * (lam + d), 0, 0.9999))
+    weight = jnp.abs(row.side) * jax.nn.sigmoid(-2 * d)
+    J = 1 / P - 1 / state.P
+    return Message(weight * (m / P - state.m / state.P), weight * J), weight * log_Phi
+
+
+def measure(params: Params, state: Gaussian, row: Rows) -> tuple[Gaussian, Message, Array]:
+    """The state after a frame, what the frame says, and the log likelihood of that."""
+    # A half clear pixel counts half: its variance is doubled.
+    J = row.clear / row.r
+    s2 = state.P + row.r
+    log_gauss = -0.5 * (jnp.log(2 * jnp.pi * s2) + (row.z - state.m) ** 2 / s2)
+    said, log_side = beyond(state, row, params.sigma_floor**2)
+    said = said + Message(J * row.z, J)
+    P = state.P / (1 + state.P * said.J)
+    # m + P (h - J m) is the information form's mean without its cancellation.
+    m = state.m + P * (said.h - said.J * state.m)
+    return Gaussian(m, P), said, row.clear * log_gauss + log_side
+
+
+@dataclasses.dataclass(frozen=True)
+class Smoother(Estimator[Params]):
+    """The estimator of this module."""
+
+    @property
+    def filters(self) -> bool:
+        return False
+
+    @property
+    def looks_ahead(self) -> bool:
+        return True
+
+    def start(self, params: Params, features: Features) -> Gaussian:
+        pixels = features.last.shape
+        mean = jnp.log(params.start + params.I0)
+        return Gaussian(jnp.broadcast_to(mean, pixels), jnp.broadcast_to(params.P0, pixels))
+
+    def run(
+        self,
+        params: Params,
+        features: Features,
+        state: Gaussian | None = None,
+        future: Message | None = None,
+    ) -> tuple[Passage, Gaussian]:
+        """As `Estimator.run`; the state is (pixels,), before the next window's first frame."""
+        frames = features.at(params.rho_ref).frames
+        rows, counts = rows_of(params, frames)
+        state = self.start(params, features) if state is None else state
+
+        def forth(at: Gaussian, row: Rows) -> tuple[Gaussian, Any]:
+            after, said, log_likelihood = measure(params, at, row)
+            return Gaussian(after.m + row.S, after.P + row.q), (at, after, said, log_likelihood)
+
+        _, (ahead, past, said, likelihood) = lax.scan(forth, state, rows)
+        number, anchor, onward = frames.rows
+        place = jnp.arange(len(rows.z))
+        last = jax.tree.map(lambda v: v[number - 1], said) if future is None else future
+
+        def back(later: Message, row: Any) -> tuple[Message, Message]:
+            i, own, S, q = row
+            here = later.earlier(S, q) + own
+            return jax.tree.map(lambda a, b: jnp.where(i == number - 1, a, b), last, here), later
+
+        steps = (place, said, rows.S, rows.q)
+        zero, one = jnp.zeros_like(state.m), jnp.ones_like(state.m)
+        first, later = lax.scan(back, Message(zero, zero), steps, reverse=True)
+
+        def compose(link: Link, row: Any) -> tuple[Link, None]:
+            i, own, S, q = row
+            longer = link.then(Link(one, S, q, own.h, own.J))
+            inside = (i >= anchor) & (i < number - 1)
+            return jax.tree.map(lambda a, b: jnp.where(inside, a, b), longer, link), None
+
+        link, _ = lax.scan(compose, Link(one, zero, zero, zero, zero), steps)
+        first = first + Message(state.m / state.P, 1 / state.P)
+        passage = Passage(past, later, first, counts, frames, link, last, likelihood.sum(1))
+        return passage, jax.tree.map(lambda v: v.at[onward].get(mode="clip"), ahead)
+
+    def read(
+        self, params: Params, trajectory: Passage, out: ReadOut
+    ) -> tuple[Float[Array, "times pixels"], Float[Array, "times pixels"]]:
+        points, frames = out.at(params.rho_ref).points, trajectory.frames
+        f = jnp.asarray(points.level)
+        rate = jnp.asarray(frames.level_rate)[f][:, None]
+        elapsed = jnp.asarray(points.elapsed)[:, None] - late(params, frames)
+        behind = jnp.asarray(points.elapsed)[:, None] < 0  # before the first frame
+
+        # ON and OFF events from the frame before to the point, and from the point to the frame
+        # after; known are those since the left edge of the piece's exposure, or, before the first
+        # one, since the window's start.
+        since = jnp.stack([points.on, points.off])
+        between = jnp.take(trajectory.events, f, axis=1)
+        before = jnp.asarray(frames.before)[:, None]
+        if frames.head is None or frames.tail is None:
+            until = jnp.where(behind, before - since, between - since)
+        else:
+            own = jnp.maximum((jnp.asarray(points.piece) - 1) // 2, 0)
+            head = jnp.take(jnp.asarray(frames.head), own, axis=1)
+            outside = (jnp.asarray(points.piece) == 0)[:, None]
+            first = jnp.where(outside, before - frames.tail[:, :1], head) - since
+            since = since - head + jnp.where((own > f)[:, None], between, 0)
+            until = jnp.where(behind, first, between - since)
+        gap = jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), 0)
+        seconds = jnp.where(behind, -elapsed, jnp.where(rate > 0, gap - elapsed, 0))
+
+        later = jax.tree.map(lambda v: v[f], trajectory.future)
+        later = jax.tree.map(lambda a, b: jnp.where(behind, a, b), trajectory.first, later)
+        later = later.earlier(brightness(params, *until), added(params, *until, seconds))
+        # Before the first frame there is no past: its variance is without bound.
+        m = jnp.where(behind, 0, trajectory.past.m[f] + brightness(params, *since))
+        P = trajectory.past.P[f] + added(params, *since, elapsed)
+        P = 1 / (jnp.where(behind, 0, 1 / jnp.where(behind, 1, P)) + later.J)
+        m = m + P * (later.h - later.J * m)
+        return jnp.exp(m) - params.I0, P
+
+    def log_likelihood(self, params: Params, features: Features) -> Float[Array, ""]:
+        """Of all frames of a prepared recording, given its events: a sum over frames and pixels."""
+        return self.run(params, features)[0].log_likelihood.sum()
+
+
+aks = Smoother("aks", Params)
