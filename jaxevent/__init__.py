@@ -9,6 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jaxevent import camera, colour, fit, metrics, simulate
     from jaxevent.errors import InputError
     from jaxevent.io import load, save
     from jaxevent.reconstruction import (
@@ -47,6 +48,7 @@ _HOME = {
         "last_frame",
     ),
 }
+_MODULES = ("camera", "colour", "fit", "metrics", "simulate")
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
@@ -59,18 +61,25 @@ __all__ = [
     "aks",
     "augmented",
     "blend",
+    "camera",
     "cf",
     "cf_augmented",
+    "colour",
     "edi",
+    "fit",
     "high_pass",
     "last_frame",
     "load",
+    "metrics",
     "prepare",
     "save",
+    "simulate",
 ]
 
 
 def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return importlib.import_module(f"jaxevent.{name}")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'jaxevent' has no attribute {name!r}")
     return getattr(importlib.import_module(_MODULE_OF[name]), name)

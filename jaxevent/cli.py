@@ -1,4 +1,4 @@
-"""The command line: `jaxevent demo | info | convert | reconstruct | evaluate`.
+"""The command line: `jaxevent demo | info | convert | reconstruct | evaluate | fit | simulate`.
 
 What cannot be used is said in one line on stderr, exit status 2. The libraries are imported by the
 command that needs them, so that help appears at once.
@@ -7,12 +7,14 @@ command that needs them, so that help appears at once.
 import argparse
 import contextlib
 import dataclasses
+import math
 import os
 import sys
 import textwrap
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import jaxevent
 from jaxevent.errors import InputError
@@ -110,13 +112,14 @@ def _parser() -> argparse.ArgumentParser:
         "images with images.txt.",
         "slider_depth.zip --method akf --rate 200 --out slider.mp4",
         "slider_depth.zip --method akf --at frames --params mine.toml --out slider.h5",
+        "bike.h5 --method akf --colour --tone log --out bike",
     )
     one.add_argument("path", metavar="PATH", type=Path, help="a recording")
     one.add_argument(
         "--method",
         metavar="NAME",
         required=True,
-        help="akf, cf, cf-augmented, high-pass, edi, augmented, blend or last-frame",
+        help="akf, aks, cf, cf-augmented, high-pass, edi, augmented, blend or last-frame",
     )
     when = one.add_mutually_exclusive_group()
     when.add_argument("--rate", metavar="HZ", type=float, help="images per second, evenly spaced")
@@ -125,12 +128,18 @@ def _parser() -> argparse.ArgumentParser:
         "--params",
         metavar="FILE",
         type=Path,
-        help="TOML file of name = value lines, e.g. c_on = 0.1",
+        help="TOML file of name = value lines, e.g. c_on = 0.1, or params.toml of a fit",
     )
     one.add_argument(
         "--tone",
         choices=["linear", "log", "percentile", "clahe"],
         help="how intensity becomes grey in PNG and MP4; default: linear",
+    )
+    one.add_argument(
+        "--colour",
+        action="store_true",
+        help="in the colours of the frames, for a recording that holds extra/rgb; in .h5 images "
+        "of red, green, blue without variance",
     )
     one.add_argument(
         "--out", metavar="DIR_or_FILE", type=Path, required=True, help="name in .h5, .mp4 or none"
@@ -145,6 +154,84 @@ def _parser() -> argparse.ArgumentParser:
     )
     one.add_argument("config", metavar="CONFIG.toml", type=Path, help="recordings and methods")
     one.add_argument("--out", metavar="DIR", type=Path, help="folder for results.json, results.md")
+
+    one = add(
+        fit,
+        "Fit parameters of methods to recordings. It writes them with tables of the errors before "
+        "and after, and prints the errors of images that it did not use. An interrupted fit goes "
+        "on with --resume.",
+        "configs/fit_slider_depth.toml --out fitted",
+        "configs/fit_slider_depth.toml --recording mine.h5 --out mine --resume",
+    )
+    one.add_argument("config", metavar="CONFIG.toml", type=Path, help="what to fit, and to what")
+    one.add_argument(
+        "--out", metavar="DIR", type=Path, required=True, help="folder for params.toml, results.md"
+    )
+    one.add_argument(
+        "--recording",
+        metavar="PATH",
+        dest="recordings",
+        action="append",
+        help="fitted to instead of those in the file; may be repeated",
+    )
+    one.add_argument("--resume", action="store_true", help="go on from the checkpoint in DIR")
+
+    one = add(
+        simulate,
+        "Make a recording whose truth is known, as HDF5. A simulated sensor looks at a drawn scene "
+        "of high dynamic range over which the camera moves, or at a video, of which the frames see "
+        "only the middle levels.",
+        "--scene lake --speed fast --out lake.h5",
+        "bike.mp4 --cut 50 --speed 0.5 --out bike.h5",
+    )
+    source = one.add_mutually_exclusive_group(required=True)
+    source.add_argument(
+        "video", metavar="VIDEO", nargs="?", type=Path, help="a video, or a folder of images"
+    )
+    source.add_argument(
+        "--scene",
+        metavar="NAME",
+        help="room, forest, mountain, lake, night, tunnel, or a number for a variant of one",
+    )
+    one.add_argument(
+        "--out", metavar="FILE", type=Path, required=True, help="the HDF5 file to write"
+    )
+    one.add_argument(
+        "--sensor",
+        metavar="NAME",
+        default="davis",
+        help="ideal, good, davis or poor; default: %(default)s",
+    )
+    one.add_argument("--seed", metavar="N", type=int, default=0, help="of all that is random")
+    one.add_argument(
+        "--speed",
+        metavar="SPEED",
+        help="of the camera over a scene, slow (default) or fast; of a video, 2: twice as fast",
+    )
+    one.add_argument(
+        "--duration",
+        metavar="S",
+        type=float,
+        help="seconds of a scene, default 1.5; of the video, before --speed, default all",
+    )
+    group = one.add_argument_group("only for a scene")
+    group.add_argument(
+        "--size", metavar="W,H", type=_size, help="sensor size in pixels; default: 128,96"
+    )
+    group = one.add_argument_group("only for a video")
+    group.add_argument("--start", metavar="S", type=float, help="first second used; default: 0")
+    group.add_argument(
+        "--cut",
+        metavar="LEVELS",
+        type=float,
+        help="levels of 255 that the frames crop at either end, 0 to 127; default: 50",
+    )
+    group.add_argument(
+        "--max-size",
+        metavar="PIXELS",
+        type=int,
+        help="longer side, to which a larger video is scaled down; default: 346",
+    )
     return parser
 
 
@@ -169,6 +256,16 @@ def evaluate(config: Path, out: Path | None) -> None:
         print(f"\nwritten to {out}: results.json, results.md, config.toml")
 
 
+def fit(config: Path, out: Path, recordings: list[str] | None, resume: bool) -> None:
+    from jaxevent.fit import fit as run
+    from jaxevent.fit import unseen
+    from jaxevent.report import markdown_table
+
+    print(markdown_table(unseen(run(config, out, recordings, resume, _progress()))), end="")
+    files = "params.toml, results.json, results.md, loss.csv, loss.png, config.toml"
+    print(f"\nwritten to {out}: {files}")
+
+
 def convert(
     source: Path, target: Path, compression: str | None, size: tuple[int, int] | None
 ) -> None:
@@ -176,9 +273,13 @@ def convert(
 
     recording = load(source, size, in_memory=False, progress=_progress())
     save(recording, target, compression, progress=_progress())
+    _print_stored(recording, target)
+
+
+def _print_stored(recording: Any, path: Path) -> None:
     frames = len(recording.frames) if recording.frames else 0
-    size_mb = target.stat().st_size / 1e6
-    print(f"{target}: {len(recording.events):,} events, {frames} frames, {size_mb:.1f} MB")
+    size_mb = path.stat().st_size / 1e6
+    print(f"{path}: {len(recording.events):,} events, {frames} frames, {size_mb:.1f} MB")
 
 
 def reconstruct(
@@ -189,8 +290,10 @@ def reconstruct(
     params: Path | None,
     size: tuple[int, int] | None,
     tone: str | None,
+    colour: bool,
     out: Path,
 ) -> None:
+    from jaxevent.colour import colour_video
     from jaxevent.evaluate import find_method, frame_times
     from jaxevent.export import evenly, write_hdf5, writer
     from jaxevent.io import load
@@ -199,7 +302,7 @@ def reconstruct(
     if tone is not None and write is write_hdf5:
         raise InputError(f"{out}: --tone is for images to look at; HDF5 holds linear intensity")
     estimator = find_method(method)
-    values = estimator.Params() if params is None else estimator.Params.load(params)
+    values = estimator.Params() if params is None else estimator.Params.load(params, method)
     recording = load(path, size, in_memory=False, progress=_progress())
     name = recording.name
     recording = dataclasses.replace(recording, name=str(path))  # for messages
@@ -211,12 +314,72 @@ def reconstruct(
         times = evenly(recording, 100.0 if rate is None else rate)
     clock = time.perf_counter()
     video = estimator.reconstruct(recording, values, progress=_progress())
-    how = write(video, times, out, tone or "linear", name)
+    colours = colour_video(video, recording) if colour else None
+    how = write(video, times, out, tone or "linear", name, colours)
     seconds = time.perf_counter() - clock
     print(
         f"{out}: {len(times):,} images{how}, {seconds:.2f} s, "
         f"{len(recording.events) / seconds:,.0f} events/s"
     )
+
+
+def simulate(
+    video: Path | None,
+    scene: str | None,
+    out: Path,
+    sensor: str,
+    seed: int,
+    speed: str | None,
+    duration: float | int | None,
+    size: tuple[int, int] | None,
+    start: float | int | None,
+    cut: float | int | None,
+    max_size: int | None,
+) -> None:
+    from jaxevent import simulate as sim
+    from jaxevent.io import save
+    from jaxevent.io.output import complete
+    from jaxevent.parameters import nearest
+    from jaxevent.simulate.scenes import SPEEDS
+
+    if sensor not in sim.SENSORS:
+        raise InputError(f"there is no sensor {sensor!r}; {nearest(sensor, sim.SENSORS)}")
+    if seed < 0:
+        raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
+    if duration is not None and not 0 < duration < math.inf:
+        raise InputError(f"--duration {duration:g} is not possible; give seconds above 0")
+    given: dict[str, Any] = {"start": start, "cut": cut, "max_size": max_size}
+    given = {name: value for name, value in given.items() if value is not None}
+    # Opened first, so that a place that cannot be written is told before the work.
+    with complete(out) as partial:
+        if scene is not None:
+            if given:
+                option = next(iter(given)).replace("_", "-")
+                raise InputError(f"--{option} is for a video; leave it out with --scene")
+            if size is not None and min(size) < 1:
+                raise InputError(f"--size {size[0]},{size[1]} is not possible; give it in pixels")
+            way: Any = speed or "slow"
+            if way not in SPEEDS:
+                raise InputError(f"--speed {way} is not possible for a scene; give slow or fast")
+            panorama = sim.scene(int(scene) if scene.isdecimal() else scene)
+            source = sim.Pan(panorama, size or (128, 96), duration or 1.5, way, seed)
+            recording = sim.simulate(source, sim.SENSORS[sensor], seed, f"{scene}-{way}")
+        else:
+            assert video is not None
+            if size is not None:
+                raise InputError("--size is for a scene; scale a video with --max-size")
+            try:
+                factor = float(speed or 1)
+            except ValueError:
+                raise InputError(
+                    f"--speed {speed} is for a scene; give a video a number, such as 0.5"
+                ) from None
+            stop = None if duration is None else (start or 0.0) + duration
+            recording = sim.from_video(
+                video, sim.SENSORS[sensor], speed=factor, stop=stop, seed=seed, **given
+            )
+        save(recording, partial)
+    _print_stored(recording, out)
 
 
 def info(path: Path, size: tuple[int, int] | None) -> None:

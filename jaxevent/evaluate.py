@@ -8,6 +8,7 @@
     [[method]]
     name = "akf"                                    # a key of jaxevent.METHODS
     params = { c_on = 0.08, clock_offset = 0.0075 } # or the path of a TOML file; omitted: defaults
+                                                    # { file = "PATH", c_on = 0.08 }: both
     label = "akf, by hand"                          # in the table; omitted: the name
 
 Paths are relative to the folder of this file. The protocol "held-out" gives the methods frames 0,
@@ -529,7 +530,7 @@ def read_plan(config: Path) -> Plan:
         if not (isinstance(metrics, list) and all(isinstance(name, str) for name in metrics)):
             raise InputError(f'metrics is {metrics!r}; give a list of names, as ["lpips"]')
         _check_measures(metrics)
-        recordings = _recordings(table.get("recordings"), config.parent)
+        recordings = find_recordings(table.get("recordings"), config.parent)
         return Plan(
             recordings,
             _methods(table.get("method"), config.parent),
@@ -541,7 +542,7 @@ def read_plan(config: Path) -> Plan:
         raise InputError(f"{config}: {error}") from None
 
 
-def _recordings(given: Any, folder: Path) -> list[tuple[str, Path]]:
+def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path]]:
     if not (isinstance(given, list) and given and all(isinstance(one, str) for one in given)):
         raise InputError('recordings is missing or not a list; give recordings = ["file.zip", ...]')
     found: dict[Path, str] = {}
@@ -577,7 +578,13 @@ def _methods(given: Any, folder: Path) -> list[tuple[str, Estimator, FrameParams
             if isinstance(values, str):
                 params = method.Params.load(folder / os.path.expandvars(values), name)
             elif isinstance(values, dict):
-                params = method.Params.of(values)
+                given = dict(values)
+                file, base = given.pop("file", None), {}
+                if file is not None:
+                    if not isinstance(file, str):
+                        raise InputError(f"file is {file!r}; give the path of a TOML file")
+                    base = method.Params.load(folder / os.path.expandvars(file), name).values()
+                params = method.Params.of({**base, **given})
             else:
                 raise InputError(f"params is {values!r}; give a table or the path of a TOML file")
             methods.append((label, method, params))

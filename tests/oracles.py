@@ -322,6 +322,7 @@ def smooth(pixel, times, p):
         r = noise**2 + p["sigma_floor"] ** 2
         z = pixel.sharp(k)
         total += clear * scipy.stats.norm.logpdf(z, m, math.sqrt(P + r))
+        total -= clear * math.log(pixel.grey[k] + I0)
         if clear < 1 and p["one_sided"]:
             sign = 1 if pixel.grey[k] > 0.5 else -1
             end = p["margin"] / 255

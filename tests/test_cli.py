@@ -16,9 +16,10 @@ from PIL import Image
 from test_evaluate import HEIGHT, ONE, STAMPS, WIDTH, small, write_config
 
 import jaxevent
-from jaxevent import cli, describe
-from jaxevent.recording import Events, Frames
+from jaxevent import cli, describe, export
+from jaxevent.recording import Events, Frames, Recording
 from jaxevent.report import tone_map
+from jaxevent.simulate import SCENES, SENSORS, Pan, from_video, scene, simulate
 
 
 @pytest.fixture
@@ -47,13 +48,14 @@ def fails(capsys, argv: list, *named: object) -> None:
         assert str(name) in said.err
 
 
-def decoded(path: Path, height: int, width: int) -> tuple[NDArray, str]:
-    """The grey images (T, H, W) of a video, and what ffmpeg says about it."""
+def decoded(path: Path, height: int, width: int, pixels: str = "gray") -> tuple[NDArray, str]:
+    """The grey images (T, H, W) of a video, in "rgb24" (T, H, W, 3), and what ffmpeg says of it."""
     # Not by the reader of imageio, which forks; JAX warns that this may deadlock.
     program = imageio_ffmpeg.get_ffmpeg_exe()
-    decode = [program, "-i", path, "-f", "rawvideo", "-pix_fmt", "gray", "pipe:1"]
+    decode = [program, "-i", path, "-f", "rawvideo", "-pix_fmt", pixels, "pipe:1"]
     done = subprocess.run(decode, capture_output=True, check=True)
-    return np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width), done.stderr.decode()
+    shape = (-1, height, width) if pixels == "gray" else (-1, height, width, 3)
+    return np.frombuffer(done.stdout, np.uint8).reshape(shape), done.stderr.decode()
 
 
 def missing(path: Path) -> None:
@@ -146,11 +148,13 @@ def test_bad_configurations(text, named, folder, capsys):
     assert not (folder / "results").exists()
 
 
-def test_unwritable_outputs(folder, capsys):
+def test_unwritable_outputs(folder, capsys, monkeypatch):
+    monkeypatch.setattr("jaxevent.simulate.scene", None)  # it is told before anything is simulated
     source = folder / "small.h5"
     config = write_config(folder, ONE)
     before = sorted(folder.rglob("*"))
     for parent in (folder / "missing", source):
+        fails(capsys, ["simulate", "--scene", "lake", "--out", parent / "a.h5"], parent / "a.h5")
         for name in ("a.h5", "a.mp4", "a"):
             out = parent / name
             fails(capsys, ["reconstruct", source, "--method", "blend", "--out", out], out)
@@ -165,6 +169,7 @@ def test_bad_ways_to_reconstruct(folder, capsys):
     jaxevent.save(small(frames=None), bare)
     (folder / "mine.toml").write_text("alpha = 3\n")
     (folder / "broken.toml").write_text("alpha = \n")
+    (folder / "other.toml").write_text("[akf]\nc_on = 0.2\n")
     before = sorted(folder.rglob("*"))
     blend = ["--method", "blend", "--out", out]
     for rate in ("0", "-1", "nan", "inf", "1e7"):
@@ -172,9 +177,12 @@ def test_bad_ways_to_reconstruct(folder, capsys):
     fails(capsys, ["reconstruct", bare, *blend], bare, "no frames")
     fails(capsys, ["reconstruct", bare, "--method", "akf", "--at", "frames", "--out", out], bare)
     fails(capsys, ["reconstruct", path, *blend, "--tone", "log"], out, "--tone")
-    for name in ("mine.toml", "broken.toml", "none.toml"):
+    for name in ("mine.toml", "broken.toml", "other.toml", "none.toml"):
         fails(capsys, ["reconstruct", path, *blend, "--params", folder / name], folder / name)
-    fails(capsys, ["reconstruct", path, "--method", "afk", "--out", out], "'akf'")
+    fails(capsys, ["reconstruct", path, "--method", "akff", "--out", out], "'akf'")
+    for name in ("out.h5", "out.mp4", "out"):
+        argv = ["reconstruct", path, *blend[:2], "--colour", "--out", folder / name]
+        fails(capsys, argv, path, "no colour frames")
     for name in ("out.avi", "out.h5.gz"):
         fails(capsys, ["reconstruct", path, *blend[:2], "--out", folder / name], folder / name)
     fails(capsys, ["reconstruct", path, *blend[:2], "--out", "."])
@@ -192,6 +200,9 @@ def test_bad_ways_to_reconstruct(folder, capsys):
         ["reconstruct", "a", "--method", "akf"],
         ["reconstruct", "a", "--method", "akf", "--out", "b", "--rate", "9", "--at", "frames"],
         ["convert", "a", "b", "--compression", "best"],
+        ["simulate", "--out", "b"],
+        ["simulate", "a.mp4", "--scene", "lake", "--out", "b"],
+        ["simulate", "--scene", "lake"],
     ],
 )
 def test_bad_arguments(argv, capsys):
@@ -201,18 +212,19 @@ def test_bad_arguments(argv, capsys):
     assert capsys.readouterr().err.startswith("usage: jaxevent")
 
 
-def test_help_and_version(capsys):
+def test_help_and_version(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "500")  # names are not broken at their hyphens
     with pytest.raises(SystemExit) as stop:
         cli.main(["--version"])
     assert stop.value.code == 0
     assert capsys.readouterr().out == f"jaxevent {jaxevent.__version__}\n"
-    for command in ("demo", "info", "convert", "reconstruct", "evaluate"):
+    named = {"reconstruct": tuple(jaxevent.METHODS), "simulate": (*SCENES, *SENSORS)}
+    for command in ("demo", "info", "convert", "reconstruct", "evaluate", "fit", "simulate"):
         with pytest.raises(SystemExit) as stop:
             cli.main([command, "--help"])
         assert stop.value.code == 0
         assert re.search(rf"\nexamples?:\n  jaxevent {command}", text := capsys.readouterr().out)
-        if command == "reconstruct":
-            assert all(name in text for name in jaxevent.METHODS)
+        assert set(named.get(command, ())) <= set(re.findall(r"[\w-]+", text))
 
 
 def test_as_a_process(tmp_path):
@@ -304,10 +316,13 @@ def test_one_event_is_enough(tmp_path, capsys):
 
 
 def test_reconstruct_to_hdf5(folder, capsys):
-    (folder / "mine.toml").write_text("c_on = 0.2\nclock_offset = 0.0025\n")
+    mine = "c_on = 0.2\nclock_offset = 0.0025\n"
+    (folder / "a.toml").write_text(mine)
+    (folder / "b.toml").write_text(f"[cf]\nc_on = 0.3\n[akf]\n{mine}")
     contents = []
     for name in ("a.h5", "b.hdf5"):
-        argv = f"reconstruct {folder}/small.h5 --method akf --params {folder}/mine.toml --out"
+        params = (folder / name).with_suffix(".toml")
+        argv = f"reconstruct {folder}/small.h5 --method akf --params {params} --out"
         assert cli.main([*argv.split(), str(folder / name)]) == 0
         said = capsys.readouterr().out
         assert said.startswith(f"{folder / name}: 6 images") and said.count("\n") == 1
@@ -367,6 +382,149 @@ def test_reconstruct_to_video(rate, fps, factor, folder, capsys):
     limits = tuple(np.percentile(video(sample)[0], [0.5, 99.5]).tolist())
     shown = tone_map(video(times)[0], "percentile", limits).astype(float)
     assert np.abs(images - shown).mean() < 3
+
+
+def test_reconstruct_in_colour(folder):
+    """Two colours side by side, far from black and white, on frames of their own brightness."""
+    ramp = 60 + 2 * np.arange(WIDTH) + 3 * np.arange(6)[:, None, None]
+    images = np.broadcast_to(ramp, (6, HEIGHT, WIDTH)).astype(np.uint8)
+    rgb = np.empty((6, HEIGHT, WIDTH, 3), np.uint8)
+    rgb[:, :, :10], rgb[:, :, 10:] = (140, 90, 60), (60, 100, 120)
+    frames = Frames(STAMPS, images, np.zeros_like(STAMPS))
+    recording = small(frames=frames, extra={"rgb": rgb})
+    jaxevent.save(recording, folder / "small.h5")
+    outs = {"a.h5": [], "b": ["--tone", "percentile"], "c.mp4": []}
+    for name, tone in outs.items():
+        argv = f"reconstruct {folder}/small.h5 --method blend --rate 300 --colour --out"
+        assert cli.main([*argv.split(), str(folder / name), *tone]) == 0
+
+    times = np.rint(np.arange(16) / 300 * 1e6).astype(np.int64)
+    grey = jaxevent.blend.reconstruct(recording)(times)[0]
+    colour = rgb[0].astype(float)
+    ratio = colour / (colour @ [0.2126, 0.7152, 0.0722])[..., None]
+    with h5py.File(folder / "a.h5") as file:
+        assert set(file) == {"t", "image"}
+        np.testing.assert_array_equal(np.asarray(file["t"]), times)
+        np.testing.assert_allclose(np.asarray(file["image"]), grey[..., None] * ratio, rtol=1e-5)
+
+    low, high = np.percentile(grey, [0.5, 99.5])  # there are no more than 16 images to sample
+    toned = np.rint(255 * ((grey - low) / (high - low)).clip(0, 1))
+    expected = (toned[..., None] * ratio).clip(0, 255)
+    for number, image in enumerate(expected):
+        with Image.open(folder / "b" / f"frame_{number:08d}.png") as stored:
+            assert np.abs(np.asarray(stored) - image).max() <= 2
+    images, _ = decoded(folder / "c.mp4", HEIGHT, WIDTH, "rgb24")
+    assert np.abs(images - 255 * grey[..., None] * ratio).mean() < 5
+
+
+def test_a_pixel_without_bound_is_white_in_colour():
+    """Pure red has no green; infinity times 0 is no number."""
+    times = np.array([0])
+    red = np.full((1, HEIGHT, WIDTH, 3), np.array([0.5, 0, 0]), np.float32)
+    red[0, 3, 4] = (np.inf, np.nan, np.nan)
+    video = jaxevent.blend.reconstruct(small())
+    ((_, image),) = export.shown(video, times, "linear", lambda _: red)
+    assert image[3, 4].tolist() == [255, 255, 255]
+    assert image[0, 0].tolist() == [127, 0, 0]
+
+
+def equal(one: Recording, other: Recording) -> None:
+    assert (one.name, one.width, one.height) == (other.name, other.width, other.height)
+    assert isinstance(one.events, Events) and one.frames and other.frames
+    for part, same in ((one.events, other.events), (one.frames, other.frames)):
+        for name, values in vars(part).items():
+            np.testing.assert_array_equal(values, getattr(same, name), name)
+    assert set(one.extra) == set(other.extra)
+    for name, values in one.extra.items():
+        np.testing.assert_array_equal(values, other.extra[name], name)
+
+
+def test_simulate_a_scene(tmp_path, capsys):
+    out = tmp_path / "night.h5"
+    argv = "simulate --scene night --speed fast --sensor poor --seed 3 --duration 0.3 --size 24,20"
+    assert cli.main([*argv.split(), "--out", str(out)]) == 0
+    source = Pan(scene("night"), (24, 20), 0.3, "fast", 3)
+    recording = simulate(source, SENSORS["poor"], 3, "night-fast")
+    equal(jaxevent.load(out), recording)
+    said = capsys.readouterr().out
+    assert said.startswith(f"{out}: {len(recording.events):,} events, 15 frames, 0.")
+    assert said.count("\n") == 1 and [file.name for file in tmp_path.iterdir()] == ["night.h5"]
+
+
+def test_what_is_simulated_by_default(tmp_path, monkeypatch):
+    asked = []
+
+    def record(*settings):
+        asked.append(settings)
+        return small()
+
+    monkeypatch.setattr("jaxevent.simulate.simulate", record)
+    assert cli.main(["simulate", "--scene", "7", "--out", str(tmp_path / "a.h5")]) == 0
+    ((source, sensor, seed, name),) = asked
+    assert (source.size, source.duration, source.speed, source.seed) == ((128, 96), 1.5, "slow", 0)
+    np.testing.assert_array_equal(source.panorama, scene(7))
+    assert (sensor, seed, name) == (SENSORS["davis"], 0, "7-slow")
+
+
+@pytest.fixture
+def film(tmp_path: Path) -> Path:
+    """A folder of 12 colour images, 32x24: stripes that move 2 pixels from each to the next."""
+    film = tmp_path / "film"
+    film.mkdir()
+    x = np.arange(32)
+    for k in range(12):
+        wave = 150 + 60 * np.sin((x - 2 * k) / 3)
+        image = np.empty((24, 32, 3), np.uint8)
+        image[:] = wave[:, None] * [1, 0.9, 0.8]
+        Image.fromarray(image).save(film / f"{k}.png")
+    return film
+
+
+def test_simulate_a_video(film, capsys):
+    part = "--start 0.1 --duration 0.2 --max-size 16"
+    for out, options, settings in (
+        ("a.h5", "", {}),
+        ("b.h5", part, {"start": 0.1, "stop": 0.1 + 0.2, "max_size": 16}),
+    ):
+        argv = f"simulate {film} --sensor ideal --cut 30 --speed 0.5 --seed 2 {options} --out"
+        assert cli.main([*argv.split(), str(film.parent / out)]) == 0
+        recording = from_video(film, SENSORS["ideal"], cut=30, speed=0.5, seed=2, **settings)
+        assert recording.frames is not None
+        equal(jaxevent.load(film.parent / out), recording)
+        said = f"{out}: {len(recording.events):,} events, {len(recording.frames)} frames, "
+        assert said in capsys.readouterr().out
+    argv = f"reconstruct {film.parent}/b.h5 --method blend --rate 10 --colour --out {film}/c"
+    assert cli.main(argv.split()) == 0
+    with Image.open(film / "c" / "frame_00000000.png") as image:
+        assert (image.mode, image.size) == ("RGB", (16, 12))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ("--scene lakes", "'lakes'"),
+        ("--scene lake --speed 2", "--speed 2"),
+        ("--scene lake --sensor davi", "did you mean 'davis'"),
+        ("--scene lake --seed -1", "--seed -1"),
+        ("--scene lake --duration 0", "--duration 0"),
+        ("--scene lake --duration inf", "--duration inf"),
+        ("--scene lake --duration 0.01", "fewer than two frames"),
+        ("--scene lake --size 0,9", "--size 0,9"),
+        ("--scene lake --cut 50", "--cut is for a video"),
+        ("--scene lake --max-size 50", "--max-size is for a video"),
+        ("film --size 9,9", "--size is for a scene"),
+        ("film --speed slow", "--speed slow is for a scene"),
+        ("film --speed 0", "speed = 0"),
+        ("film --cut 200", "200"),
+        ("film --start 5", "film"),
+        ("film --max-size 3", "max_size = 3"),
+        ("none.mp4", "none.mp4: there is no such file"),
+    ],
+)
+def test_bad_ways_to_simulate(options, said, film, capsys, monkeypatch):
+    monkeypatch.chdir(film.parent)
+    fails(capsys, ["simulate", *options.split(), "--out", "out.h5"], said)
+    assert [file.name for file in film.parent.iterdir()] == ["film"]
 
 
 def test_evaluate(folder, capsys):

@@ -367,6 +367,28 @@ def test_mat_golden(tmp_path, write_mat):
 
 
 @either_mat
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_mat_colour_references_become_the_mean_of_their_channels(tmp_path, write_mat, count):
+    """Three planes are three channels, unless there are three frames."""
+    rng = np.random.default_rng(3)
+    several, one = rng.random((3, 4, 3, count)), rng.integers(0, 9, (3, 4, 3)).astype(np.uint16)
+    path = tmp_path / "a.mat"
+    frames = {"image": np.zeros((3, 4, count), np.uint8), "time_image": np.arange(1.0, count + 1)}
+
+    def reference(images):
+        write_mat(path, bad_mat(**frames, HDR_mat=images))
+        return load(path).extra["HDR_mat"]
+
+    got = reference(several)
+    assert got.shape == (count, 3, 4)
+    for k, y, x in np.ndindex(count, 3, 4):
+        r, g, b = several[y, x, :, k]
+        assert got[k, y, x] == pytest.approx((r + g + b) / 3)
+    planes = np.moveaxis(one, 2, 0)
+    np.testing.assert_allclose(reference(one), planes if count == 3 else sum(planes / 3))
+
+
+@either_mat
 def test_mat_events_as_rows_without_events_and_a_single_frame(tmp_path, write_mat):
     path = tmp_path / "a.mat"
     arrays = mat_arrays(random_recording(1, events=7))
@@ -413,6 +435,7 @@ def changed(row, column, value):
         (dict(image=np.full((3, 4, 2), 99.0)), "image is float64 with values up to 99; .* uint8"),
         (dict(image=np.full((3, 4, 2), np.nan)), "frame 0 holds NaN"),
         (dict(image=np.zeros((3, 4, 3, 2), np.uint8)), "store grey images as H x W x K"),
+        (dict(HDR_mat=np.zeros((3, 4, 2, 2))), r"HDR_mat has shape \(3, 4, 2, 2\); .* 3 x K"),
     ],
 )
 def test_mat_bad(tmp_path, write_mat, changes, message):

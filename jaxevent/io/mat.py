@@ -4,13 +4,14 @@
     image       (H, W, K)  uint8, uint16 or floats in [0, 1]
     time_image  (K,)       mid-exposure times (us)
     exposure    (K,) or scalar  us; absent: unknown
-    f_Q         (256,)     intensity of each grey level: the inverse camera response
+    f_Q         (256,)     certainty of each grey level, see `Recording.response`
     ct          scalar     contrast threshold
-    HDR_mat     (H, W) or (H, W, K)  high-dynamic-range reference
+    HDR_mat     (H, W) or (H, W, K), in colour (H, W, 3) or (H, W, 3, K)  HDR reference
 
 Only `events` is required, and the size where there is no `image`. f_Q, ct, HDR_mat and every other
-numeric variable are kept in `Recording.extra`, HDR_mat as [y, x] or [frames, y, x]. MATLAB's rows
-and columns (1 x N) become vectors.
+numeric variable are kept in `Recording.extra`, HDR_mat as [y, x] or [frames, y, x]. HDR_mat in
+colour becomes the mean of its three channels, as in the authors' programs; (H, W, 3) is colour
+unless there are three frames. MATLAB's rows and columns (1 x N) become vectors.
 """
 
 from pathlib import Path
@@ -67,7 +68,8 @@ def _recording(path: Path, size: tuple[int, int] | None, variables: dict) -> Rec
     events = _events(path, columns, size)
     extra = {name: _squeeze(value) for name, value in arrays.items() if name != "HDR_mat"}
     if "HDR_mat" in arrays:
-        extra["HDR_mat"] = _frames_first(arrays["HDR_mat"], f"{path}: HDR_mat")
+        number = 0 if frames is None else len(frames)
+        extra["HDR_mat"] = _reference(arrays["HDR_mat"], number, f"{path}: HDR_mat")
     return Recording(path.stem, *size, events, frames, extra=extra)
 
 
@@ -114,6 +116,17 @@ def _frames_first(images: NDArray, source: str) -> NDArray:
     if images.ndim not in (2, 3):
         raise InputError(f"{source} has shape {images.shape}; store grey images as H x W x K")
     return np.ascontiguousarray(np.moveaxis(images, 2, 0) if images.ndim == 3 else images)
+
+
+def _reference(images: NDArray, frames: int, source: str) -> NDArray:
+    """HDR_mat as grey [frame, y, x] or [y, x]."""
+    colour = images.ndim == 4 or (images.ndim == 3 and images.shape[2] == 3 and frames != 3)
+    if colour and images.shape[2] != 3:
+        raise InputError(
+            f"{source} has shape {images.shape}; store it as H x W x K, or in colour as "
+            "H x W x 3 x K"
+        )
+    return _frames_first(images.mean(axis=2) if colour else images, source)
 
 
 def _squeeze(value: NDArray) -> NDArray:

@@ -31,6 +31,7 @@ class FrameParams(Parameters):
     c_off = Positive(0.1, "ln I", "contrast threshold of OFF events")
     I0 = Positive(1.0, "intensity", "offset inside the logarithm, L = ln(I + I0)")
     clock_offset = Number(0.0, "s", "added to the frames' time stamps")
+    deblur = Choice((True, False), "whether events within an exposure sharpen its frame")
     exposure = Positive(0.0, "s", "exposure of frames whose own is not known")
     rho_ref = Positive(0.0, "s", "dead time of a pixel after an event, its change made good")
 
@@ -148,7 +149,7 @@ def deblurred(
     share = s.share + late(params, frames) * s.edge
     excess = share * jnp.expm1(brightness(params, s.on, s.off))
     total = jax.ops.segment_sum(excess, s.cell, level.size).reshape(level.shape)
-    level = level - jnp.log1p(total)
+    level = level - jnp.log1p(total) * params.deblur
     return (
         level - brightness(params, frames.head[0], frames.head[1]),
         level + brightness(params, frames.tail[0], frames.tail[1]),

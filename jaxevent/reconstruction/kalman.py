@@ -36,7 +36,25 @@ class Params(AugmentParams):
     P0 = Positive(0.09, "(ln I)^2", "variance at the start")
     beyond = Number(0.0, "ln I", "how far beyond the clip clipped pixels start")
 
-    presets = {"paper": {}}
+    presets = {
+        "paper": {},
+        "hdr": {
+            "c_on": 0.2,
+            "c_off": 0.2,
+            "I0": 0.003,
+            "w_min": 1e-5,
+            "margin": 2.5,
+            "calibrate": False,
+            "weighting": "certainty",
+            "sigma_proc": 0.05**0.5,
+            "sigma_iso": 0.03**0.5,
+            "sigma_ref": 0.03**0.5,
+            "rho": 0.1,
+            "kappa": 3e4,
+            "P0": 1.0,
+            "beyond": 0.7,
+        },
+    }
 
     def __init__(self, **values: Any):
         super().__init__(**values)

@@ -198,6 +198,14 @@ class ReadOut(eqx.Module):
         """The arrays that count events."""
         return [self.points.on, self.points.off]
 
+    def images(self, rows: NDArray) -> "ReadOut":
+        """Those of its images, in that order."""
+        parts, growth = (self.points, self.slot, self.since), self.growth
+        chosen = jax.tree.map(lambda leaf: leaf[rows], parts)
+        if growth is not None:
+            growth = Growth([count[rows] for count in growth.counts], growth.rho_ref)
+        return ReadOut(*chosen, growth)
+
     def at(self, rho_ref: Array) -> "ReadOut":
         """The read-out for a dead time near the one that it was made for."""
         return _grown(self, rho_ref)

@@ -45,6 +45,10 @@ class Params(CertaintyParams):
     sigma_floor = Positive(0.02, "ln I", "noise of frames in log intensity, however certain")
     start = Positive(0.5, "intensity", "mean before the first frame")
     P0 = Positive(4.0, "(ln I)^2", "variance before the first frame")
+    presets = {
+        "hdr": {"c_on": 0.2, "c_off": 0.2, "I0": 0.003, "w_min": 1e-5, "margin": 2.5},
+    }
+
     one_sided = Choice((True, False), "whether clipped frames tell that L lies beyond the clip")
 
     def __init__(self, **values: Any):
@@ -109,6 +113,7 @@ class Rows(eqx.Module):
     z: Float[Array, "frames pixels"]  # deblurred log intensity
     r: Float[Array, "frames pixels"]  # its variance
     clear: Float[Array, "frames pixels"]  # 1: a measurement; 0: none
+    slope: Float[Array, "frames pixels"]  # d z / d I = 1 / (I + I0)
     side: Float[Array, "frames pixels"]  # +1, -1: L lies above, below `bound`; 0: nothing known
     bound: Float[Array, "frames pixels"]
     S: Float[Array, "frames pixels"]  # sum of s c until the next frame
@@ -149,6 +154,7 @@ def rows_of(params: Params, frames: FrameFeatures) -> tuple[Rows, Float[Array, "
         z,
         noise**2 + params.sigma_floor**2,
         clear * exists,
+        1 / (frames.intensity + params.I0),
         side * exists,
         jnp.broadcast_to(bound_of(params, frames), z.shape),
         brightness(params, counts[0], counts[1]),
@@ -204,7 +210,9 @@ def measure(params: Params, state: Gaussian, row: Rows) -> tuple[Gaussian, Messa
     # A half clear pixel counts half: its variance is doubled.
     J = row.clear / row.r
     s2 = state.P + row.r
+    # Of the intensity, not of its logarithm, whose density depends on I0: p(I) = p(z) dz/dI.
     log_gauss = -0.5 * (jnp.log(2 * jnp.pi * s2) + (row.z - state.m) ** 2 / s2)
+    log_gauss = log_gauss + jnp.log(row.slope)
     said, log_side = beyond(state, row, params.sigma_floor**2)
     said = said + Message(J * row.z, J)
     P = state.P / (1 + state.P * said.J)

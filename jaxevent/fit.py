@@ -1,0 +1,1043 @@
+"""Parameters fitted to recordings: one loop for every estimator.
+
+    fitted = jaxevent.fit.optimise(loss, params, ["c_on", "c_off"], batches)
+
+`loss(params, batch)` is a scalar, the mean over what a batch holds. `fit` and the command `jaxevent
+fit CONFIG.toml` run the loop as a file describes it:
+
+    recordings = ["slider_depth.zip"]   # paths or globs, relative to this file; $NAME is expanded
+    validation = []                     # recordings for early stopping,
+    test = []                           # and those that are only scored; if neither is given,
+    split = [2, 1, 1]                   # of every 4 images in turn 2 are fitted, 1, 1 are those
+    size = [240, 180]                   # only for recordings that do not tell it
+    loss = "held-out"                   # or "reference" (protocols of `jaxevent.evaluate`), or
+                                        # "likelihood" of the frames that the protocol gives
+    protocol = "held-out"               # with the likelihood: what is given, and scored
+    error = "linear"                    # or "log", "nll"; see `objectives.Objective`
+    dark_offset = 0.003                 # of the error "log"
+    weights = { dark = 1, bright = 1 }  # of pixels of HDR references outside what frames record
+    window = 1.0                        # s, of mini-batches; omitted: whole recordings
+    warm_up = 0.2                       # s that are prepared around a window
+    batch = 4                           # windows per step; omitted: all
+    iterations = 300                    # and the other fields of `Settings`
+
+    [[method]]
+    name = "akf"                        # a key of jaxevent.METHODS
+    label = "akf, mine"                 # in the results; omitted: the name
+    params = { c_on = 0.08 }            # to start from, or a TOML file; omitted: defaults
+    fit = ["c_on", "c_off"]             # by gradient
+    search = { clock_offset = [-0.02, 0.02, 9] }  # from, to, number of points
+
+A method may have its own loss, error, learning_rate, iterations and starts. Parameters that are
+fixed when a recording is prepared have no gradient to follow; each candidate of a search is
+prepared anew. Values omitted are those above, except where comments say otherwise.
+"""
+
+import contextlib
+import csv
+import dataclasses
+import functools
+import hashlib
+import io
+import json
+import math
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import scipy.optimize
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
+from tqdm import tqdm
+
+from jaxevent.errors import InputError, require
+from jaxevent.evaluate import (
+    PROTOCOLS,
+    find_method,
+    find_recordings,
+    results,
+    score,
+    subset,
+    write_rows,
+)
+from jaxevent.io import load
+from jaxevent.io.output import complete
+from jaxevent.parameters import Parameters, nearest, read_toml
+from jaxevent.reconstruction.augment import PREPARED, FrameParams
+from jaxevent.reconstruction.estimator import Estimator
+from jaxevent.reconstruction.objectives import (
+    ERRORS,
+    REGIONS,
+    SPLITS,
+    Objective,
+    Problem,
+    interleave,
+    parts,
+)
+from jaxevent.recording import Recording
+from jaxevent.report import markdown_table
+
+P = TypeVar("P", bound=Parameters)
+
+# Derivatives of so many numbers are computed forwards, of more in reverse. Loss and gradient of
+# the AKF on slider_depth (1.08 M events, 22 images, 2 cores): the loss alone 67 ms; forwards 135 ms
+# for 1 number, 181 ms for 2; in reverse 213 ms for any. Forwards over reverse, both in turn: 0.60
+# for 1 number, 0.80 for 2, 1.12 for 3, 1.15 for 4, 1.9 for 8, and 3.9 for 8 with 4 starts.
+FORWARD = 2
+
+# s between checkpoints
+PERIOD = 2.0
+
+Loss = Callable[[Any, Any], Array]
+Batches = tuple[Sequence[Any], Sequence[Any]]
+Interval = tuple[float | int, float | int, int]
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How `optimise` goes about it.
+
+    A round is a search of all searched parameters followed by `iterations` steps of Adam, whose
+    rate falls from `learning_rate`, halved with every round, to a tenth along a cosine. Every
+    `every` iterations the validation loss is looked at; a start that has not improved for
+    `patience` iterations stops, and the best of what was looked at counts. `starts` starting points
+    are followed at once: the given one, and others drawn around it with a standard deviation of
+    `spread` in the unconstrained numbers. `batch` batches make a step, drawn without replacement;
+    None: all. `forward` chooses the derivatives' mode; None: the faster.
+    """
+
+    iterations: int = 300
+    learning_rate: float | int = 0.05
+    patience: int = 50
+    every: int = 5
+    starts: int = 1
+    spread: float | int = 0.3
+    rounds: int = 2
+    batch: int | None = None
+    seed: int = 0
+    forward: bool | None = None
+
+
+class Position(eqx.Module):
+    """Where all starting points are; leaves of `raw`, `best`, `optimiser` begin with [starts]."""
+
+    raw: dict[str, Array]  # the fitted parameters, unconstrained
+    optimiser: Any
+    best: dict[str, Array]  # of this round
+    best_loss: Float[Array, " starts"]
+    best_at: Int[Array, " starts"]  # iteration
+    searched: dict[str, Array]  # common to all starts, unconstrained
+
+
+@dataclasses.dataclass
+class Run:
+    """All that changes while a fit runs: written to checkpoints.
+
+    Stage 2 r is the search of round r, 2 r + 1 its descent; one last search follows. `tried` are
+    the losses of this search's candidates in order: the search is a function of them, so it is
+    taken up again by replaying it. `history` has start, round, iteration, fit loss and validation
+    loss (None where it was not looked at).
+    """
+
+    position: Position
+    stage: int = 0
+    iteration: int = 0
+    tried: list[float] = dataclasses.field(default_factory=list)
+    history: list[list[Any]] = dataclasses.field(default_factory=list)
+
+
+@dataclasses.dataclass(frozen=True)
+class Fitted(Generic[P]):
+    """The parameters found, their validation loss (without validation: fit loss), the history."""
+
+    params: P
+    loss: float
+    history: list[list[Any]]
+
+
+def begin(
+    params: Parameters,
+    names: Sequence[str],
+    settings: Settings = Settings(),
+    search: Mapping[str, Interval] | None = None,
+) -> Run:
+    """The state of a fit before its first step; see `optimise`."""
+    search = search or {}
+    for name in [*names, *search]:
+        if name not in params.raw:
+            raise InputError(f"there is no parameter {name!r}; {nearest(name, params.raw)}")
+    for name in names:
+        if name in search:
+            raise InputError(f"{name} is both to be fitted and searched; choose one")
+        if not np.isfinite(params.raw[name]).all():
+            raise InputError(
+                f"the parameter {name} starts at 0, where its logarithm has no gradient; start at "
+                "a positive value or do not fit it"
+            )
+    for name, (low, high, count) in search.items():
+        if params.raw[name].ndim or not low < high or count < 3:
+            raise InputError(
+                f"the search of {name} is {[low, high, count]}; give [from, to, number of points], "
+                "3 or more, of a parameter that is one number"
+            )
+        params.numbers[name].check(float(low))
+    normal = np.random.default_rng(settings.seed).standard_normal
+    raw = {}
+    for name in names:
+        leaf = np.asarray(params.raw[name])
+        drawn = settings.spread * normal((settings.starts - 1, *leaf.shape))
+        raw[name] = jnp.asarray(np.concatenate([leaf[None], leaf + drawn]), leaf.dtype)
+    dtype = jnp.result_type(float)
+    position = Position(
+        raw,
+        jax.vmap(ADAM.init)(raw) if raw else None,
+        raw,
+        jnp.full(settings.starts, jnp.inf, dtype),
+        jnp.zeros(settings.starts, int),
+        {name: params.raw[name] for name in search},
+    )
+    return Run(position)
+
+
+def optimise(
+    loss: Loss,
+    params: P,
+    names: Sequence[str],
+    batches: Sequence[Any] | Callable[[P], Batches],
+    validation: Sequence[Any] = (),
+    settings: Settings = Settings(),
+    search: Mapping[str, Interval] | None = None,
+    *,
+    run: Run | None = None,
+    save: Callable[[Run, bool], None] | None = None,
+    progress: bool = False,
+    title: str = "fit",
+) -> Fitted[P]:
+    """Fit some parameters of an estimator: minimise the mean loss over batches.
+
+    Args:
+        loss: `loss(params, batch)`, the mean over a batch's measurements; pure.
+        params: Where to start; what is not named stays as it is.
+        names: Parameters to follow the gradient of.
+        batches: Pytrees, one compilation for each shape. A batch with an attribute `weight` counts
+            that much in means over batches. Or a function `prepare(params)` that gives batches to
+            fit to and batches to validate on, for parameters that act when batches are made.
+        validation: Batches for early stopping, if `batches` is a list; without any, the fit's.
+        settings: See `Settings`.
+        search: By name, (from, to, number of points): parameters searched without gradients, one
+            after another, by the fit loss of the best start. Every round looks at all points and
+            around the best, ever closer.
+        run: Where an interrupted fit is to go on; by default at `begin(...)`.
+        save: Called with the run and whether to save it for sure, after every step.
+        progress: Show a bar on stderr.
+        title: What the bar calls the fit.
+
+    Raises:
+        InputError: A name does not exist, or the loss is not finite at the start.
+    """
+    prepare = batches if callable(batches) else lambda _: (batches, validation)
+    fresh = run is None
+    run = begin(params, names, settings, search) if run is None else run
+    loop = _Loop(loss, params, prepare, settings, search or {}, run, save or (lambda *_: None))
+    with tqdm(
+        total=settings.rounds * settings.iterations * bool(names),
+        desc=title,
+        unit="step",
+        delay=2,
+        disable=not progress,
+        leave=False,
+    ) as loop.bar:
+        if fresh:
+            loop.check()
+            loop.save(run, True)
+        while run.stage <= 2 * settings.rounds:
+            stage = loop.descend if run.stage % 2 else loop.search
+            stage()
+            run.stage, run.iteration, run.tried = run.stage + 1, 0, []
+            loop.save(run, True)
+        fitted = loop.leader()
+        return Fitted(fitted, loop.loss(fitted, loop.watched(fitted)), run.history)
+
+
+# A step whose gradient is not finite is left out, however many there are.
+ADAM = optax.apply_if_finite(optax.scale_by_adam(), max_consecutive_errors=2**31 - 1)
+
+
+def with_raw(params: P, raw: Mapping[str, Array]) -> P:
+    """The parameters with some of their unconstrained numbers replaced."""
+    return eqx.tree_at(lambda p: p.raw, params, {**params.raw, **raw})
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _value(loss: Loss, params: Parameters, batch: Any) -> Array:
+    return loss(params, batch)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _values(loss: Loss, params: Parameters, raw: dict[str, Array], batch: Any) -> Array:
+    """The loss of each start, (starts,)."""
+    return jax.vmap(lambda one: loss(with_raw(params, one), batch))(raw)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _slopes(
+    loss: Loss, forward: bool, params: Parameters, raw: dict[str, Array], batch: Any
+) -> tuple[Array, dict[str, Array]]:
+    """The loss of each start, (starts,), and its derivatives in the shape of `raw`."""
+
+    def value(one: dict[str, Array]) -> Array:
+        return loss(with_raw(params, one), batch)
+
+    def forwards(one: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
+        flat, restore = ravel_pytree(one)
+
+        def along(direction: Array) -> tuple[Array, Array]:
+            return jax.jvp(lambda at: value(restore(at)), (flat,), (direction,))
+
+        directions = jnp.eye(flat.size, dtype=flat.dtype)
+        here, slope = jax.vmap(along, out_axes=(None, 0))(directions)
+        return here, restore(slope)
+
+    return jax.vmap(forwards if forward else jax.value_and_grad(value))(raw)
+
+
+@jax.jit
+def _step(position: Position, slope: dict[str, Array], rate: float | Array) -> Position:
+    update: Any = jax.vmap(ADAM.update)
+    direction, memory = update(slope, position.optimiser)
+    raw = {name: leaf - rate * direction[name] for name, leaf in position.raw.items()}
+    return dataclasses.replace(position, raw=raw, optimiser=memory)
+
+
+@jax.jit
+def _judge(
+    position: Position, seen: Array, i: int | Array, patience: int | Array
+) -> tuple[Position, Array]:
+    """Keep the best of each start at iteration i; and whether any has not stopped yet.
+
+    A start that has stopped keeps its best, however long the others make it go on.
+    """
+    first = i == 0
+    going = first | (i - position.best_at < patience)
+    better = first | (going & (seen < position.best_loss))
+
+    def choose(new: Array, old: Array) -> Array:
+        return jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+    best_at = choose(jnp.full_like(position.best_at, i), position.best_at)
+    seen = jnp.where(jnp.isnan(seen), jnp.inf, seen)
+    position = dataclasses.replace(
+        position,
+        best=jax.tree.map(choose, position.raw, position.best),
+        best_loss=choose(seen, position.best_loss),
+        best_at=best_at,
+    )
+    return position, (i - best_at < patience).any()
+
+
+def _mean(function: Callable[[Any], Any], batches: Sequence[Any]) -> Any:
+    """The mean of a function of batches (a pytree), weighted by the batches' `weight`."""
+    if len(batches) == 1:
+        return function(batches[0])
+    weights = [float(getattr(batch, "weight", 1.0)) for batch in batches]
+    total = None
+    for batch, weight in zip(batches, weights, strict=True):
+        share = weight / sum(weights)
+        part = jax.tree.map(lambda leaf, share=share: share * leaf, function(batch))
+        total = part if total is None else jax.tree.map(jnp.add, total, part)
+    return total
+
+
+class _Loop:
+    """The stages of `optimise`, which change its `Run`."""
+
+    bar: tqdm
+
+    def __init__(
+        self,
+        loss: Loss,
+        params: Parameters,
+        prepare: Callable[[Any], Batches],
+        settings: Settings,
+        intervals: Mapping[str, Interval],
+        run: Run,
+        save: Callable[[Run, bool], None],
+    ):
+        self.function, self.params, self.prepare, self.settings = loss, params, prepare, settings
+        self.intervals, self.run, self.save = intervals, run, save
+        numbers = sum(leaf[0].size for leaf in run.position.raw.values())
+        self.forward = numbers <= FORWARD if settings.forward is None else settings.forward
+
+    def leader(self) -> Any:
+        """The parameters of the best start."""
+        position = self.run.position
+        best = int(jnp.argmin(position.best_loss))
+        raw = {name: leaf[best] for name, leaf in position.raw.items()}
+        return with_raw(self.params, {**raw, **position.searched})
+
+    def watched(self, params: Any) -> Sequence[Any]:
+        fit, validation = self.prepare(params)
+        return validation or fit
+
+    def loss(self, params: Any, batches: Sequence[Any]) -> float:
+        return float(_mean(lambda batch: _value(self.function, params, batch), batches))
+
+    def check(self) -> None:
+        """Raise `InputError` unless the losses of the given parameters are finite."""
+        fit, validation = self.prepare(self.params)
+        if not fit:
+            raise InputError("there is nothing to fit to; give recordings with images")
+        for batches in (fit, validation or fit):
+            if not math.isfinite(self.loss(self.params, batches)):
+                raise InputError(
+                    "the loss is not finite where the fit starts; start from other parameters, or "
+                    "remove hot pixels"
+                )
+
+    def search(self) -> None:
+        """All searched parameters in turn, the others as the best start has them."""
+        replay, leader = iter(list(self.run.tried)), self.leader()
+
+        def look(name: str, value: float) -> float:
+            """The fit loss of a candidate; infinite if it is not a number."""
+            loss = next(replay, None)
+            if loss is None:
+                candidate = self._searched(leader, name, value)
+                loss = self.loss(candidate, self.prepare(candidate)[0])
+                loss = loss if math.isfinite(loss) else math.inf
+                self.run.tried.append(loss)
+                self.bar.set_postfix({name: f"{value:.4g}", "loss": f"{loss:.4g}"})
+                self.save(self.run, False)
+            return loss
+
+        for name, interval in self.intervals.items():
+            here = float(getattr(leader, name))
+            found = _minimise(functools.partial(look, name), interval, here, self.run.stage // 2)
+            leader = self._searched(leader, name, found)
+        searched = {name: leader.raw[name] for name in self.intervals}
+        self.run.position = dataclasses.replace(self.run.position, searched=searched)
+
+    def _searched(self, params: Any, name: str, value: float) -> Any:
+        raw = params.numbers[name].unconstrained(jnp.asarray(value, params.raw[name].dtype))
+        return with_raw(params, {name: raw})
+
+    def descend(self) -> None:
+        """The gradient steps of a round, from where all starts are to the best they come by."""
+        run, settings = self.run, self.settings
+        position, turn = run.position, run.stage // 2
+        if not position.raw:
+            return
+        params = with_raw(self.params, position.searched)
+        fit, watched = self.prepare(params)[0], self.watched(params)
+        if run.iteration == 0:
+            worst = jnp.full_like(position.best_loss, jnp.inf)
+            memory = jax.vmap(ADAM.init)(position.raw)
+            position = dataclasses.replace(position, optimiser=memory, best_loss=worst)
+        while True:
+            i, seen = run.iteration, None
+            if i % settings.every == 0 or i == settings.iterations:
+                look = functools.partial(_values, self.function, params, position.raw)
+                seen = _mean(look, watched)
+                position, going = _judge(position, seen, i, settings.patience)
+                if i == settings.iterations or not bool(going):
+                    self._record(turn, i, None, seen)
+                    break
+            slopes = functools.partial(_slopes, self.function, self.forward, params, position.raw)
+            losses, slope = _mean(slopes, [fit[k] for k in self._drawn(len(fit))])
+            fall = 0.55 + 0.45 * math.cos(math.pi * i / settings.iterations)
+            position = _step(position, slope, settings.learning_rate / 2**turn * fall)
+            self._record(turn, i, losses, seen)
+            run.position, run.iteration = position, i + 1
+            self.bar.n = turn * settings.iterations + i + 1
+            self.bar.set_postfix(loss=f"{float(jnp.min(losses)):.5g}")
+            self.save(run, False)
+        run.position = dataclasses.replace(position, raw=position.best)
+
+    def _drawn(self, count: int) -> Sequence[int]:
+        """The batches of this iteration: the next ones of one random order after another."""
+        size = self.settings.batch
+        if size is None or size >= count:
+            return range(count)
+        first = (self.run.stage // 2 * self.settings.iterations + self.run.iteration) * size
+        chosen = []
+        for k in range(first, first + size):
+            order = np.random.default_rng([self.settings.seed, k // count]).permutation(count)
+            chosen.append(int(order[k % count]))
+        return chosen
+
+    def _record(self, turn: int, i: int, losses: Array | None, seen: Array | None) -> None:
+        for start in range(self.settings.starts):
+            pair = [None if v is None else float(v[start]) for v in (losses, seen)]
+            self.run.history.append([start, turn, i, *pair])
+
+
+def _minimise(look: Callable[[float], float], interval: Interval, value: float, turn: int) -> float:
+    """Where a search of one number ends: the least of what it saw, `value` among it.
+
+    Every turn looks at all points of the interval, as the best one may be another once the other
+    parameters have moved. The first goes on to the vertex of the parabola through the best point
+    and its neighbours, later ones close in on the minimum around the best, by Brent's method.
+    """
+    low, high, count = interval
+    step = (high - low) / (count - 1)
+    grid = [float(x) for x in np.linspace(low, high, count)]
+    losses = [look(x) for x in grid]
+    k = int(np.argmin(losses))
+    best = min((losses[k], grid[k]), (look(value), value))
+    if turn:
+        reach, middle = step / 2 ** (turn - 1), min(max(best[1], low), high)
+        found = scipy.optimize.minimize_scalar(
+            look,
+            bounds=(max(low, middle - reach), min(high, middle + reach)),
+            method="bounded",
+            options={"xatol": step / 100, "maxiter": 20},
+        )
+        return min((float(found.fun), float(found.x)), best)[1]
+    if 0 < k < count - 1:
+        a, b, c = losses[k - 1 : k + 2]
+        if math.isfinite(a + c) and a - 2 * b + c > 0:
+            vertex = grid[k] + step * (a - c) / (a - 2 * b + c) / 2
+            best = min((look(vertex), vertex), best)
+    return best[1]
+
+
+def fit(
+    config: str | Path,
+    out: str | Path,
+    recordings: Sequence[str | Path] | None = None,
+    resume: bool = False,
+    progress: bool = False,
+) -> list[dict[str, Any]]:
+    """Run a fit that a TOML file describes; its layout is in the text of this module.
+
+    Writes the folder `out`, made if missing: params.toml (a table of physical values for each
+    method), results.json ({"rows": [...]}), results.md (the table of the test images), loss.csv,
+    loss.png and config.toml. While it runs, `out` holds a checkpoint at most a few seconds old, by
+    which an interrupted run goes on and ends with the same parameters, to the bit.
+
+    Args:
+        config: The TOML file.
+        out: The folder; earlier results in it are replaced at the end.
+        recordings: To be fitted to instead of those in the file, relative to the working directory.
+        resume: Go on from the checkpoint in `out`. Where the run had not got to the first one, it
+            starts; where it had ended, its rows are returned.
+        progress: Show bars on stderr.
+
+    Returns:
+        Rows as `evaluate.score` gives them, of the recordings and images of each split: `split` is
+        "fit", "validation" or "test", `method` the label, with ", before" for the start values.
+
+    Raises:
+        InputError: The file, a recording or a parameter cannot be used, `out` cannot be written or
+            holds another run's checkpoint, or matplotlib is missing (extra "plot").
+    """
+    require("matplotlib", "plot")
+    out = Path(out)
+    plan = read_plan(Path(config), recordings)
+    checkpoint = out / "checkpoint"
+    if checkpoint.exists() and not resume:
+        raise InputError(
+            f"{out}: holds the checkpoint of an interrupted fit; go on with --resume, or choose "
+            "another folder"
+        )
+    if resume and not checkpoint.exists() and (out / "results.json").exists():
+        return _finished(out, plan)
+    sources = {
+        split: [(given, _load(path, plan, progress)) for given, path in plan.recordings[split]]
+        for split in SPLITS
+    }
+    digest = plan.digest()
+    done: list[Fitted] = []
+    with contextlib.ExitStack() as new:
+        # `results` removes a folder that it made if the block raises. At the first checkpoint the
+        # block ends: from then on the folder stays.
+        write = new.enter_context(results(out))
+        run = None
+        if checkpoint.exists():
+            done, run = _restore(checkpoint, digest, plan)
+        for remains in out.glob(".*.part"):  # of a write during which the run was killed
+            remains.unlink(missing_ok=True)
+        saved = -math.inf
+
+        def save(run: Run | None, certain: bool) -> None:
+            nonlocal saved
+            if certain or time.monotonic() - saved > PERIOD:
+                _save(checkpoint, digest, done, run)
+                saved = time.monotonic()
+            new.close()
+
+        for task in plan.tasks[len(done) :]:
+            try:
+                one = optimise(
+                    task.objective, task.params, task.names, task.problem(plan, sources), (),
+                    task.settings, task.search,
+                    run=run, save=save, progress=progress, title=task.label,
+                )  # fmt: skip
+            except InputError as error:
+                raise InputError(f"{config}: {task.label}: {error}") from None
+            run = None
+            done.append(one)
+            save(None, True)
+        new.close()
+    rows = [
+        row
+        for task, one in zip(plan.tasks, done, strict=True)
+        for label, params in ((f"{task.label}, before", task.params), (task.label, one.params))
+        for row in task.score(plan, sources, label, params, progress)
+    ]
+    write("config.toml", plan.text)
+    write("loss.csv", _losses(plan.tasks, done).encode())
+    write("loss.png", _curves(plan.tasks, done))
+    write_rows(rows, write)
+    write("results.md", markdown_table(unseen(rows)).encode())
+    write("params.toml", _tables(plan.tasks, done).encode())
+    checkpoint.unlink()
+    return rows
+
+
+def unseen(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows of the test images; where there are none, of the validation or the fit."""
+    for split in reversed(SPLITS):
+        chosen = [row for row in rows if row["split"] == split]
+        if chosen:
+            return chosen
+    return []
+
+
+Sources = Mapping[str, Sequence[tuple[str, Recording]]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """One method of a configuration, checked."""
+
+    label: str
+    method: Estimator
+    params: FrameParams
+    names: tuple[str, ...]
+    search: Mapping[str, Interval]
+    objective: Objective
+    protocol: str
+    settings: Settings
+
+    def problem(self, plan: "Plan", sources: Sources) -> Problem:
+        """The batches to fit to and to validate on."""
+        cut = functools.partial(
+            parts,
+            protocol=self.protocol,
+            split=(1, 0, 0) if plan.apart else plan.split,
+            window=plan.window,
+            warm_up=plan.warm_up,
+        )
+        found: dict[str, list] = {}
+        for split in ("fit", "validation"):
+            found[split] = []
+            for _, recording in sources[split]:
+                if self.method.needs_frames and recording.frames is None:
+                    raise InputError(
+                        f"{recording.name}: holds no frames, which the method "
+                        f"{self.method.name!r} needs; use 'akf' or 'high-pass'"
+                    )
+                found[split] += cut(recording)
+        return Problem(self.objective, found["fit"], found["validation"], plan.weights)
+
+    def score(
+        self, plan: "Plan", sources: Sources, label: str, params: FrameParams, progress: bool
+    ) -> Iterator[dict[str, Any]]:
+        """Rows of every recording and split."""
+        for split in SPLITS:
+            for given, recording in sources[split]:
+                row = score(recording, self.method, params, self.protocol, progress=progress)
+                row = {**row, "recording": given, "method": label}
+                if plan.apart:
+                    yield {**row, "split": split}
+                    continue
+                shared = interleave(plan.split, row["frames"])
+                if self.objective.error is None:  # no image was looked at
+                    shared[:] = SPLITS.index("test")
+                for place, name in enumerate(SPLITS):
+                    if (shared == place).any():
+                        yield {**subset(row, np.flatnonzero(shared == place)), "split": name}
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """A checked configuration; recordings are (as given, path) by split."""
+
+    text: bytes
+    recordings: Mapping[str, list[tuple[str, Path]]]
+    tasks: list[Task]
+    size: tuple[int, int] | None
+    split: tuple[int, ...]
+    window: float | int | None
+    warm_up: float | int
+    weights: Mapping[str, float | int] | None
+
+    @property
+    def apart(self) -> bool:
+        """Whether validation and test have recordings of their own."""
+        return bool(self.recordings["validation"] or self.recordings["test"])
+
+    def digest(self) -> str:
+        """A number that changes with the configuration, the recordings and the precision."""
+        digest = hashlib.sha256(self.text)
+        digest.update(repr([task.params.values() for task in self.tasks]).encode())
+        digest.update(str(jnp.result_type(float)).encode())
+        for split in SPLITS:
+            for given, path in self.recordings[split]:
+                digest.update(f"{split} {given}".encode())
+                files = [path] if path.is_file() else sorted(path.rglob("*"))
+                for file in filter(Path.is_file, files):
+                    _fingerprint(file, digest.update)
+        return digest.hexdigest()
+
+
+def _fingerprint(path: Path, update: Callable[[bytes], None]) -> None:
+    """The file's name, size and content; of a large file 64 pieces of 1 MiB."""
+    size, piece = path.stat().st_size, 1 << 20
+    update(f"{path.name} {size}".encode())
+    step = max(piece, size // 64)
+    with path.open("rb") as file:
+        for first in range(0, size, step):
+            file.seek(first)
+            update(file.read(piece))
+
+
+def _text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _texts(value: Any) -> bool:
+    return isinstance(value, list) and all(map(_text, value))
+
+
+def _number(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
+
+
+def _natural(value: Any) -> bool:
+    return type(value) is int and value > 0
+
+
+# Of every setting: what is accepted, and how to say so.
+_POSITIVE = (lambda value: _number(value) and value > 0, "a positive number")
+_NOT_NEGATIVE = (lambda value: _number(value) and value >= 0, "a number, 0 or more")
+_NATURAL = (_natural, "a whole number, 1 or more")
+_NAME = (_text, "text")
+_PATHS = (_texts, 'a list of paths, as ["file.zip"]')
+_SETTINGS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "iterations": _NATURAL,
+    "learning_rate": _POSITIVE,
+    "patience": _NATURAL,
+    "every": _NATURAL,
+    "starts": _NATURAL,
+    "spread": _NOT_NEGATIVE,
+    "rounds": _NATURAL,
+    "batch": _NATURAL,
+    "seed": (lambda value: type(value) is int and value >= 0, "a whole number, 0 or more"),
+}
+_COMMON: dict[str, tuple[Callable[[Any], bool], str]] = {
+    **_SETTINGS,
+    "recordings": _PATHS,
+    "validation": _PATHS,
+    "test": _PATHS,
+    "split": (
+        lambda value: (
+            isinstance(value, list)
+            and len(value) == 3
+            and all(type(n) is int and n >= 0 for n in value)
+            and value[0] > 0
+        ),
+        "[fit, validation, test] in whole numbers, the first not 0",
+    ),
+    "size": (
+        lambda value: isinstance(value, list) and len(value) == 2 and all(map(_natural, value)),
+        "[width, height] in pixels",
+    ),
+    "loss": _NAME,
+    "protocol": _NAME,
+    "error": _NAME,
+    "dark_offset": _POSITIVE,
+    "weights": (
+        lambda value: (
+            isinstance(value, dict)
+            and set(value) <= set(REGIONS)
+            and all(_number(n) and n >= 0 for n in value.values())
+        ),
+        "a table of numbers named dark, well, bright",
+    ),
+    "window": _POSITIVE,
+    "warm_up": _NOT_NEGATIVE,
+    "method": (
+        lambda value: isinstance(value, list) and all(isinstance(n, dict) for n in value),
+        '[[method]] with name = "akf"',
+    ),
+}
+_METHOD: dict[str, tuple[Callable[[Any], bool], str]] = {
+    **{name: _COMMON[name] for name in ("loss", "error", "learning_rate", "iterations", "starts")},
+    "name": _NAME,
+    "label": _NAME,
+    "params": (lambda value: isinstance(value, str | dict), "a table or the path of a TOML file"),
+    "fit": (_texts, 'a list of names, as ["c_on", "c_off"]'),
+    "search": (
+        lambda value: (
+            isinstance(value, dict)
+            and all(
+                isinstance(v, list) and len(v) == 3 and all(map(_number, v)) and type(v[2]) is int
+                for v in value.values()
+            )
+        ),
+        "a table of name = [from, to, number of points]",
+    ),
+}
+
+
+def _check(
+    table: Mapping[str, Any], known: Mapping[str, tuple[Callable[[Any], bool], str]]
+) -> None:
+    for name, value in table.items():
+        if name not in known:
+            raise InputError(f"there is no setting {name!r}; {nearest(name, known)}")
+        accepts, text = known[name]
+        if not accepts(value):
+            raise InputError(f"{name} is {str(value)[:60]!r}; give {text}")
+
+
+def _one_of(value: str, what: str, known: Sequence[str]) -> str:
+    if value not in known:
+        raise InputError(f"there is no {what} {value!r}; {nearest(value, known)}")
+    return value
+
+
+def read_plan(config: Path, recordings: Sequence[str | Path] | None = None) -> Plan:
+    """Read and check a configuration; raises `InputError` naming the file and the setting.
+
+    `recordings` take the place of those that it names, relative to the working directory.
+    """
+    table = read_toml(config)
+    try:
+        _check(table, _COMMON)
+        text = config.read_bytes()
+        folders = dict.fromkeys(SPLITS, config.parent)
+        if recordings:
+            table = {**table, "recordings": [str(Path(one).absolute()) for one in recordings]}
+            text = _dump(table).encode()
+        found = {
+            split: find_recordings(table[key], folders[split]) if table.get(key) else []
+            for split, key in zip(SPLITS, ("recordings", "validation", "test"), strict=True)
+        }
+        if not found["fit"]:
+            raise InputError('no recording is given; add recordings = ["file.zip"]')
+        places = [path.resolve() for split in SPLITS for _, path in found[split]]
+        twice = [path for path in places if places.count(path) > 1]
+        if twice:
+            raise InputError(f"{twice[0]} is in two of recordings, validation and test; choose one")
+        apart = bool(found["validation"] or found["test"])
+        if apart and "split" in table:
+            raise InputError("split is for configurations without validation and test; omit it")
+        if not table.get("method"):
+            raise InputError('no method is given; add [[method]] with name = "akf"')
+        tasks: list[Task] = []
+        for number, entry in enumerate(table["method"], 1):
+            try:
+                tasks.append(_task(entry, table, config.parent))
+            except InputError as error:
+                raise InputError(f"method {number}: {error}") from None
+        labels = [task.label for task in tasks]
+        for label in labels:
+            if labels.count(label) > 1:
+                raise InputError(f"two methods are called {label!r}; give them different labels")
+        weights = table.get("weights")
+        if weights is not None and any(task.protocol != "reference" for task in tasks):
+            raise InputError("weights are for HDR references, the loss 'reference'; omit them")
+        size = table.get("size")
+        return Plan(
+            text,
+            found,
+            tasks,
+            None if size is None else (size[0], size[1]),
+            tuple(table.get("split", (2, 1, 1))),
+            table.get("window"),
+            table.get("warm_up", 0.2),
+            weights,
+        )
+    except InputError as error:
+        raise InputError(f"{config}: {error}") from None
+
+
+def _task(entry: Mapping[str, Any], table: Mapping[str, Any], folder: Path) -> Task:
+    _check(entry, _METHOD)
+    if "name" not in entry:
+        raise InputError('a method has no name; give name = "akf"')
+    method, values = find_method(entry["name"]), entry.get("params", {})
+    if isinstance(values, str):
+        params = method.Params.load(folder / values, method.name)
+    else:
+        params = method.Params.of(values)
+    both = {**table, **entry}
+    loss = _one_of(both.get("loss", "held-out"), "loss", [*PROTOCOLS, "likelihood"])
+    protocol = loss
+    if loss == "likelihood":
+        protocol = _one_of(both.get("protocol", "held-out"), "protocol", list(PROTOCOLS))
+    elif both.get("protocol", loss) != loss:
+        raise InputError(f"the loss {loss!r} has the protocol of that name; omit protocol")
+    error = _one_of(both.get("error", "linear"), "error", ERRORS)
+    names, search = tuple(entry.get("fit", ())), entry.get("search", {})
+    for name in names:
+        if name in PREPARED:
+            raise InputError(
+                f"{name} is fixed when a recording is prepared and has no gradient to follow; "
+                f"put search = {{ {name} = [from, to, number of points] }}"
+            )
+    if not names and not search:
+        raise InputError('nothing is to be fitted; give names, as fit = ["c_on", "c_off"]')
+    settings = Settings(**{name: both[name] for name in _SETTINGS if name in both})
+    intervals = {name: (low, high, count) for name, (low, high, count) in search.items()}
+    begin(params, names, settings, intervals)  # checks the names
+    objective = Objective(
+        method,
+        None if loss == "likelihood" else error,
+        protocol == "held-out",
+        both.get("dark_offset", 0.003),
+    )
+    label = entry.get("label", method.name)
+    return Task(label, method, params, names, intervals, objective, protocol, settings)
+
+
+def _load(path: Path, plan: Plan, progress: bool) -> Recording:
+    recording = load(path, plan.size, in_memory=False, progress=progress)
+    return dataclasses.replace(recording, name=str(path))  # for messages
+
+
+def _save(path: Path, digest: str, done: Sequence[Fitted], run: Run | None) -> None:
+    """Write a checkpoint: a line of JSON, then the arrays as equinox stores them."""
+    header = {
+        "digest": digest,
+        "done": [[one.loss, one.history] for one in done],
+        "run": None if run is None else [run.stage, run.iteration, run.tried, run.history],
+    }
+    arrays = [one.params.raw for one in done], None if run is None else run.position
+    with complete(path) as partial, partial.open("wb") as file:
+        file.write(json.dumps(header).encode() + b"\n")
+        eqx.tree_serialise_leaves(file, arrays)
+
+
+def _restore(path: Path, digest: str, plan: Plan) -> tuple[list[Fitted], Run | None]:
+    """The methods done and the one under way, if any, of a checkpoint."""
+    with path.open("rb") as file:
+        try:
+            header = json.loads(file.readline())
+            if header["digest"] != digest:
+                raise InputError(
+                    f"{path}: is of another configuration, other recordings or another precision; "
+                    "go on with the same ones, or choose another folder"
+                )
+            ended, under_way = header["done"], header["run"]
+            tasks = plan.tasks[: len(ended)]
+            run = None
+            if under_way is not None:
+                task = plan.tasks[len(ended)]
+                run = begin(task.params, task.names, task.settings, task.search)
+            like = [task.params.raw for task in tasks], None if run is None else run.position
+            raws, position = eqx.tree_deserialise_leaves(file, like)
+        except (ValueError, KeyError, TypeError, RuntimeError, EOFError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{path}: is not a checkpoint; remove it to start anew") from error
+    done = [
+        Fitted(with_raw(task.params, raw), *rest)
+        for task, raw, rest in zip(tasks, raws, ended, strict=True)
+    ]
+    return done, None if under_way is None else Run(position, *under_way)
+
+
+def _finished(out: Path, plan: Plan) -> list[dict[str, Any]]:
+    """The rows of a run that had ended; raises `InputError` if it was another one."""
+    try:
+        same = (out / "config.toml").read_bytes() == plan.text
+        rows = json.loads((out / "results.json").read_bytes())["rows"] if same else []
+    except (OSError, ValueError, KeyError):
+        same, rows = False, []
+    given = {name for split in SPLITS for name, _ in plan.recordings[split]}
+    if not same or {row["recording"] for row in rows} != given:
+        raise InputError(
+            f"{out}: holds results of another run and no checkpoint; leave out --resume to replace "
+            "them, or choose another folder"
+        )
+    return rows
+
+
+def _losses(tasks: Sequence[Task], done: Sequence[Fitted]) -> str:
+    """loss.csv; empty where a loss was not computed."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["method", "start", "round", "iteration", "fit", "validation"])
+    for task, one in zip(tasks, done, strict=True):
+        table.writerows([task.label, *line] for line in one.history)
+    return text.getvalue()
+
+
+def _curves(tasks: Sequence[Task], done: Sequence[Fitted]) -> bytes:
+    """loss.png: the losses of every method over iterations, a line for each start."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 3 * len(tasks)), layout="constrained")
+    for task, one, axis in zip(
+        tasks, done, figure.subplots(len(tasks), squeeze=False)[:, 0], strict=True
+    ):
+        for start in range(task.settings.starts):
+            lines = [line for line in one.history if line[0] == start]
+            for column, colour, name in ((3, "C0", "fit"), (4, "C1", "validation")):
+                seen = [line for line in lines if line[column] is not None]
+                at = [line[1] * task.settings.iterations + line[2] for line in seen]
+                losses = [line[column] for line in seen]
+                axis.plot(at, losses, colour, lw=1, label=name if start == 0 else None)
+        axis.set(title=task.label, xlabel="iteration", ylabel="loss")
+        axis.legend(frameon=False)
+    image = io.BytesIO()
+    figure.savefig(image, format="png", dpi=120)
+    return image.getvalue()
+
+
+def _tables(tasks: Sequence[Task], done: Sequence[Fitted]) -> str:
+    """params.toml: physical values with all their digits, a table for each method."""
+    lines = []
+    for task, one in zip(tasks, done, strict=True):
+        lines.append(f"[{_key(task.label)}]")
+        for name, value in one.params.values().items():
+            if name in one.params.numbers:
+                digits = np.asarray(getattr(one.params, name))
+                value = np.array([float(str(n)) for n in digits.ravel()]).reshape(digits.shape)
+                value = value.tolist()
+            lines.append(f"{name} = {_value_of(value)}")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _dump(table: Mapping[str, Any]) -> str:
+    """A configuration as TOML."""
+    lines = [f"{_key(k)} = {_value_of(v)}" for k, v in table.items() if k != "method"]
+    for entry in table.get("method", []):
+        lines += ["", "[[method]]", *(f"{_key(k)} = {_value_of(v)}" for k, v in entry.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
+
+
+def _value_of(value: Any) -> str:
+    """A value as TOML writes it."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{_key(k)} = {_value_of(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_value_of, value)) + "]"
+    # JSON's text and numbers are TOML's, but for NaN and infinity.
+    return repr(value) if isinstance(value, float) else json.dumps(value)
