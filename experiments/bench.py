@@ -26,6 +26,7 @@ import numba
 import numpy as np
 
 import jaxevent
+from jaxevent.fit import with_raw
 from jaxevent.io import load, save
 from jaxevent.reconstruction.estimator import Observation, Observer, State, Trajectory
 from jaxevent.reconstruction.pixels import Windows
@@ -39,6 +40,7 @@ GATED = {
     "filter / numba program": ("higher", 0.5),
     "filter / numba loop with neighbour look-up": ("higher", 0.5),
     "features and packing / numba program": ("higher", 0.5),
+    "loss and gradient of 8 parameters / loss": ("lower", 0.5),
     "complete path / dv-processing Accumulator": ("higher", 0.5),
     "compilations for a second recording": ("lower", 0.0),
     "peak memory of 100 M events, GB": ("lower", 0.25),
@@ -232,6 +234,30 @@ def prepare_seconds(recording: Recording) -> float:
     return best(run)
 
 
+def gradient_seconds(recording: Recording) -> tuple[float, float]:
+    """The mean squared error at 8 images, and the same with its gradient by 8 parameters."""
+    names = ("c_on", "c_off", "I0", "kappa", "w_min", "sigma_proc", "sigma_iso", "sigma_ref")
+    frames = recording.frames
+    assert frames is not None
+    start = jaxevent.akf.Params(preset="paper")
+    features, out = jaxevent.akf.prepare(recording, frames.t[1:9] + 20_000, start)
+    truth = jax.numpy.asarray(frames.intensity[1:9].reshape(8, -1))
+
+    # Everything but the parameters is given as an argument, lest it be compiled as constants.
+    def loss(raw, features, out, truth):
+        params = with_raw(start, raw)
+        image, _ = jaxevent.akf.read(params, jaxevent.akf.run(params, features)[0], out)
+        return ((image - truth) ** 2).mean()
+
+    raw = {name: start.raw[name] for name in names}
+    value, both = jax.jit(loss), jax.jit(jax.value_and_grad(loss))
+    given = (raw, features, out, truth)
+    return (
+        best(lambda: jax.block_until_ready(value(*given)), 5),
+        best(lambda: jax.block_until_ready(both(*given)), 5),
+    )
+
+
 def text_seconds(folder: Path, events: Events) -> float:
     """Reading events.txt of the Event-Camera Dataset."""
     import pandas
@@ -390,6 +416,7 @@ def main() -> int:
         given = n / loop_seconds(recording, search=False)
         filtering = n / filter_seconds(recording)
         preparing = n / prepare_seconds(recording)
+        loss, gradient = gradient_seconds(recording)
         whole, reading = complete_seconds(path)
         path.unlink()
         assert isinstance(recording.events, Events)
@@ -401,6 +428,8 @@ def main() -> int:
             "numba loop, recursion alone": given,
             "filter alone": filtering,
             "features and packing": preparing,
+            "loss of a prepared recording": n / loss,
+            "loss and gradient of 8 parameters": n / gradient,
             "reading text": 1 / text,
             "reading HDF5": n / reading,
             "complete path: HDF5 to 100 Hz images": n / whole,
@@ -411,6 +440,7 @@ def main() -> int:
             "filter / numba loop with neighbour look-up": filtering / loop,
             "filter / numba loop of the recursion alone": filtering / given,
             "features and packing / numba program": preparing / whole_program,
+            "loss and gradient of 8 parameters / loss": gradient / loss,
             "complete path / numba program": n / whole / whole_program,
             "complete path / dv-processing Accumulator": n / whole / accumulator,
             "compilations for a second recording": compilations(),

@@ -1,0 +1,46 @@
+"""What each part of the fitted filter is worth on the test scenes of ahdr.py; makes the table.
+
+    python experiments/ahdr.py --out ahdr && python experiments/ablations.py --out ahdr
+
+Runs configs/ablations.toml; numbers are geometric means over recordings, as factors of the whole.
+"""
+
+import argparse
+import json
+import os
+from pathlib import Path
+
+import ahdr
+
+from jaxevent.evaluate import evaluate
+
+CONFIG = Path(__file__).parents[1] / "configs" / "ablations.toml"
+SHOWN = ("MSE", "log MSE", "bright MSE", "dark log MSE", "well-exposed MSE")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--out", type=Path, required=True, help="the folder ahdr.py wrote")
+    out = parser.parse_args().out.absolute()
+    os.environ["AHDR"] = str(out)
+    rows = [{**row, "seed": 0} for row in evaluate(CONFIG, out / "ablations", progress=True)]
+    labels = list(dict.fromkeys(row["method"] for row in rows))
+
+    def means(label: str) -> list[float]:
+        mine = [row for row in rows if row["method"] == label]
+        return [ahdr.summary(mine, ahdr.MEASURES[name])[0] for name in SHOWN]
+
+    whole = means(labels[0])
+    lines = ["| | " + " | ".join(SHOWN) + " |", "|---|" + "---:|" * len(SHOWN)]
+    lines.append("| whole | " + " | ".join(f"{value:.3g}" for value in whole) + " |")
+    for label in labels[1:]:
+        cells = [f"x {one / all:.2f}" for one, all in zip(means(label), whole, strict=True)]
+        lines.append(f"| {label} | " + " | ".join(cells) + " |")
+    text = "\n".join(lines) + "\n"
+    (out / "ablations.md").write_text(text)
+    (out / "ablations.json").write_text(json.dumps({k: means(k) for k in labels}, indent=1))
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
