@@ -22,16 +22,19 @@ import jaxevent
 from jaxevent.evaluate import score
 from jaxevent.fit import fit
 from jaxevent.simulate import FITTING, SENSORS, TESTING, Pan, scene, simulate
+from jaxevent.simulate.scenes import Speed
 
 CONFIG = Path(__file__).parents[1] / "configs" / "fit_ahdr.toml"
-SECONDS = {"slow": 1.0, "fast": 0.5}
+SECONDS: dict[Speed, float] = {"slow": 1.0, "fast": 0.5}
 
 
 def record(folder: Path, scenes: tuple[str, ...], seeds: range, sensor: str) -> list[Path]:
     """Simulate each scene, slow and fast, once per seed."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
-    jobs = [(name, speed, seed) for seed in seeds for name in scenes for speed in SECONDS]
+    jobs: list[tuple[str, Speed, int]] = [
+        (name, speed, seed) for seed in seeds for name in scenes for speed in SECONDS
+    ]
     for name, speed, seed in tqdm(jobs, desc=f"simulating for {folder.name}"):
         path = folder / f"{name}_{speed}_{seed}.h5"
         paths.append(path)
@@ -45,7 +48,7 @@ def rows_of(paths: list[Path], fitted: Path, out: Path) -> list[dict]:
     """Score every method on the recordings; kept in a file."""
     if out.exists():
         return json.loads(out.read_text())
-    methods = [
+    methods: list[tuple] = [
         ("last-frame", jaxevent.last_frame, jaxevent.last_frame.Params()),
         ("blend", jaxevent.blend, jaxevent.blend.Params()),
     ]
@@ -97,9 +100,14 @@ def table(rows: list[dict]) -> str:
     lines = ["| method | " + " | ".join(MEASURES) + " |", "|---|" + "---:|" * len(MEASURES)]
     for label in labels:
         mine = [row for row in rows if row["method"] == label]
-        cells = [f"{m:.3g} +- {100 * s:.0f} %" for m, s in (summary(mine, f) for f in MEASURES.values())]
+        cells = [
+            f"{m:.3g} +- {100 * s:.0f} %" for m, s in (summary(mine, f) for f in MEASURES.values())
+        ]
         lines.append(f"| {label} | " + " | ".join(cells) + " |")
-    lines += ["", "| method | MSE / cf | log MSE / cf | well-exposed MSE / blend | z2 bright, dark, well |"]
+    lines += [
+        "",
+        "| method | MSE / cf | log MSE / cf | well-exposed MSE / blend | z2 bright, dark, well |",
+    ]
     lines += ["|---|---:|---:|---:|---|"]
     base = {label: [r for r in rows if r["method"] == label] for label in labels}
 

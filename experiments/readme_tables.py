@@ -18,11 +18,17 @@ def main() -> None:
     for name, value in bench["ratios"].items():
         print(f"{name}: {value:.2f}")
     print("\n| parameter | default | unit | |\n|---|---|---|---|")
-    known = {}
+    numbers, choices = {}, {}
     for method in jaxevent.METHODS.values():
-        known |= method.Params.numbers
-    for name, number in known.items():
-        print(f"| `{name}` | {number.default:.4g} | {number.unit} | {number.meaning} |")
+        numbers |= method.Params.numbers
+        choices |= method.Params.choices
+    for name, number in numbers.items():
+        default = number.default if isinstance(number.default, tuple) else (number.default,)
+        text = ", ".join(f"{value:.4g}" for value in default)
+        print(f"| `{name}` | {text} | {number.unit} | {number.meaning} |")
+    for name, choice in choices.items():
+        options = " or ".join(str(option).lower() for option in choice.options)
+        print(f"| `{name}` | {options} | | {choice.meaning} |")
 
 
 if __name__ == "__main__":

@@ -26,8 +26,8 @@ TRUE = {
 def from_model(seed: int = 0, size: tuple[int, int] = (32, 24), frames: int = 40) -> Recording:
     """Draw a recording from the smoother's model with the true values; I0 = 0.2.
 
-    Events come at random; their polarity pulls their own sum back to the middle, so that the frames
-    are rarely near black or white. (It must not depend on the noise: the likelihood is of the frames
+    Events come at random; their polarity pulls their own sum back to the middle, so that frames are
+    rarely near black or white. (It must not depend on the noise: the likelihood is of the frames,
     given the events.)
     """
     rng = np.random.default_rng(seed)
@@ -67,6 +67,7 @@ def from_model(seed: int = 0, size: tuple[int, int] = (32, 24), frames: int = 40
 
 def fitted(recording: Recording, start, names, search, iterations: int):
     """The parameters that maximise the likelihood."""
+    assert recording.frames is not None
     part = Part(recording, recording.frames, np.arange(0), np.arange(0))
     problem = Problem(Objective(jaxevent.aks, None), [part])
     settings = Settings(iterations=iterations, learning_rate=0.1, rounds=2)

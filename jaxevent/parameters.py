@@ -39,13 +39,15 @@ class Number:
         return value
 
     def check(self, value: Any) -> None:
-        many = isinstance(self.default, tuple)
-        if many and not (isinstance(value, list | tuple) and value):
+        if not isinstance(self.default, tuple):
+            self.check_one(value)
+            return
+        if not (isinstance(value, list | tuple) and value):
             raise InputError(
                 f"the parameter {self.name} is {str(value)[:40]}; give a list of numbers, as "
                 f"{list(self.default)}"
             )
-        for one in value if many else [value]:
+        for one in value:
             self.check_one(one)
 
     def check_one(self, value: Any) -> None:
@@ -72,7 +74,7 @@ class Positive(Number):
 
 
 class Choice:
-    """A setting of a `Parameters` class that takes one of a few values and is not differentiated."""
+    """A setting of a `Parameters` class: one of a few values, not differentiated."""
 
     def __init__(self, options: tuple[str | bool, ...], meaning: str):
         self.options, self.meaning = options, meaning

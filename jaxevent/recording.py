@@ -315,7 +315,7 @@ class Recording:
         )
 
     def _extra_of(self, rows: slice | NDArray | None) -> Mapping[str, NDArray]:
-        """The further arrays, those with one entry per frame ("gain", "rgb") cut like the frames."""
+        """The further arrays; those with one entry per frame ("gain", "rgb") cut like frames."""
         if rows is None:
             return self.extra
         cut = {name: self.extra[name][rows] for name in ("gain", "rgb") if name in self.extra}

@@ -202,7 +202,7 @@ def reconstruct(method, recording, p, times, likelihood=False):
             )
             if method == "aks":
                 seen, one = smooth(pixel, [int(time) - start for time in times], p)
-                images[:, :, y, x], total = seen.reshape(2, -1), total + one
+                images[:, :, y, x], total = seen.reshape(2, -1), total + float(one)
                 continue
             trace = run(method, pixel, [near[i] for i in rows], p)
             for j, time in enumerate(times):
@@ -228,6 +228,17 @@ def move(method, pixel, L, P, dt, time, n, p):
     u = reference(method, pixel)(time, n)
     if method == "akf":
         rate = pixel.rate(time)
+        if p["one_sided"] and pixel.frames:
+            k = max(sum(m <= time for m in pixel.mid) - 1, 0)
+            side, after = (
+                (1 if pixel.grey[i] > 0.5 else -1) * (1 - pixel.clear(i))
+                for i in (k, min(k + 1, pixel.frames - 1))
+            )
+            end = p["margin"] / 255
+            bound = math.log((1 - end if side > 0 else end) + p["I0"])
+            push = p["clip_rate"] * min(abs(side), abs(after)) if side * after > 0 else 0.0
+            if push and (bound - L) * side > 0:
+                u, rate = (rate * u + push * bound) / (rate + push), rate + push
         P1 = 1 / (1 / P + dt * rate)  # (18)
         return (L - u) / P * P1 + u, P1  # (16)
     if method in ("cf", "cf-augmented", "high-pass"):
@@ -274,7 +285,7 @@ def half_seen(m, P, bound, sign, floor):
     x = np.linspace(min(m, bound) - spread, max(m, bound) + spread, 100_001)
     log_weight = -0.5 * (x - m) ** 2 / P - 0.5 * math.log(2 * math.pi * P)
     log_weight += scipy.special.log_ndtr(sign * (x - bound) / math.sqrt(floor))
-    mass = scipy.special.logsumexp(log_weight)
+    mass = float(np.logaddexp.reduce(log_weight))
     weight = np.exp(log_weight - mass)
     mean = (weight * x).sum()
     return mass + math.log(x[1] - x[0]), mean, (weight * (x - mean) ** 2).sum()
@@ -300,7 +311,7 @@ def smooth(pixel, times, p):
 
     V = np.array([clock(n, time) for n, time in zip(done, when, strict=True)])
     same = np.sign(V)[:, None] == np.sign(V)[None, :]
-    C = p["P0"] + np.where(same, np.minimum(abs(V)[:, None], abs(V)[None, :]), 0)
+    C = p["P_start"] + np.where(same, np.minimum(abs(V)[:, None], abs(V)[None, :]), 0)
     prior = math.log(p["start"] + I0) + np.array([pixel.moved(n) for n in done])
     prior -= pixel.moved(first)
 

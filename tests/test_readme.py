@@ -11,12 +11,16 @@ README = (Path(__file__).parents[1] / "README.md").read_text()
 def test_table_of_parameters_is_complete():
     table = README[README.index("| parameter |") :]
     rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+?) \|", table, re.MULTILINE))
-    known = {}
+    numbers, choices = {}, {}
     for method in jaxevent.METHODS.values():
-        known |= method.Params.numbers
-    assert rows.keys() == known.keys()
-    for name, number in known.items():
-        assert float(rows[name]) == float(f"{number.default:.4g}"), name
+        numbers |= method.Params.numbers
+        choices |= method.Params.choices
+    assert rows.keys() == numbers.keys() | choices.keys()
+    for name, number in numbers.items():
+        default = number.default if isinstance(number.default, tuple) else (number.default,)
+        assert rows[name] == ", ".join(f"{value:.4g}" for value in default), name
+    for name, choice in choices.items():
+        assert rows[name] == " or ".join(str(option).lower() for option in choice.options)
 
 
 def test_every_method_is_named():

@@ -42,6 +42,8 @@ OPTIONS = {
     "certainty": [0.5, 1.3, 2.0, 0.7],
     "rho_width": 0.4,
     "beyond": 0.7,
+    "one_sided": True,
+    "clip_rate": 300.0,
 }
 
 

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from jaxevent.parameters import Choice, Number, Parameters, Positive
 from jaxevent.reconstruction.pixels import FrameFeatures, Points, Timing
 
-
 # Parameters that act through comparisons with event times: fixed when a recording is prepared.
 PREPARED = Timing._fields
 
@@ -112,6 +111,23 @@ def belief(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "fram
     """w of every frame and pixel, at least `w_min`, which is that of clipped ones."""
     clear = unclipped(params, frames)
     return clear * certainty(params, frames) + (1 - clear) * params.w_min
+
+
+def clipped_side(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
+    """+1 where a frame is clipped at white, -1 where at black, 0 where it is not."""
+    return jnp.where(jnp.asarray(frames.grey) > 0.5, 1, -1) * (1 - unclipped(params, frames))
+
+
+def bound_of(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
+    """The log intensity at which pixels begin to clip: that of a grey `margin` from the end."""
+    place = jnp.clip(params.margin, 0, 127)
+    below = place.astype(int)
+    part = place - below
+    response = jnp.asarray(frames.response)
+    dark = (1 - part) * response[below] + part * response[below + 1]
+    bright = (1 - part) * response[255 - below] + part * response[254 - below]
+    bound = jnp.where(jnp.asarray(frames.grey) > 0.5, bright, dark)
+    return jnp.log(bound / jnp.asarray(frames.gain)[:, None] + params.I0)
 
 
 SPLINE = 256

@@ -21,8 +21,8 @@ from jaxevent.reconstruction.augment import (
     event_change,
 )
 from jaxevent.reconstruction.estimator import (
-    Filter,
     Event,
+    Filter,
     Observation,
     Observer,
     State,

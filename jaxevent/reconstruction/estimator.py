@@ -54,6 +54,9 @@ class Observation(eqx.Module):
 
     level: Float[Numeric, "*points"]
     rate: Float[Numeric, "*points"]
+    # A bound and the rate at which to pull states below it (positive) or above it (negative) there.
+    bound: Float[Numeric, "*points"] | None = None
+    push: Float[Numeric, "*points"] | None = None
 
 
 class Event(eqx.Module):
@@ -62,7 +65,7 @@ class Event(eqx.Module):
     since: Float[Numeric, "*points"]  # s since the pixel's previous event
     near: Float[Numeric, "*points"]  # s since the 3x3 neighbourhood's previous event
     polarity: Int[Numeric, "*points"]  # +1, -1; 0: no event, change nothing
-    frame: Observation | None  # just before the event
+    frame: Observation  # just before the event
 
 
 class Place(eqx.Module):
@@ -163,6 +166,7 @@ class Estimator(Generic[P]):
 
         return Video(self, recording, self.Params() if params is None else params, **options)
 
+
 @dataclasses.dataclass(frozen=True)
 class Filter(Estimator[P]):
     """A causal method, made of pure functions over single pixels.
@@ -208,11 +212,12 @@ class Filter(Estimator[P]):
 
     def scan(self, params: P, observer: Observer, tiles: Tiles, state: State) -> State:
         """The states after every event, (slots,)."""
-        events = Event(*map(jnp.asarray, (tiles.since, tiles.near, tiles.polarity)), None)
+        events = (jnp.asarray(tiles.since), jnp.asarray(tiles.near), jnp.asarray(tiles.polarity))
         frame = observer(tiles.points)
         place = Place(jnp.asarray(tiles.kind), jnp.asarray(tiles.lane))
         lanes = jax.tree.map(lambda s: s[tiles.pixel], state)
-        return jax.tree.map(jnp.ravel, _path(self, params, frame, lanes, events, place))
+        path = _path(self, params, frame, lanes, events, place)
+        return State(path.L.ravel(), path.P.ravel())
 
     def read(
         self, params: P, trajectory: "Trajectory", out: ReadOut
@@ -249,9 +254,7 @@ def _over_tiles(step: Callable, lanes: Any, place: Place, slots: Any) -> Any:
         where, slots = tile
         mine = jax.tree.map(lambda s: lax.dynamic_slice(s, (where.lane,), (widest,)), lanes)
         end, out = lax.switch(where.kind, [*kinds, skip], mine, slots)
-        lanes = jax.tree.map(
-            lambda s, e: lax.dynamic_update_slice(s, e, (where.lane,)), lanes, end
-        )
+        lanes = jax.tree.map(lambda s, e: lax.dynamic_update_slice(s, e, (where.lane,)), lanes, end)
         return lanes, out
 
     return lax.scan(body, lanes, (place, slots))[1]
@@ -259,21 +262,21 @@ def _over_tiles(step: Callable, lanes: Any, place: Place, slots: Any) -> Any:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _path(
-    estimator: Filter, params: Any, frame: Observation, lanes: State, events: Event, place: Place
+    estimator: Filter, params: Any, frame: Observation, lanes: State, events: tuple, place: Place
 ) -> State:
     """The states after every event, (tiles, slots)."""
 
-    def step(at: State, slot: tuple[Event, Observation]) -> tuple[State, State]:
+    def step(at: State, slot: tuple[tuple, Observation]) -> tuple[State, State]:
         at = _each(estimator, params, at, *slot)
         return at, at
 
     return _over_tiles(step, lanes, place, (events, frame))
 
 
-def _each(estimator: Filter, params: Any, at: State, event: Event, frame: Observation) -> State:
-    """The filter's step for arrays of states and events."""
-    event = Event(event.since, event.near, event.polarity, frame)
-    return estimator.step(params, at, event)
+def _each(estimator: Filter, params: Any, at: State, event: tuple, frame: Observation) -> State:
+    """The filter's step for arrays of states and events (since, near, polarity)."""
+    since, near, polarity = event
+    return estimator.step(params, at, Event(since, near, polarity, frame))
 
 
 # With s the state before an event, f the filter's step, the state's derivative obeys
@@ -287,7 +290,7 @@ def _path_jvp(estimator: Filter, primals: tuple, tangents: tuple) -> tuple[State
     params, frame, lanes, events, place = primals
     d_params, d_frame, d_lanes, _, _ = tangents
 
-    def step(at: State, slot: tuple[Event, Observation]) -> tuple[State, tuple[State, State]]:
+    def step(at: State, slot: tuple[tuple, Observation]) -> tuple[State, tuple[State, State]]:
         after = _each(estimator, params, at, *slot)
         return after, (at, after)
 

@@ -10,17 +10,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxevent.parameters import Number, Positive
+from jaxevent.parameters import Choice, Number, Positive
 from jaxevent.reconstruction.augment import (
     Augmented,
     AugmentParams,
     BetweenFrames,
     belief,
     believed_rate,
+    bound_of,
+    clipped_side,
     event_change,
-    unclipped,
 )
-from jaxevent.reconstruction.estimator import Filter, Event, Observation, Observer, State
+from jaxevent.reconstruction.estimator import Event, Filter, Observation, Observer, State
 from jaxevent.reconstruction.pixels import FrameFeatures, Points
 
 
@@ -35,6 +36,8 @@ class Params(AugmentParams):
     kappa = Positive(7e5, "1 / (intensity^2 s)", "certainty of frames: 7e5 DAVIS, 7e7 FLIR")
     P0 = Positive(0.09, "(ln I)^2", "variance at the start")
     beyond = Number(0.0, "ln I", "how far beyond the clip clipped pixels start")
+    one_sided = Choice((False, True), "whether clipped frames tell that L lies beyond the clip")
+    clip_rate = Positive(100.0, "1 / ((ln I)^2 s)", "1/R of clipped frames, if one-sided")
 
     presets = {
         "paper": {},
@@ -42,17 +45,18 @@ class Params(AugmentParams):
             "c_on": 0.2,
             "c_off": 0.2,
             "I0": 0.003,
-            "w_min": 1e-5,
+            "w_min": 1e-6,
             "margin": 2.5,
             "calibrate": False,
             "weighting": "certainty",
             "sigma_proc": 0.05**0.5,
-            "sigma_iso": 0.03**0.5,
-            "sigma_ref": 0.03**0.5,
+            "sigma_iso": 0.1,
+            "sigma_ref": 0.1,
             "rho": 0.1,
             "kappa": 3e4,
             "P0": 1.0,
-            "beyond": 0.7,
+            "beyond": 0.5,
+            "one_sided": True,
         },
     }
 
@@ -75,6 +79,8 @@ class Augmentation(Observer):
     I0: Float[Array, ""]
     present: Float[Array, ""]
     begin: Float[Array, " pixels"]
+    bound: Float[Array, "frames pixels"] | None
+    push: Float[Array, "frames pixels"] | None
 
     def __init__(self, params: Params, frames: FrameFeatures):
         self.level = Augmented(params, frames)
@@ -87,14 +93,25 @@ class Augmentation(Observer):
             Rbar = 1 / (params.kappa * belief(params, frames))
             self.image = BetweenFrames(params, frames, jnp.asarray(frames.intensity))
             self.density = BetweenFrames(params, frames, Rbar)
-        side = jnp.where(frames.grey[0] > 0.5, 1, -1) * (1 - unclipped(params, frames)[0])
-        self.begin = params.beyond * side
+        side = clipped_side(params, frames)
+        self.begin = params.beyond * side[0]
+        self.bound = self.push = None
+        if params.one_sided:
+            # What both frames of a gap say; where one is not clipped, events tell when it began.
+            following = jnp.roll(side, -1, axis=0)
+            both = jnp.where(side * following > 0, jnp.minimum(abs(side), abs(following)), 0)
+            self.bound = bound_of(params, frames)
+            self.push = params.clip_rate * jnp.sign(side) * both
 
     def __call__(self, points: Points) -> Observation:
         if self.image is None:
-            return Observation(self.level(points), self.present * self.density(points))
-        rate = self.present * (self.image(points) + self.I0) ** 2 / self.density(points)
-        return Observation(self.level(points), rate)
+            rate = self.present * self.density(points)
+        else:
+            rate = self.present * (self.image(points) + self.I0) ** 2 / self.density(points)
+        if self.bound is None or self.push is None:
+            return Observation(self.level(points), rate)
+        push = self.present * points.of_frame(self.push)
+        return Observation(self.level(points), rate, points.of_frame(self.bound), push)
 
     def outset(self, points: Points) -> Array:
         return self.level(points) + self.begin
@@ -107,10 +124,18 @@ def initial(params: Params, level: Array) -> State:
 def advance(params: Params, state: State, dt: Array, frame: Observation) -> State:
     """Towards the augmented frame over dt: (18) and (16).
 
-    The line before (17) of the paper must read P' = -P^2 / R + Q.
+    The line before (17) of the paper must read P' = -P^2 / R + Q. One-sided evidence of clipped
+    frames acts like a frame at the bound while the state lies on its wrong side.
     """
-    gain = 1 / (1 + state.P * dt * frame.rate)
-    return State((state.L - frame.level) * gain + frame.level, state.P * gain)
+    rate, u = frame.rate, frame.level
+    if frame.push is not None:
+        wrong = frame.push * (frame.bound - state.L) > 0
+        push = jnp.where(wrong, jnp.abs(frame.push), 0)
+        total = rate + push
+        u = u + (frame.bound - u) * push / jnp.where(total > 0, total, 1)
+        rate = total
+    gain = 1 / (1 + state.P * dt * rate)
+    return State((state.L - u) * gain + u, state.P * gain)
 
 
 def noise(params: Params, event: Event) -> Array:

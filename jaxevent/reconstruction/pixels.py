@@ -204,7 +204,8 @@ class ReadOut(eqx.Module):
         chosen = jax.tree.map(lambda leaf: leaf[rows], parts)
         if growth is not None:
             growth = Growth([count[rows] for count in growth.counts], growth.rho_ref)
-        return ReadOut(*chosen, growth)
+        points, slot, since = chosen
+        return ReadOut(points, slot, since, growth)
 
     def at(self, rho_ref: Array) -> "ReadOut":
         """The read-out for a dead time near the one that it was made for."""
@@ -238,7 +239,8 @@ class Timing(NamedTuple):
     @classmethod
     def of(cls, params: Any) -> "Timing":
         """From an estimator's parameters, rounded to 10 ns: 7.5 ms is 7500 us in float32 too."""
-        return cls(*(round(float(getattr(params, name)), 8) for name in cls._fields))
+        offset, exposure, rho = (round(float(getattr(params, name)), 8) for name in cls._fields)
+        return cls(offset, exposure, rho)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -780,8 +782,16 @@ class Windows:
                 t = part.t - self.origin
                 parts.append(
                     _exposure(
-                        t, part.x, part.y, part.p, weight[i:j], m - i, row, exact[row],
-                        self.recording.width, np.zeros((2, self.pixels), self.count_dtype),
+                        t,
+                        part.x,
+                        part.y,
+                        part.p,
+                        weight[i:j],
+                        m - i,
+                        row,
+                        exact[row],
+                        self.recording.width,
+                        np.zeros((2, self.pixels), self.count_dtype),
                     )  # fmt: skip
                 )
         total = sum(len(part[0]) for part in parts)
@@ -817,8 +827,8 @@ class Windows:
         room = (max(len(events), self.events),)
         key, near = self._tile_room("key", room, np.int64), self._tile_room("near", room, dtype)
         shape = (layout.room, SLOTS)
-        # `_fill` clears what used tiles leave empty, unused tiles are skipped. (Derivatives are taken
-        # of all tiles, where nothing but numbers may lie: then the memory is fresh, so cleared.)
+        # `_fill` clears what used tiles leave empty, unused tiles are skipped. (Derivatives are
+        # taken of all tiles, where nothing but numbers may lie: then memory is fresh, so cleared.)
         floats = [self._tile_room(f"float {i}", shape, dtype) for i in range(4)]
         places = [self._tile_room(f"int {i}", shape, np.int32) for i in range(2)]
         counts = [self._tile_room(f"count {i}", shape, dtype) for i in range(2)]
@@ -833,8 +843,9 @@ class Windows:
         # Where a piece begins with its exposure, the counts at its begin are those of the stream.
         aligned = begins == (breaks[::2] if clock.exposed else breaks)
         known = (
-            self.origin, self.rho, self.growth, carry.last, at_start, reference, breaks, _rate(breaks),
-            clock.mid[first_frame:], _rate(clock.mid[first_frame:]), aligned, clock.exposed,
+            self.origin, self.rho, self.growth, carry.last, at_start, reference, breaks,
+            _rate(breaks), clock.mid[first_frame:], _rate(clock.mid[first_frame:]), aligned,
+            clock.exposed,
         )  # fmt: skip
         with ThreadPoolExecutor(WORKERS) as pool:
             bands = np.linspace(0, height, WORKERS + 1).astype(int)
@@ -1060,8 +1071,8 @@ def _sort(t, x, y, p, width, top, bottom, origin, cursor, latest, key, near):
 @_compiled
 def _fill(
     first_job, step, jobs, ranks, width, lanes, first, round_tile, shape, offset, kind, lane_of,
-    key, gap, origin, rho, growth, last, at_start, reference, breaks, piece_rate, mids, level_rate, aligned,
-    exposed, since, near, weight, blend, cell, level, on, off, polarity,
+    key, gap, origin, rho, growth, last, at_start, reference, breaks, piece_rate, mids,
+    level_rate, aligned, exposed, since, near, weight, blend, cell, level, on, off, polarity,
 ):  # fmt: skip
     """Write the slots of 64 lanes at a time: 64 sequential streams in, whole cache lines out."""
     lane_count = len(lanes)

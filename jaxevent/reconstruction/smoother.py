@@ -20,14 +20,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
 from jax.scipy.special import log_ndtr
+from jaxtyping import Array, Float
 
 from jaxevent.parameters import Choice, Positive
 from jaxevent.reconstruction.augment import (
     CertaintyParams,
+    bound_of,
     brightness,
     certainty,
+    clipped_side,
     deblurred,
     late,
     unclipped,
@@ -44,7 +46,7 @@ class Params(CertaintyParams):
     sigma_frame = Positive(0.01, "intensity", "noise of frames where the certainty w is 1")
     sigma_floor = Positive(0.02, "ln I", "noise of frames in log intensity, however certain")
     start = Positive(0.5, "intensity", "mean before the first frame")
-    P0 = Positive(4.0, "(ln I)^2", "variance before the first frame")
+    P_start = Positive(4.0, "(ln I)^2", "variance before the first frame")
     presets = {
         "hdr": {"c_on": 0.2, "c_off": 0.2, "I0": 0.003, "w_min": 1e-5, "margin": 2.5},
     }
@@ -149,7 +151,7 @@ def rows_of(params: Params, frames: FrameFeatures) -> tuple[Rows, Float[Array, "
     q = added(params, counts[0], counts[1], gap)
     noise = params.sigma_frame / certainty(params, frames) / (frames.intensity + params.I0)
     clear = unclipped(params, frames)
-    side = jnp.where(jnp.asarray(frames.grey) > 0.5, 1.0, -1.0) * (1 - clear) * params.one_sided
+    side = clipped_side(params, frames) * params.one_sided
     measured = Rows(
         z,
         noise**2 + params.sigma_floor**2,
@@ -161,18 +163,6 @@ def rows_of(params: Params, frames: FrameFeatures) -> tuple[Rows, Float[Array, "
         jnp.broadcast_to(q, z.shape),
     )
     return measured, counts
-
-
-def bound_of(params: Params, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
-    """The log intensity at which pixels begin to clip: that of a grey `margin` from the end."""
-    place = jnp.clip(params.margin, 0, 127)
-    below = place.astype(int)
-    part = place - below
-    response = jnp.asarray(frames.response)
-    dark = (1 - part) * response[below] + part * response[below + 1]
-    bright = (1 - part) * response[255 - below] + part * response[254 - below]
-    bound = jnp.where(jnp.asarray(frames.grey) > 0.5, bright, dark)
-    return jnp.log(bound / jnp.asarray(frames.gain)[:, None] + params.I0)
 
 
 def added(params: Params, on: Array, off: Array, seconds: Array) -> Array:
@@ -236,7 +226,7 @@ class Smoother(Estimator[Params]):
     def start(self, params: Params, features: Features) -> Gaussian:
         pixels = features.last.shape
         mean = jnp.log(params.start + params.I0)
-        return Gaussian(jnp.broadcast_to(mean, pixels), jnp.broadcast_to(params.P0, pixels))
+        return Gaussian(jnp.broadcast_to(mean, pixels), jnp.broadcast_to(params.P_start, pixels))
 
     def run(
         self,
@@ -308,10 +298,11 @@ class Smoother(Estimator[Params]):
 
         later = jax.tree.map(lambda v: v[f], trajectory.future)
         later = jax.tree.map(lambda a, b: jnp.where(behind, a, b), trajectory.first, later)
-        later = later.earlier(brightness(params, *until), added(params, *until, seconds))
+        S, q = brightness(params, until[0], until[1]), added(params, until[0], until[1], seconds)
+        later = later.earlier(S, q)
         # Before the first frame there is no past: its variance is without bound.
-        m = jnp.where(behind, 0, trajectory.past.m[f] + brightness(params, *since))
-        P = trajectory.past.P[f] + added(params, *since, elapsed)
+        m = jnp.where(behind, 0, trajectory.past.m[f] + brightness(params, since[0], since[1]))
+        P = trajectory.past.P[f] + added(params, since[0], since[1], elapsed)
         P = 1 / (jnp.where(behind, 0, 1 / jnp.where(behind, 1, P)) + later.J)
         m = m + P * (later.h - later.J * m)
         return jnp.exp(m) - params.I0, P

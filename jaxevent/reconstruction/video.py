@@ -13,7 +13,15 @@ from tqdm import tqdm
 
 from jaxevent.errors import InputError
 from jaxevent.reconstruction.estimator import Estimator, P
-from jaxevent.reconstruction.pixels import WINDOW_EVENTS, Carry, Features, Reader, ReadOut, Timing, Windows
+from jaxevent.reconstruction.pixels import (
+    WINDOW_EVENTS,
+    Carry,
+    Features,
+    Reader,
+    ReadOut,
+    Timing,
+    Windows,
+)
 from jaxevent.recording import Recording, Times, microseconds
 
 BEGINS = 32  # windows from which filtering can be taken up again
