@@ -522,3 +522,29 @@ def test_stored_recording_gives_the_same_images(tmp_path):
     expected = jaxevent.akf.reconstruct(recording, params, window_events=90)(times)
     images = jaxevent.akf.reconstruct(stored, params, window_events=90)(times)
     np.testing.assert_array_equal(images, expected)
+
+
+def test_frames_of_an_automatic_exposure_share_a_scale():
+    """Grey levels divided by the gain, also where only some of the frames are given."""
+    recording = random_recording(13, 40, 4)
+    gain = np.array([1.0, 2.0, 0.5, 4.0])
+    recording = dataclasses.replace(recording, extra={"gain": gain}).with_frames(slice(1, 4))
+    image, _ = jaxevent.last_frame.reconstruct(recording)(recording.frames.t)
+    expected = recording.frames.images / 255 / gain[1:, None, None]
+    np.testing.assert_allclose(image, expected, rtol=1e-12, atol=1e-14)
+    wrong = dataclasses.replace(recording, extra={"gain": gain})
+    with pytest.raises(jaxevent.InputError, match="one positive number for each of the 3 frames"):
+        jaxevent.last_frame.reconstruct(wrong)
+
+
+def test_presets():
+    paper, hdr = (jaxevent.akf.Params(preset=name) for name in ("paper", "hdr"))
+    assert paper.values() == jaxevent.akf.Params().values()
+    assert hdr.weighting == "certainty" and not hdr.calibrate
+    assert float(jaxevent.akf.Params(preset="hdr", I0=0.5).I0) == 0.5
+    with pytest.raises(jaxevent.InputError, match="no preset 'hdri'; did you mean 'hdr'"):
+        jaxevent.akf.Params(preset="hdri")
+    with pytest.raises(jaxevent.InputError, match="weighting is 'none'; give 'linear' or"):
+        jaxevent.akf.Params(weighting="none")
+    with pytest.raises(jaxevent.InputError, match="certainty is 2; give a list of numbers"):
+        jaxevent.akf.Params(certainty=2)
