@@ -31,6 +31,19 @@ class Pixel:
         """Sum of s c over the first n events."""
         return sum(w * s * self.c(s) for w, s in list(zip(self.weight, self.s, strict=True))[:n])
 
+    def part(self, n, time):
+        """How much of event n has happened at a time between the one before and it."""
+        if not 0 < n < len(self.t) or self.t[n - 1] <= 0:
+            return 0.0
+        gap = self.t[n] - self.t[n - 1]
+        near = 0 < gap <= self.p.get("spread", 0) * 1e6
+        return (time - self.t[n - 1]) / gap if near else 0.0
+
+    def spread(self, n, time, values):
+        """The sum of the first n values, one per event, and of the part of the next."""
+        part = self.part(n, time)
+        return sum(values[:n]) + (part * values[n] if part else 0.0)
+
     def before(self, time):
         """The same over the events earlier than a time."""
         return self.moved(sum(t < time for t in self.t))
@@ -303,17 +316,21 @@ def smooth(pixel, times, p):
     when = [*pixel.mid, *times]
     origin, first = when[0], done[0]
 
+    steps = [w * pixel.c(s) ** 2 for w, s in zip(pixel.weight, pixel.s, strict=True)]
+    moves = [w * s * pixel.c(s) for w, s in zip(pixel.weight, pixel.s, strict=True)]
+
     def clock(n, time):
         """Variance between the first frame and a point; negative before it."""
-        steps = [w * pixel.c(s) ** 2 for w, s in zip(pixel.weight, pixel.s, strict=True)]
-        events = sum(steps[first:n]) if n >= first else -sum(steps[n:first])
+        events = pixel.spread(n, time, steps) - pixel.spread(first, origin, steps)
         return p["sigma_event"] ** 2 * events + p["sigma_bg"] ** 2 * (time - origin) * 1e-6
 
     V = np.array([clock(n, time) for n, time in zip(done, when, strict=True)])
     same = np.sign(V)[:, None] == np.sign(V)[None, :]
     C = p["P_start"] + np.where(same, np.minimum(abs(V)[:, None], abs(V)[None, :]), 0)
-    prior = math.log(p["start"] + I0) + np.array([pixel.moved(n) for n in done])
-    prior -= pixel.moved(first)
+    prior = math.log(p["start"] + I0) + np.array(
+        [pixel.spread(n, time, moves) for n, time in zip(done, when, strict=True)]
+    )
+    prior -= pixel.spread(first, origin, moves)
 
     measured = []  # (frame, value, variance)
 

@@ -230,17 +230,21 @@ class Timing(NamedTuple):
     `clock_offset` is added to the frames' time stamps, `exposure` is that of frames whose own is
     not known, `rho_ref` a pixel's dead time after an event. An event after the gap dt at its pixel
     stands for min(dt / (dt - rho_ref), 3) events: what happened in the dead time is lost.
+
+    An event is late: the intensity has been moving since the pixel's last one. Where no more than
+    `spread` lies between the two, the second's change is spread evenly over that time, which needs
+    later events and is for methods that do not filter.
     """
 
     clock_offset: float = 0.0
     exposure: float = 0.0
     rho_ref: float = 0.0
+    spread: float = 0.0
 
     @classmethod
     def of(cls, params: Any) -> "Timing":
         """From an estimator's parameters, rounded to 10 ns: 7.5 ms is 7500 us in float32 too."""
-        offset, exposure, rho = (round(float(getattr(params, name)), 8) for name in cls._fields)
-        return cls(offset, exposure, rho)
+        return cls(**{n: round(float(getattr(params, n, 0.0)), 8) for n in cls._fields})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -343,11 +347,13 @@ class Window:
     after: Carry
     _width: int
     _events: Events
+    _ahead: Events  # the same and, where changes are spread, those soon after
     _clock: Clock
     _origin: int
     _first_frame: int
     _before: Carry
     _rho: float  # us, the dead time
+    _reach: int  # us, the longest time over which a change is spread
     _counts: NDArray  # [2, pixels] ON and OFF at the window's start
     _reference: NDArray  # [frames, 2, pixels] ON and OFF at the left edge of each exposure
     _layout: "Layout | None"
@@ -389,18 +395,19 @@ class Reader:
         overwritten by the call after the next.
         """
         window = self.window
-        clock, layout, events = window._clock, self._layout, window._events
+        clock, layout, events = window._clock, self._layout, window._ahead
         if len(times) and times[0] < self._time:
             self._rewind()
         self._buffers.reverse()
         slot, on, off, since = self._buffers[0]
         piece, level, weight, blend = clock.locate((times - window._origin).astype(float))
         self._row = _read(
-            events.t, events.x, events.y, events.p, window._width, self._row,
-            window._layout is not None, times, clock.frame(piece) - window._first_frame,
-            window._reference, window._counts, self._count, self._last, self._at, self._rank,
-            layout.kind, layout.lane, layout.round_tile, layout.round_first, self._shapes,
-            window._rho, growth, slot, since, on, off,
+            events.t, events.x, events.y, events.p, len(window._events), window._origin,
+            window._reach, window._width, self._row, window._layout is not None, times,
+            clock.frame(piece) - window._first_frame, window._reference, window._counts,
+            self._count, self._last, self._at, self._rank, layout.kind, layout.lane,
+            layout.round_tile, layout.round_first, self._shapes, window._rho, growth,
+            slot, since, on, off,
         )  # fmt: skip
         self._time = times[-1] if len(times) else self._time
 
@@ -504,8 +511,9 @@ class Windows:
         self.recording, self.filtering, self.events = recording, filtering, events
         self.clock = Clock.of(recording, timing)
         self.rho, self.growth = round(timing.rho_ref * 1e8) / 100, growth
-        # Whole events are counted in integers, weighted ones in double precision.
-        self.count_dtype = np.dtype(np.float64 if self.rho else np.int32)
+        self.reach = 0 if filtering else round(timing.spread * 1e6)
+        # Whole events are counted in integers, weighted and spread ones in double precision.
+        self.count_dtype = np.dtype(np.float64 if self.rho or self.reach else np.int32)
         self.pixels = recording.width * recording.height
         # Room for frames depends on the sensor only, to compile once: 16 frames of tables are
         # 60 MB at 346x260; larger sensors get fewer.
@@ -555,6 +563,8 @@ class Windows:
         begin = 0 if start is None else source.index(start)
         end = len(source) if stop is None else source.index(stop)
         context, finish = self._context(self._used(start, stop), begin, end)
+        if self.reach and stop is not None:
+            finish = max(finish, source.index(stop + self.reach))
         around = source[context:finish]
         if before.last_then is not None:
             before = self._moved(before, context)
@@ -563,7 +573,9 @@ class Windows:
             layout = self._layout(events)
             middle = int(events.t[len(events) // 2]) if len(events) else 0
             if layout is None or layout.ordinary or len(events) < 2 or middle == events.t[0]:
-                return self._window(start, stop, around, events, layout, before)
+                ahead = around[begin - context :]
+                ahead = ahead[: len(ahead) if stop is None else ahead.index(stop + self.reach)]
+                return self._window(start, stop, around, events, ahead, layout, before)
             stop = middle
             events = events[: events.index(stop)]
 
@@ -573,8 +585,8 @@ class Windows:
             # Of overlapping exposures, a later one may begin or an earlier one end further out.
             left, _, right = self._edges(used)
             source = self.recording.events
-            begin = min(begin, source.index(int(left.min())))
-            end = max(end, source.index(int(right.max())))
+            begin = min(begin, source.index(int(left.min()) - self.reach))
+            end = max(end, source.index(int(right.max()) + self.reach))
         return begin, end
 
     def _moved(self, carry: Carry, context: int) -> Carry:
@@ -604,7 +616,8 @@ class Windows:
         while self.events < len(self.recording.events):
             self.events += self.events // 4
         events = self.recording.events[:]
-        return self._window(None, None, events, events, self._layout(events), self.initial())
+        layout = self._layout(events)
+        return self._window(None, None, events, events, events, layout, self.initial())
 
     def __iter__(self) -> Iterator[Window]:
         before, start = self.initial(), None
@@ -646,6 +659,7 @@ class Windows:
         stop: int | None,
         around: Events,
         events: Events,
+        ahead: Events,
         layout: Layout | None,
         before: Carry,
     ) -> Window:
@@ -666,6 +680,12 @@ class Windows:
             np.zeros((2, self.pixels), self.count_dtype),
         )  # fmt: skip
         at_start = snapshot[where[0]]
+        if self.reach:
+            at_start = at_start.copy()
+            _spread(
+                around.t, around.x, around.y, around.p, weight, edges, self.recording.width,
+                self.origin, self.reach, snapshot,
+            )  # fmt: skip
         at_left, at_mid, at_right = (snapshot[w] for w in np.split(where[1:], 3))
 
         frames = self._frames(used, around, weight, at_left, at_mid, at_right, at_start)
@@ -685,11 +705,13 @@ class Windows:
             after,
             self.recording.width,
             events,
+            ahead,
             self.clock,
             self.origin,
             used.start,
             before,
             self.rho,
+            self.reach,
             at_start,
             at_left,
             layout,
@@ -892,16 +914,17 @@ def prepare(
     clock_offset: float | int = 0.0,
     exposure: float | int = 0.0,
     rho_ref: float | int = 0.0,
+    spread: float | int = 0.0,
     *,
     filtering: bool = True,
 ) -> tuple[Features, ReadOut]:
     """A whole recording on the device, for `run`, and points of images at `times`, for `read`.
 
     `times` are sorted, integers in us or floats in s on the recording's clock. `clock_offset`,
-    `exposure` and `rho_ref` (s, see `Timing`) must be those of the parameters to run with;
+    `exposure`, `rho_ref`, `spread` (s, see `Timing`) must be those of the parameters to run with;
     `method.prepare(recording, times, params)` takes them from there. Derivatives with respect to
     `clock_offset` hold between the instants at which an edge of an exposure passes an event, those
-    by a positive `rho_ref` are exact, those by `exposure` are 0. Without `filtering` the features
+    by a positive `rho_ref` are exact, those by the others are 0. Without `filtering` the features
     serve methods that do not pass over single events. Raises `InputError` for times that are not
     sorted.
 
@@ -912,7 +935,7 @@ def prepare(
     times = np.atleast_1d(microseconds(times))
     if (times[1:] < times[:-1]).any():
         raise InputError("the times of images to prepare are not sorted; sort them")
-    timing = Timing(*(round(float(v), 8) for v in (clock_offset, exposure, rho_ref)))
+    timing = Timing(*(round(float(v), 8) for v in (clock_offset, exposure, rho_ref, spread)))
 
     def made(growth: bool) -> tuple[Features, ReadOut]:
         windows = Windows(recording, timing, filtering=filtering, growth=growth)
@@ -1003,6 +1026,21 @@ def _snapshots(t, x, y, p, weight, edges, width, now):
             i += 1
         out[e] = now
     return out
+
+
+@_compiled
+def _spread(t, x, y, p, weight, edges, width, origin, reach, out):
+    """Add to the counts at each edge the part of the pixel's next event that has happened."""
+    last = np.full(out.shape[2], origin)
+    for i in range(len(t)):
+        pixel = np.int64(y[i]) * width + x[i]
+        before, last[pixel] = last[pixel], t[i]
+        gap = t[i] - before
+        if before > origin and 0 < gap <= reach:
+            e = np.searchsorted(edges, before, "right")
+            while e < len(edges) and edges[e] <= t[i]:
+                out[e, 0 if p[i] else 1, pixel] += weight[i] * (edges[e] - before) / gap
+                e += 1
 
 
 @_compiled
@@ -1160,13 +1198,15 @@ def _fill(
 
 @_compiled
 def _read(
-    t, x, y, p, width, row, filtering, times, frame, reference, at_start, count, last, at, rank,
-    kind, lane, round_tile, round_first, shapes, rho, growth, slot, since, on, off,
+    t, x, y, p, own_events, origin, reach, width, row, filtering, times, frame, reference,
+    at_start, count, last, at, rank, kind, lane, round_tile, round_first, shapes, rho, growth,
+    slot, since, on, off,
 ):  # fmt: skip
     """At each time, every pixel's last slot, the time since, and its counts in the piece."""
     pixels = len(last)
+    seen = np.full(pixels, -1)
     for j in range(len(times)):
-        while row < len(t) and t[row] <= times[j]:
+        while row < own_events and t[row] <= times[j]:
             pixel = np.int64(y[row]) * width + x[row]
             count[0 if p[row] else 1, pixel] += _stands_for(t[row] - last[pixel], rho, growth)
             last[pixel] = t[row]
@@ -1184,6 +1224,18 @@ def _read(
             since[j, pixel] = max(times[j] - last[pixel], 0) * 1e-6
             on[j, pixel] = count[0, pixel] - own[0, pixel]
             off[j, pixel] = count[1, pixel] - own[1, pixel]
+        after = row
+        while after < len(t) and t[after] <= times[j] + reach:
+            pixel = np.int64(y[after]) * width + x[after]
+            gap = t[after] - last[pixel]
+            if seen[pixel] != j and last[pixel] > origin and 0 < gap <= reach:
+                part = _stands_for(gap, rho, growth) * (times[j] - last[pixel]) / gap
+                if p[after]:
+                    on[j, pixel] += part
+                else:
+                    off[j, pixel] += part
+            seen[pixel] = j
+            after += 1
     return row
 
 

@@ -48,9 +48,17 @@ class Params(CertaintyParams):
     start = Positive(0.5, "intensity", "mean before the first frame")
     P_start = Positive(4.0, "(ln I)^2", "variance before the first frame")
     presets = {
-        "hdr": {"c_on": 0.2, "c_off": 0.2, "I0": 0.003, "w_min": 1e-5, "margin": 2.5},
+        "hdr": {
+            "c_on": 0.2,
+            "c_off": 0.2,
+            "I0": 0.003,
+            "w_min": 1e-5,
+            "margin": 2.5,
+            "spread": 0.05,
+        },
     }
 
+    spread = Positive(0.0, "s", "longest time between events over which a change is spread")
     one_sided = Choice((True, False), "whether clipped frames tell that L lies beyond the clip")
 
     def __init__(self, **values: Any):
