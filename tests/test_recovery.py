@@ -17,5 +17,5 @@ def recovery():
 
 
 def test_the_likelihood_finds_what_the_data_were_drawn_with(recovery):
-    for name, (true, found) in recovery.model_recovery(60).items():
+    for name, (true, found) in recovery.model_recovery(100).items():
         assert abs(found / true - 1) < 0.1, (name, true, found)
