@@ -574,23 +574,34 @@ def _methods(given: Any, folder: Path) -> list[tuple[str, Estimator, FrameParams
             label = entry.get("label", name)
             if not isinstance(name, str) or not isinstance(label, str):
                 raise InputError('name and label must be text; give name = "akf"')
-            method, values = find_method(name), entry.get("params", {})
-            if isinstance(values, str):
-                params = method.Params.load(folder / os.path.expandvars(values), name)
-            elif isinstance(values, dict):
-                given = dict(values)
-                file, base = given.pop("file", None), {}
-                if file is not None:
-                    if not isinstance(file, str):
-                        raise InputError(f"file is {file!r}; give the path of a TOML file")
-                    base = method.Params.load(folder / os.path.expandvars(file), name).values()
-                params = method.Params.of({**base, **given})
-            else:
-                raise InputError(f"params is {values!r}; give a table or the path of a TOML file")
+            method = find_method(name)
+            params = read_params(method, entry.get("params", {}), folder)
             methods.append((label, method, params))
         except InputError as error:
             raise InputError(f"method {number}: {error}") from None
     return methods
+
+
+def read_params(method: Estimator, given: Any, folder: Path) -> FrameParams:
+    """Params as a configuration gives them: a table, the path of a TOML file, or both.
+
+    Paths are relative to `folder`. Raises `InputError` for anything else and naming a bad setting.
+    """
+
+    def load_file(path: str) -> FrameParams:
+        return method.Params.load(folder / os.path.expandvars(path), method.name)
+
+    if isinstance(given, str):
+        return load_file(given)
+    if not isinstance(given, dict):
+        raise InputError(f"params is {given!r}; give a table or the path of a TOML file")
+    values = dict(given)
+    file = values.pop("file", None)
+    if file is None:
+        return method.Params.of(values)
+    if not isinstance(file, str):
+        raise InputError(f"file is {file!r}; give the path of a TOML file")
+    return method.Params.of({**load_file(file).values(), **values})
 
 
 def _refuse_unknown(table: Mapping[str, Any], known: tuple[str, ...]) -> None:

@@ -62,6 +62,7 @@ from jaxevent.evaluate import (
     PROTOCOLS,
     find_method,
     find_recordings,
+    read_params,
     results,
     score,
     subset,
@@ -640,11 +641,7 @@ class Task:
         for split in ("fit", "validation"):
             found[split] = []
             for _, recording in sources[split]:
-                if self.method.needs_frames and recording.frames is None:
-                    raise InputError(
-                        f"{recording.name}: holds no frames, which the method "
-                        f"{self.method.name!r} needs; use 'akf' or 'high-pass'"
-                    )
+                self.method.check(recording)
                 found[split] += cut(recording)
         return Problem(self.objective, found["fit"], found["validation"], plan.weights)
 
@@ -876,11 +873,8 @@ def _task(entry: Mapping[str, Any], table: Mapping[str, Any], folder: Path) -> T
     _check(entry, _METHOD)
     if "name" not in entry:
         raise InputError('a method has no name; give name = "akf"')
-    method, values = find_method(entry["name"]), entry.get("params", {})
-    if isinstance(values, str):
-        params = method.Params.load(folder / values, method.name)
-    else:
-        params = method.Params.of(values)
+    method = find_method(entry["name"])
+    params = read_params(method, entry.get("params", {}), folder)
     both = {**table, **entry}
     loss = _one_of(both.get("loss", "held-out"), "loss", [*PROTOCOLS, "likelihood"])
     protocol = loss

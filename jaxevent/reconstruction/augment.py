@@ -120,12 +120,9 @@ def clipped_side(params: CertaintyParams, frames: FrameFeatures) -> Float[Array,
 
 def bound_of(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
     """The log intensity at which pixels begin to clip: that of a grey `margin` from the end."""
-    place = jnp.clip(params.margin, 0, 127)
-    below = place.astype(int)
-    part = place - below
-    response = jnp.asarray(frames.response)
-    dark = (1 - part) * response[below] + part * response[below + 1]
-    bright = (1 - part) * response[255 - below] + part * response[254 - below]
+    levels, response = jnp.arange(256), jnp.asarray(frames.response)
+    margin = jnp.clip(params.margin, 0, 127)
+    dark, bright = (jnp.interp(margin, levels, end) for end in (response, response[::-1]))
     bound = jnp.where(jnp.asarray(frames.grey) > 0.5, bright, dark)
     return jnp.log(bound / jnp.asarray(frames.gain)[:, None] + params.I0)
 

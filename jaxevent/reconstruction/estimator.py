@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxevent.errors import InputError
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.pixels import (
     SHAPES,
@@ -142,6 +143,14 @@ class Estimator(Generic[P]):
         self, params: P, trajectory: Any, out: ReadOut
     ) -> tuple[Float[Array, "times pixels"], Float[Array, "times pixels"]]:
         """Intensity and variance of log intensity of each image in `out`; pure, as `run`."""
+
+    def check(self, recording: Recording) -> None:
+        """Raise `InputError` if the recording lacks what the method needs."""
+        if self.needs_frames and recording.frames is None:
+            raise InputError(
+                f"{recording.name}: holds no frames, which the method {self.name!r} needs; "
+                "use 'akf' or 'high-pass'"
+            )
 
     def prepare(
         self, recording: Recording, times: Times, params: P | None = None

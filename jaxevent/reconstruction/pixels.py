@@ -334,7 +334,7 @@ class Carry:
         return cls(last, np.full(border, recording.start), 0, then)
 
     def copy(self) -> "Carry":
-        return Carry(self.last.copy(), self.near.copy(), self.context, self.last_then, self.frames)
+        return dataclasses.replace(self, last=self.last.copy(), near=self.near.copy())
 
 
 @dataclasses.dataclass
@@ -601,7 +601,7 @@ class Windows:
             part = self.recording.events[row : min(row + WINDOW_EVENTS, context)]
             _latest(part.t, part.x, part.y, self.recording.width, last)
             row += len(part)
-        return Carry(carry.last, carry.near, context, last, carry.frames)
+        return dataclasses.replace(carry, context=context, last_then=last)
 
     def whole(self) -> Window:
         """The whole recording as one window, with room from a ladder of steps by a quarter."""

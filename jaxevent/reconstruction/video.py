@@ -74,11 +74,7 @@ class Video(Generic[P]):
         window_events: int = WINDOW_EVENTS,
         progress: bool = False,
     ):
-        if estimator.needs_frames and recording.frames is None:
-            raise InputError(
-                f"{recording.name}: holds no frames, which the method {estimator.name!r} needs; "
-                "use 'akf' or 'high-pass'"
-            )
+        estimator.check(recording)
         self.estimator, self.recording, self.params = estimator, recording, params
         self.progress = progress
         self._windows = Windows(
@@ -157,13 +153,13 @@ class Video(Generic[P]):
 
     def _window_of(self, time: int) -> tuple[Reader, Any]:
         """The filtered window that contains `time`; windows on the way are filtered in order."""
+        if self.estimator.looks_ahead and self._future is None:
+            self._look_ahead()
         if self._open is not None:
             reader, trajectory = self._open
             start, stop = reader.window.start, reader.window.stop
             if (start is None or start <= time) and (stop is None or time < stop):
                 return self._open
-        if self.estimator.looks_ahead and self._future is None:
-            self._look_ahead()
         begin = [b for b in self._begins if b.time <= time][-1]
         while True:
             self._open = None  # so that two windows are never held at once
@@ -191,6 +187,7 @@ class Video(Generic[P]):
             message = links[place][0].before(message)
             future[starts[place - 1]] = message
         self._future = future
+        self._open = reader, trajectory  # the last window has nothing later to know of
 
     def _filter(self, begin: Begin) -> tuple[tuple[Reader, Any], Begin]:
         """Prepare and filter the window that begins there; and where the next one begins."""
