@@ -96,26 +96,46 @@ class Choice:
             raise InputError(f"the parameter {self.name} is {str(value)[:40]!r}; give {options}")
 
 
+class Count:
+    """A setting of a `Parameters` class: a whole number, at least 1, that sizes arrays."""
+
+    def __init__(self, default: int, unit: str, meaning: str):
+        self.default, self.unit, self.meaning = default, unit, meaning
+
+    def __set_name__(self, owner: type, name: str):
+        self.name = name
+
+    def __get__(self, instance: "Parameters", owner: type) -> int:
+        return dict(instance.chosen)[self.name]  # type: ignore[return-value]
+
+    def check(self, value: Any) -> None:
+        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            raise InputError(
+                f"the parameter {self.name} is {str(value)[:40]!r}; give a whole number above 0"
+            )
+
+
 class Parameters(eqx.Module):
     """Base of every estimator's `Params`: `Params(sigma_iso=0.1)`, `params.sigma_iso`.
 
-    `raw` holds one differentiable leaf per number, `chosen` the choices. A named set of values is a
+    `raw` holds one differentiable leaf per number, `chosen` the choices and counts. A named set of
+    values is a
     preset: `Params(preset="paper", sigma_iso=0.1)`. Raises `InputError` for a name that does not
     exist and for a value outside its domain.
     """
 
     raw: dict[str, Array]
-    chosen: tuple[tuple[str, str | bool], ...] = eqx.field(static=True)
+    chosen: tuple[tuple[str, str | bool | int], ...] = eqx.field(static=True)
 
     numbers: ClassVar[Mapping[str, Number]] = {}
-    choices: ClassVar[Mapping[str, Choice]] = {}
+    choices: ClassVar[Mapping[str, Choice | Count]] = {}
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
         own = vars(cls).items()
         cls.numbers = {**cls.numbers, **{k: v for k, v in own if isinstance(v, Number)}}
-        cls.choices = {**cls.choices, **{k: v for k, v in own if isinstance(v, Choice)}}
+        cls.choices = {**cls.choices, **{k: v for k, v in own if isinstance(v, Choice | Count)}}
 
     def __init__(self, *, preset: str | None = None, **values: Any):
         known = {**self.numbers, **self.choices}
