@@ -119,9 +119,8 @@ class Parameters(eqx.Module):
     """Base of every estimator's `Params`: `Params(sigma_iso=0.1)`, `params.sigma_iso`.
 
     `raw` holds one differentiable leaf per number, `chosen` the choices and counts. A named set of
-    values is a
-    preset: `Params(preset="paper", sigma_iso=0.1)`. Raises `InputError` for a name that does not
-    exist and for a value outside its domain.
+    values is a preset: `Params(preset="paper", sigma_iso=0.1)`. Raises `InputError` for a name that
+    does not exist and for a value outside its domain.
     """
 
     raw: dict[str, Array]

@@ -1,0 +1,184 @@
+"""What tracks say of distance: inverse time to contact and range, with variances.
+
+Inverse time to contact (1/s) is positive while approaching; unlike its inverse it is defined at
+rest. A mean is (..., 8) in the order (px, py, vx, vy, lambda1, lambda2, theta, q), in px, s and
+rad, with its covariance (..., 8, 8). Variances are propagated to first order. All functions are
+pure and differentiable.
+"""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Num
+
+# lambda1 of the events of a disc over the disc's diameter: of an even rim (a disc that grows or
+# flickers), of the leading and trailing edges of one that moves, of an evenly filled one.
+SIZE_FACTORS = {"ring": 1 / math.sqrt(8), "disc": 1 / math.sqrt(6), "uniform": 1 / 4}
+
+Number = Num[Array, ""] | float | int
+
+
+def inverse_ttc(
+    mean_a: Float[Array, "*n 8"],
+    covariance_a: Float[Array, "*n 8 8"],
+    mean_b: Float[Array, "*n 8"],
+    covariance_b: Float[Array, "*n 8 8"],
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """1 / TTC (1/s) and its variance from two blobs at the same depth, whichever is first.
+
+    (v_a - v_b) . (p_a - p_b) / |p_a - p_b|^2, which holds while the line between them keeps its
+    direction in space. The errors of the two tracks are taken as independent. Where the positions
+    coincide the value is 0 and the variance infinite. (Event blob tracking, eq. 27.)
+    """
+    joint = (covariance_a + covariance_b)[..., :4, :4]
+    difference = (mean_a - mean_b)[..., :4]
+    d, w = difference[..., :2], difference[..., 2:]
+    squared = jnp.sum(d * d, -1)
+    apart = squared > 0
+    squared = jnp.where(apart, squared, 1)
+    value = jnp.sum(d * w, -1) / squared
+    # d value / d d = (w - 2 value d) / |d|^2 and d value / d w = d / |d|^2.
+    slope = jnp.concatenate([w - 2 * value[..., None] * d, d], -1) / squared[..., None]
+    variance = jnp.einsum("...i,...ij,...j->...", slope, joint, slope)
+    return jnp.where(apart, value, 0), jnp.where(apart, variance, jnp.inf)
+
+
+def log_size(
+    mean: Float[Array, "*n 8"], covariance: Float[Array, "*n 8 8"]
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """log sqrt(lambda1 lambda2) and its variance; it is the same whichever axis is longer."""
+    share = 0.5 / mean[..., 4:6]
+    variance = jnp.einsum("...i,...ij,...j->...", share, covariance[..., 4:6, 4:6], share)
+    return jnp.sum(jnp.log(mean[..., 4:6]), -1) / 2, variance
+
+
+@functools.partial(jax.jit, static_argnames="smooth")
+def growth(
+    times: Float[Array, " times"],
+    mean: Float[Array, "times 8"],
+    covariance: Float[Array, "times 8 8"],
+    valid: Bool[Array, " times"] | None = None,
+    *,
+    Q: Number = 0.01,
+    Q_lambda: Number | None = None,
+    smooth: bool = True,
+) -> tuple[Float[Array, " times"], Float[Array, " times"]]:
+    """1 / TTC (1/s) and its variance from the growth of one blob, at sorted times (s).
+
+    The scale w = 1 / sqrt(lambda1 lambda2) is proportional to depth, so that at constant speed it
+    is a line in time and 1 / TTC = -w' / w: a Kalman filter of (w, w'), exactly linear, whose
+    measurements are the track's sizes. `Q` (1/s^3) is the density of the speed's changes relative
+    to the depth, 0 for constant speed: the least squares line. With `smooth` all times are used
+    for each (Rauch-Tung-Striebel), otherwise those up to it. `valid` says which rows are
+    measurements; the others, which may hold anything, are predicted.
+
+    A track's errors at close times are alike. Given the filter's own Q_lambda (px^2/s), its sizes
+    count for as much as the events behind them; None stands for independent errors. Before the
+    second measurement the variance is that of the prior, about 100 1/s^2.
+    """
+    valid = jnp.ones(times.shape, bool) if valid is None else valid
+    mean = jnp.where(valid[:, None], mean, 1.0)
+    covariance = jnp.where(valid[:, None, None], covariance, jnp.eye(8, dtype=mean.dtype))
+    logarithm, relative = log_size(mean, covariance)
+    # Relative to a common size, for single precision.
+    reference = jnp.sum(jnp.where(valid, logarithm, 0)) / jnp.maximum(jnp.sum(valid), 1)
+    w = jnp.exp(reference - logarithm)
+    dt = jnp.diff(times, prepend=times[:1])
+    # Sizes known exactly would make the covariances singular.
+    R = w**2 * jnp.maximum(relative, 1e-10)
+    if Q_lambda is not None:
+        # A filter of a walk of density Q that has settled at the variance P forgets over
+        # tau = P / Q. Of P one half is noise that it passes on, the other its lag behind a walk,
+        # which steady growth is not. The mean of many samples whose errors have the correlation
+        # r^k, r = exp(-dt / tau), has the variance of independent ones times (1 + r) / (1 - r) =
+        # coth(dt / (2 tau)). So samples at dt << tau make P^2 / Q, the density of events' noise.
+        P_lambda = jnp.maximum((covariance[:, 4, 4] + covariance[:, 5, 5]) / 2, 1e-10)
+        last = jnp.max(jnp.where(valid, times, times[0]))
+        span = last - jnp.min(jnp.where(valid, times, times[-1]))
+        every = jnp.maximum(span, 0) / jnp.maximum(jnp.sum(valid) - 1, 1)
+        R = R / 2 / jnp.tanh(jnp.maximum(every * Q_lambda / (2 * P_lambda), 1e-6))
+
+    def product(a, b):
+        return jnp.sum(a[:, :, None] * b[None], 1)  # faster to compile and run than a dot
+
+    def forward(state, row):
+        m, P = state
+        dt, w, R, valid = row
+        F = jnp.array([[1.0, dt], [0.0, 1.0]])
+        noise = Q * m[0] ** 2 * jnp.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        ahead = jnp.sum(F * m, 1), product(product(F, P), F.T) + noise
+        m, P = ahead
+        gain = jnp.where(valid, P[:, 0] / (P[0, 0] + R), 0)
+        m = m + gain * (w - m[0])
+        keep = jnp.eye(2, dtype=w.dtype).at[:, 0].add(-gain)
+        fresh = gain[:, None] * gain * jnp.where(valid, R, 0)
+        P = product(product(keep, P), keep.T) + fresh
+        return (m, P), ((m, P), ahead, F)
+
+    def backward(later, row):
+        (m, P), (m_ahead, P_ahead), F = row
+        (a, b), (_, d) = P_ahead
+        adjugate = jnp.array([[d, -b], [-b, a]])
+        determinant = jnp.maximum(a * d - b * b, 8 * jnp.finfo(a.dtype).eps * a * d)
+        gain = product(product(P, F.T), adjugate) / determinant
+        m = m + jnp.sum(gain * (later[0] - m_ahead), 1)
+        P = P + product(product(gain, later[1] - P_ahead), gain.T)
+        return (m, P), (m, P)
+
+    first = w[jnp.argmax(valid)]
+    prior = jnp.array([1.0, 0.0]) * first, 100 * first**2 * jnp.eye(2, dtype=w.dtype)
+    end, (state, ahead, F) = lax.scan(forward, prior, (dt, w, R, valid))
+    if smooth:
+        # A last step of dt = 0 leads from the end to itself.
+        F = jnp.concatenate([F[1:], F[:1]])
+        ahead = jax.tree.map(lambda x, e: jnp.concatenate([x[1:], e[None]]), ahead, end)
+        _, state = lax.scan(backward, end, (state, ahead, F), reverse=True)
+    m, P = state
+    value = -m[:, 1] / m[:, 0]
+    slope = -jnp.stack([value, jnp.ones_like(value)], -1) / m[:, :1]
+    return value, jnp.einsum("ti,tij,tj->t", slope, P, slope)
+
+
+def size_range(
+    mean: Float[Array, "*n 8"],
+    covariance: Float[Array, "*n 8 8"],
+    extent: Number,
+    focal: Number,
+    size_factor: Number = SIZE_FACTORS["ring"],
+    size_factor_variance: Number = 0.0,
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """Range (m) and its variance (m^2) of a target whose `extent` (m) is known.
+
+    size_factor extent focal / max(lambda1, lambda2), the focal length in px. `size_factor` is
+    lambda over the diameter that the target has in the image: one of `SIZE_FACTORS`, or that of
+    `calibrate_size_factor`. (Event blob tracking, eq. 28, whose lambda is not a diameter.)
+    """
+    first = mean[..., 4] >= mean[..., 5]
+    size = jnp.where(first, mean[..., 4], mean[..., 5])
+    variance = jnp.where(first, covariance[..., 4, 4], covariance[..., 5, 5])
+    value = size_factor * extent * focal / size
+    relative = variance / size**2 + size_factor_variance / jnp.square(size_factor)
+    return value, value**2 * relative
+
+
+def calibrate_size_factor(
+    size: Float[Array, " n"],
+    known_range: Float[Array, " n"],
+    extent: Number,
+    focal: Number,
+    variance: Float[Array, " n"] | None = None,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The size factor, and its variance, from sizes lambda (px) at known ranges (m), n >= 2.
+
+    Least squares in size = factor extent focal / range, weighted by 1 / `variance` (px^2) where
+    given. The variance is scaled by the residuals, so that those weights need only be relative.
+    """
+    diameter = extent * focal / known_range
+    weight = jnp.ones_like(size) if variance is None else 1 / variance
+    information = jnp.sum(weight * diameter**2)
+    factor = jnp.sum(weight * diameter * size) / information
+    residual = jnp.sum(weight * (size - factor * diameter) ** 2)
+    return factor, residual / (size.shape[0] - 1) / information
