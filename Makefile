@@ -8,7 +8,7 @@ demo: .venv/demo.stamp
 	$(bin)/jaxevent demo
 
 test: lint
-	$(bin)/python -m pytest
+	$(bin)/python -m pytest -n auto --dist worksteal
 
 lint: .venv/test.stamp
 	$(bin)/ruff check
