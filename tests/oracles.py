@@ -206,20 +206,25 @@ def reconstruct(method, recording, p, times, likelihood=False):
     mid = [] if f is None else [int(v) - start + p["clock_offset"] * 1e6 for v in f.t]
     exposure = [] if f is None else [int(v) or p["exposure"] * 1e6 for v in f.exposure]
     images = np.empty((2, len(times), recording.height, recording.width))
-    for y in range(recording.height):
-        for x in range(recording.width):
-            rows = [i for i in range(len(t)) if e.x[i] == x and e.y[i] == y]
-            grey = [] if f is None else [float(g) / 255 for g in f.images[:, y, x]]
-            pixel = Pixel(
-                [t[i] for i in rows], [1 if e.p[i] else -1 for i in rows], grey, mid, exposure, p
-            )
-            if method == "aks":
-                seen, one = smooth(pixel, [int(time) - start for time in times], p)
-                images[:, :, y, x], total = seen.reshape(2, -1), total + float(one)
-                continue
-            trace = run(method, pixel, [near[i] for i in rows], p)
-            for j, time in enumerate(times):
-                images[:, j, y, x] = read(method, pixel, trace, int(time) - start, p)
+    rows, pixels = {}, {}
+    for x, y in np.ndindex(recording.width, recording.height):
+        mine = rows[x, y] = [i for i in range(len(t)) if e.x[i] == x and e.y[i] == y]
+        grey = [] if f is None else [float(g) / 255 for g in f.images[:, y, x]]
+        polarity = [1 if e.p[i] else -1 for i in mine]
+        pixels[x, y] = Pixel([t[i] for i in mine], polarity, grey, mid, exposure, p)
+    for (x, y), pixel in pixels.items():
+        if method == "aks":
+            part = p["share"] / 8
+            near_by = [
+                other for (i, j), other in pixels.items() if max(abs(i - x), abs(j - y)) == 1
+            ]
+            sources = [(1 - part * len(near_by), pixel), *((part, other) for other in near_by)]
+            seen, one = smooth(pixel, sources, [int(time) - start for time in times], p)
+            images[:, :, y, x], total = seen.reshape(2, -1), total + float(one)
+            continue
+        trace = run(method, pixel, [near[i] for i in rows[x, y]], p)
+        for j, time in enumerate(times):
+            images[:, j, y, x] = read(method, pixel, trace, int(time) - start, p)
     return (images, total) if likelihood else images
 
 
@@ -264,7 +269,10 @@ def run(method, pixel, near, p):
     """[(time, L, P)]: the start, then after each event."""
     L, P, last = reference(method, pixel)(0.0, 0), p.get("P0", math.nan), 0
     if method == "akf" and pixel.frames:
-        L += p["beyond"] * (1 if pixel.grey[0] > 0.5 else -1) * (1 - pixel.clear(0))
+        white, end = pixel.grey[0] > 0.5, p["margin"] / 255
+        bound = math.log((1 - end if white else end) + p["I0"])
+        begin = bound + (p["above"] if white else -p["below"])
+        L += (1 - pixel.clear(0)) * (begin - L)
     trace = [(last, L, P)]
     for n, (time, s) in enumerate(zip(pixel.t, pixel.s, strict=True)):
         gap = (time - last) * 1e-6
@@ -304,33 +312,33 @@ def half_seen(m, P, bound, sign, floor):
     return mass + math.log(x[1] - x[0]), mean, (weight * (x - mean) ** 2).sum()
 
 
-def smooth(pixel, times, p):
+def smooth(pixel, sources, times, p):
     """Image and variance at times (us from the start), and the log likelihood of the frames.
+
+    `sources` are the pixels whose events move this one, each with its part.
 
     The frames become measurements one after the other; then all of them condition the joint
     Gaussian of the log intensities at frames and times at once.
     """
     frames, I0 = range(pixel.frames), p["I0"]
-    done = [sum(t < m for t in pixel.t) for m in pixel.mid]
-    done += [sum(t <= time for t in pixel.t) for time in times]
     when = [*pixel.mid, *times]
-    origin, first = when[0], done[0]
 
-    steps = [w * pixel.c(s) ** 2 for w, s in zip(pixel.weight, pixel.s, strict=True)]
-    moves = [w * s * pixel.c(s) for w, s in zip(pixel.weight, pixel.s, strict=True)]
+    def so_far(value):
+        """At every frame and time, the sum of value(source, polarity) over events."""
+        sums = np.zeros(len(when))
+        for part, source in sources:
+            done = [sum(t < m for t in source.t) for m in pixel.mid]
+            done += [sum(t <= time for t in source.t) for time in times]
+            each = [w * value(source, s) for w, s in zip(source.weight, source.s, strict=True)]
+            sums += [part * source.spread(n, t, each) for n, t in zip(done, when, strict=True)]
+        return sums - sums[0]
 
-    def clock(n, time):
-        """Variance between the first frame and a point; negative before it."""
-        events = pixel.spread(n, time, steps) - pixel.spread(first, origin, steps)
-        return p["sigma_event"] ** 2 * events + p["sigma_bg"] ** 2 * (time - origin) * 1e-6
-
-    V = np.array([clock(n, time) for n, time in zip(done, when, strict=True)])
+    # Variance between the first frame and a point; negative before it.
+    V = p["sigma_event"] ** 2 * so_far(lambda source, s: source.c(s) ** 2)
+    V += p["sigma_bg"] ** 2 * (np.array(when) - when[0]) * 1e-6
     same = np.sign(V)[:, None] == np.sign(V)[None, :]
     C = p["P_start"] + np.where(same, np.minimum(abs(V)[:, None], abs(V)[None, :]), 0)
-    prior = math.log(p["start"] + I0) + np.array(
-        [pixel.spread(n, time, moves) for n, time in zip(done, when, strict=True)]
-    )
-    prior -= pixel.spread(first, origin, moves)
+    prior = math.log(p["start"] + I0) + so_far(lambda source, s: s * source.c(s))
 
     measured = []  # (frame, value, variance)
 

@@ -5,6 +5,7 @@ import csv
 import dataclasses
 import functools
 import json
+import math
 import os
 import subprocess
 import sys
@@ -825,3 +826,51 @@ def test_bad_ways_to_fit(folder, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     fails(capsys, ["fit", config, "--out", folder / "out"], "jaxevent[plot]")
     assert sorted(folder.rglob("*")) == before
+
+
+def test_relaxed_refractory_bound_finds_the_optimum_of_a_scan():
+    """Changes that follow the pixel's last event within 10 ms are ten times less certain."""
+    bound, size, stop = 0.01, 16, 800_000
+    rng = np.random.default_rng(0)
+    rows = []
+    truth = np.full(size * size, math.log(1.5))
+    for pixel in range(size * size):
+        now = 0
+        while True:
+            gap = int(np.exp(rng.uniform(np.log(1e3), np.log(1e5))))
+            now += gap
+            if now >= stop:
+                break
+            step = 0.1 * rng.choice([1, -1])
+            truth[pixel] += step + rng.normal(0, 0.2 if gap <= bound * 1e6 else 0.02)
+            rows.append((now, pixel % size, pixel // size, step > 0))
+    t, x, y, p = (np.array(column) for column in zip(*sorted(rows), strict=True))
+    events = Events(t.astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), p)
+    grey = np.full((1, size, size), 0.5, np.float32)
+    frames = Frames(np.zeros(1, np.int64), grey, np.zeros(1, np.int64))
+    recording = Recording("noisy", size, size, events, frames).check()
+
+    def params(rho):
+        return jaxevent.akf.Params(
+            sigma_ref=0.2, sigma_iso=1e-3, sigma_proc=5e-3, kappa=1e-9, P0=1e-4, rho=rho,
+            rho_width=0.3,
+        )  # fmt: skip
+
+    batch = jaxevent.akf.prepare(recording, np.array([stop]), params(bound))
+
+    @jax.jit
+    def loss(params, batch):
+        features, out = batch
+        image, P = jaxevent.akf.read(params, jaxevent.akf.run(params, features)[0], out)
+        error = jnp.log(image + params.I0) - truth
+        return (error**2 / P + jnp.log(P)).mean() / 2
+
+    scan = np.geomspace(1e-3, 0.1, 41)
+    losses = [float(loss(params(float(rho)), batch)) for rho in scan]
+    best = scan[int(np.argmin(losses))]
+    assert 0.008 < best < 0.013
+    for start in (2e-3, 0.06):
+        settings = Settings(iterations=50, learning_rate=0.2, rounds=1)
+        found = optimise(loss, params(start), ["rho"], [batch], settings=settings).params
+        assert float(loss(found, batch)) <= min(losses) + 1e-3
+        assert float(found.rho) == pytest.approx(best, rel=0.15)

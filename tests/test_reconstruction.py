@@ -41,10 +41,12 @@ OPTIONS = {
     "w_min": 1e-3,
     "certainty": [0.5, 1.3, 2.0, 0.7],
     "rho_width": 0.4,
-    "beyond": 0.7,
+    "above": 0.7,
+    "below": 0.4,
     "one_sided": True,
     "clip_rate": 300.0,
     "spread": 0.004,
+    "share": 0.3,
 }
 
 

@@ -35,7 +35,8 @@ class Params(AugmentParams):
     rho_width = Positive(0.0, "1", "width in ln time of the step at rho; 0: a sharp step")
     kappa = Positive(7e5, "1 / (intensity^2 s)", "certainty of frames: 7e5 DAVIS, 7e7 FLIR")
     P0 = Positive(0.09, "(ln I)^2", "variance at the start")
-    beyond = Number(0.0, "ln I", "how far beyond the clip clipped pixels start")
+    above = Number(0.0, "ln I", "how far above the bound of clipping saturated pixels start")
+    below = Number(0.0, "ln I", "how far below the bound of clipping black pixels start")
     one_sided = Choice((False, True), "whether clipped frames tell that L lies beyond the clip")
     clip_rate = Positive(100.0, "1 / ((ln I)^2 s)", "1/R of clipped frames, if one-sided")
 
@@ -49,13 +50,15 @@ class Params(AugmentParams):
             "margin": 2.5,
             "calibrate": False,
             "weighting": "certainty",
-            "sigma_proc": 0.05**0.5,
-            "sigma_iso": 0.1,
-            "sigma_ref": 0.1,
+            "sigma_proc": 0.35,
+            "sigma_iso": 0.2,
+            "sigma_ref": 0.2,
             "rho": 0.1,
             "kappa": 3e4,
-            "P0": 1.0,
-            "beyond": 0.5,
+            "P0": 0.8,
+            "clip_rate": 300.0,
+            "above": 0.7,
+            "below": 0.8,
             "one_sided": True,
         },
     }
@@ -78,6 +81,7 @@ class Augmentation(Observer):
     density: BetweenFrames
     I0: Float[Array, ""]
     present: Float[Array, ""]
+    clipped: Float[Array, " pixels"]
     begin: Float[Array, " pixels"]
     bound: Float[Array, "frames pixels"] | None
     push: Float[Array, "frames pixels"] | None
@@ -94,7 +98,10 @@ class Augmentation(Observer):
             self.image = BetweenFrames(params, frames, jnp.asarray(frames.intensity))
             self.density = BetweenFrames(params, frames, Rbar)
         side = clipped_side(params, frames)
-        self.begin = params.beyond * side[0]
+        # A clipped value tells its side, no more: dark ones differ by how noise is rounded.
+        edge = bound_of(params, frames)[0]
+        self.clipped = abs(side[0])
+        self.begin = edge + jnp.where(side[0] > 0, params.above, -params.below)
         self.bound = self.push = None
         if params.one_sided:
             # What both frames of a gap say; where one is not clipped, events tell when it began.
@@ -114,7 +121,8 @@ class Augmentation(Observer):
         return Observation(self.level(points), rate, points.of_frame(self.bound), push)
 
     def outset(self, points: Points) -> Array:
-        return self.level(points) + self.begin
+        level = self.level(points)
+        return level + self.clipped * (self.begin - level)
 
 
 def initial(params: Params, level: Array) -> State:

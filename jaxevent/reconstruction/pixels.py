@@ -153,6 +153,7 @@ class FrameFeatures(eqx.Module):
     present: Float[Numeric, ""]  # 1, or 0 if the recording has no frames
     rows: Int[Numeric, " 3"]  # number of frames; rows of the last one before, of the next's first
     clock_offset: Float[Numeric, ""]  # s, for which the positions were prepared
+    width: int = eqx.field(static=True)  # of the sensor, whose pixels are in rows
 
 
 class Growth(eqx.Module):
@@ -792,6 +793,7 @@ class Windows:
             np.asarray(float(n > 0), dtype),
             np.array([n, 0, 0], np.int32),
             np.asarray(clock.offset, dtype),
+            self.recording.width,
         )
 
     def _segments(self, used: slice, around: Events, weight: NDArray) -> Segments:

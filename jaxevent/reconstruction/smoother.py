@@ -6,6 +6,10 @@ mid-exposure, with variance r = (sigma_frame / w)^2 / (I + I0)^2 + sigma_floor^2
 a frame is no measurement; it says only that L lies beyond the clip (one-sided evidence, a truncated
 Gaussian whose first two moments are kept).
 
+Between two of its events a pixel's intensity moves by less than a threshold, unseen. Events around
+it tell of that: of every event the part `share` belongs to the eight neighbours (on slider_depth
+the changes between frames have a quarter less error so, and hidden frames too).
+
 Between frames nothing but sums over events matters, so the recursions pass over frames, not events.
 Forward (Kalman filter) it carries mean and variance (m, P); backward (information filter) what
 later frames say, h and J: exp(h L - J L^2 / 2). Both together give mean and variance at any time,
@@ -41,9 +45,9 @@ from jaxevent.reconstruction.pixels import Features, FrameFeatures, Numeric, Rea
 class Params(CertaintyParams):
     """Parameters of the smoother."""
 
-    sigma_event = Positive(0.05, "c", "noise of an event's step, as part of its threshold")
-    sigma_bg = Positive(0.07, "ln I / sqrt(s)", "drift without events")
-    sigma_frame = Positive(0.01, "intensity", "noise of frames where the certainty w is 1")
+    sigma_event = Positive(0.3, "c", "noise of an event's step, as part of its threshold")
+    sigma_bg = Positive(0.25, "ln I / sqrt(s)", "drift without events")
+    sigma_frame = Positive(0.007, "intensity", "noise of frames where the certainty w is 1")
     sigma_floor = Positive(0.02, "ln I", "noise of frames in log intensity, however certain")
     start = Positive(0.5, "intensity", "mean before the first frame")
     P_start = Positive(4.0, "(ln I)^2", "variance before the first frame")
@@ -54,10 +58,13 @@ class Params(CertaintyParams):
             "I0": 0.003,
             "w_min": 1e-5,
             "margin": 2.5,
+            "sigma_floor": 0.1,
+            "share": 0.3,
             "spread": 0.05,
         },
     }
 
+    share = Positive(0.5, "1", "part of an event's change that belongs to its 8 neighbours")
     spread = Positive(0.0, "s", "longest time between events over which a change is spread")
     one_sided = Choice((True, False), "whether clipped frames tell that L lies beyond the clip")
 
@@ -155,8 +162,9 @@ def rows_of(params: Params, frames: FrameFeatures) -> tuple[Rows, Float[Array, "
     follows = (rate > 0)[:, None]  # another frame follows
     exists = jnp.concatenate([jnp.asarray(frames.present)[None], (rate > 0)[:-1]])[:, None]
     counts = jnp.where(follows, counts, 0)
+    moves = shared(params, frames, counts)
     gap = jnp.where(follows, 1 / jnp.where(follows, rate[:, None], 1), 0)
-    q = added(params, counts[0], counts[1], gap)
+    q = added(params, moves[0], moves[1], gap)
     noise = params.sigma_frame / certainty(params, frames) / (frames.intensity + params.I0)
     clear = unclipped(params, frames)
     side = clipped_side(params, frames) * params.one_sided
@@ -167,10 +175,33 @@ def rows_of(params: Params, frames: FrameFeatures) -> tuple[Rows, Float[Array, "
         1 / (frames.intensity + params.I0),
         side * exists,
         jnp.broadcast_to(bound_of(params, frames), z.shape),
-        brightness(params, counts[0], counts[1]),
+        brightness(params, moves[0], moves[1]),
         jnp.broadcast_to(q, z.shape),
     )
     return measured, counts
+
+
+def shared(params: Params, frames: FrameFeatures, counts: Array) -> Array:
+    """Event counts [..., pixels] of which each pixel gives the part `share` to its neighbours.
+
+    Between two events of a pixel its intensity moves by less than a threshold, unseen; events
+    around it tell of that. At the border the missing neighbours' part stays with the pixel.
+    """
+    image = counts.reshape(*counts.shape[:-1], -1, frames.width)
+
+    def three(values: Array, axis: int) -> Array:
+        rest = [(0, 0)] * values.ndim
+        rest[axis] = (1, 1)
+        padded = jnp.pad(values, rest)
+        size = values.shape[axis]
+        return sum(lax.slice_in_dim(padded, k, k + size, axis=axis) for k in range(3))
+
+    def around(values: Array) -> Array:
+        return three(three(values, values.ndim - 1), values.ndim - 2) - values
+
+    given = around(jnp.ones(image.shape[-2:], image.dtype)) / 8
+    mixed = image + params.share * (around(image) / 8 - given * image)
+    return mixed.reshape(counts.shape)
 
 
 def added(params: Params, on: Array, off: Array, seconds: Array) -> Array:
@@ -303,6 +334,7 @@ class Smoother(Estimator[Params]):
             until = jnp.where(behind, first, between - since)
         gap = jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), 0)
         seconds = jnp.where(behind, -elapsed, jnp.where(rate > 0, gap - elapsed, 0))
+        until, since = shared(params, frames, until), shared(params, frames, since)
 
         later = jax.tree.map(lambda v: v[f], trajectory.future)
         later = jax.tree.map(lambda a, b: jnp.where(behind, a, b), trajectory.first, later)
