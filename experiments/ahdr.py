@@ -6,10 +6,12 @@ Simulates the recordings (an S-shaped response that crops, mismatched thresholds
 hot pixels; a slow and a fast pan of each scene), fits every tunable method by
 configs/fit_ahdr.toml, and scores all on the test scenes against the true HDR images. Errors are
 geometric means over test recordings; after +- is the standard deviation over the seeds of such a
-mean, in per cent. Done parts are kept in the folder and not repeated.
+mean, in per cent. Done parts are kept in the folder and not repeated. Where ColorVideoVDP is
+installed (pip install '.[hdr]'), the last table has its quality Q too, of every sixth image.
 """
 
 import argparse
+import importlib.util
 import json
 import os
 import sys
@@ -19,7 +21,7 @@ import numpy as np
 from tqdm import tqdm
 
 import jaxevent
-from jaxevent.evaluate import score
+from jaxevent.evaluate import PROTOCOLS, frame_times, score
 from jaxevent.fit import fit
 from jaxevent.simulate import FITTING, SENSORS, TESTING, Pan, scene, simulate
 from jaxevent.simulate.scenes import Speed
@@ -42,6 +44,17 @@ def record(folder: Path, scenes: tuple[str, ...], seeds: range, sensor: str) -> 
             source = Pan(scene(name), speed=speed, duration=SECONDS[speed], seed=seed)
             jaxevent.save(simulate(source, SENSORS[sensor], seed, path.stem), path)
     return paths
+
+
+def quality(recording: jaxevent.Recording, method, params) -> float | None:
+    """The mean quality of images in JOD, 10 at best; None without ColorVideoVDP."""
+    if importlib.util.find_spec("pycvvdp") is None:
+        return None
+    given, reference = PROTOCOLS["reference"](recording)
+    rows = np.arange(0, len(reference), 6)
+    images, _ = method.reconstruct(given, params)(frame_times(reference, params)[rows])
+    truth = np.stack([reference.truth(int(row)) for row in rows])
+    return float(np.mean(jaxevent.metrics.hdr_quality(images, truth)))
 
 
 def rows_of(paths: list[Path], fitted: Path, out: Path) -> list[dict]:
@@ -69,6 +82,7 @@ def rows_of(paths: list[Path], fitted: Path, out: Path) -> list[dict]:
         for label, method, params in methods:
             row = score(recording, method, params, "reference")
             del row["per_frame"]
+            row["Q"] = quality(recording, method, params)
             rows.append({**row, "method": label, "seed": int(path.stem.rpartition("_")[2])})
     out.write_text(json.dumps(rows, indent=1))
     return rows
@@ -106,9 +120,10 @@ def table(rows: list[dict]) -> str:
         lines.append(f"| {label} | " + " | ".join(cells) + " |")
     lines += [
         "",
-        "| method | MSE / cf | log MSE / cf | well-exposed MSE / blend | z2 bright, dark, well |",
+        "| method | MSE / cf | log MSE / cf | well-exposed MSE / blend | "
+        "z2 bright, dark, well | Q |",
     ]
-    lines += ["|---|---:|---:|---:|---|"]
+    lines += ["|---|---:|---:|---:|---|---:|"]
     base = {label: [r for r in rows if r["method"] == label] for label in labels}
 
     def ratio(label: str, other: str, name: str) -> float:
@@ -125,9 +140,11 @@ def table(rows: list[dict]) -> str:
                 for part in ("bright", "dark", "well")
             }
             z2 = ", ".join(f"{value:.2g}" for value in parts.values())
+        seen = [row["Q"] for row in base[label]]
+        Q = "-" if None in seen else f"{np.mean(seen):.2f}"
         lines.append(
             f"| {label} | {ratio(label, 'cf', 'MSE'):.2f} | {ratio(label, 'cf', 'log MSE'):.2f} | "
-            f"{ratio(label, 'blend', 'well-exposed MSE'):.2f} | {z2} |"
+            f"{ratio(label, 'blend', 'well-exposed MSE'):.2f} | {z2} | {Q} |"
         )
     return "\n".join(lines) + "\n"
 

@@ -1,13 +1,11 @@
-"""Print the README's tables of speed (from `bench.py --json FILE`) and of parameters.
+"""Print the README's table of speed: python experiments/readme_tables.py bench.json
 
-python experiments/readme_tables.py bench.json
+bench.json is what `bench.py --json bench.json` writes.
 """
 
 import json
 import sys
 from pathlib import Path
-
-import jaxevent
 
 
 def main() -> None:
@@ -17,18 +15,6 @@ def main() -> None:
         print(f"| {name} | {value:.1f} |")
     for name, value in bench["ratios"].items():
         print(f"{name}: {value:.2f}")
-    print("\n| parameter | default | unit | |\n|---|---|---|---|")
-    numbers, choices = {}, {}
-    for method in jaxevent.METHODS.values():
-        numbers |= method.Params.numbers
-        choices |= method.Params.choices
-    for name, number in numbers.items():
-        default = number.default if isinstance(number.default, tuple) else (number.default,)
-        text = ", ".join(f"{value:.4g}" for value in default)
-        print(f"| `{name}` | {text} | {number.unit} | {number.meaning} |")
-    for name, choice in choices.items():
-        options = " or ".join(str(option).lower() for option in choice.options)
-        print(f"| `{name}` | {options} | | {choice.meaning} |")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,50 @@
+"""Print docs/parameters.md, the table of all parameters: python experiments/parameters.py"""
+
+from collections.abc import Iterable
+
+import jaxevent
+from jaxevent.parameters import Choice, Number, Parameters
+
+
+def rows(kinds: Iterable[type[Parameters]]) -> list[str]:
+    """One row for each parameter of some classes: name, default or options, unit, meaning."""
+    numbers: dict[str, Number] = {}
+    choices = {}
+    for kind in kinds:
+        numbers |= kind.numbers
+        choices |= kind.choices
+    lines = ["| parameter | default | unit | |", "|---|---|---|---|"]
+    for name, number in numbers.items():
+        default = number.default if isinstance(number.default, tuple) else (number.default,)
+        text = ", ".join(f"{value:.4g}" for value in default)
+        lines.append(f"| `{name}` | {text} | {number.unit} | {number.meaning} |")
+    for name, choice in choices.items():
+        if isinstance(choice, Choice):
+            options = " or ".join(str(option).lower() for option in choice.options)
+            lines.append(f"| `{name}` | {options} | | {choice.meaning} |")
+        else:
+            lines.append(f"| `{name}` | {choice.default} | {choice.unit} | {choice.meaning} |")
+    return lines
+
+
+def page() -> str:
+    methods = (method.Params for method in jaxevent.METHODS.values())
+    blob = jaxevent.blob.Params
+    presets = ", ".join(f"`{name}`" for name in blob.presets)
+    parts = [
+        "# Parameters",
+        "Made by `python experiments/parameters.py`. Of several options the first is the default. "
+        "Numbers with a gradient can be named under `fit` in a fit's configuration.",
+        "## Reconstruction",
+        "A method has those of them that it uses: `jaxevent.akf.Params.numbers`, `.choices`. "
+        "Presets of `akf`: `paper`, `hdr`; of `aks`: `hdr`.",
+        "\n".join(rows(methods)),
+        "## Blob tracking",
+        f"`jaxevent.blob.Params`. Presets: {presets}.",
+        "\n".join(rows([blob])),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+if __name__ == "__main__":
+    print(page(), end="")
