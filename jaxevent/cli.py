@@ -1,4 +1,4 @@
-"""The command line: `jaxevent demo | info | convert | reconstruct | evaluate | fit | simulate`.
+"""The command line: demo, info, convert, reconstruct, track, evaluate, fit, simulate.
 
 What cannot be used is said in one line on stderr, exit status 2. The libraries are imported by the
 command that needs them, so that help appears at once.
@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="jaxevent",
-        description="Video, of high rate and dynamic range, from event cameras.",
+        description="Video of high rate and dynamic range, and tracks, from event cameras.",
         epilog="example:\n  jaxevent demo",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -147,6 +147,65 @@ def _parser() -> argparse.ArgumentParser:
     add_size(one)
 
     one = add(
+        track,
+        "Track blobs: bright spots and other compact sources of events. Without suffix the output "
+        "is a folder of tracks.csv, tracks.h5, tracks.mp4 and tracks.png; with one it is the file "
+        "of that kind. Tables have a row for each track and time.",
+        "stars.h5 --params slow.toml --out stars",
+        "dot.h5 --seed 320,240,20 --rate 2000 --out dot.csv",
+        "car.h5 --seed 400,300,15 --seed 460,300,15 --pair 0,1 --out car",
+    )
+    one.add_argument("path", metavar="PATH", type=Path, help="a recording; frames are not needed")
+    one.add_argument(
+        "--params",
+        metavar="FILE",
+        type=Path,
+        help='TOML file of name = value lines, e.g. preset = "slow" or events_per_step = 16, or '
+        "params.toml of a fit",
+    )
+    one.add_argument(
+        "--seed",
+        metavar="X,Y,SIZE[,T]",
+        dest="seeds",
+        type=_seed,
+        action="append",
+        help="where a blob is (px), how large (standard deviation of its events, px) and from when "
+        "(s, default: the start); may be repeated. Without, blobs are found",
+    )
+    one.add_argument(
+        "--detect", action="store_true", help="find further blobs where there are seeds"
+    )
+    when = one.add_mutually_exclusive_group()
+    when.add_argument(
+        "--rate", metavar="HZ", type=float, default=1000.0, help="rows per second; default: 1000"
+    )
+    when.add_argument("--at", choices=["events"], help="a row for each event of a track")
+    one.add_argument(
+        "--start", metavar="S", type=float, help="of tracking, on the recording's clock"
+    )
+    one.add_argument("--stop", metavar="S", type=float, help="its end")
+    one.add_argument(
+        "--background",
+        choices=["events", "high-pass"],
+        default="events",
+        help="behind the tracks in the video; default: events",
+    )
+    add_size(one)
+    group = one.add_argument_group("time to contact and range, in quantities.csv and the plot")
+    group.add_argument(
+        "--pair", metavar="ID,ID", type=_pair, help="two tracks whose distance tells 1 / TTC"
+    )
+    group.add_argument("--extent", metavar="M", type=float, help="the target's size in m")
+    group.add_argument("--focal", metavar="PX", type=float, help="focal length in px")
+    group.add_argument(
+        "--size-factor",
+        metavar="K",
+        type=float,
+        help="lambda over the diameter in the image; default: 0.354, of an even rim",
+    )
+    one.add_argument("--out", metavar="DIR_or_FILE", type=Path, required=True, help="what to write")
+
+    one = add(
         evaluate,
         "Compare methods on recordings. It hides frames, reconstructs them and prints a table of "
         "the errors.",
@@ -180,8 +239,9 @@ def _parser() -> argparse.ArgumentParser:
         simulate,
         "Make a recording whose truth is known, as HDF5. A simulated sensor looks at a drawn scene "
         "of high dynamic range over which the camera moves, or at a video, of which the frames see "
-        "only the middle levels.",
+        "only the middle levels. Or events alone, of moving blobs.",
         "--scene lake --speed fast --out lake.h5",
+        "--blobs lissajous --truth dot.csv --out dot.h5",
         "bike.mp4 --cut 50 --speed 0.5 --out bike.h5",
     )
     source = one.add_mutually_exclusive_group(required=True)
@@ -193,14 +253,18 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NAME",
         help="room, forest, mountain, lake, night, tunnel, or a number for a variant of one",
     )
+    source.add_argument(
+        "--blobs",
+        metavar="NAME",
+        help="lissajous, noise, growing, ttc, disc, crossing, dropout, flock or walk",
+    )
     one.add_argument(
         "--out", metavar="FILE", type=Path, required=True, help="the HDF5 file to write"
     )
     one.add_argument(
         "--sensor",
         metavar="NAME",
-        default="davis",
-        help="ideal, good, davis or poor; default: %(default)s",
+        help="ideal, good, davis or poor; default: davis",
     )
     one.add_argument("--seed", metavar="N", type=int, default=0, help="of all that is random")
     one.add_argument(
@@ -212,7 +276,14 @@ def _parser() -> argparse.ArgumentParser:
         "--duration",
         metavar="S",
         type=float,
-        help="seconds of a scene, default 1.5; of the video, before --speed, default all",
+        help="seconds of a scene, default 1.5; of the video, before --speed, or of blobs, "
+        "default all",
+    )
+    one.add_argument(
+        "--truth",
+        metavar="CSV",
+        type=Path,
+        help="of blobs: a table of their states at 1000 Hz, as that of `jaxevent track`",
     )
     group = one.add_argument_group("only for a scene")
     group.add_argument(
@@ -243,6 +314,24 @@ def _size(text: str) -> tuple[int, int]:
     return width, height
 
 
+def _seed(text: str) -> tuple[float, ...]:
+    return _numbers(text, (3, 4), float, "X,Y,SIZE or X,Y,SIZE,T, for example 120,90,8")
+
+
+def _pair(text: str) -> tuple[int, ...]:
+    return _numbers(text, (2,), int, "ID,ID, for example 0,1")
+
+
+def _numbers(text: str, counts: tuple[int, ...], kind: Callable, meant: str) -> tuple:
+    try:
+        numbers = tuple(kind(number) for number in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) not in counts:
+        raise argparse.ArgumentTypeError(f"{text!r} is not {meant}")
+    return numbers
+
+
 def _progress() -> bool:
     return sys.stderr.isatty()
 
@@ -258,10 +347,9 @@ def evaluate(config: Path, out: Path | None) -> None:
 
 def fit(config: Path, out: Path, recordings: list[str] | None, resume: bool) -> None:
     from jaxevent.fit import fit as run
-    from jaxevent.fit import unseen
-    from jaxevent.report import markdown_table
 
-    print(markdown_table(unseen(run(config, out, recordings, resume, _progress()))), end="")
+    run(config, out, recordings, resume, _progress())
+    print((out / "results.md").read_text(), end="")
     files = "params.toml, results.json, results.md, loss.csv, loss.png, config.toml"
     print(f"\nwritten to {out}: {files}")
 
@@ -323,11 +411,65 @@ def reconstruct(
     )
 
 
+def track(
+    path: Path,
+    params: Path | None,
+    seeds: list[tuple[float, ...]] | None,
+    detect: bool,
+    rate: float | int,
+    at: str | None,
+    start: float | int | None,
+    stop: float | int | None,
+    background: str,
+    size: tuple[int, int] | None,
+    pair: tuple[int, int] | None,
+    extent: float | int | None,
+    focal: float | int | None,
+    size_factor: float | int | None,
+    out: Path,
+) -> None:
+    from jaxevent.blob import Params
+    from jaxevent.blob import track as run
+    from jaxevent.blob.pictures import Output
+    from jaxevent.io import load
+
+    values = Params.of({}) if params is None else Params.load(params, "blob")
+    each = None if at == "events" else rate
+    output = Output(out, each, background, pair, extent, focal, size_factor)
+    recording = load(path, size, in_memory=False, progress=_progress())
+    recording = dataclasses.replace(recording, name=str(path))  # for messages
+    if not len(recording.events):
+        raise InputError(f"{path}: holds no events to track; choose another recording")
+    span: dict[str, Any] = {"start": start, "stop": stop}
+    clock = time.perf_counter()
+    tracks = run(
+        recording, values, seeds, **span, detect=detect or seeds is None, progress=_progress()
+    )
+    seconds = time.perf_counter() - clock
+    written = output.write(tracks, _progress())
+    count = recording.events.index(tracks.stop) - recording.events.index(tracks.start)
+    if len(tracks):
+        print("\n".join(written.summary()))
+    else:
+        print(
+            "no blob was found; say where one is with --seed X,Y,SIZE, or try --params with "
+            'preset = "slow" or "fast"'
+        )
+    how = ", ".join(written.files) + f" in {out}" if not out.suffix else str(out)
+    slow = "" if written.slow is None else f"; the video plays at {written.slow:.3g} of real time"
+    print(
+        f"\n{how}: {len(tracks):,} tracks, {count:,} events in {seconds:.2f} s, "
+        f"{count / seconds:,.0f} events/s{slow}"
+    )
+
+
 def simulate(
     video: Path | None,
     scene: str | None,
+    blobs: str | None,
+    truth: Path | None,
     out: Path,
-    sensor: str,
+    sensor: str | None,
     seed: int,
     speed: str | None,
     duration: float | int | None,
@@ -342,6 +484,16 @@ def simulate(
     from jaxevent.parameters import nearest
     from jaxevent.simulate.scenes import SPEEDS
 
+    if blobs is not None:
+        given = {"sensor": sensor, "speed": speed, "size": size, "start": start, "cut": cut}
+        for name, value in {**given, "max-size": max_size}.items():
+            if value is not None:
+                raise InputError(f"--{name} is not for blobs; leave it out")
+        _simulate_blobs(blobs, truth, out, seed, duration)
+        return
+    if truth is not None:
+        raise InputError("--truth is that of --blobs; HDR scenes hold theirs, leave it out")
+    sensor = sensor or "davis"
     if sensor not in sim.SENSORS:
         raise InputError(f"there is no sensor {sensor!r}; {nearest(sensor, sim.SENSORS)}")
     if seed < 0:
@@ -379,6 +531,33 @@ def simulate(
                 video, sim.SENSORS[sensor], speed=factor, stop=stop, seed=seed, **given
             )
         save(recording, partial)
+    _print_stored(recording, out)
+
+
+def _simulate_blobs(
+    name: str, truth: Path | None, out: Path, seed: int, duration: float | int | None
+) -> None:
+    import numpy as np
+
+    from jaxevent.blob.pictures import write_states
+    from jaxevent.io import save
+    from jaxevent.io.output import complete
+    from jaxevent.simulate import blob_scene
+
+    if seed < 0:
+        raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
+    if duration is not None and not 0 < duration < math.inf:
+        raise InputError(f"--duration {duration:g} is not possible; give seconds above 0")
+    with contextlib.ExitStack() as stack:
+        partial = stack.enter_context(complete(out))
+        table = None if truth is None else stack.enter_context(complete(truth))
+        recording, states = blob_scene(name, seed)
+        if duration is not None and duration < states.duration:
+            recording = recording[: float(duration)]
+        save(recording, partial)
+        if table is not None:
+            times = np.arange(0, recording.stop + 1, 1000)
+            write_states(table, times, states(times), states.visible(times))
     _print_stored(recording, out)
 
 

@@ -39,7 +39,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,12 +59,14 @@ from jaxevent.metrics import (
     regions,
     ssim,
 )
-from jaxevent.parameters import nearest, read_toml
+from jaxevent.parameters import Parameters, nearest, read_toml
 from jaxevent.reconstruction import METHODS
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import Estimator
 from jaxevent.recording import Frames, Recording, microseconds
 from jaxevent.report import markdown_table
+
+P = TypeVar("P", bound=Parameters)
 
 
 def held_out(recording: Recording) -> tuple[Recording, Frames]:
@@ -189,7 +191,7 @@ def find_method(name: str) -> Estimator:
     return METHODS[name]
 
 
-def values_of(params: FrameParams) -> dict[str, Any]:
+def values_of(params: Parameters) -> dict[str, Any]:
     """The values as they were given: numbers to 6 digits, lists of them, text, true and false.
 
     None where JSON has no number.
@@ -463,12 +465,16 @@ def evaluate(
 Write = Callable[[str, bytes], None]
 
 
-def write_rows(rows: Iterable[Mapping[str, Any]], write: Write) -> None:
+def write_rows(
+    rows: Iterable[dict[str, Any]],
+    write: Write,
+    table: Callable[[list[dict[str, Any]]], str] = markdown_table,
+) -> None:
     """Write results.json and results.md by a function that `results` gives."""
     rows = list(rows)
     text = json.dumps({"rows": rows}, indent=1, allow_nan=False) + "\n"
     write("results.json", text.encode())
-    write("results.md", markdown_table(rows).encode())
+    write("results.md", table(rows).encode())
 
 
 @contextlib.contextmanager
@@ -575,21 +581,21 @@ def _methods(given: Any, folder: Path) -> list[tuple[str, Estimator, FrameParams
             if not isinstance(name, str) or not isinstance(label, str):
                 raise InputError('name and label must be text; give name = "akf"')
             method = find_method(name)
-            params = read_params(method, entry.get("params", {}), folder)
+            params = read_params(method.Params, method.name, entry.get("params", {}), folder)
             methods.append((label, method, params))
         except InputError as error:
             raise InputError(f"method {number}: {error}") from None
     return methods
 
 
-def read_params(method: Estimator, given: Any, folder: Path) -> FrameParams:
-    """Params as a configuration gives them: a table, the path of a TOML file, or both.
+def read_params(kind: type[P], name: str, given: Any, folder: Path) -> P:
+    """Params of a method as a configuration gives them: a table, a TOML file's path, or both.
 
     Paths are relative to `folder`. Raises `InputError` for anything else and naming a bad setting.
     """
 
-    def load_file(path: str) -> FrameParams:
-        return method.Params.load(folder / os.path.expandvars(path), method.name)
+    def load_file(path: str) -> P:
+        return kind.load(folder / os.path.expandvars(path), name)
 
     if isinstance(given, str):
         return load_file(given)
@@ -598,10 +604,10 @@ def read_params(method: Estimator, given: Any, folder: Path) -> FrameParams:
     values = dict(given)
     file = values.pop("file", None)
     if file is None:
-        return method.Params.of(values)
+        return kind.of(values)
     if not isinstance(file, str):
         raise InputError(f"file is {file!r}; give the path of a TOML file")
-    return method.Params.of({**load_file(file).values(), **values})
+    return kind.of({**load_file(file).values(), **values})
 
 
 def _refuse_unknown(table: Mapping[str, Any], known: tuple[str, ...]) -> None:

@@ -10,16 +10,16 @@ fit CONFIG.toml` run the loop as a file describes it:
     test = []                           # and those that are only scored; if neither is given,
     split = [2, 1, 1]                   # of every 4 images in turn 2 are fitted, 1, 1 are those
     size = [240, 180]                   # only for recordings that do not tell it
+    window = 1.0                        # s, of mini-batches; omitted: whole recordings
+    batch = 4                           # windows per step; omitted: all
+    iterations = 300                    # and the other fields of `Settings`
     loss = "held-out"                   # or "reference" (protocols of `jaxevent.evaluate`), or
                                         # "likelihood" of the frames that the protocol gives
     protocol = "held-out"               # with the likelihood: what is given, and scored
     error = "linear"                    # or "log", "nll"; see `objectives.Objective`
     dark_offset = 0.003                 # of the error "log"
     weights = { dark = 1, bright = 1 }  # of pixels of HDR references outside what frames record
-    window = 1.0                        # s, of mini-batches; omitted: whole recordings
     warm_up = 0.2                       # s that are prepared around a window
-    batch = 4                           # windows per step; omitted: all
-    iterations = 300                    # and the other fields of `Settings`
 
     [[method]]
     name = "akf"                        # a key of jaxevent.METHODS
@@ -31,6 +31,9 @@ fit CONFIG.toml` run the loop as a file describes it:
 A method may have its own loss, error, learning_rate, iterations and starts. Parameters that are
 fixed when a recording is prepared have no gradient to follow; each candidate of a search is
 prepared anew. Values omitted are those above, except where comments say otherwise.
+
+The settings from `loss` on are those of reconstruction; `jaxevent.blob.objectives` tells those of
+the tracker, the method "blob". What the loop and the files need of a system is in `System`.
 """
 
 import contextlib
@@ -43,9 +46,9 @@ import json
 import math
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -60,7 +63,6 @@ from tqdm import tqdm
 from jaxevent.errors import InputError, require
 from jaxevent.evaluate import (
     PROTOCOLS,
-    find_method,
     find_recordings,
     read_params,
     results,
@@ -71,6 +73,7 @@ from jaxevent.evaluate import (
 from jaxevent.io import load
 from jaxevent.io.output import complete
 from jaxevent.parameters import Parameters, nearest, read_toml
+from jaxevent.reconstruction import METHODS
 from jaxevent.reconstruction.augment import PREPARED, FrameParams
 from jaxevent.reconstruction.estimator import Estimator
 from jaxevent.reconstruction.objectives import (
@@ -394,7 +397,7 @@ class _Loop:
         """Raise `InputError` unless the losses of the given parameters are finite."""
         fit, validation = self.prepare(self.params)
         if not fit:
-            raise InputError("there is nothing to fit to; give recordings with images")
+            raise InputError("there is nothing to fit to; give recordings with images or positions")
         for batches in (fit, validation or fit):
             if not math.isfinite(self.loss(self.params, batches)):
                 raise InputError(
@@ -534,6 +537,7 @@ def fit(
     Returns:
         Rows as `evaluate.score` gives them, of the recordings and images of each split: `split` is
         "fit", "validation" or "test", `method` the label, with ", before" for the start values.
+        Those of the tracker are described in `jaxevent.blob.objectives`.
 
     Raises:
         InputError: The file, a recording or a parameter cannot be used, `out` cannot be written or
@@ -577,7 +581,8 @@ def fit(
         for task in plan.tasks[len(done) :]:
             try:
                 one = optimise(
-                    task.objective, task.params, task.names, task.problem(plan, sources), (),
+                    task.goal.loss, task.params, task.names,
+                    task.goal.problem(sources, plan.split, plan.window), (),
                     task.settings, task.search,
                     run=run, save=save, progress=progress, title=task.label,
                 )  # fmt: skip
@@ -591,16 +596,33 @@ def fit(
         row
         for task, one in zip(plan.tasks, done, strict=True)
         for label, params in ((f"{task.label}, before", task.params), (task.label, one.params))
-        for row in task.score(plan, sources, label, params, progress)
+        for row in _rows(task, label, params, sources, plan, progress)
     ]
     write("config.toml", plan.text)
     write("loss.csv", _losses(plan.tasks, done).encode())
     write("loss.png", _curves(plan.tasks, done))
-    write_rows(rows, write)
-    write("results.md", markdown_table(unseen(rows)).encode())
+    write_rows(rows, write, lambda rows: _results(plan.tasks, unseen(rows)))
     write("params.toml", _tables(plan.tasks, done).encode())
     checkpoint.unlink()
     return rows
+
+
+def _rows(
+    task: "Task", label: str, params: Any, sources: "Sources", plan: "Plan", progress: bool
+) -> Iterator[dict[str, Any]]:
+    for row in task.goal.score(sources, plan.split, plan.window, params, progress):
+        yield {**row, "method": label}
+
+
+def _results(tasks: Sequence["Task"], rows: Sequence[dict[str, Any]]) -> str:
+    """results.md: one table for the methods of each system."""
+    goals = {name: task.goal for task in tasks for name in (task.label, f"{task.label}, before")}
+    kinds = dict.fromkeys(type(goal) for goal in goals.values())
+    parts = []
+    for kind in kinds:
+        mine = [row for row in rows if type(goals[row["method"]]) is kind]
+        parts.append(goals[mine[0]["method"]].table(mine) if mine else "")
+    return "\n".join(filter(None, parts))
 
 
 def unseen(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -612,7 +634,141 @@ def unseen(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return []
 
 
-Sources = Mapping[str, Sequence[tuple[str, Recording]]]
+Sources = Mapping[str, Sequence[tuple[str, Recording]]]  # (as given, recording) by split
+Shares = tuple[int, ...] | None  # of fit, validation, test; None: they have their own recordings
+Check = tuple[Callable[[Any], bool], str]  # of a setting: what is accepted, and how to say so
+
+
+@runtime_checkable
+class Goal(Protocol):
+    """What one method of a configuration is fitted to, and how what comes of it is scored."""
+
+    @property
+    def loss(self) -> Loss:
+        """That of `optimise`; equal goals have losses that are equal and hash alike."""
+        ...
+
+    @property
+    def prepared(self) -> Collection[str]:
+        """Parameters without gradient: they act when batches are made, or by decisions."""
+        ...
+
+    @property
+    def forward(self) -> bool | None:
+        """Which mode of derivatives is the faster; None: that depends on how many, see FORWARD."""
+        ...
+
+    def files(self, recording: Path) -> list[Path]:
+        """What is read besides the recording."""
+        ...
+
+    def problem(
+        self, sources: Sources, split: Shares, window: float | int | None
+    ) -> Callable[[Any], Batches]:
+        """The batches to fit to and to validate on, as functions of parameters."""
+        ...
+
+    def score(
+        self,
+        sources: Sources,
+        split: Shares,
+        window: float | int | None,
+        params: Any,
+        progress: bool,
+    ) -> Iterator[dict[str, Any]]:
+        """Rows of every recording and split: they have the keys recording and split."""
+        ...
+
+    def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
+        """Rows, which now have the key method too, as a Markdown table."""
+        ...
+
+
+@runtime_checkable
+class System(Protocol):
+    """A family of methods, as configurations name them: reconstruction, or the tracker."""
+
+    @property
+    def settings(self) -> Mapping[str, Check]:
+        """What a configuration may hold for it."""
+        ...
+
+    @property
+    def own(self) -> Collection[str]:
+        """Those settings that a method may have for itself."""
+        ...
+
+    def start(self, name: str, given: Any, folder: Path) -> Parameters:
+        """Parameters of a method as a configuration gives them."""
+        ...
+
+    def goal(self, name: str, params: Any, given: Mapping[str, Any]) -> Goal:
+        """From checked settings, the method's own before those of the file."""
+        ...
+
+
+def systems() -> dict[str, System]:
+    """By the name of every method that can be fitted."""
+    from jaxevent.blob.objectives import BLOB
+
+    return {**dict.fromkeys(METHODS, RECONSTRUCTION), "blob": BLOB}
+
+
+@dataclasses.dataclass(frozen=True)
+class Reconstruction:
+    """The goal of a reconstruction method."""
+
+    method: Estimator
+    loss: Objective
+    protocol: str
+    warm_up: float | int
+    weights: Mapping[str, float | int] | None
+    prepared = PREPARED
+    forward = None
+
+    def files(self, recording: Path) -> list[Path]:
+        return []
+
+    def problem(self, sources: Sources, split: Shares, window: float | int | None) -> Problem:
+        cut = functools.partial(
+            parts,
+            protocol=self.protocol,
+            split=split or (1, 0, 0),
+            window=window,
+            warm_up=self.warm_up,
+        )
+        found: dict[str, list] = {}
+        for name in ("fit", "validation"):
+            found[name] = []
+            for _, recording in sources[name]:
+                self.method.check(recording)
+                found[name] += cut(recording)
+        return Problem(self.loss, found["fit"], found["validation"], self.weights)
+
+    def score(
+        self,
+        sources: Sources,
+        split: Shares,
+        window: float | int | None,
+        params: FrameParams,
+        progress: bool,
+    ) -> Iterator[dict[str, Any]]:
+        for whole in SPLITS:
+            for given, recording in sources[whole]:
+                row = score(recording, self.method, params, self.protocol, progress=progress)
+                row["recording"] = given
+                if split is None:
+                    yield {**row, "split": whole}
+                    continue
+                shared = interleave(split, row["frames"])
+                if self.loss.error is None:  # no image was looked at
+                    shared[:] = SPLITS.index("test")
+                for place, name in enumerate(SPLITS):
+                    if (shared == place).any():
+                        yield {**subset(row, np.flatnonzero(shared == place)), "split": name}
+
+    def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
+        return markdown_table(rows)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -620,48 +776,11 @@ class Task:
     """One method of a configuration, checked."""
 
     label: str
-    method: Estimator
-    params: FrameParams
+    params: Parameters
     names: tuple[str, ...]
     search: Mapping[str, Interval]
-    objective: Objective
-    protocol: str
+    goal: Goal
     settings: Settings
-
-    def problem(self, plan: "Plan", sources: Sources) -> Problem:
-        """The batches to fit to and to validate on."""
-        cut = functools.partial(
-            parts,
-            protocol=self.protocol,
-            split=(1, 0, 0) if plan.apart else plan.split,
-            window=plan.window,
-            warm_up=plan.warm_up,
-        )
-        found: dict[str, list] = {}
-        for split in ("fit", "validation"):
-            found[split] = []
-            for _, recording in sources[split]:
-                self.method.check(recording)
-                found[split] += cut(recording)
-        return Problem(self.objective, found["fit"], found["validation"], plan.weights)
-
-    def score(
-        self, plan: "Plan", sources: Sources, label: str, params: FrameParams, progress: bool
-    ) -> Iterator[dict[str, Any]]:
-        """Rows of every recording and split."""
-        for split in SPLITS:
-            for given, recording in sources[split]:
-                row = score(recording, self.method, params, self.protocol, progress=progress)
-                row = {**row, "recording": given, "method": label}
-                if plan.apart:
-                    yield {**row, "split": split}
-                    continue
-                shared = interleave(plan.split, row["frames"])
-                if self.objective.error is None:  # no image was looked at
-                    shared[:] = SPLITS.index("test")
-                for place, name in enumerate(SPLITS):
-                    if (shared == place).any():
-                        yield {**subset(row, np.flatnonzero(shared == place)), "split": name}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -672,15 +791,8 @@ class Plan:
     recordings: Mapping[str, list[tuple[str, Path]]]
     tasks: list[Task]
     size: tuple[int, int] | None
-    split: tuple[int, ...]
+    split: Shares
     window: float | int | None
-    warm_up: float | int
-    weights: Mapping[str, float | int] | None
-
-    @property
-    def apart(self) -> bool:
-        """Whether validation and test have recordings of their own."""
-        return bool(self.recordings["validation"] or self.recordings["test"])
 
     def digest(self) -> str:
         """A number that changes with the configuration, the recordings and the precision."""
@@ -691,6 +803,8 @@ class Plan:
             for given, path in self.recordings[split]:
                 digest.update(f"{split} {given}".encode())
                 files = [path] if path.is_file() else sorted(path.rglob("*"))
+                for task in self.tasks:
+                    files += task.goal.files(path)
                 for file in filter(Path.is_file, files):
                     _fingerprint(file, digest.update)
         return digest.hexdigest()
@@ -723,13 +837,12 @@ def _natural(value: Any) -> bool:
     return type(value) is int and value > 0
 
 
-# Of every setting: what is accepted, and how to say so.
 _POSITIVE = (lambda value: _number(value) and value > 0, "a positive number")
 _NOT_NEGATIVE = (lambda value: _number(value) and value >= 0, "a number, 0 or more")
 _NATURAL = (_natural, "a whole number, 1 or more")
 _NAME = (_text, "text")
 _PATHS = (_texts, 'a list of paths, as ["file.zip"]')
-_SETTINGS: dict[str, tuple[Callable[[Any], bool], str]] = {
+_SETTINGS: dict[str, Check] = {
     "iterations": _NATURAL,
     "learning_rate": _POSITIVE,
     "patience": _NATURAL,
@@ -740,7 +853,7 @@ _SETTINGS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "batch": _NATURAL,
     "seed": (lambda value: type(value) is int and value >= 0, "a whole number, 0 or more"),
 }
-_COMMON: dict[str, tuple[Callable[[Any], bool], str]] = {
+_COMMON: dict[str, Check] = {
     **_SETTINGS,
     "recordings": _PATHS,
     "validation": _PATHS,
@@ -758,27 +871,14 @@ _COMMON: dict[str, tuple[Callable[[Any], bool], str]] = {
         lambda value: isinstance(value, list) and len(value) == 2 and all(map(_natural, value)),
         "[width, height] in pixels",
     ),
-    "loss": _NAME,
-    "protocol": _NAME,
-    "error": _NAME,
-    "dark_offset": _POSITIVE,
-    "weights": (
-        lambda value: (
-            isinstance(value, dict)
-            and set(value) <= set(REGIONS)
-            and all(_number(n) and n >= 0 for n in value.values())
-        ),
-        "a table of numbers named dark, well, bright",
-    ),
     "window": _POSITIVE,
-    "warm_up": _NOT_NEGATIVE,
     "method": (
         lambda value: isinstance(value, list) and all(isinstance(n, dict) for n in value),
         '[[method]] with name = "akf"',
     ),
 }
-_METHOD: dict[str, tuple[Callable[[Any], bool], str]] = {
-    **{name: _COMMON[name] for name in ("loss", "error", "learning_rate", "iterations", "starts")},
+_METHOD: dict[str, Check] = {
+    **{name: _SETTINGS[name] for name in ("learning_rate", "iterations", "starts")},
     "name": _NAME,
     "label": _NAME,
     "params": (lambda value: isinstance(value, str | dict), "a table or the path of a TOML file"),
@@ -796,9 +896,7 @@ _METHOD: dict[str, tuple[Callable[[Any], bool], str]] = {
 }
 
 
-def _check(
-    table: Mapping[str, Any], known: Mapping[str, tuple[Callable[[Any], bool], str]]
-) -> None:
+def _check(table: Mapping[str, Any], known: Mapping[str, Check]) -> None:
     for name, value in table.items():
         if name not in known:
             raise InputError(f"there is no setting {name!r}; {nearest(name, known)}")
@@ -807,7 +905,7 @@ def _check(
             raise InputError(f"{name} is {str(value)[:60]!r}; give {text}")
 
 
-def _one_of(value: str, what: str, known: Sequence[str]) -> str:
+def one_of(value: str, what: str, known: Sequence[str]) -> str:
     if value not in known:
         raise InputError(f"there is no {what} {value!r}; {nearest(value, known)}")
     return value
@@ -820,7 +918,9 @@ def read_plan(config: Path, recordings: Sequence[str | Path] | None = None) -> P
     """
     table = read_toml(config)
     try:
-        _check(table, _COMMON)
+        known = systems()
+        further = {k: v for one in known.values() for k, v in one.settings.items()}
+        _check(table, {**_COMMON, **further})
         text = config.read_bytes()
         folders = dict.fromkeys(SPLITS, config.parent)
         if recordings:
@@ -844,65 +944,105 @@ def read_plan(config: Path, recordings: Sequence[str | Path] | None = None) -> P
         tasks: list[Task] = []
         for number, entry in enumerate(table["method"], 1):
             try:
-                tasks.append(_task(entry, table, config.parent))
+                tasks.append(_task(entry, table, config.parent, known))
             except InputError as error:
                 raise InputError(f"method {number}: {error}") from None
         labels = [task.label for task in tasks]
         for label in labels:
             if labels.count(label) > 1:
                 raise InputError(f"two methods are called {label!r}; give them different labels")
-        weights = table.get("weights")
-        if weights is not None and any(task.protocol != "reference" for task in tasks):
-            raise InputError("weights are for HDR references, the loss 'reference'; omit them")
+        used = {k for entry in table["method"] for k in known[entry["name"]].settings}
+        for name in table:
+            if name in further and name not in used:
+                raise InputError(f"{name} is a setting of none of these methods; omit it")
         size = table.get("size")
         return Plan(
             text,
             found,
             tasks,
             None if size is None else (size[0], size[1]),
-            tuple(table.get("split", (2, 1, 1))),
+            None if apart else tuple(table.get("split", (2, 1, 1))),
             table.get("window"),
-            table.get("warm_up", 0.2),
-            weights,
         )
     except InputError as error:
         raise InputError(f"{config}: {error}") from None
 
 
-def _task(entry: Mapping[str, Any], table: Mapping[str, Any], folder: Path) -> Task:
-    _check(entry, _METHOD)
-    if "name" not in entry:
+def _task(
+    entry: Mapping[str, Any], table: Mapping[str, Any], folder: Path, known: Mapping[str, System]
+) -> Task:
+    name = entry.get("name")
+    system = known.get(name) if isinstance(name, str) else None
+    own = (one for one in known.values() if system in (one, None))
+    _check(entry, {**_METHOD, **{k: one.settings[k] for one in own for k in one.own}})
+    if name is None:
         raise InputError('a method has no name; give name = "akf"')
-    method = find_method(entry["name"])
-    params = read_params(method, entry.get("params", {}), folder)
+    if system is None:
+        raise InputError(f"there is no method {name!r}; {nearest(name, known)}")
+    params = system.start(name, entry.get("params", {}), folder)
     both = {**table, **entry}
-    loss = _one_of(both.get("loss", "held-out"), "loss", [*PROTOCOLS, "likelihood"])
-    protocol = loss
-    if loss == "likelihood":
-        protocol = _one_of(both.get("protocol", "held-out"), "protocol", list(PROTOCOLS))
-    elif both.get("protocol", loss) != loss:
-        raise InputError(f"the loss {loss!r} has the protocol of that name; omit protocol")
-    error = _one_of(both.get("error", "linear"), "error", ERRORS)
+    goal = system.goal(name, params, both)
     names, search = tuple(entry.get("fit", ())), entry.get("search", {})
-    for name in names:
-        if name in PREPARED:
+    for one in names:
+        if one in goal.prepared:
             raise InputError(
-                f"{name} is fixed when a recording is prepared and has no gradient to follow; "
-                f"put search = {{ {name} = [from, to, number of points] }}"
+                f"{one} is fixed when a recording is prepared and has no gradient to follow; "
+                f"put search = {{ {one} = [from, to, number of points] }}"
             )
     if not names and not search:
         raise InputError('nothing is to be fitted; give names, as fit = ["c_on", "c_off"]')
-    settings = Settings(**{name: both[name] for name in _SETTINGS if name in both})
+    given = {name: both[name] for name in _SETTINGS if name in both}
+    settings = Settings(**given, forward=goal.forward)
     intervals = {name: (low, high, count) for name, (low, high, count) in search.items()}
     begin(params, names, settings, intervals)  # checks the names
-    objective = Objective(
-        method,
-        None if loss == "likelihood" else error,
-        protocol == "held-out",
-        both.get("dark_offset", 0.003),
-    )
-    label = entry.get("label", method.name)
-    return Task(label, method, params, names, intervals, objective, protocol, settings)
+    return Task(entry.get("label", name), params, names, intervals, goal, settings)
+
+
+class _Reconstructions:
+    """The system of the methods of `jaxevent.METHODS`."""
+
+    settings: dict[str, Check] = {
+        "loss": _NAME,
+        "protocol": _NAME,
+        "error": _NAME,
+        "dark_offset": _POSITIVE,
+        "weights": (
+            lambda value: (
+                isinstance(value, dict)
+                and set(value) <= set(REGIONS)
+                and all(_number(n) and n >= 0 for n in value.values())
+            ),
+            "a table of numbers named dark, well, bright",
+        ),
+        "warm_up": _NOT_NEGATIVE,
+    }
+    own = ("loss", "error")
+
+    def start(self, name: str, given: Any, folder: Path) -> FrameParams:
+        return read_params(METHODS[name].Params, name, given, folder)
+
+    def goal(self, name: str, params: Any, given: Mapping[str, Any]) -> Reconstruction:
+        method = METHODS[name]
+        loss = one_of(given.get("loss", "held-out"), "loss", [*PROTOCOLS, "likelihood"])
+        protocol = loss
+        if loss == "likelihood":
+            protocol = one_of(given.get("protocol", "held-out"), "protocol", list(PROTOCOLS))
+        elif given.get("protocol", loss) != loss:
+            raise InputError(f"the loss {loss!r} has the protocol of that name; omit protocol")
+        error = one_of(given.get("error", "linear"), "error", ERRORS)
+        weights = given.get("weights")
+        if weights is not None and protocol != "reference":
+            raise InputError("weights are for HDR references, the loss 'reference'; omit them")
+        objective = Objective(
+            method,
+            None if loss == "likelihood" else error,
+            protocol == "held-out",
+            given.get("dark_offset", 0.003),
+        )
+        return Reconstruction(method, objective, protocol, given.get("warm_up", 0.2), weights)
+
+
+RECONSTRUCTION = _Reconstructions()
 
 
 def _load(path: Path, plan: Plan, progress: bool) -> Recording:

@@ -75,7 +75,7 @@ def started(params, position, size):
     v = {name: float(getattr(params, name)) for name in params.numbers}
     x = np.zeros(10)
     x[:2], x[4:6] = position, np.log(size)
-    P = [v["P0_p"]] * 2 + [v["P0_v"]] * 2 + [v["P0_lambda"] / size**2] * 2
+    P = [v["P0_p"]] * 2 + [v["P0_v"]] * 2 + [v["P0_lambda"] / v["lambda0"] ** 2] * 2
     d = v["P0_d"] * params.polarity_offset
     return x, np.diag(P + [v["P0_theta"], v["P0_q"], d, d])
 
@@ -162,7 +162,11 @@ def moment_oracle(params, position, size, events):
             mean = weight @ e / m
             C = np.vstack([C, rows])
             noise = linalg.block_diag(spread / m, np.diag(noises))
+            before = x[4:6]
             x, P = kalman(x, P, C, np.r_[mean, innovations], noise)
+            # The mean of an inverse gamma distribution, not the Kalman filter's.
+            slope = (3 * fourth - kappa**2) * np.array([l1, l2]) ** 2 / V
+            x[4:6] = before + np.log(1 + slope * (x[4:6] - before)) / slope
         yield in_px(x, P)
 
 
@@ -241,10 +245,15 @@ def constant_velocity_oracle(params, position, size, events):
 
 
 SETTINGS = [
-    (1, "moment", {}, moment_oracle),
-    (3, "moment", {"gate_shape": "ellipse", "polarity_offset": True, "tau_q": 0.01}, moment_oracle),
-    (1, "chi2_split", {"n": 7}, window_oracle),
-    (3, "chi2_split", {"polarity_offset": True, "tau_q": 0.01, "beta": 0.2}, window_oracle),
+    (1, "moment", {"gate_shape": "circle"}, moment_oracle),
+    (3, "moment", {"gate": 2.5, "polarity_offset": True, "tau_q": 0.01}, moment_oracle),
+    (1, "chi2_split", {"n": 7, "gate_shape": "circle"}, window_oracle),
+    (
+        3,
+        "chi2_split",
+        {"gate_shape": "circle", "polarity_offset": True, "tau_q": 0.01, "beta": 0.2},
+        window_oracle,
+    ),
     (3, "chi2", {"n": 7, "target": "2n"}, window_oracle),
     (1, "chi2", {"polarity_offset": True, "beta": 0.2, "n": 1}, window_oracle),
     (1, "chi2", {"current_in_jacobian": True}, window_oracle),
@@ -534,7 +543,7 @@ def test_errors_are_as_large_as_predicted(name, gate, m):
     values = {"P0_theta": 0.05, "gate_shape": gate or "circle"}
     params = params_of(filter=name, events_per_step=m, **values)
     truth, xi = random_walks(params, 64, 6016, dt, size, True)
-    error, position, nees = errors(params, truth, xi, dt, 8.0, gate and 3.0, m)
+    error, position, nees = errors(params, truth, xi, dt, 8.0, gate and 3.5, m)
     tail = slice(2000 // m, None)
     bias = (error[:, tail, 4:6] / truth[:, m - 1 :: m][:, tail, 4:6]).mean((0, 1))
     assert np.abs(bias).max() < 0.025, bias

@@ -155,7 +155,7 @@ def oracle(rec, params, seeds):
     return np.array([k for k, _ in whose]), np.array([w for _, w in whose]), np.mean(loss), at
 
 
-NEAREST = {"association": "nearest", "gate_shape": "ellipse", "events_per_step": 4}
+NEAREST = {"association": "nearest", "gate_shape": "circle", "events_per_step": 4}
 
 
 @pytest.mark.parametrize(

@@ -60,6 +60,9 @@ class Params(FilterParams):
     cell = Count(8, "px", "cell of the grid of unassociated events, about a blob's lambda")
     tau_birth = Positive(3e-3, "s", "time constant in which the grid forgets")
     n_birth = Positive(30.0, "", "unassociated events in 3x3 cells that begin a track")
+    surround = Positive(
+        1.0, "", "radius, in gates, around a track whose events begin no other (jAER: surround)"
+    )
     n_confirm = Positive(100.0, "", "events after which a track is confirmed")
     t_confirm = Positive(2e-3, "s", "least age of a confirmed track")
     t_tentative = Positive(10e-3, "s", "tentative tracks end after this time without events, and "
@@ -74,21 +77,19 @@ class Params(FilterParams):
     sigma_max = Positive(50.0, "px", "tracks end when the position is less certain")
 
     presets = {
+        **FilterParams.presets,
         "slow": {  # stars: 50 events/s each
-            "Q_p": 0.5, "Q_v": 5.0, "Q_lambda": 0.05, "Q_theta": 0.01, "Q_q": 0.01,
-            "P0_v": 100.0, "P0_lambda": 1.0, "lambda0": 3.0, "lambda_max": 8.0,
-            "gate_min": 4.0, "gate_max": 15.0, "gate_decay": 1.0,
+            **FilterParams.presets["slow"],
+            "gate_decay": 1.0,
             "cycle": 0.05, "cell": 6, "tau_birth": 0.5, "n_birth": 12.0, "n_confirm": 40.0,
             "t_confirm": 0.5, "t_tentative": 1.0, "t_coast": 3.0, "t_merge": 1.0,
             "sigma_max": 10.0,
         },
         "fast": {  # more than 10,000 px/s
-            "Q_v": 1e9, "Q_lambda": 1e3, "Q_theta": 10.0, "Q_q": 1e6,
-            "P0_p": 100.0, "P0_v": 1e8, "lambda0": 20.0, "gate_min": 10.0,
-            "cycle": 2e-4, "cell": 16, "tau_birth": 5e-4, "t_confirm": 5e-4,
+            **FilterParams.presets["fast"],
+            "cycle": 2e-4, "cell": 16, "tau_birth": 5e-4, "surround": 2.0, "t_confirm": 5e-4,
             "t_tentative": 2e-3, "t_coast": 2e-2, "t_merge": 1e-2, "sigma_max": 200.0,
         },
-        "ttc": {"Q_v": 1e3},
     }  # fmt: skip
 
 
@@ -218,7 +219,8 @@ def _step(
     blob = filter_of(params)
     times, xi, polarity, valid = events
     time = times[-1]
-    age = seconds(time - times, xi)
+    # A single event's is 0 for the compiler too, which leaves out what it would multiply.
+    age = seconds(time - times, xi) if len(times) > 1 else jnp.zeros_like(xi[:, 0])
     alive = time - slots.heard <= limit
     dt = jnp.where(alive, seconds(jnp.maximum(time - slots.last, 0), xi), 0)
     predicted = jax.vmap(blob.predict, (None, 0, 0))(params, slots.state, dt)
@@ -254,6 +256,7 @@ def _step(
         slots.confirmed,
     )
     some = inside.any(0)
+    near = held(fixed, now, jnp.maximum(fixed.surround, 1) * radius, residual) & alive[:, None]
     told: dict[str, Any] = {}
     if wanted == "states":
         told["slots"] = slots
@@ -277,7 +280,7 @@ def _step(
         density = jnp.where(counted, density, 0)
         told["loss"] = -jnp.where(counted, jax.nn.logsumexp(density, axis=0), 0).sum()
         told["count"] = counted.sum().astype(xi.dtype)
-    return slots, Step(valid & ~some, **told)
+    return slots, Step(valid & ~near.any(0), **told)
 
 
 def _line(params: Params, slots: Slots) -> tuple[Array, Array, Array]:
