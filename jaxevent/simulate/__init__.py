@@ -8,6 +8,11 @@ Moving blobs, discs and lights, events only:
 
 recording, truth = jaxevent.simulate.blob_scene("lissajous")
 truth(recording.events.t)  # the state of every target at every event
+
+A camera that moves in a rigid world:
+
+recording, truth = jaxevent.simulate.motion_scene("texture", motion="varying")
+truth.twist(recording.events.t)  # T and Omega of the camera at every event
 """
 
 from jaxevent.simulate.blobs import (
@@ -24,30 +29,54 @@ from jaxevent.simulate.blobs import (
     simulate_blobs,
 )
 from jaxevent.simulate.hybrid import SENSORS, Sensor, simulate
+from jaxevent.simulate.motion import (
+    MOTION_SCENES,
+    CameraMotion,
+    MovingCamera,
+    Patch,
+    Texture,
+    World,
+    frame_events,
+    motion_scene,
+    planar_motion,
+    simulate_motion,
+    texture_of,
+)
 from jaxevent.simulate.scenes import FITTING, SCENES, TESTING, Pan, Source, scene
 from jaxevent.simulate.video import Clip, from_video
 
 __all__ = [
     "BLOB_SCENES",
     "FITTING",
+    "MOTION_SCENES",
     "SCENES",
     "SENSORS",
     "TESTING",
     "Approach",
+    "CameraMotion",
     "Circle",
     "Clip",
     "Line",
     "Lissajous",
     "Motion",
+    "MovingCamera",
     "Pan",
+    "Patch",
     "RandomWalk",
     "Sensor",
     "Source",
     "Target",
+    "Texture",
     "Truth",
+    "World",
     "blob_scene",
+    "frame_events",
     "from_video",
+    "motion_scene",
+    "planar_motion",
     "scene",
     "simulate",
     "simulate_blobs",
+    "simulate_motion",
+    "texture_of",
 ]
