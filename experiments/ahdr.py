@@ -21,7 +21,7 @@ import numpy as np
 from tqdm import tqdm
 
 import jaxevent
-from jaxevent.evaluate import PROTOCOLS, frame_times, score
+from jaxevent.evaluate import PROTOCOLS, Reference, frame_times, score
 from jaxevent.fit import fit
 from jaxevent.simulate import FITTING, SENSORS, TESTING, Pan, scene, simulate
 from jaxevent.simulate.scenes import Speed
@@ -51,6 +51,7 @@ def quality(recording: jaxevent.Recording, method, params) -> float | None:
     if importlib.util.find_spec("pycvvdp") is None:
         return None
     given, reference = PROTOCOLS["reference"](recording)
+    assert isinstance(reference, Reference)
     rows = np.arange(0, len(reference), 6)
     images, _ = method.reconstruct(given, params)(frame_times(reference, params)[rows])
     truth = np.stack([reference.truth(int(row)) for row in rows])

@@ -132,8 +132,9 @@ class FilterParams(Parameters):
             "P0_lambda": 80.0,
             "gate_min": 10.0,
         },
-        # Time to contact: the velocity is averaged over tenths of a second.
-        "ttc": {"Q_v": 1e3},
+        # Time to contact: the velocity is averaged over tenths of a second. A Q_p above
+        # lambda sqrt(Q_v / rate), here 0.4, would make its time constant sqrt(Q_p / Q_v).
+        "ttc": {"Q_p": 0.01, "Q_v": 300.0},
         # Published settings of the authors' program, for cars.
         "authors": {
             "filter": "chi2",

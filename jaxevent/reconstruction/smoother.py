@@ -194,7 +194,8 @@ def shared(params: Params, frames: FrameFeatures, counts: Array) -> Array:
         rest[axis] = (1, 1)
         padded = jnp.pad(values, rest)
         size = values.shape[axis]
-        return sum(lax.slice_in_dim(padded, k, k + size, axis=axis) for k in range(3))
+        left, middle, right = (lax.slice_in_dim(padded, k, k + size, axis=axis) for k in range(3))
+        return left + middle + right
 
     def around(values: Array) -> Array:
         return three(three(values, values.ndim - 1), values.ndim - 2) - values
