@@ -1,0 +1,225 @@
+"""Earlier neighbours of events, from which hypotheses of a motion are scored: on the host.
+
+A point of the scene that crosses the pixels fires at one after another. So the earlier events of
+the same polarity near an event are candidates for its predecessor: each is a displacement d [px]
+and an age dt [s], and a motion with image velocity U explains it if d = U dt. Candidates depend on
+the data only. They are gathered once, in batches of fixed shape; filters then run many times.
+
+Several events per pixel are kept, not only the latest: an edge fires bursts, and the last event of
+a burst is late, so a surface of latest events makes every motion too fast (by 4 to 27 %).
+"""
+
+import inspect
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numba
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from numpy.typing import NDArray
+
+from jaxevent.camera import PinholeCamera
+from jaxevent.egomotion.geometry import undistorted
+from jaxevent.recording import Recording
+
+READ_ROWS = 65536  # events read from a file at a time
+NEVER = np.iinfo(np.int64).min // 2
+
+Numeric = Array | np.ndarray
+
+
+class Candidates(eqx.Module):
+    """Batches of K events with up to C candidates each; an axis of batches leads where stacked.
+
+    Where there is no candidate the age is 0, as no real one is; see `mask`. Where an event had more
+    than C, these are C of them in even steps, and `scale` says how many each stands for.
+    """
+
+    d: Float[Numeric, "*batches 2 C K"]  # px, x and y: the event's position less the candidate's
+    age: Float[Numeric, "*batches C K"]  # s
+    xi: Float[Numeric, "*batches K 2"]  # px, of the event; see `coordinates`
+    valid: Bool[Numeric, "*batches K"]  # an event; others only fill up
+    scale: Float[Numeric, "*batches K"]
+    elapsed: Float[Numeric, "*batches"]  # s from the last event of the batch before to this one's
+    history: Float[Numeric, "*batches"]  # s for which events have come without a long silence
+    reach: int = eqx.field(static=True)  # candidates are at most so many pixels away, in x and y
+
+    @property
+    def mask(self) -> Bool[Numeric, "*batches C K"]:
+        """Which candidates are there."""
+        return self.age > 0
+
+
+class Batches(NamedTuple):
+    """Some batches, the times (us) of each one's last event, and which rows the events are."""
+
+    candidates: Candidates
+    t: NDArray[np.int64]  # (batches,); batches without any event have the time of the one before
+    row: NDArray[np.int64]  # (batches, K), -1 where not valid
+
+
+def coordinates(
+    width: int, height: int, camera: PinholeCamera | None
+) -> tuple[NDArray[np.float64], float]:
+    """Positions (height, width, 2) of pixels in px, and the focal length (px) they belong to.
+
+    With a camera as `geometry.undistorted` gives them, which says what is raised. Without one they
+    are the pixels' own columns and rows, counted from the middle of the sensor, and f is 1.
+    """
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    if camera is None:
+        return np.stack([x - (width - 1) / 2, y - (height - 1) / 2], -1), 1.0
+    xi, f = undistorted(camera, x.ravel(), y.ravel())
+    return xi.reshape(height, width, 2), f
+
+
+class Gatherer:
+    """Candidates of a recording, some batches after another.
+
+    One event in `every` is scored (the first, then every `every`-th), all are candidates. A batch
+    holds `batch` scored events, fewer where they would take longer than `longest` seconds; a gap
+    of `silence` seconds between events makes history begin anew. For each
+    the `per_pixel` most recent earlier events of the same polarity at every pixel at most `radius`
+    away in x and y are looked at; those of the same timestamp never count.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        camera: PinholeCamera | None = None,
+        *,
+        radius: int = 6,
+        per_pixel: int = 8,
+        most: int = 128,
+        every: int = 8,
+        batch: int = 64,
+        longest: float | int = 0.02,
+        silence: float | int = 0.1,
+    ):
+        self.recording, self.radius = recording, radius
+        self.most, self.every, self.batch = most, every, batch
+        self.longest, self.silence = round(1e6 * longest), round(1e6 * silence)
+        shape = recording.height, recording.width
+        self.xi, self.f = coordinates(recording.width, recording.height, camera)
+        self._ring = np.full((2, *shape, per_pixel), NEVER)
+        self._head = np.zeros((2, *shape), np.int16)
+        window = (2 * radius + 1) ** 2 * per_pixel
+        self._scratch = np.zeros((3, window))
+        self._row, self._end = 0, len(recording.events)
+        self._last = int(recording.events[:1].t[0]) if self._end else 0
+        self._clock = np.array([self._last, self._last])  # activity's begin, the last event
+
+    @property
+    def done(self) -> bool:
+        """Whether all events have been taken."""
+        return self._row >= self._end
+
+    def gather(self, batches: int, youngest: float | int, oldest: float | int) -> Batches:
+        """The next `batches` batches, with candidates from `youngest` to `oldest` seconds of age.
+
+        The shape is always the same. Batches for which no event is left hold none.
+        """
+        real = np.dtype(jnp.result_type(float))
+        size, most = self.batch, self.most
+        d, age = np.zeros((batches, 2, most, size), real), np.zeros((batches, most, size), real)
+        xi, scale = np.zeros((batches, size, 2), real), np.ones((batches, size), real)
+        row, t = np.full((batches, size), -1), np.zeros(batches, np.int64)
+        history = np.zeros(batches, real)
+        limits = np.array([max(1, np.ceil(1e6 * youngest - 1e-6)), np.floor(1e6 * oldest + 1e-6)])
+        state = np.zeros(3, np.int64)  # batch, events in it, time of its first
+        full = False
+        while not full and not self.done:
+            events = self.recording.events[self._row : self._row + READ_ROWS]
+            used, full = _gather(
+                events.t, events.x, events.y, events.p, self._row, self.every, self.longest,
+                self.xi, self._ring, self._head, self.radius, limits.astype(np.int64),
+                self._scratch, state, self._clock, self.silence, d, age, xi, scale, row, t, history,
+            )  # fmt: skip
+            self._row += used
+        begun = state[0] + (state[1] > 0)
+        history[begun:] = history[begun - 1] if begun else 0
+        t[begun:] = t[begun - 1] if begun else self._last
+        elapsed = np.diff(t, prepend=self._last) * 1e-6
+        self._last = int(t[-1])
+        made = Candidates(
+            d, age, xi, row >= 0, scale, elapsed.astype(real), history, self.radius
+        )  # fmt: skip
+        return Batches(made, t, row)
+
+    def whole(self, youngest: float | int, oldest: float | int) -> Batches:
+        """All batches that are left, at least one, for recordings that fit into memory."""
+        parts: list[Batches] = []
+        while not parts or not self.done:
+            parts.append(self.gather(64, youngest, oldest))
+        fields = {}
+        used = max(1, sum(int(part.candidates.valid.any(-1).sum()) for part in parts))
+        for name in ("d", "age", "xi", "valid", "scale", "elapsed", "history"):
+            fields[name] = np.concatenate([getattr(part.candidates, name) for part in parts])[:used]
+        t, row = (np.concatenate([getattr(part, name) for part in parts]) for name in ("t", "row"))
+        return Batches(Candidates(**fields, reach=self.radius), t[:used], row[:used])
+
+
+def _compiled(function: Callable) -> Any:
+    """Compile with numba, without the argument checks that tests wrap around functions."""
+    return numba.njit(cache=True, nogil=True)(inspect.unwrap(function))
+
+
+@_compiled
+def _gather(
+    t_in, x, y, p, row_in, every, longest, position, ring, head, radius, limits,
+    scratch, state, clock, silence, d, age, xi, scale, row, t, history,
+):  # fmt: skip
+    """Fill batches from events: how many events were used, and whether all batches are full."""
+    batch, fill, first = state
+    batches, most, size = age.shape
+    height, width, kept = ring.shape[1], ring.shape[2], ring.shape[3]
+    for i in range(len(t_in)):
+        now, column, line, sign = t_in[i], int(x[i]), int(y[i]), int(p[i])
+        if now - clock[1] > silence:
+            clock[0] = now
+        clock[1] = now
+        if (row_in + i) % every == 0:
+            if fill == size or (fill > 0 and now - first > longest):
+                batch, fill = batch + 1, 0
+            if batch == batches:
+                state[:] = batch, 0, 0
+                return i, True
+            if fill == 0:
+                first = now
+            found = 0
+            here_x, here_y = position[line, column, 0], position[line, column, 1]
+            for v in range(max(0, line - radius), min(height, line + radius + 1)):
+                for u in range(max(0, column - radius), min(width, column + radius + 1)):
+                    newest = head[sign, v, u]
+                    for k in range(kept):
+                        past = now - ring[sign, v, u, newest - k]  # from the end below 0
+                        if past > limits[1]:
+                            break
+                        if past >= limits[0]:
+                            scratch[0, found] = here_x - position[v, u, 0]
+                            scratch[1, found] = here_y - position[v, u, 1]
+                            scratch[2, found] = past * 1e-6
+                            found += 1
+            # Steps of found / C from an offset that changes from event to event (multiples of the
+            # golden ratio, evenly spread): every candidate is as likely to be taken.
+            taken = min(found, most)
+            offset = ((row_in + i) * 0.6180339887498949) % 1.0
+            for c in range(taken):
+                j = c if found <= most else min(int((c + offset) * found / most), found - 1)
+                d[batch, 0, c, fill] = scratch[0, j]
+                d[batch, 1, c, fill] = scratch[1, j]
+                age[batch, c, fill] = scratch[2, j]
+            scale[batch, fill] = found / most if found > most else 1.0
+            xi[batch, fill, 0] = here_x
+            xi[batch, fill, 1] = here_y
+            row[batch, fill] = row_in + i
+            t[batch] = now
+            history[batch] = (now - clock[0]) * 1e-6
+            fill += 1
+        at = (head[sign, line, column] + 1) % kept
+        head[sign, line, column] = at
+        ring[sign, line, column, at] = now
+    state[:] = batch, fill, first
+    return len(t_in), False

@@ -1,0 +1,421 @@
+"""Candidates against a slow search; the filter against NumPy, finite differences, known motions."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxevent.camera import PinholeCamera
+from jaxevent.egomotion import candidates, voting
+from jaxevent.errors import InputError
+from jaxevent.recording import Events, Recording
+
+WIDTH, HEIGHT = 120, 90
+CAMERA = PinholeCamera(100.0, 100.0, 59.5, 44.5)
+
+
+def recorded(t, x, y, p, width=WIDTH, height=HEIGHT, camera=None):
+    events = Events(
+        np.asarray(t, np.int64), np.asarray(x, np.uint16), np.asarray(y, np.uint16),
+        np.asarray(p, bool),
+    )  # fmt: skip
+    return Recording("made", width, height, events, camera=camera)
+
+
+def moved(flow, seconds, number, seed, camera=None):
+    """Points that follow flow(positions) in px/s, each an event at every pixel that it enters."""
+    rng = np.random.default_rng(seed)
+    at = rng.uniform([0, 0], [WIDTH, HEIGHT], (number, 2))
+    sign, cell, dt, rows = rng.random(number) < 0.5, np.floor(at), 4e-4, []
+    for k in range(int(seconds / dt)):
+        at = at + flow(at - 0.5) * dt  # a pixel's centre is at its whole coordinates
+        left = (at < 0).any(1) | (at >= [WIDTH, HEIGHT]).any(1)
+        at = np.where(left[:, None], np.mod(at, [WIDTH, HEIGHT]), at)
+        new = np.flatnonzero((np.floor(at) != cell).any(1) & ~left)
+        cell = np.floor(at)
+        rows.append(np.stack([1e6 * dt * (k + rng.random(len(new))), *cell[new].T, sign[new]], 1))
+    t, x, y, p = np.concatenate(rows)[np.argsort(np.concatenate(rows)[:, 0])].T
+    return recorded(t, x, y, p, camera=camera)
+
+
+def turning(omega):
+    """The flow of a camera that turns, by the derivative of projected points: P' = -omega x P."""
+
+    def flow(at):
+        P = np.stack([(at[:, 0] - 59.5) / 100, (at[:, 1] - 44.5) / 100, np.ones(len(at))], 1)
+        V = -np.cross(omega, P)
+        return 100 * (V[:, :2] - P[:, :2] * V[:, 2:])
+
+    return flow
+
+
+def scattered(number=400, seed=0, width=9, height=7, span=4000):
+    """Random events, many at the same time, all over a small sensor."""
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.integers(0, span, number)) // 20 * 20
+    x, y, p = (rng.integers(0, n, number) for n in (width, height, 2))
+    return recorded(t, x, y, p, width, height)
+
+
+def slow(recording, row, radius, per_pixel, youngest, oldest):
+    """(dx, dy, age in us) of an event's candidates, looked for among all earlier events."""
+    e = recording.events
+    found, at_pixel = set(), {}
+    for i in reversed(range(row)):
+        place = int(e.x[i]), int(e.y[i])
+        dx, dy = int(e.x[row]) - place[0], int(e.y[row]) - place[1]
+        if e.p[i] != e.p[row] or max(abs(dx), abs(dy)) > radius:
+            continue
+        at_pixel[place] = at_pixel.get(place, 0) + 1
+        age = int(e.t[row] - e.t[i])
+        if at_pixel[place] <= per_pixel and age > 0 and youngest <= age <= oldest:
+            found.add((dx, dy, age))
+    return found
+
+
+@pytest.mark.parametrize("every, batch, pieces, per_pixel", [(1, 7, 3, 3), (3, 16, 64, 8)])
+def test_candidates_are_the_recent_neighbours(every, batch, pieces, per_pixel):
+    recording = scattered()
+    gatherer = candidates.Gatherer(
+        recording, radius=2, per_pixel=per_pixel, most=200, every=every, batch=batch, longest=1e9
+    )
+    rows, ends = [], []
+    while not gatherer.done:
+        made = gatherer.gather(pieces, 40e-6, 2000e-6)
+        c = made.candidates
+        for b, k in zip(*np.nonzero(made.row >= 0), strict=True):
+            rows.append(made.row[b, k])
+            there = c.mask[b, :, k]
+            seen = zip(*c.d[b, :, there, k].T, np.rint(c.age[b, there, k] * 1e6), strict=True)
+            seen = [tuple(int(v) for v in one) for one in seen]
+            expected = slow(recording, rows[-1], 2, per_pixel, 40, 2000)
+            assert set(seen) == expected
+            assert c.scale[b, k] == 1
+            np.testing.assert_allclose(
+                c.xi[b, k],
+                [int(recording.events.x[rows[-1]]) - 4, int(recording.events.y[rows[-1]]) - 3],
+            )
+        filled = (made.row >= 0).any(1)
+        ends += made.t[filled].tolist()
+        np.testing.assert_array_equal(made.t[filled], recording.events.t[made.row.max(1)[filled]])
+    np.testing.assert_array_equal(rows, np.arange(0, len(recording.events), every))
+    assert sum(len(slow(recording, r, 2, per_pixel, 40, 2000)) for r in rows) > 500
+    assert len(ends) == -(-len(rows) // batch)
+
+
+def test_too_many_candidates_are_thinned_evenly():
+    recording = scattered(number=3000)
+    some = candidates.Gatherer(recording, radius=2, per_pixel=4, most=10, every=1, batch=50)
+    every = candidates.Gatherer(recording, radius=2, per_pixel=4, most=200, every=1, batch=50)
+    few, all_ = (g.whole(1e-6, 1e-2).candidates for g in (some, every))
+    number = all_.mask.sum(-2)
+    np.testing.assert_allclose(few.scale, np.maximum(number / 10, 1))
+    np.testing.assert_array_equal(few.mask.sum(-2), np.minimum(number, 10))
+    # Every candidate stands for as many as there were: sums over all are kept on average.
+    for value in (lambda c: c.age, lambda c: c.d[:, 0] ** 2, lambda c: c.d[:, 1] > 0):
+        total = (value(all_) * all_.mask).sum()
+        thinned = ((value(few) * few.mask).sum(-2) * few.scale).sum()
+        assert abs(thinned / total - 1) < 0.02
+
+
+def test_a_batch_ends_in_time_and_times_add_up():
+    recording = recorded([0, 100, 5000, 30000, 30001, 30001], [1] * 6, [1] * 6, [1] * 6)
+    made = candidates.Gatherer(recording, every=1, batch=4, longest=0.004, silence=0.02).whole(
+        0.0, 1.0
+    )
+    assert made.t.tolist() == [100, 5000, 30001]
+    np.testing.assert_allclose(made.candidates.elapsed, [1e-4, 4.9e-3, 25.001e-3])
+    np.testing.assert_allclose(made.candidates.history, [1e-4, 5e-3, 1e-6])
+
+
+def test_displacements_are_undistorted():
+    camera = PinholeCamera(80.0, 80.0, 60.0, 45.0, (-0.3, 0.1, 0.001, -0.002, 0.0))
+    recording = recorded([0, 1000], [110, 113], [80, 78], [1, 1])
+    c = candidates.Gatherer(recording, camera, every=1).whole(0.0, 1.0).candidates
+    xi: np.ndarray = np.asarray(c.xi)[0, :2]
+    np.testing.assert_allclose(c.d[0, :, 0, 1], xi[1] - xi[0])
+    x, y = np.transpose(xi) / 80
+    r2 = x**2 + y**2
+    radial = 1 - 0.3 * r2 + 0.1 * r2**2
+    back_x = x * radial + 2 * 0.001 * x * y - 0.002 * (r2 + 2 * x**2)
+    np.testing.assert_allclose(80 * back_x + 60, [110, 113], atol=1e-6)
+    assert np.abs(np.asarray(c.d)[0, :, 0, 1] - [3, -2]).max() > 0.5
+
+
+def prepared(likelihood="soft", model="planar", number=500, **settings):
+    small = {"every": 1, "batch": 16, "particles": 30, "candidates": 20, "radius": 3}
+    params = voting.Params.of({"likelihood": likelihood, **small, **settings})
+    rng = np.random.default_rng(1)
+    t = np.sort(rng.integers(0, 100_000, number))
+    x, y, p = rng.integers(0, 14, number), rng.integers(0, 11, number), rng.random(number) < 0.5
+    recording = recorded(t, x, y, p, 14, 11, PinholeCamera(20.0, 20.0, 6.0, 5.0))
+    kind, gatherer = voting.prepare(recording, params, model)
+    return params, kind, gatherer.whole(1e-3, 0.1).candidates
+
+
+def by_hand(params, model, batch, particles, weights, searching):
+    """Sum over events of each particle's log-likelihood, one term after another."""
+    total = np.zeros(len(particles))
+    band = searching or params.likelihood == "band"
+    b, tau_max = float(params.baseline), float(params.tau_max)
+    sigma = float(params.sigma_x) * (2 if searching else 1)
+    for k in np.flatnonzero(batch.valid):
+        x, y = batch.xi[k]
+        f = model.f
+        rows = np.array([[x * y / f, -(f + x * x / f), y], [f + y * y / f, -x * y / f, -x]])
+        flows = [rows @ q if model.name == "rotation" else q for q in particles]
+        speeds = [np.hypot(*U) for U in flows]
+        tau = min(b / np.hypot(*(weights @ np.array(flows))), tau_max)
+        for i, (U, speed) in enumerate(zip(flows, speeds, strict=True)):
+            S, least, own = 0.0, np.inf, []
+            for c in range(batch.age.shape[0]):
+                age, d = batch.age[c, k], batch.d[:, c, k]
+                if age <= 0:
+                    continue
+                oldest = min(b / speed, tau_max) if band else tau
+                youngest = b / speed / 2 if band else tau / 2
+                if youngest <= age <= oldest:
+                    S += np.exp(-((d - U * age) ** 2).sum() / (2 * sigma**2))
+                if not d.any():
+                    own.append(age)
+            for c in range(batch.age.shape[0]):
+                age, d = batch.age[c, k], batch.d[:, c, k]
+                if age <= 0:
+                    continue
+                if model.name == "planar":
+                    cost = np.hypot(*(d - U / speed)) + float(params.r_t) * abs(age - 1 / speed)
+                else:
+                    late = abs(age - min(own)) if own else 0
+                    cost = np.hypot(*(d - U * age)) + float(params.r_t) * late
+                least = min(least, cost)
+            if params.likelihood == "literal":
+                most = float(params.d_max if model.name == "planar" else params.V_max)
+                total[i] -= float(params.alpha_literal) * min(least, most)
+                continue
+            rate = speed / (weights @ np.array(speeds)) if band else 1
+            S *= batch.scale[k] * rate / float(params.s0)
+            total[i] += float(params.alpha) * np.log(1 + S)
+    return total
+
+
+def cloud_of(kind):
+    rng = np.random.default_rng(2)
+    centre, width = ([120, -60], 60) if kind.name == "planar" else ([3, -3, 4], 3)
+    particles = centre + rng.normal(0, width, (30, kind.dimension))
+    return particles, rng.dirichlet(np.ones(30) * 20)
+
+
+@pytest.mark.parametrize("model", ["planar", "rotation"])
+@pytest.mark.parametrize("likelihood", ["soft", "band", "literal", "search"])
+def test_a_score_is_the_slow_one(likelihood, model):
+    searching = likelihood == "search"
+    params, kind, c = prepared("soft" if searching else likelihood, model, r_t=50.0)
+    batch = jax.tree.map(lambda a: a[25], c)
+    particles, weights = cloud_of(kind)
+    told = eqx.filter_jit(voting.score)(
+        params, kind, batch, *map(jnp.asarray, (particles, weights, searching))
+    )
+    expected = by_hand(params, kind, batch, particles, weights, searching)
+    assert expected.std() > 0.1
+    np.testing.assert_allclose(told.log_likelihood.sum(0), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("searching", [False, True])
+def test_a_step_is_the_slow_one(searching):
+    params, kind, c = prepared()
+    batch = dataclasses.replace(
+        jax.tree.map(lambda a: jnp.asarray(a[25]), c), history=jnp.array(1.0)
+    )
+    particles, weights = cloud_of(kind)
+    carry = voting.Carry(
+        *map(jnp.asarray, (particles, np.log(weights), searching, 0.0, 0.0, 0.0, 0.0))
+    )
+    cloud, zero = jnp.zeros_like(carry.particles), jnp.zeros(())
+    after, told = STEP(params, kind, carry, jax.tree.map(jnp.asarray, batch), cloud, zero, cloud)
+    gain = by_hand(params, kind, batch, particles, weights, searching)
+    gain = gain * (min(1, 0.5 / gain.std()) if searching else 1)
+    w = weights * np.exp(gain)
+    np.testing.assert_allclose(told.evidence, np.log(w.sum()), rtol=1e-9)
+    w /= w.sum()
+    mean = w @ particles
+    np.testing.assert_allclose(told.mean, mean, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        told.covariance, (particles - mean).T @ np.diag(w) @ (particles - mean), rtol=1e-8
+    )
+    few = 1 / (w**2).sum() <= 15
+    np.testing.assert_allclose(jnp.exp(after.log_weights), 1 / 30 if few else w, rtol=1e-9)
+
+
+STEP = eqx.filter_jit(voting.step)
+
+
+def test_systematic_resampling_is_unbiased():
+    w = np.random.default_rng(0).dirichlet(np.full(20, 0.3))
+    u = (jnp.arange(2000) + 0.5) / 2000
+    ancestor, renewed = jax.vmap(voting.resample, (None, 0))(jnp.log(w), u)
+    counts = (np.asarray(ancestor)[..., None] == np.arange(20)).sum(1)
+    np.testing.assert_allclose(counts.mean(0), 20 * w, atol=2e-3)
+    assert (np.abs(counts - 20 * w) < 1 + 1e-9).all()  # at most one more or less than its share
+    np.testing.assert_allclose(renewed, -np.log(20))
+
+
+def test_resampling_carries_the_score():
+    w = np.random.default_rng(0).dirichlet(np.full(20, 0.3))
+    ancestor, _ = voting.resample(jnp.log(w), jnp.asarray(0.3))
+    jacobian = jax.jacobian(lambda lw: voting.resample(lw, jnp.asarray(0.3))[1])(jnp.log(w))
+    np.testing.assert_allclose(jacobian, np.eye(20)[ancestor])
+
+
+@pytest.mark.parametrize("likelihood", ["soft", "literal"])
+def test_gradient_without_resampling(likelihood):
+    params, kind, c = prepared(likelihood, number=300, resample_below=0.0, r_t=50.0, memory=1e9)
+    noise = voting.draw(jax.random.key(3), len(c.elapsed), params, kind)
+    carry = voting.begin(params, kind, noise)
+    carry = dataclasses.replace(carry, particles=carry.particles / 6, searching=jnp.asarray(False))
+    names = ["noise"] + (["r_t", "alpha_literal"] if likelihood == "literal" else
+                         ["sigma_x", "s0", "alpha"])  # fmt: skip
+
+    @jax.jit
+    def loss(values):
+        raw = {**params.raw, **dict(zip(names, values, strict=True))}
+        tuned = eqx.tree_at(lambda p: p.raw, params, raw)
+        _, told = voting.run(tuned, kind, c, noise, carry)
+        return ((told.mean - jnp.array([50.0, 20.0])) ** 2).mean() / 1e3 - told.evidence.sum() / 100
+
+    at = jnp.stack([params.raw[name] for name in names])
+    h = 1e-6
+    slopes = [(loss(at + h * e) - loss(at - h * e)) / (2 * h) for e in jnp.eye(len(names))]
+    gradient = jax.jacfwd(loss)(at)
+    np.testing.assert_allclose(gradient, slopes, rtol=1e-5, atol=1e-6)
+    assert (np.abs(gradient) > 1e-4).all()
+
+
+def relative_error(motion, truth):
+    """After the first 300 ms."""
+    late = motion.t > motion.t[0] + 300_000
+    assert late.sum() > 20 and not motion.lost[late].any()
+    return np.linalg.norm(motion.mean[late] - truth, axis=1).mean() / np.linalg.norm(truth)
+
+
+FAST = voting.Params.of({"every": 2, "candidates": 48})
+
+
+def test_planar_motion_is_found():
+    truth = np.array([130.0, -70.0])
+    recording = moved(lambda at: truth, 0.5, 120, seed=3)
+    for seed in range(3):
+        motion = voting.estimate(recording, FAST, seed=seed)
+        assert relative_error(motion, truth) < 0.03
+    again = voting.estimate(recording, FAST, seed=2)
+    np.testing.assert_array_equal(motion.mean, again.mean)
+    truth = np.array([-40.0, -260.0])  # another speed
+    assert relative_error(voting.estimate(moved(lambda at: truth, 0.4, 120, 4), FAST), truth) < 0.03
+
+
+def test_rotation_is_found():
+    truth = np.array([0.5, 1.5, -1.2])
+    recording = moved(turning(truth), 0.6, 150, seed=5, camera=CAMERA)
+    for seed in range(3):
+        motion = voting.estimate(recording, FAST, model="rotation", seed=seed)
+        assert relative_error(motion, truth) < 0.05
+
+
+def test_single_precision(float32):
+    truth = np.array([130.0, -70.0])
+    motion = voting.estimate(
+        moved(lambda at: truth, 0.5, 120, seed=3), voting.Params.of(FAST.values())
+    )
+    assert motion.mean.dtype == np.float32
+    assert relative_error(motion, truth) < 0.03
+
+
+@pytest.mark.parametrize(
+    "before, truth", [((200, 0), (-40, -250)), ((60, 0), (300, 0)), ((300, 0), (60, 0))]
+)
+def test_a_motion_that_changes_at_once_is_found_again(before, truth):
+    first = moved(lambda at: np.array(before), 0.3, 120, seed=6).events
+    second = moved(lambda at: np.array(truth), 0.8, 120, seed=7).events
+    parts = [np.concatenate([getattr(first, n), getattr(second, n)]) for n in "xyp"]
+    recording = recorded(np.concatenate([first.t, second.t + 400_000]), *parts)
+    motion = voting.estimate(recording, FAST)
+    assert motion.lost[motion.t > 400_000].any()
+    mean, covariance, lost = motion(1.19)
+    assert not lost[0]
+    np.testing.assert_allclose(mean[0], truth, atol=12)
+    assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+def test_seeds_and_parameters_in_one_call():
+    params, kind, c = prepared()
+    keys = jax.random.split(jax.random.key(0), 3)
+
+    def final(key, alpha):
+        tuned = eqx.tree_at(lambda p: p.raw["alpha"], params, alpha)
+        noise = voting.draw(key, len(c.elapsed), params, kind)
+        return RUN(tuned, kind, c, noise, voting.begin(params, kind, noise))[1].mean[-1]
+
+    alphas = jnp.log(jnp.array([1.0, 2.0, 3.0]))
+    together = jax.jit(jax.vmap(final))(keys, alphas)
+    for k in range(3):
+        np.testing.assert_allclose(together[k], final(keys[k], alphas[k]), rtol=1e-7)
+    assert len(np.unique(np.asarray(together))) == together.size
+
+
+RUN = eqx.filter_jit(voting.run)
+
+
+@pytest.mark.parametrize("model", ["planar", "rotation"])
+def test_odd_streams(model):
+    rng = np.random.default_rng(0)
+    n = 300
+    x, y, p = rng.integers(0, WIDTH, n), rng.integers(0, HEIGHT, n), rng.random(n) < 0.5
+    even = np.arange(n) * 100
+    few = recorded(even[:5], x[:5], y[:5], p[:5], camera=CAMERA)
+    silent = recorded(even + 1_000_000 * (even > 15000), x, y, p, camera=CAMERA)
+    at_once = recorded(0 * even, x, y, p, camera=CAMERA)
+    one_pixel = recorded(even, 0 * x + 5, 0 * y, p, camera=CAMERA)
+    for recording in (few, silent, at_once, one_pixel):
+        motion = voting.estimate(recording, FAST, model=model)
+        assert len(motion) > 0
+        states = motion(recording.start + np.arange(5) * 300_000)
+        for value in (motion.mean, motion.covariance, motion.contrast, motion.evidence, *states):
+            assert np.isfinite(value).all()
+    assert motion.lost.all()
+    nothing = dataclasses.replace(few, events=Events.empty())
+    states = voting.estimate(nothing, FAST, model=model)(0.5)
+    assert states.lost.all() and np.isnan(states.mean).all()
+
+
+def test_particles_that_all_die_begin_anew():
+    params, kind, c = prepared()
+    noise = voting.draw(jax.random.key(0), len(c.elapsed), params, kind)
+    carry = voting.begin(params, kind, noise)
+    dead = dataclasses.replace(carry, log_weights=jnp.full_like(carry.log_weights, -jnp.inf))
+    after, told = RUN(params, kind, c, noise, dead)
+    assert told.searching[0]
+    for value in (*jax.tree.leaves(told), after.particles, after.log_weights):
+        assert np.isfinite(value).all()
+
+
+def test_states_between_batches():
+    motion = voting.Motion(
+        "planar", np.array([1000, 3000]), np.array([[1.0, 0], [3, 4]]),
+        np.stack([np.eye(2), 3 * np.eye(2)]), np.array([True, False]),
+        np.ones(2), np.full(2, 5e-4), np.zeros(2),
+    )  # fmt: skip
+    mean, covariance, lost = motion(np.array([500, 1500, 3000, 9000]))
+    np.testing.assert_allclose(mean, [[1, 0], [1.5, 1], [3, 4], [3, 4]])
+    np.testing.assert_allclose(covariance[1], 1.5 * np.eye(2))
+    assert lost.tolist() == [True, True, False, False]
+    np.testing.assert_allclose(motion(np.array([1500]), centred=True).mean, [[2, 2]])
+
+
+def test_what_cannot_be_estimated_is_refused():
+    recording = recorded([0, 1], [0, 1], [0, 1], [0, 1])
+    with pytest.raises(InputError, match="calibration"):
+        voting.estimate(recording, FAST, model="rotation")
+    with pytest.raises(InputError, match="planar"):
+        voting.estimate(recording, FAST, model="planer")
