@@ -275,6 +275,9 @@ def _style(kind: str, arrays: list[NDArray], panels: Sequence[tuple]) -> dict[st
     return {"cmap": "viridis", "vmin": low, "vmax": top if top > low else low + 1.0}
 
 
+Column = tuple[str, str, float | int, int]
+
+
 def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
     """The results of an evaluation as a Markdown table, its columns aligned as plain text too.
 
@@ -283,20 +286,6 @@ def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
     has them; others are not shown. A number that is None, NaN or absent appears as "-". MSE is
     multiplied by 100 where its column says so; seconds are those of computing.
     """
-
-    def number(value: float | int | None, digits: int) -> str:
-        return "-" if value is None or math.isnan(value) else f"{value:.{digits}f}"
-
-    def text(value: str) -> str:
-        return " ".join(value.split()).replace("|", r"\|")
-
-    def find(row: Mapping[str, Any], path: str) -> Any:
-        value: Any = row
-        for key in path.split("."):
-            if key not in value:
-                return None
-            value = value[key]
-        return value
 
     always = {"mse", "ssim", "frames", "seconds"}
     columns = [  # title, place in a row, factor, digits
@@ -317,13 +306,29 @@ def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
     shown = [
         column
         for column in columns
-        if column[1] in always or any(find(row, column[1]) is not None for row in rows)
+        if column[1] in always or any(_find(row, column[1]) is not None for row in rows)
     ]
-    table = [["recording", "method", *(title for title, _, _, _ in shown)]]
+    return aligned(rows, shown)
+
+
+def aligned(rows: Iterable[Mapping[str, Any]], columns: Sequence[Column]) -> str:
+    """A Markdown table of rows with the keys recording and method, and columns of numbers.
+
+    A column is its title, its place in a row ("regions.well.mse"), a factor and how many digits are
+    shown. A number that is None, NaN or absent appears as "-".
+    """
+
+    def number(value: float | int | None, digits: int) -> str:
+        return "-" if value is None or math.isnan(value) else f"{value:.{digits}f}"
+
+    def text(value: str) -> str:
+        return " ".join(value.split()).replace("|", r"\|")
+
+    table = [["recording", "method", *(title for title, _, _, _ in columns)]]
     for row in rows:
         cells = [text(row["recording"]), text(row["method"])]
-        for _, place, factor, digits in shown:
-            value = find(row, place)
+        for _, place, factor, digits in columns:
+            value = _find(row, place)
             cells.append(number(None if value is None else factor * value, digits))
         table.append(cells)
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
@@ -335,3 +340,12 @@ def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
         for cells in (enumerate(zip(line, widths, strict=True)) for line in table)
     )
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _find(row: Mapping[str, Any], path: str) -> Any:
+    value: Any = row
+    for key in path.split("."):
+        if key not in value:
+            return None
+        value = value[key]
+    return value

@@ -52,6 +52,7 @@ from jaxevent.evaluate import read_params, values_of
 from jaxevent.parameters import nearest
 from jaxevent.reconstruction.objectives import SPLITS, interleave
 from jaxevent.recording import Recording
+from jaxevent.report import aligned
 
 LOSSES = ("likelihood", "positions")
 EVENTS = ("all", "associated")
@@ -227,26 +228,11 @@ class Goal:
                 yield {**row, "params": values_of(params)}
 
     def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
-        columns = [("NLL", "nll", 4), ("windows", "windows", 0), ("events", "events", 0)]
+        columns = [("NLL", "nll", 1, 4), ("windows", "windows", 1, 0), ("events", "events", 1, 0)]
         if any("rmse" in row for row in rows):
-            columns[1:1] = [("RMSE px", "rmse", 3), ("median px", "median", 3)]
-            columns[3:3] = [("covered", "covered", 3)]
-        cells = [["recording", "method", *(title for title, _, _ in columns)]]
-        for row in rows:
-            numbers = [
-                "-" if row.get(place) is None else f"{row[place]:,.{digits}f}"
-                for _, place, digits in columns
-            ]
-            names = [" ".join(row[k].split()).replace("|", r"\|") for k in ("recording", "method")]
-            cells.append([*names, *numbers])
-        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-        rule = ["-" * w if i < 2 else "-" * (w - 1) + ":" for i, w in enumerate(widths)]
-        cells.insert(1, rule)
-        lines = (
-            [c.ljust(w) if i < 2 else c.rjust(w) for i, (c, w) in enumerate(pairs)]
-            for pairs in (zip(line, widths, strict=True) for line in cells)
-        )
-        return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+            columns[1:1] = [("RMSE px", "rmse", 1, 3), ("median px", "median", 1, 3)]
+            columns[3:3] = [("covered", "covered", 1, 3)]
+        return aligned(rows, columns)
 
     def _known(self, recording: Recording) -> Known | None:
         """The positions of a recording, those in the time of its events."""
