@@ -42,6 +42,9 @@ def page() -> str:
         "## Blob tracking",
         f"`jaxevent.blob.Params`. Presets: {presets}.",
         "\n".join(rows([blob])),
+        "## Egomotion",
+        "`jaxevent.egomotion.Params`.",
+        "\n".join(rows([jaxevent.egomotion.Params])),
     ]
     return "\n\n".join(parts) + "\n"
 

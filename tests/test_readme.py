@@ -13,7 +13,8 @@ README = (ROOT / "README.md").read_text()
 def test_table_of_parameters_is_that_of_the_code():
     page = runpy.run_path(str(ROOT / "experiments" / "parameters.py"))["page"]()
     assert (ROOT / "docs" / "parameters.md").read_text() == page
-    for kind in (*(method.Params for method in jaxevent.METHODS.values()), jaxevent.blob.Params):
+    kinds = [method.Params for method in jaxevent.METHODS.values()]
+    for kind in (*kinds, jaxevent.blob.Params, jaxevent.egomotion.Params):
         for name in (*kind.numbers, *kind.choices):
             assert f"| `{name}` |" in page
 
