@@ -80,7 +80,7 @@ def model_recovery(iterations: int = 100) -> dict[str, tuple[float, float]]:
     """True and found values, from a start that is wrong by a factor of 2 or so."""
     start = jaxevent.aks.Params(
         c_on=0.2, c_off=0.2, I0=0.2, sigma_event=0.1, sigma_bg=0.1, sigma_frame=0.03,
-        sigma_floor=1e-4, w_min=1.0,
+        sigma_floor=1e-4, w_min=1.0, share=0.0,
     )  # fmt: skip
     params = fitted(from_model(), start, list(TRUE), None, iterations)
     return {name: (value, float(getattr(params, name))) for name, value in TRUE.items()}

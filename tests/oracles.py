@@ -269,10 +269,11 @@ def run(method, pixel, near, p):
     """[(time, L, P)]: the start, then after each event."""
     L, P, last = reference(method, pixel)(0.0, 0), p.get("P0", math.nan), 0
     if method == "akf" and pixel.frames:
-        white, end = pixel.grey[0] > 0.5, p["margin"] / 255
+        k = max(sum(m <= 0 for m in pixel.mid) - 1, 0)
+        white, end = pixel.grey[k] > 0.5, p["margin"] / 255
         bound = math.log((1 - end if white else end) + p["I0"])
         begin = bound + (p["above"] if white else -p["below"])
-        L += (1 - pixel.clear(0)) * (begin - L)
+        L += (1 - pixel.clear(k)) * (begin - L)
     trace = [(last, L, P)]
     for n, (time, s) in enumerate(zip(pixel.t, pixel.s, strict=True)):
         gap = (time - last) * 1e-6

@@ -81,8 +81,8 @@ class Augmentation(Observer):
     density: BetweenFrames
     I0: Float[Array, ""]
     present: Float[Array, ""]
-    clipped: Float[Array, " pixels"]
-    begin: Float[Array, " pixels"]
+    clipped: Float[Array, "frames pixels"]
+    begin: Float[Array, "frames pixels"]
     bound: Float[Array, "frames pixels"] | None
     push: Float[Array, "frames pixels"] | None
 
@@ -99,15 +99,15 @@ class Augmentation(Observer):
             self.density = BetweenFrames(params, frames, Rbar)
         side = clipped_side(params, frames)
         # A clipped value tells its side, no more: dark ones differ by how noise is rounded.
-        edge = bound_of(params, frames)[0]
-        self.clipped = abs(side[0])
-        self.begin = edge + jnp.where(side[0] > 0, params.above, -params.below)
+        edge = bound_of(params, frames)
+        self.clipped = abs(side)
+        self.begin = edge + jnp.where(side > 0, params.above, -params.below)
         self.bound = self.push = None
         if params.one_sided:
             # What both frames of a gap say; where one is not clipped, events tell when it began.
             following = jnp.roll(side, -1, axis=0)
             both = jnp.where(side * following > 0, jnp.minimum(abs(side), abs(following)), 0)
-            self.bound = bound_of(params, frames)
+            self.bound = edge
             self.push = params.clip_rate * jnp.sign(side) * both
 
     def __call__(self, points: Points) -> Observation:
@@ -122,7 +122,7 @@ class Augmentation(Observer):
 
     def outset(self, points: Points) -> Array:
         level = self.level(points)
-        return level + self.clipped * (self.begin - level)
+        return level + points.of_frame(self.clipped) * (points.of_frame(self.begin) - level)
 
 
 def initial(params: Params, level: Array) -> State:

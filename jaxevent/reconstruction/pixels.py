@@ -644,7 +644,7 @@ class Windows:
             ]
         )
         first, last = self.clock.frame(np.searchsorted(self.clock.breaks, span, "right"))
-        return slice(max(int(first) - 1, 0), min(int(last) + 2, len(self.clock)))
+        return slice(max(int(first) - 1, 0), min(max(int(last), 0) + 2, len(self.clock)))
 
     def _edges(self, used: slice) -> list[NDArray[np.int64]]:
         """Left edge, middle and right edge of exposures (us): events with t < edge are before it.
