@@ -534,7 +534,6 @@ def test_bias_of_the_paper_and_without_it(n, target):
         ("moment", "ellipse", 32),
         ("moment", "circle", 1),
         ("chi2_split", "ellipse", 1),
-        ("chi2_split", "circle", 1),
     ],
 )
 def test_errors_are_as_large_as_predicted(name, gate, m):

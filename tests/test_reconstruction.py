@@ -378,7 +378,6 @@ def test_step_maps_over_pixels():
     [
         ("akf", 3_000, PARAMS),
         ("akf", 0, OPTIONS),
-        ("akf", 3_000, OPTIONS),
         ("aks", 0, PARAMS),
         ("aks", 3_000, OPTIONS),
         ("cf-augmented", 3_000, OPTIONS),
