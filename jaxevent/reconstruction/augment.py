@@ -122,9 +122,12 @@ def bound_of(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "fr
     """The log intensity at which pixels begin to clip: that of a grey `margin` from the end."""
     levels, response = jnp.arange(256), jnp.asarray(frames.response)
     margin = jnp.clip(params.margin, 0, 127)
-    dark, bright = (jnp.interp(margin, levels, end) for end in (response, response[::-1]))
-    bound = jnp.where(jnp.asarray(frames.grey) > 0.5, bright, dark)
-    return jnp.log(bound / jnp.asarray(frames.gain)[:, None] + params.I0)
+    gain = jnp.asarray(frames.gain)[:, None]
+    dark, bright = (
+        jnp.log(jnp.interp(margin, levels, end) / gain + params.I0)
+        for end in (response, response[::-1])
+    )
+    return jnp.where(jnp.asarray(frames.grey) > 0.5, bright, dark)
 
 
 SPLINE = 256
