@@ -404,7 +404,7 @@ def test_states_between_batches():
     motion = voting.Motion(
         "planar", np.array([1000, 3000]), np.array([[1.0, 0], [3, 4]]),
         np.stack([np.eye(2), 3 * np.eye(2)]), np.array([True, False]),
-        np.ones(2), np.full(2, 5e-4), np.zeros(2),
+        np.full(2, 5e-4), np.ones(2), np.zeros(2),
     )  # fmt: skip
     mean, covariance, lost = motion(np.array([500, 1500, 3000, 9000]))
     np.testing.assert_allclose(mean, [[1, 0], [1.5, 1], [3, 4], [3, 4]])

@@ -37,9 +37,10 @@ from tqdm import tqdm
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.candidates import Candidates, Gatherer
 from jaxevent.egomotion.geometry import B
+from jaxevent.egomotion.motion import Motion
 from jaxevent.errors import InputError
 from jaxevent.parameters import Choice, Count, Number, Parameters, Positive, nearest
-from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.recording import Recording
 
 CHUNK = 1024  # scored events after which the host looks where the motion is
 MODELS = ("planar", "rotation")
@@ -401,73 +402,6 @@ def run(
 _run, _begin, _draw = eqx.filter_jit(run), eqx.filter_jit(begin), eqx.filter_jit(draw)
 
 
-class States(NamedTuple):
-    """Motion at some times: mean (times, dimension), covariance (times, dimension, dimension).
-
-    `lost` says where the motion was being searched for, or no event told it.
-    """
-
-    mean: NDArray[np.floating]
-    covariance: NDArray[np.floating]
-    lost: NDArray[np.bool_]
-
-
-@dataclasses.dataclass(frozen=True)
-class Motion:
-    """An estimated motion: `mean, covariance, lost = motion(times)`.
-
-    Arrays by batch: `t` (us) of its last event, `mean` (n, dimension) and `covariance` in px/s or
-    rad/s, `lost`, `contrast` (votes in units of chance's; about 1 means nothing was seen), `lag`
-    (s) by which what candidates show is older than `t`, and `evidence`.
-    """
-
-    model: str
-    t: NDArray[np.int64]
-    mean: NDArray[np.floating]
-    covariance: NDArray[np.floating]
-    lost: NDArray[np.bool_]
-    contrast: NDArray[np.floating]
-    lag: NDArray[np.floating]
-    evidence: NDArray[np.floating]
-
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def __repr__(self) -> str:
-        return f"Motion({self.model}, {len(self)} batches, {int(self.lost.sum())} lost)"
-
-    def __call__(self, times: Times, *, centred: bool = False) -> States:
-        """The motion at `times`: integers (us) or floats (s).
-
-        Means and covariances are interpolated linearly between the batches before and after the
-        time, and held before the first and after the last one. With `centred` a batch's estimate
-        counts for the time that its candidates show, `lag` before its last event: a fixed-lag
-        estimate, which needs the events up to that much later. `lost` is set where either batch is
-        lost, and before the first. Raises `InputError` for times that are not finite.
-        """
-        times = np.atleast_1d(microseconds(times))
-        n, dimension = self.mean.shape
-        if n == 0:
-            return States(
-                np.full((len(times), dimension), np.nan),
-                np.full((len(times), dimension, dimension), np.nan),
-                np.ones(len(times), bool),
-            )
-        at = self.t - (1e6 * self.lag if centred else 0)
-        at = np.maximum.accumulate(at)
-        place = np.searchsorted(at, times, "right")
-        after, before = np.minimum(place, n - 1), np.maximum(place - 1, 0)
-        gap = at[after] - at[before]
-        share = np.where(gap > 0, (times - at[before]) / np.where(gap > 0, gap, 1), 0)
-        share = np.clip(share, 0, 1)[:, None]
-        mean = (1 - share) * self.mean[before] + share * self.mean[after]
-        share = share[..., None]
-        covariance = (1 - share) * self.covariance[before] + share * self.covariance[after]
-        return States(
-            mean, covariance, self.lost[before] | self.lost[after] | (times < at[0])
-        )  # fmt: skip
-
-
 def prepare(
     recording: Recording,
     params: Params | None = None,
@@ -572,24 +506,19 @@ def estimate(
             parts.append((made.t[:used], jax.tree.map(lambda a, n=used: np.asarray(a)[:n], told)))
             bar.update(int(made.row.max(initial=0)) + 1 - bar.n)
             number += 1
-    if not parts:
-        n = kind.dimension
-        none = np.zeros(0)
-        return Motion(
-            model, none.astype(np.int64), np.zeros((0, n)), np.zeros((0, n, n)),
-            none.astype(bool), none, none, none,
-        )  # fmt: skip
 
     def whole(name: str) -> NDArray:
         return np.concatenate([getattr(told, name) for _, told in parts])
 
+    if not parts:
+        return Motion.nothing(model)
     return Motion(
         model,
         np.concatenate([t for t, _ in parts]),
         whole("mean"),
         whole("covariance"),
         whole("searching"),
-        whole("contrast"),
         whole("lag"),
+        whole("contrast"),
         whole("evidence"),
     )
