@@ -1,4 +1,6 @@
-"""A recording in a few lines: sensor, events, frames, and what else it holds."""
+"""A recording in a few lines: sensor, events, frames, clocks, and what else it holds."""
+
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,10 +10,18 @@ from jaxevent.recording import EventSource, Frames, Recording
 
 BLOCK = 1 << 20  # events looked at together: 13 MB
 BIN = 10_000  # us over which the peak rate is taken
+PARTS = 10  # of a recording, whose rates show how the rate changes
+GAP = 100_000  # us without an event that may be a jump of the clock
+_TRUTH = ("omega", "rvec", "tvec", "HDR_mat", "hdr", "motion", "tracks")
 
 
 def describe(recording: Recording, progress: bool = False) -> list[tuple[str, str]]:
-    """What a user wants to know first of a recording, as (name, text); reads events in blocks."""
+    """What a user wants to know first of a recording, as (name, text); reads events in blocks.
+
+    A hot pixel is one that fired more than five times as often as the busiest of its neighbours,
+    and at least 20 times; an edge that passes has busy neighbours. A gap is 0.1 s and more without
+    an event, an interval between frames or samples counts as one where it exceeds 1.5 medians.
+    """
     lines = [
         ("name", recording.name),
         ("sensor", f"{recording.width} x {recording.height} pixels"),
@@ -34,13 +44,53 @@ def describe(recording: Recording, progress: bool = False) -> list[tuple[str, st
     for name, part in (("poses", recording.poses), ("IMU", recording.imu)):
         if part is not None and len(part):
             lines.append((name, f"{len(part):,}{_rate_of(part.t)}"))
+    lines += [("clocks", text) for text in _about_clocks(recording)]
+    lines.append(("ground truth", _truth(recording, recording.extra)))
     for name, values in recording.extra.items():
-        lines.append((f"extra {name}", f"{values.dtype} of shape {values.shape}"))
+        lines.append((f"extra {name}", _value(np.asarray(values))))
     return lines
+
+
+def _value(values: NDArray) -> str:
+    if values.ndim == 0 or (values.dtype.kind == "U" and values.size < 10):
+        return ", ".join(str(value) for value in values.ravel().tolist())
+    return f"{values.dtype} of shape {values.shape}"
+
+
+def _truth(recording: Recording, extra: Mapping[str, NDArray]) -> str:
+    known = ["poses"] if recording.poses is not None and len(recording.poses) else []
+    known += [name for name in extra if name.startswith(_TRUTH)]
+    return ", ".join(known) or "none"
 
 
 def _rate_of(t: NDArray[np.int64]) -> str:
     return f", {(len(t) - 1) / ((t[-1] - t[0]) / 1e6):.1f} per s" if t[-1] > t[0] else ""
+
+
+def _about_clocks(recording: Recording) -> list[str]:
+    """Intervals of frames and samples that are too long, and clocks that do not overlap."""
+    texts = []
+    events = recording.events
+    parts = [("frames", recording.frames), ("poses", recording.poses), ("IMU", recording.imu)]
+    for name, part in parts:
+        if part is None or not len(part):
+            continue
+        steps = np.diff(part.t)
+        long = np.flatnonzero(steps > 1.5 * np.median(steps)) if len(steps) > 1 else []
+        if len(long):
+            row = int(np.argmax(steps))
+            texts.append(
+                f"{name}: {len(long)} intervals over 1.5 medians, the longest "
+                f"{steps[row] / 1000:.3f} ms after {part.t[row] / 1e6:.6f} s"
+            )
+        if len(events):
+            first, last = int(events[:1].t[0]), int(events[len(events) - 1 :].t[0])
+            if part.t[-1] < first or part.t[0] > last:
+                texts.append(
+                    f"{name}: {part.t[0] / 1e6:.6f} to {part.t[-1] / 1e6:.6f} s, not at the time "
+                    "of the events"
+                )
+    return texts
 
 
 def _about_events(
@@ -50,13 +100,14 @@ def _about_events(
     if not count:
         return [("events", "none")]
     at_pixel = np.zeros(width * height, np.int64)
-    on = peak = carried = 0
+    on = peak = carried = gaps = 0
     last_bin = None
-    first = last = 0
+    first, last = int(events[:1].t[0]), int(events[count - 1 :].t[0])
+    in_part = np.zeros(PARTS, np.int64)
+    longest, longest_after, before = 0, first, first
     blocks = range(0, count, BLOCK)
     for row in tqdm(blocks, unit="M events", delay=2, disable=not progress, leave=False):
         block = events[row : row + BLOCK]
-        first, last = first if row else int(block.t[0]), int(block.t[-1])
         on += int(block.p.sum())
         at_pixel += np.bincount(block.y.astype(np.int64) * width + block.x, minlength=len(at_pixel))
         # Sorted, so that only the first bin of a block can have begun in the one before it.
@@ -64,6 +115,14 @@ def _about_events(
         if last_bin == bins[0]:
             counts[0] += carried
         peak, last_bin, carried = max(peak, int(counts.max())), bins[-1], int(counts[-1])
+        steps = np.diff(block.t, prepend=before)
+        gaps += int(np.count_nonzero(steps >= GAP))
+        if (widest := int(np.argmax(steps))) >= 0 and steps[widest] > longest:
+            longest = int(steps[widest])
+            longest_after = int(block.t[widest]) - longest
+        before = int(block.t[-1])
+        edges = first + (last - first) * np.arange(1, PARTS) // PARTS
+        in_part += np.diff(np.searchsorted(block.t, edges), prepend=0, append=len(block))
     lines = [
         ("events", f"{count:,}, from {first / 1e6:.6f} to {last / 1e6:.6f} s"),
         ("polarity", f"{100 * on / count:.1f} % ON, {100 * (count - on) / count:.1f} % OFF"),
@@ -71,13 +130,28 @@ def _about_events(
     # The last bin is rarely full, so a recording shorter than a bin has no rate.
     seconds = (last - first) / 1e6
     if last - first >= BIN:
-        lines.append(
+        part = seconds / PARTS
+        rates = ", ".join(_short(n / part) for n in in_part)
+        lines += [
             (
                 "event rate",
                 f"mean {count / seconds:,.0f} per s, peak {peak / BIN * 1e6:,.0f} per s in "
                 f"{BIN // 1000} ms",
+            ),
+            ("rate over time", f"{rates} per s, in tenths of {part:.3g} s"),
+        ]
+    if longest:
+        text = f"longest {longest / 1000:.3f} ms, after {longest_after / 1e6:.6f} s"
+        if gaps:
+            text += (
+                f"; {gaps} of {GAP // 1000} ms and more, each a jump of the clock or a standstill"
             )
-        )
+        lines.append(("gaps", text))
+    hot = _hot(at_pixel.reshape(height, width))
+    share = 100 * at_pixel[hot].sum() / count
+    lines.append(
+        ("hot pixels", f"{len(hot):,}, with {share:.2f} % of the events" if len(hot) else "none")
+    )
     hottest = np.argsort(-at_pixel, kind="stable")[:3]
     shown = []
     for pixel in hottest[at_pixel[hottest] > 0]:
@@ -86,6 +160,26 @@ def _about_events(
         shown.append(f"({pixel % width}, {pixel // width}) {n:,} events{rate}")
     lines.append(("hottest pixels", "; ".join(shown)))
     return lines
+
+
+def _short(rate: float) -> str:
+    """Three digits with k or M: 12.3k."""
+    for unit, name in ((1e6, "M"), (1e3, "k")):
+        if rate >= unit:
+            return f"{rate / unit:.3g}{name}" if rate < 999.5 * unit else f"{rate / unit:.0f}{name}"
+    return f"{rate:.0f}"
+
+
+def _hot(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Which pixels are hot, as indices into the flattened counts."""
+    height, width = counts.shape
+    around = np.pad(counts, 1)
+    busiest = np.zeros_like(counts)
+    for dy in range(3):
+        for dx in range(3):
+            if (dy, dx) != (1, 1):
+                np.maximum(busiest, around[dy : dy + height, dx : dx + width], out=busiest)
+    return np.flatnonzero((counts >= 20) & (counts > 5 * busiest))
 
 
 def _about_frames(frames: Frames | None) -> list[tuple[str, str]]:

@@ -243,7 +243,7 @@ def test_as_a_process(tmp_path):
 
 @pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt, 130), (BrokenPipeError, 1)])
 def test_interrupted_and_broken_pipe(error, status, monkeypatch, capsys):
-    def info(path, size):
+    def info(path, size, stream):
         raise error
 
     monkeypatch.setattr(cli, "info", info)
@@ -285,6 +285,9 @@ def test_info(tmp_path, capsys, monkeypatch):
         "events": "6, from 0.000000 to 0.100000 s",
         "polarity": "50.0 % ON, 50.0 % OFF",
         "event rate": "mean 60 per s, peak 400 per s in 10 ms",
+        "rate over time": "400, 100, 0, 0, 0, 0, 0, 0, 0, 100 per s, in tenths of 0.01 s",
+        "gaps": "longest 90.000 ms, after 0.010000 s",
+        "hot pixels": "none",
         "hottest pixels": "(4, 2) 3 events, 30 per s; (3, 7) 2 events, 20 per s; "
         "(1, 0) 1 events, 10 per s",
         "frames": "2 of 24 x 20, float64, 24.7 per s",
@@ -292,6 +295,7 @@ def test_info(tmp_path, capsys, monkeypatch):
         "grey levels": "37.5 % dark (< 0.02), 12.5 % saturated (> 0.98)",
         "calibration": "fx 0.00, fy 1.00, cx 2.00, cy 3.00; distortion 4, 5, 6, 7, 8",
         "IMU": "2, 1000.0 per s",
+        "ground truth": "none",
         "extra threshold": "float64 of shape (2,)",
     }
 

@@ -761,7 +761,7 @@ def test_load_refuses_other_things(tmp_path):
         load(other)
     with File(other, "w") as file:
         file["data"] = 1
-    with pytest.raises(InputError, match="neither events/t nor an events array"):
+    with pytest.raises(InputError, match="neither events/t, x, y and p nor"):
         load(other)
     with pytest.raises(InputError, match="two positive numbers of pixels"):
         load(other, size=(0, 5))

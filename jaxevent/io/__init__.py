@@ -1,8 +1,10 @@
 """Reading and writing recordings: `load` any readable file or folder, `save` as HDF5.
 
-The layouts are described in the reader modules: `text`, `mat`, `npz` and `hdf5`. They are imported
-when first needed. This module also turns the raw numbers of a file into checked fields, so that
-every reader accepts the same values and words its errors alike.
+The layouts are described in the reader modules, and what each was checked against: `aedat2`,
+`aedat4`, `columns` (tables of text and NumPy records), `event_stream`, `hdf5`, `hdf5_layouts`,
+`mat`, `npz`, `prophesee`, `ros` and `text`. They are imported when first needed. This module also
+turns the raw numbers of a file into checked fields, so that every reader accepts the same values
+and words its errors alike.
 """
 
 import contextlib
@@ -11,6 +13,7 @@ import os
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +24,12 @@ from jaxevent.recording import Events, Frames, Recording
 
 __all__ = ["load", "save"]
 
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+
 READABLE = (
-    "readable are a folder or zip with events.txt (Event-Camera Dataset), .npz, "
-    "MATLAB .mat (v5 and v7.3) and HDF5 (jaxevent's own or DSEC-like)"
+    "readable are a folder or zip with events.txt (Event-Camera Dataset), AEDAT 2 and 4, "
+    "Prophesee RAW and DAT, Event Stream, ROS 1 bags, HDF5 (jaxevent's own, DSEC, MVSEC, M3ED and "
+    "others), MATLAB .mat (v5 and v7.3), .npz, .npy and tables of text"
 )
 
 
@@ -32,16 +38,21 @@ def load(
     size: tuple[int, int] | None = None,
     in_memory: bool = True,
     progress: bool = False,
+    stream: str | None = None,
 ) -> Recording:
     """Read and check a recording; its format is told by its content, not by its name.
 
     Args:
-        path: A folder, zip, .npz, .mat or HDF5 file.
+        path: A file or folder in one of the layouts that `jaxevent.io` lists.
         size: (width, height) in pixels; overrides the sensor size of the file, and is needed where
             the file does not tell it.
-        in_memory: False leaves the events of an HDF5 file on disk, as `hdf5.StoredEvents`; they
-            are then read and checked piece by piece. The other formats are always read whole.
-        progress: Show a bar on stderr where reading text takes longer than two seconds.
+        in_memory: False leaves events and images in the file, at the memory of a few blocks. Those
+            of HDF5 are then read and checked where they are asked for (`hdf5.StoredEvents`); other
+            formats are decoded and checked once now and again then (`decoded.DecodedEvents`).
+            .npz, .mat and folders and zips of text are always read whole.
+        progress: Show a bar on stderr where reading takes longer than two seconds.
+        stream: Which camera, of a file that holds the events of several: a topic of a ROS bag,
+            "left" or "right" of MVSEC and M3ED, the number of a stream of AEDAT 4.
 
     Raises:
         InputError: The file is missing, damaged or of another format, or what it holds is not a
@@ -50,7 +61,7 @@ def load(
     path = Path(path)
     if size is not None and min(size) < 1:
         raise InputError(f"size = {size} must be two positive numbers of pixels, (width, height)")
-    return _reader(path, in_memory, progress)(path, size).check(str(path))
+    return _reader(path, in_memory, progress, stream)(path, size).check(str(path))
 
 
 def save(
@@ -78,58 +89,139 @@ def save(
 
 
 def _reader(
-    path: Path, in_memory: bool, progress: bool
+    path: Path, in_memory: bool, progress: bool, stream: str | None
 ) -> Callable[[Path, tuple[int, int] | None], Recording]:
     with reading(str(path)):
         is_folder, exists = path.is_dir(), path.exists()
+    if not is_folder and not exists:
+        raise InputError(f"{path}: there is no such file or folder; correct the path")
+    with reading(str(path)):
+        head = b"" if is_folder else _head(path)
+    if head.startswith((b"#!AER-DAT4", b"#ROSBAG")):
+        from jaxevent.io import aedat4, ros
+
+        read = aedat4.read if head.startswith(b"#!AER-DAT4") else ros.read
+        return functools.partial(read, in_memory=in_memory, progress=progress, stream=stream)
+    if not is_folder and head.startswith(HDF5_MAGIC) or _later_hdf5(path, is_folder):
+        return _hdf5_reader(path, in_memory, stream)
+    if stream is not None:
+        raise InputError(f"{path}: holds one camera only; leave out stream= or --stream")
     if is_folder:
+        if (path / "metadata.yaml").is_file():
+            raise InputError(
+                f"{path}: is a ROS 2 bag; turn it into a ROS 1 bag first, with rosbags-convert"
+            )
         if not (path / "events.txt").is_file():
             raise InputError(f"{path}: the folder holds no events.txt; {READABLE}")
         from jaxevent.io import text
 
         return functools.partial(text.read, progress=progress)
-    if not exists:
-        raise InputError(f"{path}: there is no such file or folder; correct the path")
-    with reading(str(path)), path.open("rb") as file:
-        head = file.read(128)
-    if not head:
-        raise InputError(f"{path}: the file is empty; fetch it again")
     if head.startswith(b"PK"):
-        with reading(str(path)), zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-        if any(name.rpartition("/")[2] == "events.txt" for name in names):
-            from jaxevent.io import text
-
-            return functools.partial(text.read, progress=progress)
-        if names and all(name.endswith(".npy") for name in names):
-            from jaxevent.io import npz
-
-            return npz.read
-        raise InputError(f"{path}: the zip holds neither events.txt nor .npy arrays; {READABLE}")
+        return _zip_reader(path, progress)
     # The header of MATLAB v5: 116 bytes of text, 8 of offset, the version 0x0100 and the letters
     # MI as the writing machine ordered both. (v7.3 has 0x0200 there and is HDF5.)
     if head[124:128] in (b"\x00\x01IM", b"\x01\x00MI"):
         from jaxevent.io import mat
 
         return mat.read_v5
+    read = _streamed_reader(path, head)
+    return functools.partial(read, in_memory=in_memory, progress=progress)
 
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        head = file.read(128)
+    if not head:
+        raise InputError(f"{path}: the file is empty; fetch it again")
+    return head
+
+
+def _streamed_reader(path: Path, head: bytes) -> Callable[..., Recording]:
+    """The reader of a format that is told by its first bytes and decoded block by block."""
+    if head.startswith(b"#!AER-DAT"):
+        if not head.startswith(b"#!AER-DAT2"):
+            raise InputError(
+                f"{path}: is AEDAT {head[9:12].decode('latin-1')}; only AEDAT 2 and 4 can be read, "
+                "so convert it with jAER or DV"
+            )
+        from jaxevent.io import aedat2
+
+        return aedat2.read
+    if head.startswith(b"Event Stream"):
+        from jaxevent.io import event_stream
+
+        return event_stream.read
+    if head.startswith(b"% "):
+        from jaxevent.io import prophesee
+
+        return prophesee.read
+    from jaxevent.io import columns
+
+    if head.startswith(columns.NUMPY_MAGIC):
+        return columns.read_npy
+    if columns.is_text(head):
+        return columns.read_text
+    raise InputError(f"{path}: the format is not recognised; {READABLE}")
+
+
+def _zip_reader(path: Path, progress: bool) -> Callable[[Path, tuple[int, int] | None], Recording]:
+    with reading(str(path)), zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+    if any(name.rpartition("/")[2] == "events.txt" for name in names):
+        from jaxevent.io import text
+
+        return functools.partial(text.read, progress=progress)
+    if names and all(name.endswith(".npy") for name in names):
+        from jaxevent.io import npz
+
+        return npz.read
+    raise InputError(f"{path}: the zip holds neither events.txt nor .npy arrays; {READABLE}")
+
+
+def _later_hdf5(path: Path, is_folder: bool) -> bool:
+    """Whether HDF5 begins after 512, 1024, ... bytes that are not its own, as in MATLAB v7.3."""
+    if is_folder:
+        return False
+    with reading(str(path)), path.open("rb") as file:
+        at = 512
+        while file.seek(at) == at and (signature := file.read(len(HDF5_MAGIC))):
+            if signature == HDF5_MAGIC:
+                return True
+            at *= 2
+    return False
+
+
+def _hdf5_reader(
+    path: Path, in_memory: bool, stream: str | None
+) -> Callable[[Path, tuple[int, int] | None], Recording]:
     import h5py
 
-    if not h5py.is_hdf5(path):
-        raise InputError(f"{path}: the format is not recognised; {READABLE}")
-    with reading(str(path)), h5py.File(path) as file:
-        events = file.get("events")
-        ours = isinstance(events, h5py.Group) and "t" in events
-        matlab = isinstance(events, h5py.Dataset)
-    if ours:
-        from jaxevent.io import hdf5
+    from jaxevent.io import hdf5
 
+    with hdf5.open_file(path) as opened, reading(str(path)):
+        file: Any = opened
+        events = file.get("events")
+        ours = isinstance(events, h5py.Group) and {"t", "x", "y", "p"} <= set(events)
+        ours |= str(hdf5.attribute(file, "format")) == "jaxevent"
+        from jaxevent.io import hdf5_layouts
+
+        others = not ours and hdf5_layouts.knows(file)
+        matlab = isinstance(events, h5py.Dataset)
+    if others:
+        read = hdf5_layouts.read if in_memory else hdf5_layouts.open_stored
+        return functools.partial(read, stream=stream)
+    if stream is not None:
+        raise InputError(f"{path}: holds one camera only; leave out stream= or --stream")
+    if ours:
         return hdf5.read if in_memory else hdf5.open_stored
     if matlab:
         from jaxevent.io import mat
 
         return mat.read_v73
-    raise InputError(f"{path}: the HDF5 file has neither events/t nor an events array; {READABLE}")
+    raise InputError(
+        f"{path}: the HDF5 file has neither events/t, x, y and p nor events under other known "
+        f"names; {READABLE}"
+    )
 
 
 @contextlib.contextmanager
@@ -144,24 +236,37 @@ def reading(source: str) -> Iterator[None]:
         raise
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
+        reason = reason if len(reason) < 200 else reason[:200] + "..."
         raise InputError(
             f"{source}: cannot be read ({reason}); the file is damaged, incomplete or not "
             "permitted, so fetch it again or check its permissions"
         ) from error
 
 
-def times(values: NDArray, source: str, what: str, scale: float = 1e6) -> NDArray[np.int64]:
-    """Times (n,) as int64 us: integers are us already, floats are multiplied by `scale`."""
+def times(
+    values: NDArray, source: str, what: str, scale: float = 1e6, first_row: int = 0
+) -> NDArray[np.int64]:
+    """Times (n,) as int64 us: integers are us already, floats are multiplied by `scale`.
+
+    `first_row` is the row of the first one in `source`.
+    """
     values = _numbers(values, source, f"{what} times")
     if values.dtype.kind != "f":
+        if values.dtype == np.uint64 and len(values) and values.max() > np.iinfo(np.int64).max:
+            row = int(np.argmax(values > np.iinfo(np.int64).max))
+            raise InputError(
+                f"{source}: {what} {first_row + row} has the time {values[row]}, too large for "
+                "microseconds; correct the unit or remove it"
+            )
         return values.astype(np.int64, copy=False)
     # int64 ends at 9.2e18; NaN and infinity fail this comparison too.
     good = np.abs(values) < 9e18 / scale
     if not good.all():
         row = int(np.argmin(good))
         raise InputError(
-            f"{source}: {what} {row} has the time {values[row]:.16g}, not finite or too large for "
-            f"{'seconds' if scale == 1e6 else 'microseconds'}; correct the unit or remove it"
+            f"{source}: {what} {first_row + row} has the time {values[row]:.16g}, not finite "
+            f"or too large for {'seconds' if scale == 1e6 else 'microseconds'}; correct the unit "
+            "or remove it"
         )
     return np.rint(values.astype(np.float64, copy=False) * scale).astype(np.int64)
 

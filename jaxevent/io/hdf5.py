@@ -15,11 +15,19 @@
     /extra/*              further arrays by name
 
 All times but events/t are on the recording's clock. Only /events is required to read a file, so
-DSEC's event files (t uint32, no attributes) can be read too when the sensor's size is given.
+files of DSEC and VECtor (t uint32, no attributes) can be read too, and RVT's (events/width and
+height). DSEC's rectify_map.h5, where it lies beside the file, tells the sensor's size and is kept
+in `extra["rectify_map"]`; otherwise the size must be given. Other layouts: `hdf5_layouts`.
+
+Data compressed by a filter that HDF5 itself lacks (DSEC: Blosc) need the package hdf5plugin, which
+is imported when first needed. A file that claims many more events than its bytes can hold is
+refused before any memory is asked for.
 """
 
 import dataclasses
-from collections.abc import Sequence
+import re
+import struct
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,15 +36,37 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, require
 from jaxevent.io import checked_events, pinhole, reading, times, vectors
 from jaxevent.io.output import complete
-from jaxevent.recording import Events, EventSource, Frames, Imu, Poses, Recording
+from jaxevent.recording import Events, EventSource, Frames, ImageSource, Imu, Poses, Recording
 
 VERSION = 1
+_MOST_COMPRESSED = 4096  # times smaller than in memory that any filter makes real events
+_ECF = 36559  # Prophesee's filter
+_HEAPS = 1 << 24
+# An attribute that is one string: its type, its space, then its length, heap and place in that.
+_STRING = re.compile(rb"\x19.[\x00\x01]\x00\x10\x00\x00\x00\x10.{15}\x01\x00{7}(.{16})", re.DOTALL)
 _BLOCK = 1 << 20  # events copied at a time: 13 MB
 _CHUNK = 1 << 16  # values compressed together
 _MOST_MS = 10**9  # 11.6 days; a stray timestamp would otherwise fill the disk with ms_to_idx
+
+
+Column = Any  # one field of the events: a dataset, or what is sliced like one
+
+
+class Microseconds:
+    """Times in floating-point seconds, read as int64 us."""
+
+    def __init__(self, seconds: Column, source: str):
+        self._seconds, self._source = seconds, source
+        self.shape, self.dtype = seconds.shape, np.dtype(np.int64)
+
+    def __getitem__(self, rows: Any) -> Any:
+        values = np.asarray(self._seconds[rows], np.float64)
+        first = rows.start or 0 if isinstance(rows, slice) else int(rows)
+        t = times(values.reshape(-1), self._source, "event", first_row=first)
+        return t if values.ndim else t[0]
 
 
 class StoredEvents:
@@ -45,14 +75,21 @@ class StoredEvents:
     The file stays open for as long as this object lives.
     """
 
-    def __init__(self, file: h5py.File, size: tuple[int, int], source: str):
-        """`size` is (width, height). Raises `InputError` unless the fields fit each other."""
-        self._file = file
+    def __init__(
+        self,
+        columns: Mapping[str, Column],
+        size: tuple[int, int],
+        source: str,
+        offset: int = 0,
+        ms_to_idx: h5py.Dataset | None = None,
+    ):
+        """`columns` are t, x, y and p; t holds us since `offset` (us).
+
+        `size` is (width, height). Raises `InputError` unless the fields fit each other.
+        """
         self._size = size
         self._source = source
-        self._t, self._x, self._y, self._p = (
-            _dataset(file, f"events/{name}", source) for name in "txyp"
-        )
+        self._t, self._x, self._y, self._p = (columns[name] for name in "txyp")
         shapes = [field.shape for field in (self._t, self._x, self._y, self._p)]
         if len(shapes[0]) != 1 or len(set(shapes)) != 1:
             raise InputError(
@@ -61,14 +98,9 @@ class StoredEvents:
             )
         if self._t.dtype.kind not in "iu":
             raise InputError(f"{source}: events/t is {self._t.dtype}; store integer microseconds")
-        self._offset = 0
-        if "t_offset" in file:
-            with reading(f"{source}: t_offset"):
-                self._offset = int(_dataset(file, "t_offset", source)[()])
-        self._ms_to_idx = _dataset(file, "ms_to_idx", source) if "ms_to_idx" in file else None
-        if self._ms_to_idx is not None and (
-            self._ms_to_idx.ndim != 1 or self._ms_to_idx.dtype.kind not in "iu"
-        ):
+        self._offset = offset
+        self._ms_to_idx = ms_to_idx
+        if ms_to_idx is not None and (ms_to_idx.ndim != 1 or ms_to_idx.dtype.kind not in "iu"):
             raise InputError(f"{source}: ms_to_idx must be a list of integers; remove it")
 
     def __len__(self) -> int:
@@ -87,9 +119,8 @@ class StoredEvents:
         lead = min(start, 1)
         part = slice(start - lead, stop)
         with reading(f"{self._source}: events"):
-            t = self._t[part].astype(np.int64, copy=False)
+            t = self._t[part].astype(np.int64) + self._offset
             x, y, p = self._x[part], self._y[part], self._p[part]
-        t += self._offset
         events = checked_events(t, x, y, p, self._size, self._source, first_row=start - lead)
         return events[lead:] if lead else events
 
@@ -164,28 +195,89 @@ class StoredImages:
 
 def read(path: Path, size: tuple[int, int] | None) -> Recording:
     """Read a file into memory; `size` is (width, height). Raises `InputError` for bad input."""
-    with _open(path) as file:
-        recording = _recording(file, path, size)
-        frames = recording.frames
-        if frames is not None:
-            frames = dataclasses.replace(frames, images=np.asarray(frames.images))
-        return dataclasses.replace(recording, events=recording.events[:], frames=frames)
+    with reading(str(path)), open_file(path) as file:
+        return in_memory(_recording(file, path, size))
 
 
 def open_stored(path: Path, size: tuple[int, int] | None) -> Recording:
     """Read all but events and images, which stay in the file: `StoredEvents`, `StoredImages`."""
-    return _recording(_open(path), path, size)
-
-
-def _open(path: Path) -> h5py.File:
     with reading(str(path)):
+        return _recording(open_file(path), path, size)
+
+
+def in_memory(recording: Recording) -> Recording:
+    """The recording with its events and images read from their file."""
+    frames = recording.frames
+    if frames is not None:
+        frames = dataclasses.replace(frames, images=np.asarray(frames.images))
+    return dataclasses.replace(recording, events=recording.events[:], frames=frames)
+
+
+def open_file(path: Path) -> h5py.File:
+    """The open file, or `InputError`."""
+    with reading(str(path)):
+        check_heaps(path)
         return h5py.File(path)
+
+
+def attribute(of: Any, name: str) -> Any:
+    """An attribute of a file, group or dataset, None where it has none; text as str.
+
+    Only numbers and strings are read: of a damaged type HDF5 2.0 reads memory that is not there.
+    """
+    if name not in of.attrs:
+        return None
+    kind = of.attrs.get_id(name).get_type()
+    if not isinstance(kind, h5py.h5t.TypeIntegerID | h5py.h5t.TypeFloatID | h5py.h5t.TypeStringID):
+        raise ValueError(f"the attribute {name} is of an unknown type")
+    value = of.attrs[name]
+    return value.decode() if isinstance(value, bytes) else value
+
+
+def check_heaps(path: Path) -> None:
+    """Raise `InputError` for a global heap (of strings) whose end libhdf5 would never find.
+
+    HDF5 2.0 goes on by the size of each piece, and stays where that is 0 or overflows; for a heap
+    that an attribute puts past the end of the file it takes gigabytes of memory first. The heaps
+    of a file's attributes lie near its start or, if written late, its end: `_HEAPS` bytes of both
+    are searched, which takes 40 ms at most.
+    """
+    damaged = InputError(f"{path}: a string or its heap is damaged; fetch the file again")
+    with path.open("rb") as file:
+        pieces = [file.read(_HEAPS)]
+        length = file.seek(0, 2)
+        if length > _HEAPS:
+            file.seek(max(_HEAPS, length - _HEAPS))
+            pieces.append(file.read())
+        base = max(pieces[0].find(b"\x89HDF\r\n\x1a\n"), 0)
+        for count, heap, _ in (
+            struct.unpack("<IQI", match[1]) for piece in pieces for match in _STRING.finditer(piece)
+        ):
+            if count and heap < length:
+                file.seek(heap + base)
+            if count and (heap >= length or count > length or file.read(4) != b"GCOL"):
+                raise damaged
+    for piece in pieces:
+        at = -1
+        while (at := piece.find(b"GCOL\x01\0\0\0", at + 1)) >= 0:
+            if at + 16 > len(piece):
+                continue
+            (size,) = struct.unpack_from("<Q", piece, at + 8)
+            here, stop = at + 16, at + size
+            while here + 16 <= min(stop, len(piece)):
+                index, held = struct.unpack_from("<H6xQ", piece, here)
+                need = held if index == 0 else 16 + held + -held % 8
+                if not 16 <= need <= stop - here:
+                    raise damaged
+                here += need
 
 
 def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Recording:
     source = str(path)
     with reading(source):
-        attributes: dict[str, Any] = dict(file.attrs)
+        names = ("format", "version", "name", "width", "height")
+        held = ((name, attribute(file, name)) for name in names)
+        attributes: dict[str, Any] = {name: value for name, value in held if value is not None}
     version = attributes.get("version")
     if attributes.get("format") == "jaxevent" and version != VERSION:
         raise InputError(
@@ -196,20 +288,31 @@ def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Rec
     if isinstance(file.get("frames"), h5py.Group):
         t, exposure = (_times(file, f"frames/{name}", source) for name in ("t", "exposure"))
         name = f"{source}: frames/images"
-        images = StoredImages(_dataset(file, "frames/images", source), name)
+        images = StoredImages(dataset(file, "frames/images", source), name)
         if len(images.shape) != 3:
             raise InputError(f"{name} has shape {images.shape}; store (frames, height, width)")
         if len(t):
             frames = Frames(t, images, exposure)
+    extra = _extra(file, source)
     if size is None and "width" in attributes and "height" in attributes:
         with reading(f"{source}: attributes width and height"):
             size = (int(attributes["width"]), int(attributes["height"]))
+    if size is None and "events/width" in file and "events/height" in file:
+        with reading(f"{source}: events/width and events/height"):
+            size = (
+                int(array(file, "events/width", source)),
+                int(array(file, "events/height", source)),
+            )
+    rectify_map = _rectify_map(path) if attributes.get("format") != "jaxevent" else None
+    if rectify_map is not None:
+        extra["rectify_map"] = rectify_map
+        size = size or (rectify_map.shape[1], rectify_map.shape[0])
     if size is None:
         raise InputError(
             f"{path}: has no attributes width and height; give size=(width, height) or --size"
         )
     if isinstance(file.get("camera"), h5py.Dataset):
-        camera = pinhole(_array(file, "camera", source), f"{path}: camera")
+        camera = pinhole(array(file, "camera", source), f"{path}: camera")
     if isinstance(file.get("poses"), h5py.Group):
         t = _times(file, "poses/t", source)
         position = _vectors(file, "poses/position", (len(t), 3), source)
@@ -219,8 +322,29 @@ def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Rec
         gyro, acc = (_vectors(file, f"imu/{name}", (len(t), 3), source) for name in ("gyro", "acc"))
         imu = Imu(t, gyro, acc)
     name = str(attributes.get("name", path.stem))
-    events = StoredEvents(file, size, source)
-    return Recording(name, *size, events, frames, camera, poses, imu, _extra(file, source))
+    columns: dict[str, Column] = {n: dataset(file, f"events/{n}", source) for n in "txyp"}
+    offset = 0
+    if "t_offset" in file:
+        with reading(f"{source}: t_offset"):
+            offset = int(dataset(file, "t_offset", source)[()])
+    table = dataset(file, "ms_to_idx", source) if "ms_to_idx" in file else None
+    events = StoredEvents(columns, size, source, offset, table)
+    return Recording(name, *size, events, frames, camera, poses, imu, extra)
+
+
+def _rectify_map(path: Path) -> NDArray | None:
+    """Where each pixel of a DSEC camera lies in the rectified image, (height, width, 2)."""
+    beside = path.with_name("rectify_map.h5")
+    if not beside.is_file():
+        return None
+    with open_file(beside) as file:
+        values = array(file, "rectify_map", str(beside))
+    if values.ndim != 3 or values.shape[2] != 2 or values.dtype.kind != "f":
+        raise InputError(
+            f"{beside}: rectify_map is {values.dtype} of shape {values.shape}; it must be "
+            "(height, width, 2)"
+        )
+    return values
 
 
 def write(
@@ -293,13 +417,13 @@ def _write_events(
 
 
 def _write(file: h5py.File, name: str, values: Any, compression: str | None) -> None:
-    if isinstance(values, StoredImages) and len(values):
-        options = _options(len(values), compression)
+    if isinstance(values, ImageSource) and not isinstance(values, np.ndarray):
+        options = _options(values.shape[0], compression)
         if options:
             options["chunks"] = (1, *values.shape[1:])
-        dataset = file.create_dataset(name, values.shape, values.dtype, **options)
-        for row in range(len(values)):
-            dataset[row : row + 1] = np.asarray(values[row : row + 1])
+        stored = file.create_dataset(name, values.shape, values.dtype, **options)
+        for row in range(values.shape[0]):
+            stored[row : row + 1] = np.asarray(values[row : row + 1])
         return
     values = np.asarray(values)
     dtype = h5py.string_dtype() if values.dtype.kind == "U" else values.dtype
@@ -321,26 +445,64 @@ def _options(count: int, compression: str | None) -> dict[str, Any]:
     return {"compression": compression, "shuffle": True, "chunks": (min(count, _CHUNK),)}
 
 
-def _dataset(file: h5py.File, name: str, source: str) -> h5py.Dataset:
-    dataset = file.get(name)
-    if not isinstance(dataset, h5py.Dataset):
-        raise InputError(f"{source}: has no dataset {name}; add it or save the recording again")
-    return dataset
-
-
-def _array(file: h5py.File, name: str, source: str) -> NDArray:
+def dataset(file: h5py.File, name: str, source: str) -> h5py.Dataset:
+    """The dataset of a name, which can be read and is not larger than its bytes allow."""
     with reading(f"{source}: {name}"):
-        return np.asarray(_dataset(file, name, source)[()])
+        found = file.get(name)
+        if not isinstance(found, h5py.Dataset):
+            raise InputError(f"{source}: has no dataset {name}; add it or save the recording again")
+        if found.dtype.hasobject and h5py.check_string_dtype(found.dtype) is None:
+            raise InputError(f"{source}: {name} holds {found.dtype}; store numbers")
+        properties = found.id.get_create_plist()
+        filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
+        stored = found.id.get_storage_size()
+        count = found.size or 0
+        for code in filters:
+            if not h5py.h5z.filter_avail(code):
+                _bring(code, f"{source}: {name}")
+        held = stored * (_MOST_COMPRESSED if filters else 1)
+        in_other_file = properties.get_external_count() or found.is_virtual
+        if count * found.dtype.itemsize > held and not in_other_file:
+            raise InputError(
+                f"{source}: {name} claims {count} values but holds {stored} bytes; the file is "
+                "damaged or incomplete, so fetch it again"
+            )
+    return found
+
+
+def _bring(code: int, source: str) -> None:
+    """Make the filter of this number known to HDF5, or raise `InputError`."""
+    if code == _ECF:
+        raise InputError(
+            f"{source} is compressed with Prophesee's ECF, which only Metavision's tools read; "
+            "convert the recording to RAW with metavision_hdf5_to_raw, or ask for its RAW file"
+        )
+    try:
+        require("hdf5plugin", "dsec")
+    except InputError as error:
+        raise InputError(f"{source} is compressed with a filter of its own; {error}") from error
+    if not h5py.h5z.filter_avail(code):
+        raise InputError(
+            f"{source} is compressed with HDF5 filter {code}, which hdf5plugin does not have; "
+            "store it with gzip instead"
+        )
+
+
+def array(file: h5py.File, name: str, source: str) -> NDArray:
+    """A whole dataset in memory."""
+    found = dataset(file, name, source)
+    with reading(f"{source}: {name}"):
+        return np.asarray(found[()])
 
 
 def _times(file: h5py.File, name: str, source: str) -> NDArray[np.int64]:
-    return times(_array(file, name, source), f"{source}: {name}", "row")
+    return times(array(file, name, source), f"{source}: {name}", "row")
 
 
 def _vectors(
     file: h5py.File, name: str, shape: tuple[int, int], source: str
 ) -> NDArray[np.float64]:
-    return vectors(_array(file, name, source), shape, source, name)
+    return vectors(array(file, name, source), shape, source, name)
 
 
 def _extra(file: h5py.File, source: str) -> dict[str, NDArray]:
@@ -350,6 +512,7 @@ def _extra(file: h5py.File, source: str) -> dict[str, NDArray]:
 
         def keep(name: str, item: h5py.Dataset | h5py.Group) -> None:
             if isinstance(item, h5py.Dataset):
+                item = dataset(file, f"extra/{name}", source)
                 text = h5py.check_string_dtype(item.dtype) is not None and item.dtype.kind == "O"
                 values = item.asstr()[()] if text else item[()]
                 extra[name] = np.asarray(values, dtype=np.str_ if text else None)

@@ -14,6 +14,9 @@ colour becomes the mean of its three channels, as in the authors' programs; (H, 
 unless there are three frames. MATLAB's rows and columns (1 x N) become vectors.
 """
 
+import struct
+import zlib
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -23,30 +26,106 @@ from jaxevent.errors import InputError
 from jaxevent.io import checked_events, reading, sensor_size, times
 from jaxevent.recording import Events, Frames, Recording
 
+_MATRIX, _COMPRESSED = 14, 15  # types of elements
+_FLAGS, _SIZES, _NAME = 6, 5, 1
+_NUMBERS = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13}
+_CLASSES = range(6, 16)  # of arrays: double, single and the integers
+
 
 def read_v5(path: Path, size: tuple[int, int] | None) -> Recording:
     """Read a v5 file; `size` is (width, height). Raises `InputError` for bad input."""
     import scipy.io
 
     with reading(str(path)):
-        variables = scipy.io.loadmat(path)
+        variables = scipy.io.loadmat(_unpacked(path))
     return _recording(
         path, size, {name: v for name, v in variables.items() if not name.startswith("__")}
     )
+
+
+def _unpacked(path: Path) -> BytesIO:
+    """The numeric variables of a file, without compression and checked to be whole.
+
+    SciPy takes the number of a type as an index into its table without looking, and reads on past
+    the end of a variable: a damaged file ends the process.
+    """
+    data = path.read_bytes()
+    order = "<" if data[126:128] == b"IM" else ">"
+    out = BytesIO()
+    out.write(data[:128])
+    at = 128
+    while at < len(data):
+        kind, size = struct.unpack_from(order + "2I", data, at)
+        body = data[at + 8 : at + 8 + size]
+        if len(body) != size or kind not in (_COMPRESSED, _MATRIX):
+            raise InputError(
+                f"{path}: the variable at byte {at} is damaged or cut off; fetch the file again"
+            )
+        if kind == _COMPRESSED:
+            body = zlib.decompress(body)
+            kind, size = struct.unpack_from(order + "2I", body)
+            body = body[8:]
+        if kind != _MATRIX or len(body) != size:
+            raise InputError(f"{path}: the variable at byte {at} is damaged; fetch it again")
+        if _is_numeric(memoryview(body), order, f"{path}: the variable at byte {at}"):
+            out.write(struct.pack(order + "2I", kind, size))
+            out.write(body)
+        at += 8 + int(struct.unpack_from(order + "2I", data, at)[1])
+    out.seek(0)
+    return out
+
+
+def _is_numeric(body: memoryview, order: str, source: str) -> bool:
+    """Whether a variable is an array of numbers; `InputError` where its elements do not fill it.
+
+    They are the flags, whose lowest byte is the class and whose bit 11 says complex, the sizes, the
+    name, the real and for complex the imaginary numbers.
+    """
+    damaged = InputError(f"{source} is damaged; fetch the file again")
+    kinds = []
+    at = 0
+    numeric = is_complex = False
+    while at < len(body):
+        if len(body) - at < 8:
+            raise damaged
+        kind, size = struct.unpack_from(order + "2I", body, at)
+        start, stop = at + 8, at + 8 + size + -size % 8
+        if kind >> 16:  # up to 4 bytes, beside the type
+            kind, size, start, stop = kind & 0xFFFF, kind >> 16, at + 4, at + 8
+        if start + size > len(body) or (stop == at + 8 and start == at + 4 and size > 4):
+            raise damaged
+        if not kinds:
+            if kind != _FLAGS or size != 8:
+                raise damaged
+            (flags,) = struct.unpack_from(order + "I", body, start)
+            numeric, is_complex = flags & 0xFF in _CLASSES, bool(flags & 0x800)
+            if not numeric:
+                return False
+        kinds.append(kind)
+        at = stop
+    if (
+        kinds[1:3] != [_SIZES, _NAME]
+        or len(kinds) != 4 + is_complex
+        or not set(kinds[3:]) <= _NUMBERS
+    ):
+        raise damaged
+    return True
 
 
 def read_v73(path: Path, size: tuple[int, int] | None) -> Recording:
     """Read a v7.3 file; `size` is (width, height). Raises `InputError` for bad input."""
     import h5py
 
+    from jaxevent.io import hdf5
+
     variables = {}
-    with reading(str(path)), h5py.File(path) as file:
+    with reading(str(path)), hdf5.open_file(path) as file:
         for name, dataset in file.items():
             if isinstance(dataset, h5py.Dataset) and dataset.dtype.kind in "biuf":
                 with reading(f"{path}: {name}"):
                     # MATLAB stores the shape of an empty array as its data, and all axes reversed.
-                    empty = "MATLAB_empty" in dataset.attrs and dataset.attrs["MATLAB_empty"]
-                    stored = dataset[()]
+                    empty = hdf5.attribute(dataset, "MATLAB_empty")
+                    stored = hdf5.array(file, name, str(path))
                     variables[name] = np.zeros(stored.astype(int)) if empty else stored.T
     return _recording(path, size, variables)
 

@@ -9,7 +9,8 @@
     calib                 fx fy cx cy k1 k2 p1 p2 k3
 
 Times are integers in microseconds or floats in seconds. Only the events are required, and width
-and height where there are no frames. Every other array is kept in `Recording.extra`.
+and height where there are no frames. The events may have the other names of `columns`, or stand
+together in one structured array of any name. Every other array is kept in `Recording.extra`.
 """
 
 from pathlib import Path
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.io import checked_events, pinhole, reading, sensor_size, times, vectors
+from jaxevent.io.columns import find, of_records
 from jaxevent.recording import Frames, Imu, Recording
 
 
@@ -30,6 +32,14 @@ def read(path: Path, size: tuple[int, int] | None) -> Recording:
         for name in names:
             with reading(f"{path}: {name}"):
                 arrays[name] = archive[name]
+
+    records = [name for name, array in arrays.items() if array.dtype.names is not None]
+    if find(list(arrays)) is None and len(records) == 1:
+        arrays |= of_records(arrays.pop(records[0]), f"{path}: {records[0]}")
+    # An archive of the layout may hold more times: t is t wherever there is one.
+    fields = {} if {"t", "x", "y", "p"} <= set(arrays) else find(list(arrays)) or {}
+    for field, name in fields.items():
+        arrays[field] = arrays.pop(name)
 
     def take(*names: str) -> list[NDArray]:
         missing = [name for name in names if name not in arrays]

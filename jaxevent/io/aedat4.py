@@ -1,0 +1,276 @@
+"""AEDAT 4 recordings (iniVation DV): events, frames with their exposures, IMU samples.
+
+The file is a row of packets, each of one stream: events (t in us, x, y from the top left, p),
+frames, inertial samples or triggers. Kept are one stream of events and what stands beside it: the
+only stream of frames and of samples, or the one with the same number among its kind. Streams that
+are not kept are named in `extra["streams_left_out"]`; a file with several cameras needs the number
+of the stream of events. Times stay those of the file. A frame's time is the middle of its
+exposure; where the file has no exposure, its own timestamp. Colour frames become grey (ITU-R 601
+luma) and are kept in `extra["rgb"]`. Samples turn from g into m/s^2 (9.80665) and from degrees
+into radians per second.
+
+Decoder. The package aedat (MIT, 1 MB) is taken: 48 million events/s, frames and both ends of their
+exposures. dv-processing (24 MB) decodes the same file (davis346.aedat4) to the same 78,830 events,
+59 frames with exposures and 2,363 samples; it gives a frame the start of its exposure as time and
+takes g as 9.81. aedat reports most damage, but some as a Rust panic, which is no Exception, and a
+header whose text is damaged ends the whole process; so header and packets are checked here first.
+"""
+
+import contextlib
+import struct
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError, require
+from jaxevent.io import reading
+from jaxevent.io.decoded import BLOCK, Columns, DecodedImages, decoded
+from jaxevent.recording import Frames, Imu, Recording
+
+MAGIC = b"#!AER-DAT4.0"
+_STANDARD_GRAVITY = 9.80665  # m/s^2
+
+
+def read(
+    path: Path,
+    size: tuple[int, int] | None,
+    in_memory: bool = True,
+    progress: bool = False,
+    stream: str | None = None,
+) -> Recording:
+    """Read a file; `size` is (width, height). Raises `InputError` for bad input.
+
+    `stream` is the number of a stream of events, needed where there are several.
+    """
+    source = str(path)
+    with reading(source):
+        _walk(path)
+    with _decoding(path):
+        aedat: Any = require("aedat", "aedat")
+        streams: dict[int, dict] = dict(sorted(aedat.Decoder(path).id_to_stream().items()))
+    of_kind = {
+        kind: [number for number, stream in streams.items() if stream["type"] == kind]
+        for kind in ("events", "frame", "imus")
+    }
+    number, chosen = _choose(path, of_kind["events"], stream, streams)
+    for kind in ("frame", "imus"):
+        several = of_kind[kind]
+        if len(several) == 1:
+            chosen[kind] = several[0]
+        elif number is not None and len(several) == len(of_kind["events"]):
+            chosen[kind] = several[of_kind["events"].index(number)]
+    frames, rgb, imu = _others(path, chosen, in_memory)
+    extra: dict[str, NDArray] = {} if rgb is None else {"rgb": rgb}
+    left_out = [
+        f"{number} {stream['type']}"
+        for number, stream in streams.items()
+        if number not in chosen.values()
+    ]
+    if left_out:
+        extra["streams_left_out"] = np.array(left_out)
+    told = streams[number if number is not None else chosen["frame"]]
+    size = size or (int(told["width"]), int(told["height"]))
+
+    def decode(state: int | None) -> Iterator[tuple[int, Columns]]:
+        held: list[NDArray] = []
+        first = 0
+        with _decoding(path):
+            for packet, content in enumerate(aedat.Decoder(path)):
+                if packet < (state or 0) or content["stream_id"] != number:
+                    continue
+                first = first if held else packet
+                held.append(content["events"])
+                if sum(map(len, held)) >= BLOCK:
+                    yield first, _columns(held)
+                    held = []
+        if held:
+            yield first, _columns(held)
+
+    events = decoded(decode, size, source, in_memory, progress)
+    return Recording(path.stem, *size, events, frames, imu=imu, extra=extra)
+
+
+def _choose(
+    path: Path, several: list[int], stream: str | None, streams: dict[int, dict]
+) -> tuple[int | None, dict[str, int]]:
+    """The number of the stream of events, None where there is none, and it by its kind."""
+    if stream is not None and stream not in map(str, several):
+        raise InputError(
+            f"{path}: has no stream of events {stream!r}; its streams of events are "
+            f"{', '.join(map(str, several)) or 'none'}"
+        )
+    if stream is None and len(several) > 1:
+        named = ", ".join(f"{n} ({streams[n]['width']}x{streams[n]['height']})" for n in several)
+        raise InputError(
+            f"{path}: holds {len(several)} streams of events, {named}; choose one with stream=, or "
+            "with jaxevent convert --stream"
+        )
+    if not several:
+        if not any(other["type"] == "frame" for other in streams.values()):
+            raise InputError(f"{path}: holds no stream of events and none of frames")
+        return None, {}
+    number = several[0] if stream is None else int(stream)
+    return number, {"events": number}
+
+
+def _columns(packets: list[NDArray]) -> Columns:
+    events = np.concatenate(packets)
+    t = events["t"]
+    # The decoder passes signed 64-bit times on as unsigned.
+    return (
+        t.view(np.int64) if t.dtype == np.uint64 and t.flags.c_contiguous else t.astype(np.int64),
+        events["x"].copy(),
+        events["y"].copy(),
+        events["p"].copy(),
+    )
+
+
+def _others(
+    path: Path, chosen: dict[str, int], in_memory: bool
+) -> tuple[Frames | None, NDArray | None, Imu | None]:
+    """Frames, their colours and inertial samples, in one pass; left-out images are not kept."""
+    if "frame" not in chosen and "imus" not in chosen:
+        return None, None, None
+    aedat: Any = require("aedat", "aedat")
+    times, exposures, images, colours, samples = [], [], [], [], []
+    shape = None
+    with _decoding(path), warnings.catch_warnings():
+        # Frames of an unknown kind would be passed over with a warning.
+        warnings.simplefilter("error")
+        for packet in aedat.Decoder(path):
+            if packet["stream_id"] == chosen.get("frame", -1):
+                frame = packet["frame"]
+                start, end = frame["exposure_begin_t"], frame["exposure_end_t"]
+                known = 0 < start < end
+                times.append(start + (end - start) // 2 if known else frame["t"])
+                exposures.append(end - start if known else 0)
+                image = _grey(frame["pixels"])
+                shape = shape or (image.shape, image.dtype)
+                if shape != (image.shape, image.dtype):
+                    raise InputError(
+                        f"{path}: frame {len(times) - 1} is {image.dtype} of shape {image.shape} "
+                        f"but the first one is {shape[1]} of shape {shape[0]}; all frames must "
+                        "have the sensor's size and one depth"
+                    )
+                if in_memory:
+                    images.append(image)
+                if frame["pixels"].ndim == 3:
+                    colours.append(frame["pixels"][..., :3])
+            elif packet["stream_id"] == chosen.get("imus", -1):
+                samples.append(packet["imus"])
+    frames = imu = None
+    if shape is not None:
+        exposure = np.array(exposures, np.int64)
+        if in_memory:
+            stored: Any = np.stack(images)
+        else:
+            stored = DecodedImages(
+                lambda row: _images(path, chosen["frame"], row),
+                (len(times), *shape[0]),
+                shape[1],
+                str(path),
+            )
+        frames = Frames(np.array(times, np.int64), stored, exposure)
+    if samples:
+        rows = np.concatenate(samples)
+        gyro, acc = (
+            np.stack([rows[f"{name}_{axis}"] for axis in "xyz"], axis=1).astype(np.float64)
+            for name in ("gyroscope", "accelerometer")
+        )
+        if not (np.isfinite(gyro).all() and np.isfinite(acc).all()):
+            raise InputError(f"{path}: an IMU sample is not finite; the file is damaged")
+        t = rows["t"].astype(np.int64)
+        imu = Imu(t, np.deg2rad(gyro), acc * _STANDARD_GRAVITY)
+    rgb = np.stack(colours) if colours and len(colours) == len(times) else None
+    return frames, rgb, imu
+
+
+def _images(path: Path, number: int, row: int) -> Iterator[NDArray]:
+    aedat: Any = require("aedat", "aedat")
+    with _decoding(path):
+        for packet in aedat.Decoder(path):
+            if packet["stream_id"] == number:
+                if row <= 0:
+                    yield _grey(packet["frame"]["pixels"])
+                row -= 1
+
+
+def _grey(pixels: NDArray) -> NDArray:
+    if pixels.ndim == 2:
+        return pixels
+    return np.rint(pixels[..., :3] @ np.array([0.299, 0.587, 0.114])).astype(pixels.dtype)
+
+
+@contextlib.contextmanager
+def _decoding(path: Path) -> Iterator[None]:
+    """Like `reading`, and for a panic of the decoder, which is no Exception, too."""
+    try:
+        with reading(str(path)):
+            yield
+    except BaseException as error:
+        if type(error).__name__ != "PanicException":
+            raise
+        raise InputError(
+            f"{path}: a packet is damaged ({' '.join(str(error).split())[:120]}); fetch the file "
+            "again"
+        ) from None
+
+
+def _walk(path: Path) -> None:
+    """Check the header, and that the packets fill the file, to the table of packets or the end.
+
+    The header is a FlatBuffers table: its second field is the place of that table (-1: none), its
+    third an XML text that names the streams.
+    """
+    length = path.stat().st_size
+    damaged = InputError(f"{path}: its header is damaged; fetch the file again")
+    with path.open("rb") as file:
+        head = file.read(18)
+        (size,) = struct.unpack_from("<I", head, 14)
+        if not 8 <= size <= length - 18:
+            raise InputError(f"{path}: its header is cut off; fetch the file again")
+        header = file.read(size)
+        try:
+            (root,) = struct.unpack_from("<I", header)
+            (back,) = struct.unpack_from("<i", header, root)
+            if root < back:
+                raise damaged
+            fields, _, _, for_table, for_text = struct.unpack_from("<5H", header, root - back)
+            if header[4:8] != b"IOHE" or fields < 10 or not for_text:
+                raise damaged
+            stop = struct.unpack_from("<q", header, root + for_table)[0] if for_table else -1
+            start = root + for_text
+            start += struct.unpack_from("<I", header, start)[0]
+            (count,) = struct.unpack_from("<I", header, start)
+            text = header[start + 4 : start + 4 + count]
+            streams = {
+                int(node.get("name", ""))
+                for node in ElementTree.fromstring(text.decode()).iterfind("node/node")
+            }
+        except (struct.error, ValueError, ElementTree.ParseError) as error:
+            raise damaged from error
+        if len(text) != count:
+            raise damaged
+        at = 18 + size
+        if stop < 0:
+            stop = length
+        elif not at <= stop <= length:
+            raise InputError(
+                f"{path}: its header puts the table of packets at byte {stop} of {length}; the "
+                "file was cut off, so fetch it again"
+            )
+        while at < stop:
+            file.seek(at)
+            packet = file.read(8)
+            number, size = struct.unpack("<ii", packet) if len(packet) == 8 else (-1, -1)
+            if number not in streams or size < 0 or at + 8 + size > stop:
+                raise InputError(
+                    f"{path}: the packet at byte {at} does not fit into the file; the recording "
+                    "was cut off or is damaged, so fetch it again"
+                )
+            at += 8 + size

@@ -1,0 +1,263 @@
+"""The names under which files hold the fields of events, and tables of named columns.
+
+    t   t, ts, time, timestamp, timestamps       us where integers, seconds where floats
+    x   x, xs                                    column from 0
+    y   y, ys                                    row from 0, downwards
+    p   p, ps, pol, pols, polarity, polarities, on   bool, 0/1 or -1/1
+
+These are the names of tonic (x y t p), expelliarmus and OpenEB (t x y p), dv-processing (timestamp
+x y polarity), faery and aedat (t x y on) and event_utils (ts xs ys ps). The order of the columns
+does not count, as it differs from one program to the next; a table without names is refused.
+
+Here are read NumPy structured arrays (.npy) and text: a first line with the names, separated by
+commas, semicolons, tabs or blanks, then one line per event. Lines before it that begin with # or %
+are passed over; a line of two whole numbers before the events is the sensor's width and height, as
+rpg_e2vid writes it. Text of four columns separated by blanks may lack the line of names: then it is
+the Event-Camera Dataset's t x y p, with t in seconds. In text, a column of times without any
+decimal point holds integers.
+"""
+
+import functools
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError
+from jaxevent.io import reading, times
+from jaxevent.io.decoded import BLOCK, Columns, decoded
+from jaxevent.recording import Recording
+
+NAMES = {
+    "t": ("t", "ts", "time", "timestamp", "timestamps"),
+    "x": ("x", "xs"),
+    "y": ("y", "ys"),
+    "p": ("p", "ps", "pol", "pols", "polarity", "polarities", "on"),
+}
+NUMPY_MAGIC = b"\x93NUMPY"
+_BYTES = 1 << 24  # of text parsed together: about a million events
+_LONGEST_LINE = 1 << 12
+
+
+def find(names: Sequence[str]) -> dict[str, str] | None:
+    """Which of some names are t, x, y and p; None unless each is there, once."""
+    found = {}
+    for field, aliases in NAMES.items():
+        fitting = [name for name in names if name.strip().lower() in aliases]
+        if len(fitting) != 1:
+            return None
+        found[field] = fitting[0]
+    return found
+
+
+def of_records(records: NDArray, source: str) -> dict[str, NDArray]:
+    """The fields t, x, y and p of a structured array of events, or `InputError`."""
+    fields = find(records.dtype.names or ())
+    if records.ndim != 1 or fields is None:
+        held = ", ".join(records.dtype.names or ()) or str(records.dtype)
+        raise InputError(
+            f"{source}: holds an array of {held[:80]} of shape {records.shape}; store a list of "
+            "records with the fields t, x, y and p"
+        )
+    return {key: records[name] for key, name in fields.items()}
+
+
+def read_npy(
+    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool = False
+) -> Recording:
+    """Read a structured array; `size` is (width, height). Raises `InputError` for bad input."""
+    source = str(path)
+    with reading(source):
+        records = np.load(path, mmap_mode="r", allow_pickle=False)
+    of_records(records[:0], source) if records.ndim else of_records(records, source)
+    if size is None:
+        raise InputError(
+            f"{path}: an array does not tell the sensor's size; give size=(width, height) or --size"
+        )
+
+    def decode(state: int | None) -> Iterator[tuple[int, Columns]]:
+        for row in range(state or 0, len(records), BLOCK):
+            fields = of_records(np.array(records[row : row + BLOCK]), source)
+            t = times(fields["t"], source, "event", first_row=row)
+            x, y, p = (np.ascontiguousarray(fields[key]) for key in "xyp")
+            yield row, (t, x, y, p)
+
+    return Recording(path.stem, *size, decoded(decode, size, source, in_memory, progress))
+
+
+def is_text(head: bytes) -> bool:
+    """Whether a file that begins so can be a table of text."""
+    return bool(re.match(rb"[ -~\t\r\n]*[ -~\t\r\n\x80-\xff]{0,3}\Z", head)) and bool(
+        re.search(rb"\d", head) or find(_split(head.splitlines()[0].decode("latin-1")))
+    )
+
+
+def read_text(
+    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool = False
+) -> Recording:
+    """Read a table of text; `size` is (width, height). Raises `InputError` for bad input."""
+    source = str(path)
+    with reading(source), path.open("rb") as file:
+        table = _table(file, source)
+    size = size or table.size
+    if size is None:
+        raise InputError(
+            f"{path}: the table does not tell the sensor's size; give size=(width, height) or "
+            "--size"
+        )
+    decode = functools.partial(_rows, path, table)
+    return Recording(path.stem, *size, decoded(decode, size, source, in_memory, progress))
+
+
+class _Table:
+    def __init__(
+        self,
+        start: int,
+        names: list[str],
+        fields: Mapping[str, str],
+        separator: str,
+        in_seconds: bool,
+        size: tuple[int, int] | None,
+    ):
+        self.start, self.names, self.fields = start, names, fields
+        self.separator, self.in_seconds, self.size = separator, in_seconds, size
+
+
+def _split(line: str) -> list[str]:
+    """The fields of a line, by the separator that it has."""
+    line = line.strip()
+    separator = next((mark for mark in ",;\t" if mark in line), None)
+    return [field.strip().strip('"') for field in line.split(separator)]
+
+
+def _table(file: Any, source: str) -> _Table:
+    """What the lines before the first event tell, and how the first event is written."""
+    size = None
+    names: list[str] | None = None
+    while True:
+        start = file.tell()
+        raw = file.readline(_LONGEST_LINE)
+        if len(raw) == _LONGEST_LINE:
+            raise InputError(f"{source}: has a line of over {_LONGEST_LINE} bytes; {_WANTED}")
+        if not raw:
+            raise InputError(f"{source}: holds no event; {_WANTED}")
+        line = raw.decode("utf-8-sig" if start == 0 else "utf-8", "replace").strip()
+        geometry = re.match(r"[#%]\s*geometry\s*[:=]?\s*(\d{1,5})\s*[,x ]\s*(\d{1,5})\s*$", line)
+        if geometry:
+            size = (int(geometry.group(1)), int(geometry.group(2)))
+        if not line or line[0] in "#%":
+            # A line of names may be a comment too: "# t x y p".
+            bare = _split(line.lstrip("#% "))
+            names = bare if line and find(bare) else names
+            continue
+        fields = _split(line)
+        if names is None and find(fields):
+            names = fields
+            continue
+        if len(fields) == 2 and all(re.fullmatch(r"[1-9]\d{0,4}", field) for field in fields):
+            size = (int(fields[0]), int(fields[1]))
+            continue
+        break
+    mark = next((mark for mark in ",;\t" if mark in line), r"\s+")
+    if names is None:
+        if mark in ",;" or len(fields) != 4 or not all(_is_number(field) for field in fields):
+            raise InputError(f"{source}: the line {line[:60]!r} comes before any names; {_WANTED}")
+        return _Table(start, ["t", "x", "y", "p"], {n: n for n in "txyp"}, mark, True, size)
+    if len(fields) != len(names) or len(set(names)) != len(names):
+        raise InputError(
+            f"{source}: the line {line[:60]!r} does not have the columns {', '.join(names)[:80]}; "
+            "each line must have one value for each name"
+        )
+    found = find(names) or {}
+    stamp = fields[names.index(found["t"])]
+    return _Table(start, names, found, mark, not re.fullmatch(r"[+-]?\d+", stamp), size)
+
+
+_WANTED = (
+    "a table of events begins with a line of names such as t,x,y,p, and each line after it is one "
+    "event"
+)
+
+
+def _is_number(field: str) -> bool:
+    try:
+        return math.isfinite(float(field))
+    except ValueError:
+        return False
+
+
+def _rows(
+    path: Path, table: _Table, state: tuple[int, int] | None
+) -> Iterator[tuple[tuple[int, int], Columns]]:
+    """Events of the lines from a place on: its offset in bytes and the number of events before."""
+    offset, row = state or (table.start, 0)
+    with path.open("rb") as file:
+        file.seek(offset)
+        rest = b""
+        while piece := file.read(_BYTES - len(rest)):
+            text = rest + piece
+            cut = text.rfind(b"\n") + 1
+            if len(text) < _BYTES:
+                cut = len(text)  # the last line may lack its end
+            elif not cut:
+                raise InputError(f"{path}: has a line of over {_BYTES} bytes; {_WANTED}")
+            columns = _parsed(path, table, text[:cut], row)
+            yield (offset, row), columns
+            row += len(columns[0])
+            offset += cut
+            rest = text[cut:]
+
+
+def _parsed(path: Path, table: _Table, text: bytes, row: int) -> Columns:
+    # The import takes a third of a second.
+    import pandas as pd
+
+    if not text.strip():
+        none = np.empty(0)
+        return none.astype(np.int64), none, none, none
+    with reading(str(path)):
+        try:
+            frame = pd.read_csv(
+                BytesIO(text),
+                sep=table.separator,
+                header=None,
+                names=table.names,
+                engine="c",
+                low_memory=False,
+                quoting=3,
+                comment="#",
+            )
+        except pd.errors.EmptyDataError:
+            frame = pd.DataFrame({name: np.empty(0) for name in table.names})
+    if not isinstance(frame.index, pd.RangeIndex):  # pandas makes surplus columns the index
+        raise InputError(f"{path}: has too many columns; {_WANTED}")
+    columns = {}
+    for key, name in table.fields.items():
+        values = frame[name].to_numpy()
+        if values.dtype.kind not in "iub":
+            numbers = np.asarray(pd.to_numeric(frame[name], errors="coerce"), np.float64)
+            if not np.isfinite(numbers).all():
+                bad = int(np.argmin(np.isfinite(numbers)))
+                held = str(values[bad])
+                if key != "p" or held.strip().lower() not in ("true", "false"):
+                    raise InputError(
+                        f"{path}: event {row + bad} has {name} = {held[:40]}; {_WANTED}"
+                    )
+                words = [str(value).strip().lower() for value in values]
+                numbers = np.array([{"true": 1, "false": 0}.get(word, 9) for word in words])
+            values = numbers
+        columns[key] = values
+    t = columns["t"]
+    if table.in_seconds and t.dtype.kind != "f":
+        t = t.astype(np.float64)
+    elif not table.in_seconds and t.dtype.kind == "f":
+        raise InputError(
+            f"{path}: the times of the events from number {row} on have decimals, those before "
+            "have none; write all as whole microseconds or all as seconds with decimals"
+        )
+    return (times(t, str(path), "event", first_row=row), columns["x"], columns["y"], columns["p"])

@@ -1,0 +1,238 @@
+"""Events and images of a decoder that gives them block by block, in memory or left in the file.
+
+A decoder is a generator function. Called with None it gives the blocks of a file in order, each
+after the state that it was in before the block; called with one of these states it gives that
+block and those after it. What a state is, is the decoder's own affair: an offset into the file and
+the time base there, or, where packets can only be read in turn, the number of a packet. The first
+pass over a file checks every event; a file that is left on disk is later decoded again where
+events are asked for, at the memory of a few blocks.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from jaxevent.errors import InputError
+from jaxevent.io import checked_events, reading
+from jaxevent.recording import Events, EventSource
+
+BLOCK = 1 << 20  # events decoded together: 13 MB
+
+Columns = tuple[NDArray, NDArray, NDArray, NDArray]
+Decoder = Callable[[Any], Iterator[tuple[Any, Columns]]]
+
+
+class _Block(NamedTuple):
+    state: Any
+    row: int
+    first: int
+    last: int
+
+
+def decoded(
+    decode: Decoder,
+    size: tuple[int, int],
+    source: str,
+    in_memory: bool = True,
+    progress: bool = False,
+    origin: int = 0,
+) -> EventSource:
+    """All events of a decoder, checked: `Events` in memory, else `DecodedEvents`.
+
+    The blocks hold t (int64 us), x, y and p as `checked_events` takes them. `size` is (width,
+    height). Raises `InputError` for the first bad event and whatever the decoder finds wrong.
+    """
+    blocks: list[_Block] = []
+    kept: list[Events] = []
+    row = 0
+    with (
+        reading(source),
+        tqdm(unit=" events", unit_scale=True, delay=2, disable=not progress, leave=False) as bar,
+    ):
+        for state, (t, x, y, p) in decode(None):
+            if not len(t):
+                continue
+            events = checked_events(t, x, y, p, size, source, first_row=row, origin=origin)
+            first, last = int(events.t[0]), int(events.t[-1])
+            if blocks and first < blocks[-1].last:
+                raise InputError(
+                    f"{source}: event {row} is at {first} us, earlier than the one before it at "
+                    f"{blocks[-1].last} us; sort the events by time (stable)"
+                )
+            blocks.append(_Block(state, row, first, last))
+            if in_memory or len(kept) < 2:
+                kept.append(events)
+            else:
+                kept[1] = events
+            row += len(events)
+            bar.update(len(events))
+    if not blocks:
+        return Events.empty()
+    if in_memory or len(blocks) <= 2:
+        return _joined(kept)
+    return DecodedEvents(decode, blocks, row, (kept[0], kept[1]), size, source, origin)
+
+
+def _joined(pieces: list[Events]) -> Events:
+    if len(pieces) == 1:
+        return pieces[0]
+    columns = []
+    for name in ("t", "x", "y", "p"):
+        columns.append(np.concatenate([getattr(piece, name) for piece in pieces]))
+    return Events(*columns)
+
+
+class DecodedEvents:
+    """Events left in a file that a decoder reads, an `EventSource`; see the module."""
+
+    def __init__(
+        self,
+        decode: Decoder,
+        blocks: list[_Block],
+        count: int,
+        ends: tuple[Events, Events],
+        size: tuple[int, int],
+        source: str,
+        origin: int,
+    ):
+        self._decode = decode
+        self._states = [block.state for block in blocks]
+        self._rows = np.array([block.row for block in blocks] + [count])
+        self._first = np.array([block.first for block in blocks])
+        self._last = np.array([block.last for block in blocks])
+        # A recording's start and stop are asked for often; neither may cost a pass over the file.
+        self._ends = {0: ends[0], len(blocks) - 1: ends[1]}
+        self._recent: dict[int, Events] = {}
+        self._stream: Iterator[tuple[Any, Columns]] = iter(())
+        self._next = -1
+        self._size, self._source, self._origin = size, source, origin
+
+    def __len__(self) -> int:
+        return int(self._rows[-1])
+
+    def __getitem__(self, rows: slice) -> Events:
+        """Decode the events of a range of rows; the file must not have changed since."""
+        start, stop, step = rows.indices(len(self))
+        if step != 1:
+            raise ValueError("decoded events are read as a range of rows, events[i:j], step 1")
+        if stop <= start:
+            return Events.empty()
+        block = int(np.searchsorted(self._rows, start, side="right")) - 1
+        pieces = []
+        while block < len(self._states) and self._rows[block] < stop:
+            row = int(self._rows[block])
+            pieces.append(self._block(block)[max(start - row, 0) : stop - row])
+            block += 1
+        return _joined(pieces)
+
+    def index(self, time: int) -> int:
+        """The number of events earlier than `time` (us): at most one block is decoded."""
+        block = int(np.searchsorted(self._first, time)) - 1
+        if block < 0:
+            return 0
+        if self._last[block] < time:
+            return int(self._rows[block + 1])
+        return int(self._rows[block]) + self._block(block).index(time)
+
+    def _block(self, number: int) -> Events:
+        for held in (self._ends, self._recent):
+            if number in held:
+                return held[number]
+        with reading(self._source):
+            if number != self._next:
+                self._stream = self._decode(self._states[number])
+            columns = next((block for _, block in self._stream if len(block[0])), None)
+        count = int(self._rows[number + 1] - self._rows[number])
+        if columns is None or len(columns[0]) != count:
+            raise InputError(
+                f"{self._source}: no longer holds the events it held when it was opened; load it "
+                "again"
+            )
+        events = checked_events(
+            *columns,
+            self._size,
+            self._source,
+            first_row=int(self._rows[number]),
+            origin=self._origin,
+        )
+        self._next = number + 1
+        # Windows read in turn straddle two blocks and look back by one.
+        self._recent = {n: b for n, b in self._recent.items() if n >= number - 1} | {number: events}
+        if len(self._recent) > 3:
+            self._recent = {number: events}
+        return events
+
+
+class DecodedImages:
+    """Images (frames, height, width) that a decoder gives in turn, left in the file.
+
+    `images(i)` iterates over the images from number i on.
+    """
+
+    def __init__(
+        self,
+        images: Callable[[int], Iterable[NDArray]],
+        shape: tuple[int, int, int],
+        dtype: np.dtype,
+        source: str,
+    ):
+        self._reader = _ImageReader(images, shape[1:], dtype, source)
+        self._rows: Any = range(shape[0])
+
+    @property
+    def dtype(self) -> np.dtype:
+        return self._reader.dtype
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (len(self._rows), *self._reader.shape)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, rows: slice | NDArray) -> "DecodedImages":
+        part = object.__new__(DecodedImages)
+        part._reader = self._reader
+        if isinstance(rows, slice):
+            part._rows = self._rows[rows]
+        else:
+            part._rows = [self._rows[i] for i in np.arange(len(self))[rows].tolist()]
+        return part
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
+        images = np.empty(self.shape, self.dtype)
+        for i, row in enumerate(self._rows):
+            images[i] = self._reader.read(row)
+        return np.asarray(images, dtype)
+
+
+class _ImageReader:
+    """The images of a file, read on from where it was left or else from anew."""
+
+    def __init__(
+        self,
+        images: Callable[[int], Iterable[NDArray]],
+        shape: tuple[int, ...],
+        dtype: np.dtype,
+        source: str,
+    ):
+        self.shape, self.dtype = shape, dtype
+        self._images, self._source = images, source
+        self._stream: Iterator[NDArray] = iter(())
+        self._next = -1
+
+    def read(self, row: int) -> NDArray:
+        with reading(self._source):
+            if row != self._next:
+                self._stream = iter(self._images(row))
+            image = next(self._stream, None)
+        if image is None or image.shape != self.shape or image.dtype != self.dtype:
+            raise InputError(
+                f"{self._source}: no longer holds the image it held when it was opened; load it "
+                "again"
+            )
+        self._next = row + 1
+        return image

@@ -1,0 +1,252 @@
+"""Recordings as HDF5 in other layouts than jaxevent's own, told by the names inside.
+
+    event_utils (ECD as HDF5)   /events/{ts, xs, ys, ps}: ts in s; /images/image000000000 and on,
+                                each with its time, attribute timestamp; sensor_resolution (H, W)
+    MVSEC                       /davis/{left, right}/events (N, 4): x, y, t in s, p -1/1;
+                                image_raw (frames, H, W), image_raw_ts in s, imu (N, 6): 3 of
+                                acceleration, 3 of angular velocity, imu_ts in s
+    M3ED                        /prophesee/{left, right}/{t, x, y, p}: t in us; ms_map_idx;
+                                calib/{intrinsics (fx fy cx cy), distortion_coeffs, resolution}
+    Metavision                  /CD/events, records with fields t, x, y, p; attribute geometry
+    others                      /events or the file itself with t, x, y and p, whole lists or
+                                records, under the names that `columns.NAMES` lists
+
+Integers are us, floats seconds. Exposures are unknown: 0. Where a file holds two cameras, left or
+right must be chosen. M3ED's frames come from cameras beside the event camera, with pixels of their
+own, and MVSEC's and M3ED's ground truth from further files: they are not read. Files compressed by
+Metavision's ECF are refused with a remedy, as no permissive package decodes it.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.camera import PinholeCamera
+from jaxevent.errors import InputError
+from jaxevent.io import pinhole, reading, sensor_size, times, vectors
+from jaxevent.io.columns import find
+from jaxevent.io.decoded import DecodedImages
+from jaxevent.io.hdf5 import (
+    Column,
+    Microseconds,
+    StoredEvents,
+    StoredImages,
+    array,
+    attribute,
+    dataset,
+    in_memory,
+    open_file,
+)
+from jaxevent.recording import Frames, Imu, Recording
+
+_GROUPS = ("events", "", "CD/events")
+_SIDES = {"prophesee": "M3ED", "davis": "MVSEC"}
+
+
+def knows(file: Any) -> bool:
+    """Whether a file holds events in one of these layouts."""
+    if any(isinstance(file.get(name), h5py.Group) for name in _SIDES):
+        return True
+    return any(_fields(file, name) is not None for name in _GROUPS)
+
+
+def read(path: Path, size: tuple[int, int] | None, stream: str | None = None) -> Recording:
+    """Read a file into memory; `size` is (width, height). Raises `InputError` for bad input.
+
+    `stream` is "left" or "right" of a file with two cameras.
+    """
+    with reading(str(path)), open_file(path) as file:
+        return in_memory(_recording(file, path, size, stream))
+
+
+def open_stored(path: Path, size: tuple[int, int] | None, stream: str | None = None) -> Recording:
+    """Read all but events and images, which stay in the file."""
+    with reading(str(path)):
+        return _recording(open_file(path), path, size, stream)
+
+
+def _recording(
+    file: Any, path: Path, size: tuple[int, int] | None, stream: str | None
+) -> Recording:
+    source = str(path)
+    for name in _SIDES:
+        group = file.get(name)
+        if isinstance(group, h5py.Group):
+            side = _side(path, group, stream)
+            read = _m3ed if name == "prophesee" else _mvsec
+            return read(file, path, size, f"{name}/{side}")
+    if stream is not None:
+        raise InputError(f"{path}: holds one camera only; leave out stream= or --stream")
+    with reading(source):
+        name = next(name for name in _GROUPS if _fields(file, name) is not None)
+    columns = _columns(file, name, source)
+    frames = _images(file, source) if isinstance(file.get("images"), h5py.Group) else None
+    told = _told_size(file, source)
+    otherwise = f"{path}: neither an attribute nor an image tells the sensor's size;"
+    size = sensor_size(size, told, frames=frames, otherwise=otherwise)
+    return Recording(path.stem, *size, StoredEvents(columns, size, source), frames)
+
+
+def _side(path: Path, group: Any, stream: str | None) -> str:
+    sides = [name for name in ("left", "right") if isinstance(group.get(name), h5py.Group)]
+    if stream is None and len(sides) == 1:
+        return sides[0]
+    if stream is None and sides:
+        raise InputError(
+            f"{path}: holds the events of two cameras, left and right; choose one with stream=, or "
+            "with jaxevent convert --stream"
+        )
+    if stream not in sides:
+        raise InputError(
+            f"{path}: has no camera {stream or 'left'!r}; its cameras are "
+            f"{', '.join(sides) or 'none'}"
+        )
+    return str(stream)
+
+
+def _m3ed(file: Any, path: Path, size: tuple[int, int] | None, group: str) -> Recording:
+    source = str(path)
+    columns = _columns(file, group, source)
+    camera = None
+    if f"{group}/calib/intrinsics" in file:
+        with reading(f"{source}: {group}/calib"):
+            if f"{group}/calib/resolution" in file and size is None:
+                width, height = array(file, f"{group}/calib/resolution", source)
+                size = (int(width), int(height))
+            camera = _camera(file, f"{group}/calib", source)
+    if size is None:
+        raise InputError(
+            f"{path}: {group}/calib has no resolution; give size=(width, height) or --size"
+        )
+    table = None
+    if f"{group}/ms_map_idx" in file:
+        table = dataset(file, f"{group}/ms_map_idx", source)
+    return Recording(path.stem, *size, StoredEvents(columns, size, source, 0, table), camera=camera)
+
+
+def _camera(file: Any, group: str, source: str) -> PinholeCamera | None:
+    fx, fy, cx, cy = array(file, f"{group}/intrinsics", source)
+    k = np.zeros(4)
+    if f"{group}/distortion_coeffs" in file:
+        k = array(file, f"{group}/distortion_coeffs", source)
+    if f"{group}/distortion_model" in file:
+        text = array(file, f"{group}/distortion_model", source).item()
+        if "equi" in (text.decode() if isinstance(text, bytes) else str(text)):
+            return None
+    return pinhole(np.array([fx, fy, cx, cy, *k, 0.0]), f"{source}: {group}")
+
+
+class _Part:
+    """A column of (N, 4), or a field of records, as a list of its own."""
+
+    def __init__(self, whole: h5py.Dataset, key: int | str):
+        self._whole, self._key = whole, key
+        self.shape: tuple[int, ...] = whole.shape[:1]
+        self.dtype: np.dtype = whole.dtype if isinstance(key, int) else whole.dtype[key]
+
+    def __getitem__(self, rows: Any) -> Any:
+        if isinstance(self._key, int):
+            return self._whole[rows, self._key]
+        return self._whole.fields(self._key)[rows]
+
+
+def _mvsec(file: Any, path: Path, size: tuple[int, int] | None, group: str) -> Recording:
+    source = str(path)
+    whole = dataset(file, f"{group}/events", source)
+    if whole.ndim != 2 or whole.shape[1] != 4:
+        raise InputError(
+            f"{source}: {group}/events has shape {whole.shape}; store (events, 4): x, y, t, p"
+        )
+    x, y, t, p = (_Part(whole, column) for column in range(4))
+    columns: dict[str, Column] = {"t": Microseconds(t, source), "x": x, "y": y, "p": p}
+    frames = imu = None
+    if f"{group}/image_raw" in file:
+        images = dataset(file, f"{group}/image_raw", source)
+        stamps = _times(file, f"{group}/image_raw_ts", source)
+        if images.ndim != 3:
+            raise InputError(f"{source}: {group}/image_raw has shape {images.shape}; store 3 axes")
+        if len(stamps):
+            frames = Frames(stamps, StoredImages(images, source), np.zeros_like(stamps))
+    if f"{group}/imu" in file:
+        stamps = _times(file, f"{group}/imu_ts", source)
+        name = f"{group}/imu"
+        values = vectors(array(file, name, source), (len(stamps), 6), source, name)
+        imu = Imu(stamps, values[:, 3:], values[:, :3])
+    otherwise = f"{path}: has no {group}/image_raw to tell the sensor's size;"
+    size = sensor_size(size, frames=frames, otherwise=otherwise)
+    return Recording(path.stem, *size, StoredEvents(columns, size, source), frames, imu=imu)
+
+
+def _fields(file: Any, name: str) -> Mapping[str, str] | None:
+    """The names under which a group or records hold t, x, y and p; None where they do not."""
+    found = file.get(name) if name else file
+    if isinstance(found, h5py.Group):
+        return find(list(found))
+    if isinstance(found, h5py.Dataset) and found.dtype.names:
+        return find(found.dtype.names)
+    return None
+
+
+def _columns(file: Any, name: str, source: str) -> dict[str, Column]:
+    found = file.get(name) if name else file
+    fields = _fields(file, name)
+    if fields is None:
+        raise InputError(f"{source}: {name} has no t, x, y and p; add them")
+    if isinstance(found, h5py.Dataset):
+        whole = dataset(file, name, source)
+        columns: dict[str, Column] = {key: _Part(whole, fields[key]) for key in "txyp"}
+    else:
+        columns = {key: dataset(file, f"{name}/{fields[key]}", source) for key in "txyp"}
+    if columns["t"].dtype.kind == "f":
+        columns["t"] = Microseconds(columns["t"], source)
+    return columns
+
+
+def _told_size(file: Any, source: str) -> tuple[int, int] | None:
+    with reading(f"{source}: attributes"):
+        if (size := attribute(file, "sensor_resolution")) is not None:
+            height, width = (int(n) for n in np.ravel(size)[:2])
+            return width, height
+        if (text := attribute(file, "geometry")) is not None:
+            width, _, height = str(text).partition("x")
+            return int(width), int(height)
+        width, height = (attribute(file, name) for name in ("width", "height"))
+        if width is not None and height is not None:
+            return int(width), int(height)
+    return None
+
+
+def _images(file: Any, source: str) -> Frames | None:
+    """The images of event_utils, one dataset each, in the order of their names."""
+    with reading(f"{source}: images"):
+        names = sorted(file["images"])
+        if not names:
+            return None
+        stamps = np.array([float(attribute(file["images"][name], "timestamp")) for name in names])
+    first = dataset(file, f"images/{names[0]}", source)
+    if first.ndim not in (2, 3):
+        raise InputError(f"{source}: images/{names[0]} has shape {first.shape}; store grey images")
+    t = times(stamps, source, "image")
+
+    def image(name: str) -> NDArray:
+        pixels = array(file, f"images/{name}", source)
+        if pixels.ndim == 2:
+            return pixels
+        # As event_utils stores them with OpenCV: blue, green, red.
+        return np.rint(pixels[..., :3] @ np.array([0.114, 0.587, 0.299])).astype(pixels.dtype)
+
+    images = DecodedImages(
+        lambda row: (image(name) for name in names[row:]),
+        (len(names), first.shape[0], first.shape[1]),
+        first.dtype,
+        f"{source}: images",
+    )
+    return Frames(t, images, np.zeros_like(t))
+
+
+def _times(file: Any, name: str, source: str) -> NDArray[np.int64]:
+    return times(array(file, name, source), f"{source}: {name}", "row")
