@@ -10,9 +10,12 @@
     params = { c_on = 0.08, clock_offset = 0.0075 } # or the path of a TOML file; omitted: defaults
                                                     # { file = "PATH", c_on = 0.08 }: both
     label = "akf, by hand"                          # in the table; omitted: the name
+    grid = { c_on = [0.05, 0.1], kappa = [1, 2] }   # each combination, added to params and label
+    normalise = "affine"                            # fit each image's brightness to the truth
 
-Paths are relative to the folder of this file. The protocol "held-out" gives the methods frames 0,
-2, 4, ... and asks for images where frames 1, 3, 5, ... are, at their time stamps plus the method's
+A method of the name "external" scores images of another program: `jaxevent.external`. Paths are
+relative to the folder of this file. The protocol "held-out" gives the methods frames 0, 2, 4, ...
+and asks for images where frames 1, 3, 5, ... are, at their time stamps plus the method's
 `clock_offset`. Images are clipped to [0, 1], the range of the truth, before they are scored.
 
 The protocol "reference" gives the whole recording and compares with HDR images that it keeps in
@@ -26,11 +29,18 @@ The protocol "reference" gives the whole recording and compares with HDR images 
 Pixels that are NaN in hdr have no reference. HDR_mat counts in the frames' grey levels (255 is
 white where they are uint8) and is 0 where it has no reference, as the authors' programs have it. In
 the measures of whole images such pixels count as right; regions and mean errors leave them out.
+
+Each recording with each method is a task (`jaxevent.tasks`). With a folder for the results, what is
+finished stays in its folder tasks, under a key made of the content of the recording, method,
+parameters, protocol and metrics: an evaluation that was stopped, or to which recordings or methods
+were added, computes only what is missing. Remove the folder tasks to compute everything again.
 """
 
 import contextlib
 import dataclasses
 import glob
+import hashlib
+import itertools
 import json
 import math
 import os
@@ -41,10 +51,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from tqdm import tqdm
 
+import jaxevent
 from jaxevent.errors import InputError, require
+from jaxevent.external import External, Normalise, check_normalise, fit_brightness
 from jaxevent.io import load
 from jaxevent.io.output import complete
 from jaxevent.metrics import (
@@ -64,7 +79,12 @@ from jaxevent.reconstruction import METHODS
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import Estimator
 from jaxevent.recording import Frames, Recording, microseconds
-from jaxevent.report import markdown_table
+from jaxevent.report import markdown_table, write_parquet
+from jaxevent.tasks import Outcome, Place, Task, run
+
+# Part of the keys of stored results: raised whenever the same recording, method and parameters give
+# other results than before.
+RESULTS_VERSION = 1
 
 P = TypeVar("P", bound=Parameters)
 
@@ -207,7 +227,7 @@ def values_of(params: Parameters) -> dict[str, Any]:
     return {name: plain(value) for name, value in params.values().items()}
 
 
-def frame_times(frames: Frames, params: FrameParams) -> np.ndarray:
+def frame_times(frames: Frames, params: FrameParams | External) -> np.ndarray:
     """When the frames were taken (us) on the events' clock: time stamps plus `clock_offset`.
 
     The times of a `Reference` on that clock as they are.
@@ -355,13 +375,24 @@ def subset(row: Mapping[str, Any], frames: ArrayLike) -> dict[str, Any]:
     return {**row, **_means(per_frame), "frames": len(rows), "per_frame": per_frame}
 
 
+@dataclasses.dataclass(frozen=True)
+class Sample:
+    """One of the images asked for, at `t` (us, as stamped), and the truth, NaN where unknown."""
+
+    t: int
+    image: NDArray[np.floating]
+    truth: NDArray[np.floating]
+    hdr: bool
+
+
 def score(
     recording: Recording,
-    method: Estimator,
+    method: Estimator | External,
     params: FrameParams | None = None,
     protocol: str = "held-out",
     *,
     metrics: Iterable[str] = (),
+    normalise: Normalise = "none",
     progress: bool = False,
 ) -> dict[str, Any]:
     """Reconstruct the images that `protocol` asks for, and compare: one row of a table of results.
@@ -379,87 +410,380 @@ def score(
     and `z2_median` the mean over images of its median, then 0.45 if errors are Gaussian. "lpips" is
     that of ln(I + 0.003), clipped to the truth's range.
 
+    With `normalise` "affine", which is then in the row, the brightness of each image is fitted to
+    the truth first (`external.fit_brightness`), and no variance is judged. Of `External` images,
+    taken for those of `recording.name`, `missing` is how many were asked for in vain, and `seconds`
+    is None.
+
     Raises `InputError` for a recording that the protocol or the method cannot use, for unknown
     metrics and for those whose extra is missing.
     """
+    check_normalise(normalise)
+    return _score(recording, method, params, protocol, metrics, normalise, progress)[0]
+
+
+def _score(
+    recording: Recording,
+    method: Estimator | External,
+    params: FrameParams | None,
+    protocol: str,
+    metrics: Iterable[str],
+    normalise: str,
+    progress: bool,
+    name: str | None = None,
+) -> tuple[dict[str, Any], Sample | None]:
+    """As `score`, with the middle one of the images; `name` is by which images are found."""
     if protocol not in PROTOCOLS:
         raise InputError(f"there is no protocol {protocol!r}; {nearest(protocol, PROTOCOLS)}")
     names = list(metrics)
     _check_measures(names)
-    values = params or method.Params()
     given, hidden = PROTOCOLS[protocol](recording)
     hdr = hidden if isinstance(hidden, Reference) else None
     clock = time.perf_counter()
     seconds, estimated = 0.0, False  # whether the method estimates a variance
+    values: dict[str, Any]
+    if isinstance(method, External):
+        estimates = _external(given, hidden, method, name or recording.name)
+        values, I0 = method.values(), 0.0
+    else:
+        chosen: FrameParams = params or method.Params()
+        estimates = _estimates(given, hidden, method, chosen, progress)
+        values, I0 = values_of(chosen), float(chosen.I0)
     scores: list[Scores] = []
-    video = method.reconstruct(given, values, progress=progress)
-    for _, images, variances in video.batches(frame_times(hidden, values)):
+    t: list[int] = []
+    sample: Sample | None = None
+    for first, images, variances in estimates:
         seconds += time.perf_counter() - clock
-        first = len(scores)
         if hdr is None:
             truths = hidden[first : first + len(images)].intensity
-            for image, truth in zip(images, truths, strict=True):
-                scores.append(_measures(image, truth, names))
         else:
+            truths = np.stack([hdr.truth(row) for row in range(first, first + len(images))])
             if not scores:
-                estimated = not np.isnan(variances).all()
-            for row, (image, variance) in enumerate(zip(images, variances, strict=True), first):
-                P, I0 = variance if estimated else None, float(values.I0)
-                scores.append(_hdr_measures(image, P, hdr.truth(row), names, hdr.clip, I0))
+                estimated = normalise == "none" and not np.isnan(variances).all()
+        for row, (image, variance, truth) in enumerate(
+            zip(images, variances, truths, strict=True), first
+        ):
+            if normalise == "affine":
+                image = fit_brightness(image, truth)
+            if hdr is None:
+                scores.append(_measures(image, truth, names))
+            else:
+                P = variance if estimated else None
+                scores.append(_hdr_measures(image, P, truth, names, hdr.clip, I0))
+            t.append(int(hidden.t[row]))
+            if row == len(hidden) // 2:
+                sample = Sample(t[-1], image, truth, hdr is not None)
         clock = time.perf_counter()
-    per_frame = {"t": [int(t) for t in hidden.t], **_listed(scores)}
-    return {
+    external = isinstance(method, External)
+    per_frame = {"t": t, **_listed(scores)}
+    row = {
         "recording": recording.name,
         "method": method.name,
         **_means(per_frame),
         **({} if hdr is None else {"clip": list(hdr.clip)}),
         "frames": len(scores),
+        **({"missing": len(hidden) - len(scores)} if external else {}),
         "events": len(recording.events),
-        "seconds": seconds,
-        "params": values_of(values),
+        "seconds": None if external else seconds,
+        **({} if normalise == "none" else {"normalise": normalise}),
+        "params": values,
         "per_frame": per_frame,
     }
+    return row, sample
+
+
+# The number of the first image, and some images with their variances, each (images, height, width).
+Estimates = Iterator[tuple[int, NDArray[np.floating], NDArray[np.floating]]]
+
+
+def _estimates(
+    given: Recording, hidden: Frames, method: Estimator, params: FrameParams, progress: bool
+) -> Estimates:
+    video = method.reconstruct(given, params, progress=progress)
+    first = 0
+    for _, images, variances in video.batches(frame_times(hidden, params)):
+        yield first, images, variances
+        first += len(images)
+
+
+def _external(given: Recording, hidden: Frames, method: External, name: str) -> Estimates:
+    series = method.find(name)
+    times = frame_times(hidden, method)
+    shape = (given.height, given.width)
+    found = False
+    for row, place in method.nearest(series, times):
+        image = series.read(place)
+        if image.shape != shape:
+            raise InputError(
+                f"{method.images}: the image at {series.t[place]} us of {name} has the size "
+                f"{image.shape[1]}x{image.shape[0]}; the sensor has {shape[1]}x{shape[0]} pixels"
+            )
+        found = True
+        yield row, image[None], np.full((1, *shape), np.nan)
+    if not found:
+        after = np.searchsorted(series.t, times)
+        gap = min(
+            int(np.abs(series.t[(after - back).clip(0, len(series.t) - 1)] - times).min())
+            for back in (0, 1)
+        )
+        raise InputError(
+            f"{method.images}: no image of {name} is within {method.tolerance:g} s of those asked "
+            f"for (the nearest is {gap / 1e6:g} s away); correct the times or raise tolerance"
+        )
 
 
 def evaluate(
-    config: str | Path, out: str | Path | None = None, progress: bool = False
+    config: str | Path,
+    out: str | Path | None = None,
+    progress: bool = False,
+    *,
+    workers: int | None = None,
+    cluster: str | None = None,
+    scheduler_file: str | Path | None = None,
+    retries: int = 2,
 ) -> list[dict[str, Any]]:
     """Run an evaluation that a TOML file describes: one row, as of `score`, per recording, method.
 
     The file's layout is in the text of this module. In a row, `recording` is the path as the file
-    gives it and `method` is the label.
+    gives it and `method` is the label. Where a method cannot be run on a recording, the row has
+    only those, `params` and `error`, a sentence. Rows do not depend on where they are computed, but
+    for `seconds`.
 
     Args:
         config: The TOML file.
-        out: A folder for results.json ({"rows": [...]}), results.md (the table) and config.toml
-            (the file as it was run); made if missing. Existing results are replaced at the end.
-        progress: Show a bar on stderr while a method takes long.
+        out: A folder for results.json ({"rows": [...]}), results.md (the table), report.html (one
+            page that opens anywhere), results.parquet (a line per row; only where the extra
+            "parquet" is installed), config.toml (the file as it was run) and tasks (finished rows,
+            which are not computed again); made if missing. Existing results are replaced at the
+            end.
+        progress: Show bars on stderr.
+        workers: Compute in so many processes instead of this one.
+        cluster: Compute on the Dask cluster whose scheduler has this address. Its workers need the
+            same version of jaxevent, and to find recordings by the same paths; those with one
+            thread each serve best.
+        scheduler_file: The same, of the scheduler that wrote this file.
+        retries: How often a task is tried again whose process dies or that fails for another reason
+            than bad input.
 
     Raises:
-        InputError: The file, a recording or a parameter cannot be used, or `out` not be written.
+        InputError: The file or a parameter cannot be used, `out` not be written, the cluster not be
+            reached; or not a single row could be computed.
     """
     plan = read_plan(Path(config))
+    place = Place(workers, cluster, None if scheduler_file is None else Path(scheduler_file))
     with contextlib.ExitStack() as stack:
         text = Path(config).read_bytes()
         write = None if out is None else stack.enter_context(results(Path(out)))
-        rows = []
-        for given, path in plan.recordings:
-            recording = load(path, plan.size, in_memory=False, progress=progress)
-            recording = dataclasses.replace(recording, name=str(path))  # for messages
-            for label, method, params in plan.methods:
-                row = score(
-                    recording,
-                    method,
-                    params,
-                    plan.protocol,
-                    metrics=plan.metrics,
-                    progress=progress,
-                )
-                rows.append({**row, "recording": given, "method": label})
-        if write is not None:
+        folder = None if out is None else Path(out) / "tasks"
+        stack.callback(_opened.clear)
+        tasks = _tasks(plan, folder, progress, place == Place())
+        outcomes = run(_compute, tasks, folder, place, retries=retries, progress=progress)
+        rows = _rows(plan, outcomes)
+        if write is not None and out is not None:
+            from jaxevent.page import page
+
             write("config.toml", text)
             write_rows(rows, write)
+            pictures = [(o.result or {}).get("picture") for o in outcomes]
+            hosts = sorted({o.host for o in outcomes if o.host})
+            html = page(rows, pictures, plan.protocol, text.decode(), hosts, Path(config).name)
+            write("report.html", html.encode())
+            write_parquet(Path(out) / "results.parquet", rows)
     return rows
+
+
+def _rows(plan: "Plan", outcomes: list[Outcome]) -> list[dict[str, Any]]:
+    """The rows, named as the configuration does; raises `InputError` if all are errors."""
+    rows: list[dict[str, Any]] = []
+    pairs = itertools.product(plan.recordings, plan.methods)
+    for ((given, _), entry), outcome in zip(pairs, outcomes, strict=True):
+        named = {"recording": given, "method": entry.label}
+        if outcome.error is None:
+            rows.append({**outcome.result["row"], **named})
+        else:
+            rows.append({**named, "params": entry.shown(), "error": outcome.error})
+    errors = list(dict.fromkeys(row["error"] for row in rows if "error" in row))
+    if all("error" in row for row in rows):
+        more = f" (and {len(errors) - 1} further errors)" if len(errors) > 1 else ""
+        raise InputError(f"{errors[0]}{more}")
+    return rows
+
+
+def _tasks(plan: "Plan", folder: Path | None, progress: bool, here: bool) -> list[Task]:
+    """A task for each recording and method; with a folder, keyed by all that its row depends on.
+
+    Tasks that are run `here` show a bar of their own.
+    """
+    contents = None if folder is None else _Contents(folder / "contents", progress)
+    double = jnp.result_type(float) == jnp.float64
+    tasks: list[Task] = []
+    for (given, path), entry in itertools.product(plan.recordings, plan.methods):
+        path = path.absolute()
+        about = {
+            "method": entry.method.name,
+            "params": entry.settings(),
+            "protocol": plan.protocol,
+            "metrics": list(plan.metrics),
+            "normalise": entry.normalise,
+            "size": plan.size,
+            "double": double,
+            "version": f"{jaxevent.__version__}, results {RESULTS_VERSION}",
+        }
+        key = None
+        if contents is not None:
+            # What cannot be read has no key; computing it says why.
+            with contextlib.suppress(OSError, InputError):
+                read = contents.of(path)
+                whole = {**about, "content": read}
+                if isinstance(entry.method, External):
+                    files = entry.method.find(_name(path)).files
+                    whole["images"] = [contents.of(file) for file in files]
+                    whole["params"] = entry.method.values()
+                text = json.dumps(whole, sort_keys=True)
+                key = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+        arguments = {"path": str(path), **about, "progress": progress and here}
+        tasks.append(Task(f"{given}, {entry.label}", arguments, key))
+    if contents is not None:
+        contents.save()
+    return tasks
+
+
+def _compute(
+    path: str,
+    method: str,
+    params: dict[str, Any],
+    protocol: str,
+    metrics: list[str],
+    normalise: str,
+    size: tuple[int, int] | None,
+    double: bool,
+    version: str,
+    progress: bool,
+) -> dict[str, Any]:
+    """The task: {"row", "picture"} of a recording and a method, on whichever machine."""
+    from jaxevent.page import picture
+
+    mine = f"{jaxevent.__version__}, results {RESULTS_VERSION}"
+    if version != mine:
+        raise InputError(
+            f"{path}: this worker has jaxevent {mine}, not {version}; install the same everywhere"
+        )
+    with jax.enable_x64(double):
+        recording = _opened.load(Path(path), size, progress)
+        source = External(**params) if method == "external" else find_method(method)
+        values = None if isinstance(source, External) else source.Params.of(params)
+        name = _name(Path(path))
+        row, sample = _score(
+            recording, source, values, protocol, metrics, normalise, progress, name
+        )
+    return {"row": row, "picture": None if sample is None else picture(sample)}
+
+
+def _name(path: Path) -> str:
+    """How other programs' results call a recording: its name without suffix."""
+    return path.name if path.is_dir() else path.stem
+
+
+class _Opened:
+    """The recording last loaded: methods are run on it one after another."""
+
+    def __init__(self):
+        self.clear()
+
+    def clear(self) -> None:
+        self._last: tuple[Any, Recording | InputError | None] = (None, None)
+
+    def load(self, path: Path, size: tuple[int, int] | None, progress: bool) -> Recording:
+        size = None if size is None else (size[0], size[1])
+        what = (path, size, [_stamp(file) for file in _files(path)])
+        before, loaded = self._last
+        if loaded is None or before != what:
+            self.clear()
+            try:
+                loaded = load(path, size, in_memory=False, progress=progress)
+                loaded = dataclasses.replace(loaded, name=str(path))  # for messages
+            except InputError as error:
+                loaded = error
+            self._last = what, loaded
+        if isinstance(loaded, InputError):
+            raise InputError(str(loaded))
+        return loaded
+
+
+_opened = _Opened()
+
+
+def _files(path: Path) -> list[Path]:
+    return sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+
+
+def _stamp(file: Path) -> tuple[str, int, int]:
+    try:
+        about = file.stat()
+    except OSError:
+        return str(file), -1, 0
+    return str(file), about.st_size, about.st_mtime_ns
+
+
+class _Contents:
+    """Hashes of what files and folders hold, kept in a file as long as size and time agree."""
+
+    # A file changed again within the clock's tick (s) after it was read would look unchanged.
+    TICK = 2
+
+    def __init__(self, cache: Path, progress: bool):
+        self.cache, self.progress = cache, progress
+        self.known: dict[str, list] = {}
+        with contextlib.suppress(OSError, ValueError):
+            self.known = dict(json.loads(cache.read_bytes()))
+        self.used: dict[str, list] = {}
+        self.now: dict[Path, str] = {}
+
+    def of(self, path: Path) -> str:
+        """The hash of a file, or of all names and files in a folder; raises OSError."""
+        if path not in self.now:
+            files = _files(path)
+            hashes = [self._of_file(file) for file in files]
+            if path.is_dir():
+                names = [str(file.relative_to(path)) for file in files]
+                text = json.dumps(list(zip(names, hashes, strict=True)))
+                self.now[path] = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+            else:
+                self.now[path] = hashes[0]
+        return self.now[path]
+
+    def _of_file(self, file: Path) -> str:
+        name, size, changed = _stamp(file)
+        known = self.known.get(name)
+        if isinstance(known, list) and known[:2] == [size, changed]:
+            self.used[name] = known
+            return known[2]
+        digest = hashlib.blake2b(digest_size=16)
+        with (
+            file.open("rb") as opened,
+            tqdm(
+                desc=f"reading {file.name}",
+                total=size,
+                unit="B",
+                unit_scale=True,
+                delay=2,
+                disable=not self.progress,
+                leave=False,
+            ) as bar,
+        ):
+            while block := opened.read(1 << 22):
+                digest.update(block)
+                bar.update(len(block))
+        if time.time_ns() - changed > self.TICK * 10**9:
+            self.used[name] = [size, changed, digest.hexdigest()]
+        return digest.hexdigest()
+
+    def save(self) -> None:
+        known = {**self.known, **self.used}
+        if known != self.known:
+            self.cache.parent.mkdir(exist_ok=True)
+            with complete(self.cache) as partial:
+                partial.write_text(json.dumps(known))
 
 
 Write = Callable[[str, bytes], None]
@@ -481,8 +805,8 @@ def write_rows(
 def results(folder: Path) -> Iterator[Write]:
     """Open a folder for results, made if missing; gives the function `write(name, content)`.
 
-    A folder made here is removed again if the block raises. Raises `InputError` if the folder
-    cannot be made.
+    A folder made here is removed again if the block raises, unless it holds finished tasks. Raises
+    `InputError` if the folder cannot be made.
     """
     made = not folder.exists()
     try:
@@ -502,20 +826,44 @@ def results(folder: Path) -> Iterator[Write]:
             raise InputError(f"{folder}: is not writable; choose another folder")
         yield write
     except BaseException:
-        if made:
+        if made and not any(folder.glob("tasks/*.json")):
             shutil.rmtree(folder, ignore_errors=True)
         raise
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """A checked configuration: recordings (as given, path), methods (label, method, params)."""
+    """A checked configuration: recordings (as given, path) and methods."""
 
     recordings: list[tuple[str, Path]]
-    methods: list[tuple[str, Estimator, FrameParams]]
+    methods: list["Entry"]
     protocol: str
     size: tuple[int, int] | None
     metrics: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """A method of a configuration with one set of parameters; `External` has none."""
+
+    label: str
+    method: Estimator | External
+    params: FrameParams | None
+    normalise: str
+
+    def settings(self) -> dict[str, Any]:
+        """What `_compute` makes it from again."""
+        if isinstance(self.method, External):
+            return dict(vars(self.method))
+        assert self.params is not None
+        return self.params.values()
+
+    def shown(self) -> dict[str, Any]:
+        """The parameters as a row shows them."""
+        if isinstance(self.method, External):
+            return self.method.values()
+        assert self.params is not None
+        return values_of(self.params)
 
 
 def read_plan(config: Path) -> Plan:
@@ -569,23 +917,51 @@ def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path]]:
     return [(text, path) for path, text in found.items()]
 
 
-def _methods(given: Any, folder: Path) -> list[tuple[str, Estimator, FrameParams]]:
+def _methods(given: Any, folder: Path) -> list[Entry]:
     if not (isinstance(given, list) and given and all(isinstance(one, dict) for one in given)):
         raise InputError('no method is given; add [[method]] with name = "akf"')
-    methods: list[tuple[str, Estimator, FrameParams]] = []
-    for number, entry in enumerate(given, 1):
+    entries: list[Entry] = []
+    for number, table in enumerate(given, 1):
         try:
-            _refuse_unknown(entry, ("name", "params", "label"))
-            name = entry.get("name")
-            label = entry.get("label", name)
-            if not isinstance(name, str) or not isinstance(label, str):
-                raise InputError('name and label must be text; give name = "akf"')
-            method = find_method(name)
-            params = read_params(method.Params, method.name, entry.get("params", {}), folder)
-            methods.append((label, method, params))
+            for entry in _entries(table, folder):
+                if any(entry.label == other.label for other in entries):
+                    raise InputError(f"another one is labelled {entry.label!r} too; add a label")
+                entries.append(entry)
         except InputError as error:
             raise InputError(f"method {number}: {error}") from None
-    return methods
+    return entries
+
+
+def _entries(table: Mapping[str, Any], folder: Path) -> Iterator[Entry]:
+    """The method of one table, once for each combination of its grid."""
+    own = dict(table)
+    name, normalise = own.pop("name", None), own.pop("normalise", "none")
+    label = own.pop("label", name)
+    if not isinstance(name, str) or not isinstance(label, str):
+        raise InputError('name and label must be text; give name = "akf"')
+    check_normalise(normalise)
+    fitted = "" if normalise == "none" else ", brightness fitted"
+    if name == External.name:
+        yield Entry(label + fitted, External.of(own, folder.absolute()), None, normalise)
+        return
+    _refuse_unknown(own, ("name", "params", "label", "grid", "normalise"))
+    method = find_method(name)
+    params = read_params(method.Params, method.name, own.get("params", {}), folder)
+    grid = own.get("grid", {})
+    if not isinstance(grid, dict) or not all(isinstance(v, list) and v for v in grid.values()):
+        raise InputError(f"grid is {grid!r}; give a table of lists, as {{ c_on = [0.05, 0.1] }}")
+    if "preset" in grid:
+        raise InputError("a preset cannot be in a grid; add a [[method]] for each preset")
+    for values in itertools.product(*grid.values()):
+        point = dict(zip(grid, values, strict=True))
+        said = "".join(
+            f", {key} {value:g}"
+            if isinstance(value, int | float) and not isinstance(value, bool)
+            else f", {key} {value}"
+            for key, value in point.items()
+        )
+        chosen = method.Params.of({**params.values(), **point}) if point else params
+        yield Entry(f"{label}{said}{fitted}", method, chosen, normalise)
 
 
 def read_params(kind: type[P], name: str, given: Any, folder: Path) -> P:

@@ -4,6 +4,7 @@ Tone mapping serves the display alone; stored intensities stay linear.
 """
 
 import contextlib
+import json
 import math
 import subprocess
 import tempfile
@@ -278,37 +279,47 @@ def _style(kind: str, arrays: list[NDArray], panels: Sequence[tuple]) -> dict[st
 Column = tuple[str, str, float | int, int]
 
 
+# What a row of an evaluation is shown by: title, place in the row, factor, digits.
+ALWAYS = {"mse", "ssim", "frames", "seconds"}
+COLUMNS: list[Column] = [
+    ("MSE x 1e-2", "mse", 100, 3),
+    ("SSIM", "ssim", 1, 3),
+    ("log MSE", "log_mse", 1, 4),
+    ("log SSIM", "log_ssim", 1, 3),
+    ("bright MSE", "regions.bright.mse", 1, 3),
+    ("dark log MSE", "regions.dark.log_mse", 1, 4),
+    ("well MSE x 1e-2", "regions.well.mse", 100, 3),
+    ("LPIPS", "lpips", 1, 3),
+    ("JOD", "hdr_quality", 1, 2),
+    ("global SSIM", "global_ssim", 1, 3),
+    ("frames", "frames", 1, 0),
+    ("missing", "missing", 1, 0),
+    ("seconds", "seconds", 1, 2),
+]
+
+
+def columns_of(rows: Sequence[Mapping[str, Any]]) -> list[Column]:
+    """Those of `COLUMNS` that any of the rows has, and those of `ALWAYS`."""
+    return [
+        column
+        for column in COLUMNS
+        if column[1] in ALWAYS or any(find(row, column[1]) is not None for row in rows)
+    ]
+
+
 def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
     """The results of an evaluation as a Markdown table, its columns aligned as plain text too.
 
     Each row has the keys recording, method, mse, ssim, frames and seconds, and may have those of
     `evaluate.score` against HDR references and of further metrics, which get columns where a row
     has them; others are not shown. A number that is None, NaN or absent appears as "-". MSE is
-    multiplied by 100 where its column says so; seconds are those of computing.
+    multiplied by 100 where its column says so; seconds are those of computing. The `error` of rows
+    that have one follows the table, each once.
     """
-
-    always = {"mse", "ssim", "frames", "seconds"}
-    columns = [  # title, place in a row, factor, digits
-        ("MSE x 1e-2", "mse", 100, 3),
-        ("SSIM", "ssim", 1, 3),
-        ("log MSE", "log_mse", 1, 4),
-        ("log SSIM", "log_ssim", 1, 3),
-        ("bright MSE", "regions.bright.mse", 1, 3),
-        ("dark log MSE", "regions.dark.log_mse", 1, 4),
-        ("well MSE x 1e-2", "regions.well.mse", 100, 3),
-        ("LPIPS", "lpips", 1, 3),
-        ("JOD", "hdr_quality", 1, 2),
-        ("global SSIM", "global_ssim", 1, 3),
-        ("frames", "frames", 1, 0),
-        ("seconds", "seconds", 1, 2),
-    ]
     rows = list(rows)
-    shown = [
-        column
-        for column in columns
-        if column[1] in always or any(_find(row, column[1]) is not None for row in rows)
-    ]
-    return aligned(rows, shown)
+    errors = [" ".join(row["error"].split()) for row in rows if "error" in row]
+    said = "".join(f"\nfailed ({errors.count(one)}): {one}\n" for one in dict.fromkeys(errors))
+    return aligned(rows, columns_of(rows)) + said
 
 
 def aligned(rows: Iterable[Mapping[str, Any]], columns: Sequence[Column]) -> str:
@@ -318,9 +329,6 @@ def aligned(rows: Iterable[Mapping[str, Any]], columns: Sequence[Column]) -> str
     shown. A number that is None, NaN or absent appears as "-".
     """
 
-    def number(value: float | int | None, digits: int) -> str:
-        return "-" if value is None or math.isnan(value) else f"{value:.{digits}f}"
-
     def text(value: str) -> str:
         return " ".join(value.split()).replace("|", r"\|")
 
@@ -328,8 +336,7 @@ def aligned(rows: Iterable[Mapping[str, Any]], columns: Sequence[Column]) -> str
     for row in rows:
         cells = [text(row["recording"]), text(row["method"])]
         for _, place, factor, digits in columns:
-            value = _find(row, place)
-            cells.append(number(None if value is None else factor * value, digits))
+            cells.append(number(row, place, factor, digits))
         table.append(cells)
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     left = 2  # the names; numbers are aligned to the right
@@ -342,10 +349,70 @@ def aligned(rows: Iterable[Mapping[str, Any]], columns: Sequence[Column]) -> str
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
-def _find(row: Mapping[str, Any], path: str) -> Any:
+def number(row: Mapping[str, Any], place: str, factor: float | int, digits: int) -> str:
+    """A number of a row times `factor` as text; "-" if it is None, NaN or absent."""
+    value = find(row, place)
+    if value is None or math.isnan(value):
+        return "-"
+    return f"{factor * value:.{digits}f}"
+
+
+def find(row: Mapping[str, Any], path: str) -> Any:
+    """What a nested row holds at "regions.well.mse"; None if there is nothing."""
     value: Any = row
     for key in path.split("."):
         if key not in value:
             return None
         value = value[key]
     return value
+
+
+def write_parquet(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows as Parquet, a line per row; nested names are joined by dots.
+
+    Lists of numbers, as `per_frame.mse`, are columns of lists; what is of several kinds is JSON
+    text. Without the extra "parquet" no file is written, and an older one is removed.
+    """
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError:
+        path.unlink(missing_ok=True)
+        return
+
+    flat: list[dict[str, Any]] = []
+    for row in rows:
+        flat.append({})
+        pending = [("", row)]
+        while pending:
+            prefix, table = pending.pop(0)
+            for key, value in table.items():
+                if isinstance(value, Mapping):
+                    pending.append((f"{prefix}{key}.", value))
+                else:
+                    flat[-1][f"{prefix}{key}"] = value
+
+    def kind(values: list[Any]) -> pyarrow.DataType | None:
+        kinds = {type(value) for value in values}
+        if not kinds:
+            return pyarrow.float64()
+        if kinds == {bool}:
+            return pyarrow.bool_()
+        if kinds <= {int, float}:
+            return pyarrow.int64() if kinds == {int} else pyarrow.float64()
+        if kinds == {str}:
+            return pyarrow.string()
+        if kinds == {list}:
+            inner = kind([one for value in values for one in value if one is not None])
+            return None if inner is None else pyarrow.list_(inner)
+        return None
+
+    columns: dict[str, Any] = {}
+    for name in dict.fromkeys(name for row in flat for name in row):
+        values = [row.get(name) for row in flat]
+        of = kind([value for value in values if value is not None])
+        if of is None:
+            values = [None if value is None else json.dumps(value) for value in values]
+        columns[name] = pyarrow.array(values, pyarrow.string() if of is None else of)
+    with complete(path) as partial:
+        parquet.write_table(pyarrow.table(columns), partial)

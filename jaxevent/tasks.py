@@ -1,0 +1,367 @@
+"""Tasks that survive: stored once finished, tried again when they fail, here or on many machines.
+
+A task is a module-level function with keyword arguments that pickle; its result is what JSON holds.
+With a `folder`, a finished task is the file KEY.json in it, where KEY names all that the result
+depends on: whoever runs the same task with this folder again reads the file instead, whether the
+first run ended, was killed, or still goes on elsewhere. log.txt in the folder has a line for every
+start and end of an attempt: time (UTC), host, process, key, what happened.
+"""
+
+import collections
+import contextlib
+import dataclasses
+import datetime
+import json
+import multiprocessing
+import multiprocessing.connection
+import os
+import signal
+import socket
+import threading
+import traceback
+from collections.abc import Callable, Generator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from jaxevent.errors import InputError, require
+
+CONNECT = 30  # s that a scheduler has to answer
+LEAVE = 5  # s that a process has to end
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """Arguments of the function, a name for the progress bar, and the key of the stored result.
+
+    Tasks of equal keys are computed once. Without a key nothing is stored.
+    """
+
+    name: str
+    arguments: Mapping[str, Any]
+    key: str | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """Either a `result`, as JSON gives it back, computed on `host`; or an `error`, one sentence."""
+
+    result: Any = None
+    error: str | None = None
+    host: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where tasks run: in this process; in `workers` processes; on a Dask cluster.
+
+    `cluster` is the address of its scheduler, `scheduler_file` the file that tells it. Raises
+    `InputError` if more than one is given, for less than one worker and without the extra.
+    """
+
+    workers: int | None = None
+    cluster: str | None = None
+    scheduler_file: Path | None = None
+
+    def __post_init__(self):
+        given = [self.workers, self.cluster, self.scheduler_file]
+        if sum(one is not None for one in given) > 1:
+            raise InputError("workers, cluster and scheduler file exclude each other; give one")
+        if self.workers is not None and self.workers < 1:
+            raise InputError(f"{self.workers} workers cannot work; give at least 1")
+        if self.remote:
+            require("distributed", "cluster")
+
+    @property
+    def remote(self) -> bool:
+        """Whether tasks run on a cluster."""
+        return self.cluster is not None or self.scheduler_file is not None
+
+
+def run(
+    function: Callable[..., Any],
+    tasks: Sequence[Task],
+    folder: Path | None = None,
+    place: Place | None = None,
+    *,
+    retries: int = 2,
+    progress: bool = False,
+) -> list[Outcome]:
+    """Run `function(**task.arguments)` for every task; outcomes in the order of the tasks.
+
+    An `InputError` is the task's outcome at once. Any other exception, and the death of the process
+    that computes it, costs one of 1 + `retries` attempts (on a cluster, deaths of workers are
+    counted by Dask's own `allowed-failures`); what the last one said is the outcome.
+
+    Args:
+        function: Of module level, so that other processes find it; gives what JSON can hold.
+        tasks: What to run it on.
+        folder: Keeps results of tasks that have a key; made if missing.
+        place: Where; None: in this process.
+        retries: Further attempts of each task.
+        progress: Show a bar on stderr with the name of the last finished task.
+
+    Raises:
+        InputError: Results cannot be stored, or the cluster does not answer.
+    """
+    if retries < 0:
+        raise InputError(f"{retries} retries are not possible; give 0 or more")
+    place = place or Place()
+    folder = None if folder is None else folder.absolute()
+    if folder is not None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"{folder}: the folder cannot be made ({error.strerror}); choose a writable place"
+            ) from None
+    found: dict[int, dict[str, Any]] = {}
+    same: dict[Any, list[int]] = {}  # by key, the tasks that have it
+    for number, task in enumerate(tasks):
+        record = _stored(folder, task.key)
+        if record is not None:
+            found[number] = record
+        else:
+            same.setdefault(number if task.key is None else task.key, []).append(number)
+    firsts = [numbers[0] for numbers in same.values()]
+    todo = [tasks[number] for number in firsts]
+    if place.workers is not None:
+        done = _in_processes(function, todo, folder, retries, place.workers)
+    elif place.remote:
+        done = _on_cluster(function, todo, folder, retries, place)
+    else:
+        done = _here(function, todo, folder, retries)
+    with (
+        tqdm(total=len(tasks), initial=len(found), unit="task", disable=not progress) as bar,
+        contextlib.closing(done),
+    ):
+        for number, record in done:
+            task = todo[number]
+            if "result" in record and _stored(folder, task.key) is None:
+                _store(folder, task.key, record)
+            numbers = same[firsts[number] if task.key is None else task.key]
+            found.update(dict.fromkeys(numbers, record))
+            bar.set_postfix_str(task.name)
+            bar.update(len(numbers))
+    return [
+        Outcome(record.get("result"), record.get("error"), record.get("host", ""))
+        for record in (found[number] for number in range(len(tasks)))
+    ]
+
+
+# The number of a task and its record: {"result", "host"} or {"error"}.
+Records = Generator[tuple[int, dict[str, Any]], None, None]
+
+
+def attempt(function: Callable[..., Any], task: Task, folder: Path | None) -> dict[str, Any]:
+    """Run one task, on whichever machine: {"result", "host"}, or {"error"} of an `InputError`.
+
+    A stored result is read; a new one is stored if this machine sees the folder. Any other
+    exception is raised.
+    """
+    record = _stored(folder, task.key)
+    if record is not None:
+        return record
+    _log(folder, task.key, "started")
+    try:
+        record = {"result": function(**task.arguments), "host": socket.gethostname()}
+        record = json.loads(json.dumps(record, allow_nan=False))
+    except InputError as error:
+        _log(folder, task.key, f"cannot be done: {error}")
+        return {"error": str(error)}
+    except Exception:
+        _log(folder, task.key, f"failed\n{traceback.format_exc()}")
+        raise
+    # The caller stores it again where this fails, and says why if that fails too.
+    with contextlib.suppress(InputError):
+        _store(folder, task.key, record)
+    _log(folder, task.key, "finished")
+    return record
+
+
+def _said(error: BaseException) -> dict[str, Any]:
+    reason = " ".join(str(error).split())
+    return {"error": f"{type(error).__name__}{': ' * bool(reason)}{reason}"}
+
+
+def _file(folder: Path | None, key: str | None) -> Path | None:
+    return None if folder is None or key is None else folder / f"{key}.json"
+
+
+def _stored(folder: Path | None, key: str | None) -> dict[str, Any] | None:
+    """The record of a finished task; None if there is none, or none that can be read."""
+    file = _file(folder, key)
+    if file is None:
+        return None
+    with contextlib.suppress(OSError, ValueError):
+        record = json.loads(file.read_bytes())
+        if isinstance(record, dict) and "result" in record:
+            return record
+    return None
+
+
+def _store(folder: Path | None, key: str | None, record: dict[str, Any]) -> None:
+    from jaxevent.io.output import complete
+
+    file = _file(folder, key)
+    if file is not None:
+        with complete(file) as partial:
+            partial.write_text(json.dumps(record, allow_nan=False))
+
+
+def _log(folder: Path | None, key: str | None, what: str) -> None:
+    if folder is None or key is None:
+        return
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
+    line = f"{now} {socket.gethostname()} {os.getpid()} {key} {what}\n"
+    # One write of an appended line is not torn by those of other processes. A machine that does
+    # not see the folder has nowhere to log.
+    with contextlib.suppress(OSError):
+        log = os.open(folder / "log.txt", os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+        with contextlib.closing(os.fdopen(log, "wb", buffering=0)) as file:
+            file.write(line.encode())
+
+
+def _here(
+    function: Callable[..., Any], tasks: Sequence[Task], folder: Path | None, retries: int
+) -> Records:
+    for number, task in enumerate(tasks):
+        record: dict[str, Any] = {}
+        for _ in range(1 + retries):
+            try:
+                record = attempt(function, task, folder)
+                break
+            except Exception as error:
+                record = _said(error)
+        yield number, record
+
+
+def _in_processes(
+    function: Callable[..., Any],
+    tasks: Sequence[Task],
+    folder: Path | None,
+    retries: int,
+    workers: int,
+) -> Records:
+    """One pipe and one task at a time for each process, so that a death has one task to blame.
+
+    A `ProcessPoolExecutor` breaks as a whole when a process dies, does not say which task it was,
+    and leaves its processes behind when this one is killed.
+    """
+    context = multiprocessing.get_context("spawn")  # JAX has threads, which do not survive a fork
+    waiting = collections.deque((number, 0) for number in range(len(tasks)))
+    workers = min(workers, len(tasks))
+    threads = max(1, _cores() // max(workers, 1))
+    idle: list[tuple[Any, Any]] = []
+    busy: dict[Any, tuple[Any, int, int]] = {}  # by connection: its process, task, earlier attempts
+
+    def start() -> tuple[Any, Any]:
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_serve, args=(theirs, threads), daemon=True)
+        process.start()
+        theirs.close()  # else the end of the process would not end the pipe
+        return ours, process
+
+    try:
+        while waiting or busy:
+            while waiting and len(busy) < workers:
+                connection, process = idle.pop() if idle else start()
+                number, tried = waiting.popleft()
+                busy[connection] = process, number, tried
+                with contextlib.suppress(OSError):  # it died; reading says so
+                    connection.send((function, tasks[number], folder))
+            ready: list[Any] = multiprocessing.connection.wait(list(busy))
+            for connection in ready:
+                process, number, tried = busy.pop(connection)
+                try:
+                    record, again = connection.recv()
+                    idle.append((connection, process))
+                except (EOFError, OSError):
+                    process.join()
+                    connection.close()
+                    reason = f"its process died (exit code {process.exitcode})"
+                    _log(folder, tasks[number].key, reason)
+                    record, again = {"error": f"{tasks[number].name}: {reason}"}, True
+                if again and tried < retries:
+                    waiting.appendleft((number, tried + 1))
+                else:
+                    yield number, record
+    finally:
+        for connection, _ in idle:
+            connection.close()  # which ends it
+        for connection, (process, _, _) in busy.items():
+            process.kill()
+            connection.close()
+        for process in [*(p for _, p in idle), *(p for p, _, _ in busy.values())]:
+            process.join(LEAVE)
+            process.kill()
+            process.join()
+
+
+def _cores() -> int:
+    with contextlib.suppress(AttributeError):  # not on every system
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _serve(connection: multiprocessing.connection.Connection, threads: int) -> None:
+    """What a worker process does: answer tasks by (record, whether to try again)."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started it ends it
+    os.environ["NPROC"] = str(threads)  # of XLA on the CPU, when it starts
+    parent = multiprocessing.parent_process()
+
+    def leave() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=leave, daemon=True).start()
+    while True:
+        try:
+            function, task, folder = connection.recv()
+            answer = attempt(function, task, folder), False
+        except EOFError:
+            return
+        except Exception as error:
+            answer = _said(error), True
+        connection.send(answer)
+
+
+def _on_cluster(
+    function: Callable[..., Any],
+    tasks: Sequence[Task],
+    folder: Path | None,
+    retries: int,
+    place: Place,
+) -> Records:
+    distributed = require("distributed", "cluster")
+    address = place.cluster or str(place.scheduler_file)
+    if place.scheduler_file is not None and not place.scheduler_file.is_file():
+        raise InputError(f"{address}: there is no such scheduler file; start a scheduler with it")
+    where: dict[str, Any] = {"address": place.cluster}
+    if place.cluster is None:
+        where = {"scheduler_file": address}
+    try:
+        client = distributed.Client(**where, timeout=CONNECT, set_as_default=False)
+    except (OSError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"{address}: no Dask scheduler answers ({reason}); start one or correct the address"
+        ) from None
+    with client:
+        numbers = {}
+        for number, task in enumerate(tasks):
+            key = None if task.key is None else f"jaxevent-{task.key}"
+            future = client.submit(
+                attempt, function, task, folder, key=key, pure=False, retries=retries
+            )
+            numbers[future] = number
+        for future in distributed.as_completed(list(numbers), loop=client.loop):
+            if future.cancelled():
+                raise InputError(
+                    f"{address}: the scheduler lost tasks or went away; run the same again, "
+                    "finished tasks are kept"
+                )
+            error = future.exception()
+            yield numbers[future], future.result() if error is None else _said(error)
