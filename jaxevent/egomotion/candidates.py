@@ -9,6 +9,7 @@ Several events per pixel are kept, not only the latest: an edge fires bursts, an
 a burst is late, so a surface of latest events makes every motion too fast (by 4 to 27 %).
 """
 
+import dataclasses
 import inspect
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -28,6 +29,18 @@ READ_ROWS = 65536  # events read from a file at a time
 NEVER = np.iinfo(np.int64).min // 2
 
 Numeric = Array | np.ndarray
+Ages = float | int | NDArray[np.floating]
+
+
+class Expected(NamedTuple):
+    """Where candidates are looked for: at most margin + slack dt [px] from the flow's d = U dt.
+
+    Arrays (rows, columns) are by as many equal parts of the sensor.
+    """
+
+    U: NDArray[np.floating]  # (2, rows, columns), px/s
+    slack: NDArray[np.floating]  # (rows, columns), px/s
+    margin: float  # px
 
 
 class Candidates(eqx.Module):
@@ -40,10 +53,12 @@ class Candidates(eqx.Module):
     d: Float[Numeric, "*batches 2 C K"]  # px, x and y: the event's position less the candidate's
     age: Float[Numeric, "*batches C K"]  # s
     xi: Float[Numeric, "*batches K 2"]  # px, of the event; see `coordinates`
+    room: Float[Numeric, "*batches 2 2 K"]  # px, x and y: least and largest d within the sensor
     valid: Bool[Numeric, "*batches K"]  # an event; others only fill up
     scale: Float[Numeric, "*batches K"]
+    rate: Float[Numeric, "*batches K"]  # 1/s of age, candidates wherever in the window
     elapsed: Float[Numeric, "*batches"]  # s from the last event of the batch before to this one's
-    history: Float[Numeric, "*batches"]  # s for which events have come without a long silence
+    history: Float[Numeric, "*batches"]  # s, age up to which there are all candidates; see `gather`
     reach: int = eqx.field(static=True)  # candidates are at most so many pixels away, in x and y
 
     @property
@@ -116,46 +131,74 @@ class Gatherer:
         """Whether all events have been taken."""
         return self._row >= self._end
 
-    def gather(self, batches: int, youngest: float | int, oldest: float | int) -> Batches:
+    def gather(
+        self,
+        batches: int,
+        youngest: Ages,
+        oldest: Ages,
+        span: float | int = np.inf,
+        expected: Expected | None = None,
+    ) -> Batches:
         """The next `batches` batches, with candidates from `youngest` to `oldest` seconds of age.
 
-        The shape is always the same. Batches for which no event is left hold none.
+        Ages may be arrays (rows, columns) for as many equal parts of the sensor, and where the flow
+        is about known it may be told where they are `expected`. The shape of what
+        is given is always the same; batches for which no event is left, or only events more than
+        `span` seconds after the first one, hold none. `history` is since when events have come
+        without a long silence, but never longer than `oldest`.
         """
         real = np.dtype(jnp.result_type(float))
         size, most = self.batch, self.most
         d, age = np.zeros((batches, 2, most, size), real), np.zeros((batches, most, size), real)
         xi, scale = np.zeros((batches, size, 2), real), np.ones((batches, size), real)
+        rate = np.zeros((batches, size), real)
+        room = np.zeros((batches, 2, 2, size), real)
         row, t = np.full((batches, size), -1), np.zeros(batches, np.int64)
         history = np.zeros(batches, real)
-        limits = np.array([max(1, np.ceil(1e6 * youngest - 1e-6)), np.floor(1e6 * oldest + 1e-6)])
-        state = np.zeros(3, np.int64)  # batch, events in it, time of its first
+        young, old = np.broadcast_arrays(np.atleast_2d(youngest), np.atleast_2d(oldest))
+        # Single precision may fall short of a whole number of microseconds.
+        young, old = 1e6 * (1 - 1e-6) * young, 1e6 * (1 + 1e-6) * old
+        limits = np.stack([np.maximum(1, np.ceil(young)), np.floor(old)])
+        limits = np.minimum(limits, -NEVER / 2).astype(np.int64)
+        if expected is None:
+            gate = np.zeros((3, 1, 1))
+            gate[2] = np.inf
+        else:
+            gate = np.concatenate([expected.U, expected.slack[None]]).astype(np.float64)
+        margin = 0.0 if expected is None else expected.margin
+        # Batch, events in it, time of its first, and after which no event is taken.
+        state = np.array([0, 0, 0, -NEVER])
+        span = -NEVER if span == np.inf else round(1e6 * span)
         full = False
         while not full and not self.done:
             events = self.recording.events[self._row : self._row + READ_ROWS]
             used, full = _gather(
-                events.t, events.x, events.y, events.p, self._row, self.every, self.longest,
-                self.xi, self._ring, self._head, self.radius, limits.astype(np.int64),
-                self._scratch, state, self._clock, self.silence, d, age, xi, scale, row, t, history,
+                events.t, events.x, events.y, events.p, self._row, self.every, self.longest, span,
+                self.xi, self._ring, self._head, self.radius, limits, gate, margin, self._scratch,
+                state, self._clock, self.silence, d, age, xi, room, scale, rate, row, t, history,
             )  # fmt: skip
             self._row += used
         begun = state[0] + (state[1] > 0)
         history[begun:] = history[begun - 1] if begun else 0
         t[begun:] = t[begun - 1] if begun else self._last
+        history = np.minimum(history, 1e-6 * limits[1].min())
         elapsed = np.diff(t, prepend=self._last) * 1e-6
         self._last = int(t[-1])
         made = Candidates(
-            d, age, xi, row >= 0, scale, elapsed.astype(real), history, self.radius
+            d, age, xi, room, row >= 0, scale, rate, elapsed.astype(real), history.astype(real),
+            self.radius,
         )  # fmt: skip
         return Batches(made, t, row)
 
-    def whole(self, youngest: float | int, oldest: float | int) -> Batches:
+    def whole(self, youngest: Ages, oldest: Ages) -> Batches:
         """All batches that are left, at least one, for recordings that fit into memory."""
         parts: list[Batches] = []
         while not parts or not self.done:
             parts.append(self.gather(64, youngest, oldest))
         fields = {}
         used = max(1, sum(int(part.candidates.valid.any(-1).sum()) for part in parts))
-        for name in ("d", "age", "xi", "valid", "scale", "elapsed", "history"):
+        names = {field.name for field in dataclasses.fields(Candidates)} - {"reach"}
+        for name in names:
             fields[name] = np.concatenate([getattr(part.candidates, name) for part in parts])[:used]
         t, row = (np.concatenate([getattr(part, name) for part in parts]) for name in ("t", "row"))
         return Batches(Candidates(**fields, reach=self.radius), t[:used], row[:used])
@@ -168,11 +211,13 @@ def _compiled(function: Callable) -> Any:
 
 @_compiled
 def _gather(
-    t_in, x, y, p, row_in, every, longest, position, ring, head, radius, limits,
-    scratch, state, clock, silence, d, age, xi, scale, row, t, history,
+    t_in, x, y, p, row_in, every, longest, span, position, ring, head, radius, limits,
+    gate, margin, scratch, state, clock, silence, d, age, xi, room, scale, rate, row, t, history,
 ):  # fmt: skip
     """Fill batches from events: how many events were used, and whether all batches are full."""
-    batch, fill, first = state
+    batch, fill, first, until = state
+    parts_y, parts_x = limits.shape[1:]
+    gates_y, gates_x = gate.shape[1:]
     batches, most, size = age.shape
     height, width, kept = ring.shape[1], ring.shape[2], ring.shape[3]
     for i in range(len(t_in)):
@@ -183,24 +228,34 @@ def _gather(
         if (row_in + i) % every == 0:
             if fill == size or (fill > 0 and now - first > longest):
                 batch, fill = batch + 1, 0
-            if batch == batches:
-                state[:] = batch, 0, 0
+            if batch == batches or now > until:
+                state[:] = batch, fill, first, until
                 return i, True
             if fill == 0:
+                if batch == 0:
+                    until = now + span
                 first = now
-            found = 0
+            found, number = 0, 0
+            part_y, part_x = line * parts_y // height, column * parts_x // width
+            youngest, oldest = limits[0, part_y, part_x], limits[1, part_y, part_x]
+            part_y, part_x = line * gates_y // height, column * gates_x // width
+            flow_x, flow_y, slack = gate[:, part_y, part_x]
             here_x, here_y = position[line, column, 0], position[line, column, 1]
             for v in range(max(0, line - radius), min(height, line + radius + 1)):
                 for u in range(max(0, column - radius), min(width, column + radius + 1)):
                     newest = head[sign, v, u]
                     for k in range(kept):
                         past = now - ring[sign, v, u, newest - k]  # from the end below 0
-                        if past > limits[1]:
+                        if past > oldest:
                             break
-                        if past >= limits[0]:
-                            scratch[0, found] = here_x - position[v, u, 0]
-                            scratch[1, found] = here_y - position[v, u, 1]
-                            scratch[2, found] = past * 1e-6
+                        if past < youngest:
+                            continue
+                        number += 1
+                        dt = past * 1e-6
+                        dx, dy = here_x - position[v, u, 0], here_y - position[v, u, 1]
+                        off = (dx - flow_x * dt) ** 2 + (dy - flow_y * dt) ** 2
+                        if off <= (margin + slack * dt) ** 2:
+                            scratch[0, found], scratch[1, found], scratch[2, found] = dx, dy, dt
                             found += 1
             # Steps of found / C from an offset that changes from event to event (multiples of the
             # golden ratio, evenly spread): every candidate is as likely to be taken.
@@ -212,8 +267,15 @@ def _gather(
                 d[batch, 1, c, fill] = scratch[1, j]
                 age[batch, c, fill] = scratch[2, j]
             scale[batch, fill] = found / most if found > most else 1.0
+            ages = min(oldest, now - clock[0]) - youngest
+            rate[batch, fill] = number / (ages * 1e-6) if ages > 0 else 0.0
             xi[batch, fill, 0] = here_x
             xi[batch, fill, 1] = here_y
+            # d is the event's position less the candidate's: the least at the far side.
+            room[batch, 0, 0, fill] = here_x - position[line, width - 1, 0]
+            room[batch, 1, 0, fill] = here_x - position[line, 0, 0]
+            room[batch, 0, 1, fill] = here_y - position[height - 1, column, 1]
+            room[batch, 1, 1, fill] = here_y - position[0, column, 1]
             row[batch, fill] = row_in + i
             t[batch] = now
             history[batch] = (now - clock[0]) * 1e-6
@@ -221,5 +283,5 @@ def _gather(
         at = (head[sign, line, column] + 1) % kept
         head[sign, line, column] = at
         ring[sign, line, column, at] = now
-    state[:] = batch, fill, first
+    state[:] = batch, fill, first, until
     return len(t_in), False

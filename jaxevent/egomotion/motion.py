@@ -39,7 +39,8 @@ class Motion:
     (n, dimension); `covariance`; `lost`; `lag` (s) by which what was seen is older than `t`;
     `contrast`, how much better the motion explains the events than chance would, about 1 where it
     does not; `evidence`, the log-likelihood of the events since the estimate before. The last two
-    are NaN where an estimator has none.
+    are NaN where an estimator has none. `cloud` (n, particles, dimension), where it was asked for,
+    is some of a filter's particles: the likelier a motion, the more of them are near it.
     """
 
     model: str
@@ -50,6 +51,7 @@ class Motion:
     lag: NDArray[np.floating]
     contrast: NDArray[np.floating]
     evidence: NDArray[np.floating]
+    cloud: NDArray[np.floating] | None = None
 
     @classmethod
     def of(
