@@ -1,14 +1,14 @@
 """Speed, memory and compilation of reconstruction, as ratios measured in one run.
 
-    python experiments/bench.py [--gate | --bless] [--json FILE] [--skip-memory] [--blob]
+    python experiments/bench.py [--gate | --bless] [--json FILE] [--skip-memory] [--blob | --motion]
 
 A stream of 5 M events at 346x260 (gamma-distributed pixel rates, 2 s, 25 frames per second) is
 filtered, prepared and read. Beside it run, on one core: the whole filter as a plain numba program
 over events, which is what a C++ program does; its recursion with and without the look-up of
 neighbours; and the Accumulator of dv-processing. The tracker of blobs runs on a simulated blob,
 beside the same filter as a numba loop and what its authors publish, 0.1 M updates/s; `--blob` runs
-nothing else. `--gate` compares the ratios with bench_baseline.json and exits with 1 if one is worse
-than its tolerance; `--bless` writes them.
+nothing else, and `--motion` nothing but egomotion, see bench_motion.py. `--gate` compares the ratios
+with bench_baseline.json and exits with 1 if one is worse than its tolerance; `--bless` writes them.
 """
 
 import argparse
@@ -26,6 +26,7 @@ import equinox as eqx
 import jax
 import numba
 import numpy as np
+from bench_motion import motion_bench
 
 import jaxevent
 from jaxevent.blob.filters import Batch, _truncation, filter_of
@@ -630,6 +631,7 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write all numbers")
     parser.add_argument("--skip-memory", action="store_true", help="leave out the 100 M events")
     parser.add_argument("--blob", action="store_true", help="the tracker of blobs alone")
+    parser.add_argument("--motion", action="store_true", help="egomotion alone")
     parser.add_argument("--long", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.long:
@@ -638,6 +640,8 @@ def main() -> int:
 
     if arguments.blob:
         return finish(arguments, *blob_bench())
+    if arguments.motion:
+        return finish(arguments, *motion_bench())
     recording = stream(5_000_000, 2.0, 0)
     n = len(recording.events) / 1e6
     speed, ratio = {}, {}
@@ -701,7 +705,9 @@ def finish(arguments: argparse.Namespace, speed: dict[str, float], ratio: dict[s
         text = json.dumps({"machine": machine(), "M events/s": speed, "ratios": ratio}, indent=1)
         arguments.json.write_text(text + "\n")
     if arguments.bless:
-        old = json.loads(BASELINE.read_text())["ratios"] if arguments.blob else {}
+        old = (
+            json.loads(BASELINE.read_text())["ratios"] if arguments.blob or arguments.motion else {}
+        )
         kept = {**old, **{k: round(v, 3) for k, v in ratio.items()}}
         BASELINE.write_text(json.dumps({"machine": machine(), "ratios": kept}, indent=1) + "\n")
     if not arguments.gate:

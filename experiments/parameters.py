@@ -43,9 +43,10 @@ def page() -> str:
         f"`jaxevent.blob.Params`. Presets: {presets}.",
         "\n".join(rows([blob])),
         "## Egomotion",
-        "`jaxevent.egomotion.Params`.",
-        "\n".join(rows([jaxevent.egomotion.Params])),
+        "Each method of `jaxevent.egomotion.METHODS` has its own `Params`.",
     ]
+    for name, method in jaxevent.egomotion.METHODS.items():
+        parts += [f"### {name}", "\n".join(rows([method.Params]))]
     return "\n\n".join(parts) + "\n"
 
 

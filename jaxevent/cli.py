@@ -1,4 +1,4 @@
-"""The command line: demo, info, convert, reconstruct, track, evaluate, fit, simulate.
+"""The command line: demo, info, convert, reconstruct, track, motion, evaluate, fit, simulate.
 
 What cannot be used is said in one line on stderr, exit status 2. The libraries are imported by the
 command that needs them, so that help appears at once.
@@ -18,6 +18,8 @@ from typing import Any
 
 import jaxevent
 from jaxevent.errors import InputError
+
+_CLOUD = 64  # particles of an estimate that are kept for the plot
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -47,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="jaxevent",
-        description="Video of high rate and dynamic range, and tracks, from event cameras.",
+        description="Video of high rate and dynamic range, tracks, and motion, from event cameras.",
         epilog="example:\n  jaxevent demo",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -90,20 +92,30 @@ def _parser() -> argparse.ArgumentParser:
         help="default: %(default)s",
     )
 
+    def add_stream(one: argparse.ArgumentParser) -> None:
+        one.add_argument(
+            "--stream",
+            metavar="NAME",
+            help="which camera, of a file that holds several: a topic, left, right or a number",
+        )
+
     one = add(info, "Describe a recording.", "slider_depth.zip", "events.npz --size 240,180")
     one.add_argument("path", metavar="PATH", type=Path, help="a recording")
     add_size(one)
+    add_stream(one)
 
     one = add(
         convert,
         "Store a recording as HDF5. The file opens at once and need not fit in memory.",
         "slider_depth.zip slider_depth.h5",
+        "stereo.bag left.h5 --stream /davis/left/events",
         "slider_depth.zip small.h5 --compression gzip",
     )
     one.add_argument("source", metavar="SRC", type=Path, help="a recording")
     one.add_argument("target", metavar="DST", type=Path, help="the HDF5 file to write")
     one.add_argument("--compression", choices=["gzip"], help="smaller, but slower to read")
     add_size(one)
+    add_stream(one)
 
     one = add(
         reconstruct,
@@ -206,13 +218,110 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("--out", metavar="DIR_or_FILE", type=Path, required=True, help="what to write")
 
     one = add(
+        motion,
+        "Estimate how the camera moved. It writes a folder of tables (motion.csv, motion.h5), "
+        "plots and an image of the events before and after they are moved back along the motion, "
+        "and with --truth the errors. The camera's axes are x to the right, y down, z forward.",
+        "slider_depth.zip --model planar --truth --out slider",
+        "spin.h5 --model rotation --truth spin.csv --flow --out spin",
+        "drone.h5 --model general --gyro --start 2 --stop 3 --out drone",
+    )
+    one.add_argument("path", metavar="PATH", type=Path, help="a recording; frames are not needed")
+    one.add_argument(
+        "--model",
+        metavar="MODEL",
+        required=True,
+        help="planar: image velocity vx, vy (px/s); rotation: angular velocity wx, wy, wz (rad/s); "
+        "general: heading tx, ty, tz, a unit vector, and angular velocity",
+    )
+    one.add_argument(
+        "--method",
+        metavar="NAME",
+        help="voting, batch, contrast, planes or frames; default: voting, for general motion batch",
+    )
+    one.add_argument(
+        "--params",
+        metavar="FILE",
+        type=Path,
+        help="TOML file of name = value lines, e.g. particles = 400, or params.toml of a fit",
+    )
+    one.add_argument("--seed", metavar="N", type=int, default=0, help="of all that is random")
+    one.add_argument(
+        "--truth",
+        metavar="CSV",
+        nargs="?",
+        const="auto",
+        help="compare with a table with columns as in motion.csv, or without a name with the "
+        "recording's poses or else its gyro",
+    )
+    one.add_argument(
+        "--gyro", action="store_true", help="let the recording's gyro help the method batch"
+    )
+    one.add_argument(
+        "--still",
+        metavar="S,S",
+        type=_span,
+        help="from when to when the camera is still: what its gyro shows then is its bias",
+    )
+    one.add_argument(
+        "--rate", metavar="HZ", type=float, default=1000.0, help="rows per second; default: 1000"
+    )
+    one.add_argument(
+        "--centred",
+        action="store_true",
+        help="take every estimate for the time that what it saw shows, some ms earlier",
+    )
+    one.add_argument(
+        "--smooth", action="store_true", help="use the events that come later too, with voting"
+    )
+    one.add_argument("--start", metavar="S", type=float, help="on the recording's clock")
+    one.add_argument("--stop", metavar="S", type=float, help="its end")
+    one.add_argument(
+        "--flow", action="store_true", help="write the optical flow of each event too: flow.h5"
+    )
+    one.add_argument(
+        "--focal",
+        metavar="PX",
+        type=float,
+        help="focal length, for a recording without calibration; the centre is the sensor's",
+    )
+    add_size(one)
+    one.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
+
+    one = add(
         evaluate,
         "Compare methods on recordings. It hides frames, reconstructs them and prints a table of "
-        "the errors.",
+        "the errors. With --out, what is finished is kept: the same again goes on where it was "
+        "stopped, and computes only what is new. A recording or method that fails is said, and the "
+        "others go on; the exit status is 2 only if all fail.",
         "configs/slider_depth.toml --out results",
+        "mine.toml --out results --workers 8",
+        "mine.toml --out results --cluster tcp://10.0.0.1:8786",
     )
     one.add_argument("config", metavar="CONFIG.toml", type=Path, help="recordings and methods")
-    one.add_argument("--out", metavar="DIR", type=Path, help="folder for results.json, results.md")
+    one.add_argument(
+        "--out", metavar="DIR", type=Path, help="folder for report.html, results.json and others"
+    )
+    where = one.add_mutually_exclusive_group()
+    where.add_argument(
+        "--workers", metavar="N", type=int, help="compute in N processes instead of one"
+    )
+    where.add_argument(
+        "--cluster", metavar="ADDRESS", help="compute on the Dask cluster with this scheduler"
+    )
+    where.add_argument(
+        "--scheduler-file",
+        metavar="FILE",
+        type=Path,
+        help="the same, of the scheduler that wrote this file",
+    )
+    one.add_argument(
+        "--retries",
+        metavar="K",
+        type=int,
+        default=2,
+        help="further attempts where a worker dies or fails; default: %(default)s",
+    )
 
     one = add(
         fit,
@@ -239,9 +348,11 @@ def _parser() -> argparse.ArgumentParser:
         simulate,
         "Make a recording whose truth is known, as HDF5. A simulated sensor looks at a drawn scene "
         "of high dynamic range over which the camera moves, or at a video, of which the frames see "
-        "only the middle levels. Or events alone, of moving blobs.",
+        "only the middle levels. Or events alone, of moving blobs. Or a camera that moves in a "
+        "rigid world.",
         "--scene lake --speed fast --out lake.h5",
         "--blobs lissajous --truth dot.csv --out dot.h5",
+        "--motion rotation --change varying --truth spin.csv --out spin.h5",
         "bike.mp4 --cut 50 --speed 0.5 --out bike.h5",
     )
     source = one.add_mutually_exclusive_group(required=True)
@@ -258,36 +369,51 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NAME",
         help="lissajous, noise, growing, ttc, disc, crossing, dropout, flock or walk",
     )
+    source.add_argument(
+        "--motion",
+        metavar="NAME",
+        help="of the camera: planar, rotation, or general before a wall, shapes or texture",
+    )
     one.add_argument(
         "--out", metavar="FILE", type=Path, required=True, help="the HDF5 file to write"
     )
     one.add_argument(
         "--sensor",
         metavar="NAME",
-        help="ideal, good, davis or poor; default: davis",
+        help="ideal, good, davis or poor; default: davis, with --motion an ideal one",
     )
     one.add_argument("--seed", metavar="N", type=int, default=0, help="of all that is random")
     one.add_argument(
         "--speed",
         metavar="SPEED",
-        help="of the camera over a scene, slow (default) or fast; of a video, 2: twice as fast",
+        help="of the camera over a scene, slow (default) or fast; of a video, 2: twice as fast; of "
+        "--motion, px/s (planar), rad/s (rotation) or m/s",
     )
     one.add_argument(
         "--duration",
         metavar="S",
         type=float,
-        help="seconds of a scene, default 1.5; of the video, before --speed, or of blobs, "
-        "default all",
+        help="seconds of a scene, default 1.5, or of --motion, default 0.5; of the video, before "
+        "--speed, or of blobs, default all",
     )
     one.add_argument(
         "--truth",
         metavar="CSV",
         type=Path,
-        help="of blobs: a table of their states at 1000 Hz, as that of `jaxevent track`",
+        help="a table at 1000 Hz: of blobs their states, as that of `jaxevent track`, of --motion "
+        "the motion, as that of `jaxevent motion`",
     )
-    group = one.add_argument_group("only for a scene")
+    one.add_argument(
+        "--size",
+        metavar="W,H",
+        type=_size,
+        help="sensor size in pixels; default: 128,96 for a scene, 240,180 for --motion",
+    )
+    group = one.add_argument_group("only for --motion")
     group.add_argument(
-        "--size", metavar="W,H", type=_size, help="sensor size in pixels; default: 128,96"
+        "--change",
+        metavar="HOW",
+        help="how the motion changes: constant (default), linear or varying",
     )
     group = one.add_argument_group("only for a video")
     group.add_argument("--start", metavar="S", type=float, help="first second used; default: 0")
@@ -322,6 +448,10 @@ def _pair(text: str) -> tuple[int, ...]:
     return _numbers(text, (2,), int, "ID,ID, for example 0,1")
 
 
+def _span(text: str) -> tuple[float, ...]:
+    return _numbers(text, (2,), float, "START,STOP in seconds, for example 0,0.5")
+
+
 def _numbers(text: str, counts: tuple[int, ...], kind: Callable, meant: str) -> tuple:
     try:
         numbers = tuple(kind(number) for number in text.split(","))
@@ -336,13 +466,36 @@ def _progress() -> bool:
     return sys.stderr.isatty()
 
 
-def evaluate(config: Path, out: Path | None) -> None:
+def evaluate(
+    config: Path,
+    out: Path | None,
+    workers: int | None,
+    cluster: str | None,
+    scheduler_file: Path | None,
+    retries: int,
+) -> None:
     from jaxevent.evaluate import evaluate as run
     from jaxevent.report import markdown_table
 
-    print(markdown_table(run(config, out, progress=_progress())), end="")
+    rows = run(
+        config,
+        out,
+        progress=_progress(),
+        workers=workers,
+        cluster=cluster,
+        scheduler_file=scheduler_file,
+        retries=retries,
+    )
+    print(markdown_table(rows), end="")
     if out is not None:
-        print(f"\nwritten to {out}: results.json, results.md, config.toml")
+        files = "report.html, results.json, results.md, results.parquet, config.toml"
+        if not (out / "results.parquet").exists():
+            files = files.replace("results.parquet, ", "")
+            files += "; results.parquet needs pip install 'jaxevent[parquet]'"
+        print(f"\nwritten to {out}: {files}")
+    failed = sum("error" in row for row in rows)
+    if failed:
+        print(f"jaxevent: {failed} of {len(rows)} rows failed, see below them", file=sys.stderr)
 
 
 def fit(config: Path, out: Path, recordings: list[str] | None, resume: bool) -> None:
@@ -355,11 +508,15 @@ def fit(config: Path, out: Path, recordings: list[str] | None, resume: bool) -> 
 
 
 def convert(
-    source: Path, target: Path, compression: str | None, size: tuple[int, int] | None
+    source: Path,
+    target: Path,
+    compression: str | None,
+    size: tuple[int, int] | None,
+    stream: str | None,
 ) -> None:
     from jaxevent.io import load, save
 
-    recording = load(source, size, in_memory=False, progress=_progress())
+    recording = load(source, size, in_memory=False, progress=_progress(), stream=stream)
     save(recording, target, compression, progress=_progress())
     _print_stored(recording, target)
 
@@ -463,10 +620,101 @@ def track(
     )
 
 
+def motion(
+    path: Path,
+    model: str,
+    method: str | None,
+    params: Path | None,
+    seed: int,
+    truth: str | None,
+    gyro: bool,
+    still: tuple[float, float] | None,
+    rate: float | int,
+    centred: bool,
+    smooth: bool,
+    start: float | int | None,
+    stop: float | int | None,
+    flow: bool,
+    focal: float | int | None,
+    size: tuple[int, int] | None,
+    out: Path,
+) -> None:
+    import inspect
+    import json
+
+    from jaxevent.camera import PinholeCamera
+    from jaxevent.egomotion import find_method, from_gyro, gyro_bias
+    from jaxevent.egomotion.pictures import Output
+    from jaxevent.io import load
+
+    estimator = find_method(method, model)
+    method = estimator.__name__.rpartition(".")[2]
+    values = estimator.Params.of({}) if params is None else estimator.Params.load(params, method)
+    if seed < 0:
+        raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
+    takes = inspect.signature(estimator.estimate).parameters
+    for option, used, other in (("gyro", gyro, "batch"), ("smooth", smooth, "voting")):
+        if used and option not in takes:
+            raise InputError(
+                f"--{option} is not for the method {method}; leave it out or use {other}"
+            )
+    output = Output(out, rate, truth, centred, flow)
+    recording = load(path, size, in_memory=False, progress=_progress())
+    recording = dataclasses.replace(recording, name=str(path))  # for messages
+    if not len(recording.events):
+        raise InputError(f"{path}: holds no events; choose another recording")
+    if focal is not None:
+        if not 0 < focal < math.inf:
+            raise InputError(f"--focal {focal:g} is not possible; give pixels above 0")
+        if recording.camera is not None:
+            raise InputError(f"{path}: has a calibration; leave out --focal")
+        centre = (recording.width - 1) / 2, (recording.height - 1) / 2
+        recording = dataclasses.replace(recording, camera=PinholeCamera(focal, focal, *centre))
+    if model != "planar" and recording.camera is None:
+        raise InputError(
+            f"{path}: has no calibration, which {model} motion needs; give --focal or choose "
+            "--model planar"
+        )
+    imu = recording.imu
+    if imu is None and (gyro or still is not None):
+        raise InputError(
+            f"{path}: holds no IMU; leave out {'--gyro' if gyro else '--still'} or choose another "
+            "recording"
+        )
+    bias = None if imu is None or still is None else gyro_bias(imu, *still)
+    true = output.known(recording, model, bias)
+    settings: dict[str, Any] = {"cloud": _CLOUD} if "cloud" in takes else {}
+    if smooth:
+        settings["smooth"] = True
+    if imu is not None and gyro:
+        settings["gyro"] = from_gyro(imu) if bias is None else from_gyro(imu, bias)
+    if start is not None or stop is not None:
+        poses, measured = recording.poses, recording.imu
+        recording = dataclasses.replace(recording[start:stop], poses=poses, imu=measured)
+        if not len(recording.events):
+            raise InputError(f"{path}: holds no events from --start to --stop; choose other times")
+    clock = time.perf_counter()
+    told = estimator.estimate(
+        recording, values, model=model, seed=seed, progress=_progress(), **settings
+    )
+    seconds = time.perf_counter() - clock
+    about = {"method": method, "parameters": json.dumps(values.values()), "seed": seed}
+    about |= {"smooth": smooth, "gyro": gyro, "centred": centred}
+    written = output.write(recording, told, about, true, _progress())
+    print("\n".join([f"{model} motion by {method}:", *written.summary()]))
+    count = len(recording.events)
+    print(
+        f"\n{', '.join(written.files)} in {out}: {count:,} events in {seconds:.2f} s, "
+        f"{count / seconds:,.0f} events/s"
+    )
+
+
 def simulate(
     video: Path | None,
     scene: str | None,
     blobs: str | None,
+    motion: str | None,
+    change: str | None,
     truth: Path | None,
     out: Path,
     sensor: str | None,
@@ -484,22 +732,36 @@ def simulate(
     from jaxevent.parameters import nearest
     from jaxevent.simulate.scenes import SPEEDS
 
-    if blobs is not None:
-        given = {"sensor": sensor, "speed": speed, "size": size, "start": start, "cut": cut}
-        for name, value in {**given, "max-size": max_size}.items():
-            if value is not None:
-                raise InputError(f"--{name} is not for blobs; leave it out")
-        _simulate_blobs(blobs, truth, out, seed, duration)
-        return
-    if truth is not None:
-        raise InputError("--truth is that of --blobs; HDR scenes hold theirs, leave it out")
-    sensor = sensor or "davis"
-    if sensor not in sim.SENSORS:
-        raise InputError(f"there is no sensor {sensor!r}; {nearest(sensor, sim.SENSORS)}")
     if seed < 0:
         raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
     if duration is not None and not 0 < duration < math.inf:
         raise InputError(f"--duration {duration:g} is not possible; give seconds above 0")
+    if size is not None and min(size) < 1:
+        raise InputError(f"--size {size[0]},{size[1]} is not possible; give it in pixels")
+    if sensor is not None and sensor not in sim.SENSORS:
+        raise InputError(f"there is no sensor {sensor!r}; {nearest(sensor, sim.SENSORS)}")
+    if blobs is not None or motion is not None:
+        given = {"start": start, "cut": cut, "max-size": max_size}
+        if blobs is not None:
+            given |= {"sensor": sensor, "speed": speed, "size": size, "change": change}
+        for name, value in given.items():
+            if value is not None:
+                what = "blobs" if blobs is not None else "the motion of a camera"
+                raise InputError(f"--{name} is not for {what}; leave it out")
+        if blobs is not None:
+            _simulate_blobs(blobs, truth, out, seed, duration)
+        else:
+            assert motion is not None
+            how = {"change": change or "constant", "sensor": sensor, "speed": speed}
+            _simulate_motion(motion, truth, out, seed, duration or 0.5, size or (240, 180), **how)
+        return
+    if truth is not None:
+        raise InputError(
+            "--truth is that of --blobs and --motion; HDR scenes hold theirs, leave it out"
+        )
+    if change is not None:
+        raise InputError("--change is for --motion; leave it out")
+    sensor = sensor or "davis"
     given: dict[str, Any] = {"start": start, "cut": cut, "max_size": max_size}
     given = {name: value for name, value in given.items() if value is not None}
     # Opened first, so that a place that cannot be written is told before the work.
@@ -508,8 +770,6 @@ def simulate(
             if given:
                 option = next(iter(given)).replace("_", "-")
                 raise InputError(f"--{option} is for a video; leave it out with --scene")
-            if size is not None and min(size) < 1:
-                raise InputError(f"--size {size[0]},{size[1]} is not possible; give it in pixels")
             way: Any = speed or "slow"
             if way not in SPEEDS:
                 raise InputError(f"--speed {way} is not possible for a scene; give slow or fast")
@@ -544,10 +804,6 @@ def _simulate_blobs(
     from jaxevent.io.output import complete
     from jaxevent.simulate import blob_scene
 
-    if seed < 0:
-        raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
-    if duration is not None and not 0 < duration < math.inf:
-        raise InputError(f"--duration {duration:g} is not possible; give seconds above 0")
     with contextlib.ExitStack() as stack:
         partial = stack.enter_context(complete(out))
         table = None if truth is None else stack.enter_context(complete(truth))
@@ -561,11 +817,55 @@ def _simulate_blobs(
     _print_stored(recording, out)
 
 
-def info(path: Path, size: tuple[int, int] | None) -> None:
+def _simulate_motion(
+    name: str,
+    truth: Path | None,
+    out: Path,
+    seed: int,
+    duration: float | int,
+    size: tuple[int, int],
+    *,
+    change: str,
+    sensor: str | None,
+    speed: str | None,
+) -> None:
+    import numpy as np
+
+    from jaxevent.egomotion.pictures import write_known
+    from jaxevent.io import save
+    from jaxevent.io.output import complete
+    from jaxevent.simulate import SENSORS, motion_scene
+
+    try:
+        pace = None if speed is None else float(speed)
+    except ValueError:
+        pace = math.nan
+    if pace is not None and not 0 < pace < math.inf:
+        raise InputError(f"--speed {speed} is not possible; give a number above 0, such as 1.5")
+    with contextlib.ExitStack() as stack:
+        partial = stack.enter_context(complete(out))
+        table = None if truth is None else stack.enter_context(complete(truth))
+        # The field of view is always that of 240 px and f = 200 px.
+        recording, source = motion_scene(
+            name, change, seed, size=size, focal=size[0] / 1.2, duration=duration, speed=pace,
+            sensor=None if sensor is None else SENSORS[sensor],
+        )  # fmt: skip
+        save(recording, partial)
+        if table is not None:
+            times = np.arange(0, round(1e6 * duration) + 1, 1000)
+            T, Omega = source.twist(times)
+            heading = T / np.maximum(np.linalg.norm(T, axis=1, keepdims=True), 1e-12)
+            kinds = {"planar": source.velocity, "rotation": lambda _: Omega}
+            values = kinds.get(name, lambda _: np.concatenate([heading, Omega], 1))(times)
+            write_known(table, name if name in kinds else "general", times, values)
+    _print_stored(recording, out)
+
+
+def info(path: Path, size: tuple[int, int] | None, stream: str | None) -> None:
     from jaxevent.describe import describe
     from jaxevent.io import load
 
-    recording = load(path, size, in_memory=False, progress=_progress())
+    recording = load(path, size, in_memory=False, progress=_progress(), stream=stream)
     lines = [("file", str(path)), *describe(recording, progress=_progress())]
     width = max(len(name) for name, _ in lines)
     for name, text in lines:

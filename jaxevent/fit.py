@@ -32,8 +32,9 @@ A method may have its own loss, error, learning_rate, iterations and starts. Par
 fixed when a recording is prepared have no gradient to follow; each candidate of a search is
 prepared anew. Values omitted are those above, except where comments say otherwise.
 
-The settings from `loss` on are those of reconstruction; `jaxevent.blob.objectives` tells those of
-the tracker, the method "blob". What the loop and the files need of a system is in `System`.
+The settings from `loss` on are those of reconstruction. `jaxevent.blob.objectives` tells those of
+the tracker, the method "blob", and `jaxevent.egomotion.objectives` those of egomotion, the method
+"voting". What the loop and the files need of a system is in `System`.
 """
 
 import contextlib
@@ -710,8 +711,9 @@ class System(Protocol):
 def systems() -> dict[str, System]:
     """By the name of every method that can be fitted."""
     from jaxevent.blob.objectives import BLOB
+    from jaxevent.egomotion.objectives import VOTING
 
-    return {**dict.fromkeys(METHODS, RECONSTRUCTION), "blob": BLOB}
+    return {**dict.fromkeys(METHODS, RECONSTRUCTION), "blob": BLOB, "voting": VOTING}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,7 +14,8 @@ def test_table_of_parameters_is_that_of_the_code():
     page = runpy.run_path(str(ROOT / "experiments" / "parameters.py"))["page"]()
     assert (ROOT / "docs" / "parameters.md").read_text() == page
     kinds = [method.Params for method in jaxevent.METHODS.values()]
-    for kind in (*kinds, jaxevent.blob.Params, jaxevent.egomotion.Params):
+    kinds += [method.Params for method in jaxevent.egomotion.METHODS.values()]
+    for kind in (*kinds, jaxevent.blob.Params):
         for name in (*kind.numbers, *kind.choices):
             assert f"| `{name}` |" in page
 

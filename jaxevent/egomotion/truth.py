@@ -9,13 +9,16 @@ axes. Errors follow the egomotion thesis, 5.20 to 5.21 and 6.22 to 6.29. All on 
 """
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from jaxevent.egomotion.motion import COMPONENTS
 from jaxevent.errors import InputError
-from jaxevent.recording import Imu, Poses, Times, microseconds
+from jaxevent.recording import Imu, Poses, Recording, Times, microseconds
 
 _OUTLIER = 0.05  # relative magnitude error from which the thesis counts an outlier
 
@@ -128,6 +131,113 @@ def gyro_bias(imu: Imu, start: Times, stop: Times) -> NDArray[np.float64]:
             "seconds on the recording's clock"
         )
     return imu.gyro[rows].mean(0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """A motion that is known at times t (us), n of them: values (n, components) of `model`.
+
+    The components are those of `motion.COMPONENTS`, in px/s, or rad/s and unit headings.
+    """
+
+    model: str
+    t: NDArray[np.int64]
+    values: NDArray[np.float64]
+
+    def __call__(self, times: Times) -> NDArray[np.float64]:
+        """The motion (times, components) at integers (us) or floats (s), linear in between.
+
+        Raises `InputError` for times before the first and after the last that is known.
+        """
+        us = np.atleast_1d(microseconds(times))
+        if len(us) and (us.min() < self.t[0] or us.max() > self.t[-1]):
+            raise InputError(
+                f"the true motion is known from {self.t[0]} to {self.t[-1]} us, not at {us.min()} "
+                f"to {us.max()} us; integers are microseconds, floats seconds"
+            )
+        between = np.stack([np.interp(us, self.t, column) for column in self.values.T], 1)
+        if self.model == "general":
+            between[:, :3] = _unit(between[:, :3])
+        return between
+
+    def within(self, times: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """At which times (us) it is known."""
+        return (times >= self.t[0]) & (times <= self.t[-1])
+
+
+def known(
+    recording: Recording,
+    model: str,
+    source: str | Path = "auto",
+    bias: ArrayLike = (0.0, 0.0, 0.0),
+    span: float | int = 0.02,
+) -> Known:
+    """What is true of a recording's motion.
+
+    Args:
+        recording: With poses or an IMU, unless `source` is a table.
+        model: Of `motion.COMPONENTS`. Planar motion is known from tables alone.
+        source: "poses", "gyro", "auto" (poses, else the gyro), or the path of a table.
+        bias: Taken off the gyro, rad/s.
+        span: Time (s) over which velocities are taken from poses.
+
+    Raises:
+        InputError: The recording holds no such truth, or the table cannot be read.
+    """
+    if source not in ("auto", "poses", "gyro"):
+        return read_motion(source, model)
+    if model == "planar":
+        raise InputError(
+            f"{recording.name}: image velocity is known neither from poses nor from a gyro; give "
+            "a table with the columns t, vx, vy"
+        )
+    poses, imu = recording.poses, recording.imu
+    if source != "gyro" and poses is not None and len(poses):
+        twists = from_poses(poses, span)
+    elif source != "poses" and imu is not None and len(imu) and model == "rotation":
+        twists = from_gyro(imu, bias)
+    else:
+        what = {"auto": "neither poses nor an IMU", "poses": "no poses", "gyro": "no IMU"}[
+            str(source)
+        ]
+        if source != "poses" and model == "general" and imu is not None:
+            what = "no poses, and its gyro does not tell the heading"
+        raise InputError(f"{recording.name}: holds {what}; give a table of the true motion")
+    if model == "rotation":
+        return Known(model, twists.t, twists.Omega)
+    assert twists.T is not None
+    return Known(model, twists.t, np.concatenate([_unit(twists.T), twists.Omega], 1))
+
+
+def read_motion(path: str | Path, model: str) -> Known:
+    """The true motion from a table: columns t (s) and the components; further ones are left out.
+
+    Raises `InputError` for a file that cannot be read, missing columns or numbers, times that do
+    not rise.
+    """
+    path = Path(path)
+    try:
+        table = pd.read_csv(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+    except ValueError as error:
+        raise InputError(f"{path}: is no table ({error}); give columns t and components") from None
+    names = ("t", *COMPONENTS[model])
+    for name in names:
+        if name not in table.columns:
+            raise InputError(f"{path}: has no column {name!r}; give the columns {', '.join(names)}")
+    numbers = np.stack(
+        [np.asarray(pd.to_numeric(table[name], errors="coerce"), np.float64) for name in names], 1
+    )
+    finite = np.isfinite(numbers).all(1)
+    if not len(numbers) or not finite.all():
+        line = int(np.argmin(finite)) + 2 if len(numbers) else 2
+        raise InputError(f"{path}: line {line} holds no numbers; give them, or leave the line out")
+    t = np.rint(numbers[:, 0] * 1e6).astype(np.int64)
+    if (np.diff(t) <= 0).any():
+        line = int(np.argmax(np.diff(t) <= 0)) + 3
+        raise InputError(f"{path}: the time in line {line} does not rise; sort the table by t")
+    return Known(model, t, numbers[:, 1:])
 
 
 def endpoint_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:

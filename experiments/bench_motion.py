@@ -1,0 +1,156 @@
+"""Speed of egomotion, as part of `bench.py`: events scored per second, and seconds per window.
+
+    python experiments/bench.py --motion
+
+Filters run over prepared candidates of simulated scenes, one event in 8, neighbours up to R px
+away; beside them the same sums over candidates and particles as a numba loop on one core. The
+thesis publishes 100,000 events/s with N = 100 (GPU and CPU).
+"""
+
+import time
+from typing import Any
+
+import equinox as eqx
+import jax
+import numba
+import numpy as np
+
+from jaxevent.egomotion import batch, voting
+from jaxevent.egomotion.candidates import Candidates
+from jaxevent.simulate import motion_scene
+
+PUBLISHED = 0.1  # M events/s, N = 100
+SIZE, RADIUS, BASELINE = (160, 120), 6, 4.5
+CASES = (("planar", "planar", 200), ("rotation", "rotation", 200), ("general", "texture", 500))
+
+
+@numba.njit(cache=True, fastmath=True)
+def votes(dx, dy, age, count, xi, scale, particles, model, f, tau, exponent, rho, s0, alpha):
+    """The log-likelihood of every particle: what `voting.score` adds up, in float32."""
+    total = np.zeros(len(particles), np.float32)
+    one = np.float32(1)
+    for e in range(len(count)):
+        x, y = xi[e, 0], xi[e, 1]
+        for n in range(len(particles)):
+            ax, ay = np.float32(0), np.float32(0)
+            if model == 0:
+                ux, uy = particles[n, 0], particles[n, 1]
+            else:
+                first = 3 if model == 2 else 0
+                wx, wy, wz = particles[n, first], particles[n, first + 1], particles[n, first + 2]
+                ux = x * y / f * wx - (f + x * x / f) * wy + y * wz
+                uy = (f + y * y / f) * wx - x * y / f * wy - x * wz
+                if model == 2:
+                    ax = x * particles[n, 2] - f * particles[n, 0]
+                    ay = y * particles[n, 2] - f * particles[n, 1]
+                    size = np.float32(np.sqrt(max(ax * ax + ay * ay, np.float32(1e-12))))
+                    ax, ay = ax / size, ay / size
+            S = np.float32(0)
+            for c in range(count[e]):
+                dt = age[e, c]
+                qx, qy = dx[e, c] - ux * dt, dy[e, c] - uy * dt
+                if model == 2:
+                    s = min(max(qx * ax + qy * ay, np.float32(0)), rho * dt)
+                    qx, qy = qx - s * ax, qy - s * ay
+                S += np.exp((qx * qx + qy * qy) * exponent)
+            total[n] += alpha * np.log(one + S * scale[e] / s0)
+    return total
+
+
+def timed(function: Any, repeat: int = 3) -> float:
+    """The least of some times, after one call that compiles."""
+    jax.block_until_ready(function())
+    seconds = []
+    for _ in range(repeat):
+        clock = time.perf_counter()
+        jax.block_until_ready(function())
+        seconds.append(time.perf_counter() - clock)
+    return min(seconds)
+
+
+def loop_seconds(
+    made: Candidates, particles: np.ndarray, kind: voting.Model, params: voting.Params, tau: float
+) -> tuple[float, np.ndarray]:
+    """Seconds of the numba loop over candidates of ages in [youngest tau, tau], and its sums."""
+    age = np.moveaxis(np.asarray(made.age), 1, 2).reshape(-1, made.age.shape[1])
+    d = np.moveaxis(np.asarray(made.d), (1, 3), (0, 2)).reshape(2, *age.shape)
+    keep = (age >= np.float32(float(params.youngest) * tau)) & (age <= np.float32(tau))
+    keep &= np.asarray(made.valid).reshape(-1, 1)
+    order = np.argsort(~keep, 1, kind="stable")
+    dx, dy, age = (np.take_along_axis(part, order, 1) for part in (d[0], d[1], age))
+    count = keep.sum(1)
+    xi, scale = np.asarray(made.xi).reshape(-1, 2), np.asarray(made.scale).ravel()
+    number = {"planar": 0, "rotation": 1, "general": 2}[kind.name]
+    rest = (
+        np.float32(kind.f), tau, np.float32(-0.5 / float(params.sigma_x) ** 2),
+        np.float32(params.rho_max), np.float32(params.s0), np.float32(params.alpha),
+    )  # fmt: skip
+    arguments = (dx, dy, age, count, xi, scale, particles, number, *rest)
+    return timed(lambda: votes(*arguments)), votes(*arguments)
+
+
+def voting_bench() -> tuple[dict[str, float], dict[str, float]]:
+    speed, ratio = {}, {}
+    for model, scene, N in CASES:
+        recording, truth = motion_scene(scene, "constant", 200, size=SIZE, duration=0.3)
+        params = voting.Params.of({"radius": RADIUS, "baseline": BASELINE, "particles": N})
+        kind, gatherer = voting.prepare(recording, params, model)
+        rng = np.random.default_rng(0)
+        at = np.array([0.2])
+        T, Omega = (part[0] for part in truth.twist(at))
+        middle = {
+            "planar": lambda truth=truth, at=at: truth.velocity(at)[0],
+            "rotation": lambda Omega=Omega: Omega,
+            "general": lambda T=T, Omega=Omega: np.r_[T / np.linalg.norm(T), Omega],
+        }[model]()
+        particles = middle + 0.02 * np.abs(middle).max() * rng.normal(size=(N, len(middle)))
+        particles = particles.astype(np.float32)
+        oldest = float(params.tau_general if model == "general" else params.tau_max)
+        made = jax.device_put(gatherer.whole(0.2 * oldest, oldest).candidates)
+        events = int(np.asarray(made.valid).sum())
+        noise = voting.draw(jax.random.key(0), len(made.elapsed), params, kind)
+        start = voting.begin(params, kind, noise)
+        start = eqx.tree_at(
+            lambda c: (c.particles, c.searching),
+            start,
+            (jax.numpy.asarray(particles), jax.numpy.asarray(False)),
+        )
+        run = eqx.filter_jit(voting.run)
+        seconds = timed(lambda a=(run, params, kind, made, noise, start): a[0](*a[1:])[1].mean)
+        # The loop's ages: those that the filter has for planar motion; there one tau is all.
+        tau = oldest
+        if model == "planar":
+            tau = min(BASELINE / float(np.linalg.norm(middle)), oldest)
+        slow, _ = loop_seconds(made, particles, kind, params, tau)
+        whole = timed(
+            lambda a=(recording, params, model): voting.estimate(a[0], a[1], model=a[2]).mean, 2
+        )
+        name = f"{model} voting, N = {N}"
+        speed[name] = events / seconds / 1e6
+        speed[f"{name}, as a numba loop"] = events / slow / 1e6
+        speed[f"{name}, `estimate` in all, events of the recording"] = (
+            len(recording.events) / whole / 1e6
+        )
+        ratio[f"{name} / numba loop"] = slow / seconds
+        ratio[f"{name} / thesis' 0.1 M"] = speed[name] / PUBLISHED
+    return speed, ratio
+
+
+def batch_bench() -> tuple[dict[str, float], dict[str, float]]:
+    """Seconds of one window of 300 ms and 100,000 events, all starts included."""
+    recording, _ = motion_scene("texture", "varying", 200, duration=0.5)
+    assert recording.camera is not None
+    windows = batch.Windows(recording, batch.Params.of({"events": 100_000}), recording.camera)
+
+    def whole() -> np.ndarray:
+        fit = windows.fit(250_000, windows.starts(250_000))
+        assert fit is not None
+        return np.asarray(fit.path.O)
+
+    return {"batch general motion, s per 300 ms window of 100 k events": timed(whole, 2)}, {}
+
+
+def motion_bench() -> tuple[dict[str, float], dict[str, float]]:
+    speed, ratio = voting_bench()
+    more, _ = batch_bench()
+    return speed | more, ratio

@@ -1,0 +1,209 @@
+"""Flow of events from a known motion: against a slow search, closed forms and a scene's truth."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from jaxevent.camera import PinholeCamera
+from jaxevent.egomotion import flow as module
+from jaxevent.egomotion.flow import Params, flow, iterate
+from jaxevent.egomotion.motion import COMPONENTS, Motion
+from jaxevent.errors import InputError
+from jaxevent.recording import Events, Recording
+from jaxevent.simulate import motion_scene
+
+WIDTH, HEIGHT, F = 96, 72, 80.0
+CAMERA = PinholeCamera(F, F, 47.5, 35.5)
+
+
+@functools.cache
+def textured():
+    """From 0.05 to 0.15 s; flow is known about 50 ms later."""
+    recording, source = motion_scene("texture", size=(WIDTH, HEIGHT), focal=F, duration=0.16)
+    return recording[0.05:0.15], source
+
+
+def known(model, mean, t=(0, 300_000), lost=None):
+    n = len(COMPONENTS[model])
+    mean = np.broadcast_to(np.asarray(mean, float), (len(t), n))
+    return Motion.of(model, np.array(t), mean, np.zeros((len(t), n, n)), lost)
+
+
+def true_motion(source, sign=1):
+    t = np.arange(0, 160_001, 5_000)
+    T, Omega = source.twist(t)
+    return known("general", np.c_[sign * T / np.linalg.norm(T, axis=1, keepdims=True), Omega], t)
+
+
+def by_hand(x, y, T, Omega, inverse_depth):
+    """Image velocity (px/s) of the scene's points, by projecting them a moment later."""
+    h = 1e-6
+    P = np.stack([x / F, y / F, np.ones_like(x)], -1) / inverse_depth[..., None]
+    P_later = P + h * (-T - np.cross(Omega, P))
+    return F * (P_later[..., :2] / P_later[..., 2:] - P[..., :2] / P[..., 2:]) / h
+
+
+def test_flow_of_a_scene_is_the_true_one():
+    recording, source = textured()
+    told = flow(recording, true_motion(source))
+    events = recording.events
+    late = events.t > 100_000
+    T, Omega = source.twist(events.t)
+    depth = np.stack([source.depth(float(t)) for t in np.arange(0, 0.16, 0.01)])
+    Z = depth[np.rint(events.t / 1e4).astype(int), events.y, events.x]
+    U = by_hand(events.x - 47.5, events.y - 35.5, T, Omega, 1 / Z)
+    assert told.valid[late].mean() > 0.85
+    use = told.valid & late
+    error = np.linalg.norm(told.flow - U, axis=1) / np.linalg.norm(U, axis=1)
+    assert np.median(error[use]) < 0.12  # 0.09 when written
+    assert (told.residual[told.valid] <= 1).all()
+    assert np.isnan(told.flow[~told.valid]).all()
+    # A camera that moves the other way explains less.
+    flipped = flow(recording, true_motion(source, -1))
+    outlier, flipped = told.residual > 1, flipped.residual > 1
+    assert flipped[late].mean() > 2 * outlier[late].mean()  # 0.19 and 0.08
+
+
+def scattered(number=500, span=60_000, seed=0):
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.integers(0, span, number)) // 50 * 50
+    x, y, p = (rng.integers(0, n, number) for n in (17, 13, 2))
+    events = Events(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(bool))
+    return Recording("scattered", 17, 13, events, camera=PinholeCamera(20.0, 20.0, 7.3, 6.1))
+
+
+def slow(recording, row, base, a, params):
+    """Flow and residual of an event by looking at all earlier ones, one after another."""
+    e, sigma, b = recording.events, float(params.sigma_x), float(params.baseline)
+    found, seen = [], {}
+    for i in reversed(range(row)):
+        d = np.array([float(e.x[row]) - float(e.x[i]), float(e.y[row]) - float(e.y[i])])
+        age = (e.t[row] - e.t[i]) * 1e-6
+        if e.p[i] != e.p[row] or np.abs(d).max() > params.radius:
+            continue
+        place = (e.x[i], e.y[i])
+        seen[place] = seen.get(place, 0) + 1
+        if seen[place] <= params.per_pixel and 0 < age <= float(params.tau_max):
+            found.append((d, age))
+
+    def inside(rho, age):
+        return b / 2 <= age * np.linalg.norm(base + rho * a) <= b
+
+    def vote(rho, d, age):
+        return np.exp(-(np.linalg.norm(d - age * (base + rho * a)) ** 2) / (2 * sigma**2))
+
+    rho = 0.0
+    if a.any():
+        factor = float(params.fastest / params.slowest) ** (1 / (params.speeds - 1))
+        grid = [0.0, *(float(params.slowest) * factor**k for k in range(params.speeds))]
+        S = [
+            np.linalg.norm(base + rho * a) ** float(params.gain)
+            * sum(vote(rho, d, age) for d, age in found if inside(rho, age))
+            for rho in grid
+        ]
+        rho = grid[int(np.argmax(S))]
+        for _ in range(2):
+            w = [(vote(rho, d, age), d, age) for d, age in found if inside(rho, age)]
+            moment = sum(v * age**2 for v, _, age in w)
+            if moment > 0:
+                along = sum(v * age * ((d - age * base) @ a) for v, d, age in w)
+                rho = min(max(along / moment, 0), float(params.fastest))
+    left = [np.linalg.norm(d - age * (base + rho * a)) for d, age in found if inside(rho, age)]
+    return base + rho * a, min(left, default=np.inf)
+
+
+@pytest.mark.parametrize("model", ["planar", "rotation", "general"])
+def test_flow_is_the_slow_one(model):
+    recording = scattered()
+    params = Params.of({"candidates": 256, "radius": 4, "baseline": 3.1, "speeds": 7, "limit": 0.7})
+    mean = {
+        "planar": [180.0, -60.0],
+        "rotation": [3.0, -4.0, 9.0],
+        "general": [0.6, 0.0, 0.8, 3.0, -4.0, 9.0],
+    }[model]
+    told = flow(recording, known(model, mean), params)
+    e = recording.events
+    x, y = e.x - 7.3, e.y - 6.1
+    one, ahead = np.ones(1), np.zeros(3)
+    for row in range(0, len(e), 7):
+        u, v, a = x[row : row + 1], y[row : row + 1], np.zeros(2)
+        if model == "planar":
+            base = np.array(mean)
+        else:
+            # Cameras of f = 20 px and of F see the same rays.
+            u, v = u * F / 20, v * F / 20
+            base = by_hand(u, v, ahead, np.array(mean[-3:]), one)[0] * 20 / F
+        if model == "general":
+            a = by_hand(u, v, np.array(mean[:3]), ahead, one)[0]
+            a = a / np.linalg.norm(a)
+        U, residual = slow(recording, row, base, a, params)
+        np.testing.assert_allclose(told.residual[row], residual, rtol=1e-3, atol=1e-4)
+        assert told.valid[row] == (model != "general" or residual <= 0.7)
+        if told.valid[row]:
+            np.testing.assert_allclose(told.flow[row], U, rtol=1e-3, atol=1e-2)
+
+
+def test_pieces_are_the_whole(monkeypatch):
+    recording, source = textured()
+    recording = recording[:0.08]
+    motion = true_motion(source)
+    whole = flow(recording, motion)
+    assert len(whole.valid) == len(recording.events)
+    monkeypatch.setattr(module, "BATCHES", 3)
+    parts = list(iterate(recording, motion))
+    assert len(parts) == -(-len(recording.events) // (3 * module.BATCH))
+    for name in ("flow", "valid", "residual"):
+        joined = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_allclose(joined, getattr(whole, name), rtol=1e-5)
+
+
+def test_where_the_motion_is_lost_there_is_no_flow():
+    recording = scattered()
+    motion = known("planar", [100.0, 50.0], t=(0, 20_000, 40_000), lost=np.array([0, 1, 0], bool))
+    told = flow(recording, motion)
+    between = (recording.events.t > 0) & (recording.events.t < 40_000)
+    assert np.array_equal(told.valid, ~between)
+    assert np.isnan(told.flow[between]).all() and np.isnan(told.residual[between]).all()
+    assert (told.flow[~between] == [100, 50]).all() and told.flow.dtype == np.float32
+    late = known("planar", [[0.0, 0.0], [60.0, 0.0]], t=(20_000, 80_000))
+    told = flow(recording, dataclasses.replace(late, lag=np.full(2, 0.02)))
+    np.testing.assert_allclose(told.flow[:, 0], recording.events.t * 1e-3, atol=1e-3)
+    nothing = flow(recording, Motion.nothing("planar"))
+    assert not nothing.valid.any() and nothing.outliers() == 0
+
+
+def test_noise_is_an_outlier():
+    recording, source = textured()
+    rng = np.random.default_rng(0)
+    noise = scattered(2000, 100_000, 1).events
+    noise = dataclasses.replace(noise, t=noise.t + 50_000)
+    x = rng.integers(0, WIDTH, 2000).astype(np.uint16)
+    y = rng.integers(0, HEIGHT, 2000).astype(np.uint16)
+    e = recording.events
+    order = np.argsort(np.r_[e.t, noise.t], kind="stable")
+    events = Events(
+        np.r_[e.t, noise.t][order], np.r_[e.x, x][order], np.r_[e.y, y][order],
+        np.r_[e.p, noise.p][order],
+    )  # fmt: skip
+    drawn = (order >= len(e)) & (events.t > 100_000)
+    real = (order < len(e)) & (events.t > 100_000)
+    told = flow(dataclasses.replace(recording, events=events), true_motion(source))
+    outlier = told.residual > 1
+    assert outlier[drawn].mean() > 2 * outlier[real].mean()
+
+
+def test_bad_input():
+    recording = dataclasses.replace(scattered(), camera=None)
+    with pytest.raises(InputError, match="scattered: has no calibration, which the flow of rot"):
+        flow(recording, known("rotation", [1.0, 2.0, 3.0]))
+    assert flow(recording, known("planar", [1.0, 2.0])).valid.all()
+    empty = dataclasses.replace(recording, events=Events.empty())
+    assert flow(empty, known("planar", [1.0, 2.0])).flow.shape == (0, 2)
+
+
+def test_single_precision(float32):
+    recording, source = textured()
+    told = flow(recording[:0.12], true_motion(source))
+    assert told.valid.mean() > 0.5 and np.isfinite(told.flow[told.valid]).all()
