@@ -7,8 +7,9 @@ filtered, prepared and read. Beside it run, on one core: the whole filter as a p
 over events, which is what a C++ program does; its recursion with and without the look-up of
 neighbours; and the Accumulator of dv-processing. The tracker of blobs runs on a simulated blob,
 beside the same filter as a numba loop and what its authors publish, 0.1 M updates/s; `--blob` runs
-nothing else, and `--motion` nothing but egomotion, see bench_motion.py. `--gate` compares the ratios
-with bench_baseline.json and exits with 1 if one is worse than its tolerance; `--bless` writes them.
+nothing else, and `--motion` nothing but egomotion, see bench_motion.py. `--gate` compares the
+ratios with bench_baseline.json and exits with 1 if one is worse than its tolerance; `--bless`
+writes them.
 """
 
 import argparse

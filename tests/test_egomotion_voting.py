@@ -202,7 +202,8 @@ def test_displacements_are_undistorted():
 
 def prepared(likelihood="soft", model="planar", number=500, **settings):
     small = {"every": 1, "batch": 16, "particles": 30, "candidates": 20, "radius": 3,
-             "baseline": 3.0, "alpha": 2.5, "tau_general": 0.09}  # fmt: skip
+             "baseline": 3.0, "alpha": 2.5, "tau_general": 0.09,
+             "rho_max": 25.0}  # fmt: skip
     params = voting.Params.of({"likelihood": likelihood, **small, **settings})
     rng = np.random.default_rng(1)
     t = np.sort(rng.integers(0, 100_000, number))
@@ -213,8 +214,11 @@ def prepared(likelihood="soft", model="planar", number=500, **settings):
 
 
 def by_hand(params, model, batch, particles, weights, searching):
-    """Sum over events of each particle's log-likelihood, one term after another."""
-    total = np.zeros(len(particles))
+    """Sums over events, one term after another: each particle's log-likelihood; votes; chance; tau.
+
+    `tau` is the mean over events of the age of a common range's oldest candidates.
+    """
+    total, votes, chance, taus = np.zeros(len(particles)), 0.0, 0.0, []
     band = (searching or params.likelihood == "band") and model.name != "general"
     share = float(params.youngest)
     b, tau_max = float(params.baseline), float(params.tau_max)
@@ -225,13 +229,14 @@ def by_hand(params, model, batch, particles, weights, searching):
         f, general = model.f, model.name == "general"
         rows = np.array([[x * y / f, -(f + x * x / f), y], [f + y * y / f, -x * y / f, -x]])
         flows = [q if model.name == "planar" else rows @ q[-3:] for q in particles]
-        lines = [np.array([-f * q[0] + x * q[2], -f * q[1] + y * q[2]]) if general else None
+        lines = [np.array([-f * q[0] + x * q[2], -f * q[1] + y * q[2]]) if general else np.zeros(2)
                  for q in particles]  # fmt: skip
         speeds = [np.hypot(*U) for U in flows]
         usual = weights @ np.array(flows)
         tau = min(b / np.hypot(*usual), tau_max)
         if general:
             tau = float(params.tau_general)
+        taus.append(tau)
         if band or general:
             asked = (-least_d >= 0.99 * b).all() and (most_d >= 0.99 * b).all()
         else:
@@ -274,9 +279,17 @@ def by_hand(params, model, batch, particles, weights, searching):
                 total[i] -= float(params.alpha_literal) * min(least, most)
                 continue
             rate = speed / (weights @ np.array(speeds)) if band else 1
+            votes += weights[i] * S * batch.scale[k]
             S *= batch.scale[k] * rate / float(params.s0)
             total[i] += float(params.alpha) * np.log(1 + S)
-    return total
+        # Of candidates all over the window as many as one vote's area holds; of a half-line's
+        # votes, a disc's and a strip's of the window's half width.
+        area = 2 * np.pi * sigma**2
+        if general:
+            area = area / 2 + np.sqrt(2 * np.pi) * sigma * batch.reach
+        usual = batch.rate[k] * (1 - share) * tau
+        chance += max(usual * area / (2 * batch.reach + 1) ** 2, 0.2)
+    return total, votes, chance, np.mean(taus)
 
 
 def cloud_of(kind):
@@ -299,9 +312,13 @@ def test_a_score_is_the_slow_one(likelihood, model):
     told = eqx.filter_jit(voting.score)(
         params, kind, batch, *map(jnp.asarray, (particles, weights, searching))
     )
-    expected = by_hand(params, kind, batch, particles, weights, searching)
-    assert expected.std() > 0.1
+    expected, votes, chance, tau = by_hand(params, kind, batch, particles, weights, searching)
+    assert expected.std() > 0.05
     np.testing.assert_allclose(told.log_likelihood.sum(0), expected, rtol=1e-9, atol=1e-12)
+    if likelihood != "literal":
+        np.testing.assert_allclose([told.votes, told.chance], [votes, chance], rtol=1e-9)
+        # Seen is the mean flow since candidates: that of half their ages ago.
+        np.testing.assert_allclose(told.lag, (0.7 * tau + tau) / 2 / 2)
 
 
 @pytest.mark.parametrize("searching", [False, True])
@@ -316,7 +333,7 @@ def test_a_step_is_the_slow_one(searching):
     )
     cloud, zero = jnp.zeros_like(carry.particles), jnp.zeros(())
     after, told = STEP(params, kind, carry, jax.tree.map(jnp.asarray, batch), cloud, zero, cloud)
-    gain = by_hand(params, kind, batch, particles, weights, searching)
+    gain, *_ = by_hand(params, kind, batch, particles, weights, searching)
     gain = gain * (min(1, 0.5 / gain.std()) if searching else 1)
     w = weights * np.exp(gain)
     np.testing.assert_allclose(told.evidence, np.log(w.sum()), rtol=1e-9)
