@@ -52,9 +52,8 @@ def seen() -> Recording:
     return Recording("points", WIDTH, HEIGHT, events, camera=CAMERA)
 
 
-PARAMS = batch.Params.of(
-    {"events": 8192, "fewest": 500, "starts": 1, "flow_max": 120.0, "cell": 16}
-)
+GIVEN = {"events": 8192, "fewest": 500, "starts": 1, "flow_max": 120.0, "cell": 16}
+PARAMS = batch.Params.of(GIVEN)
 
 
 def test_the_warp_is_the_rigid_scene():

@@ -255,7 +255,7 @@ def by_hand(params, model, batch, particles, weights, searching):
                 if youngest <= age <= oldest:
                     distance = d - U * age
                     if general:
-                        a = lines[i] / np.hypot(*lines[i])
+                        a = lines[i] / np.hypot(lines[i][0], lines[i][1])
                         distance -= np.clip(distance @ a, 0, float(params.rho_max) * age) * a
                     S += np.exp(-(distance**2).sum() / (2 * sigma**2))
                 if not d.any():
