@@ -6,7 +6,7 @@ Settings of the method "voting" in a configuration of `jaxevent.fit`:
     truth = "*.csv"                     # beside each recording, * being its name without suffix;
                                         # or "poses", "gyro" of the recording itself
     centred = false                     # compare with the motion that candidates show, `lag` ago
-    seeds = 4                           # runs of every window with different random numbers
+    runs = 4                            # of every window, with different random numbers
     settle = 0.05                       # s of every window before errors count
     gyro_bias = [0.0, 0.0, 0.0]         # rad/s, taken off the gyro first
 
@@ -17,7 +17,7 @@ A recording is cut into windows of `window` seconds. If neither validation nor t
 are shared out: with `split` = [2, 1, 1], of every 4 windows in turn 2 are to fit, 1 to validate and
 1 to test; then `window` is by default an eighth of the recording. In every window particles start
 around the true motion, so that no search is fitted; their random numbers stay the same during the
-fit. The loss is the mean over batches and seeds of |estimate - truth|^2, in units of the truth's;
+fit. The loss is the mean over batches and runs of |estimate - truth|^2, in units of the truth's;
 of a general motion those of heading and of angular velocity are added. Its gradient goes through
 weights, particles and, by the carried score, resampling; ages of candidates are held fixed.
 
@@ -67,10 +67,10 @@ RATE = 200.0  # Hz at which estimates are scored
 
 
 class Batch(eqx.Module):
-    """A window: its candidates, the truth at the end of every batch, random numbers by seed."""
+    """A window: its candidates, the truth at the end of every batch, random numbers by run."""
 
     candidates: Candidates
-    noise: Noise  # leaves begin with [seeds]
+    noise: Noise  # leaves begin with [runs]
     start: Float[Array | np.ndarray, "N dimension"]  # standard normal, of the first particles
     time: Float[Array | np.ndarray, " batches"]  # s since the window's start
     grid: Float[Array | np.ndarray, " T"]  # s, of the truth
@@ -82,7 +82,7 @@ class Batch(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class Loss:
-    """The mean relative squared error of estimates, over seeds: `loss(params, batch)`."""
+    """The mean relative squared error of estimates, over runs: `loss(params, batch)`."""
 
     centred: bool = False
 
@@ -90,7 +90,7 @@ class Loss:
         return jnp.mean(jax.vmap(lambda noise: self.one(params, batch, noise))(batch.noise))
 
     def one(self, params: Params, batch: Batch, noise: Noise) -> Float[Array, ""]:
-        """Of one seed."""
+        """Of one run."""
         parts = [slice(0, 3), slice(3, 6)] if batch.model.name == "general" else [slice(None)]
         first, normal = jnp.asarray(batch.truth)[0], jnp.asarray(batch.start)
         around = [
@@ -136,7 +136,7 @@ class Goal:
     loss: Loss
     model: str
     truth: str
-    seeds: int
+    runs: int
     settle: float | int
     gyro_bias: tuple[float, ...]
     prepared = PREPARED
@@ -190,10 +190,10 @@ class Goal:
             counted = candidates.valid[:n].any(1) & (time >= self.settle) & part.known.within(t)
             key = jax.random.key(number)
             cloud = jax.random.normal(
-                jax.random.fold_in(key, self.seeds), (params.particles, kind.dimension), real
+                jax.random.fold_in(key, self.runs), (params.particles, kind.dimension), real
             )
             noise = jax.vmap(lambda k: voting.draw(k, most, params, kind))(  # noqa: B023
-                jax.random.split(key, self.seeds)
+                jax.random.split(key, self.runs)
             )
             batches.append(
                 Batch(
@@ -332,7 +332,7 @@ class _Voting:
             'the name of tables beside the recordings, as "*.csv", or "poses", "gyro"',
         ),
         "centred": (lambda value: isinstance(value, bool), "true or false"),
-        "seeds": (lambda value: type(value) is int and value > 0, "a whole number, 1 or more"),
+        "runs": (lambda value: type(value) is int and value > 0, "a whole number, 1 or more"),
         "settle": (
             lambda value: type(value) in (int, float) and 0 <= value < np.inf,
             "a number of seconds, 0 or more",
@@ -359,7 +359,7 @@ class _Voting:
             Loss(given.get("centred", False)),
             model,
             truth,
-            given.get("seeds", 4),
+            given.get("runs", 4),
             given.get("settle", 0.05),
             tuple(map(float, given.get("gyro_bias", (0.0, 0.0, 0.0)))),
         )
