@@ -5,7 +5,7 @@
 
 An ideal event camera of 160 x 120 pixels, f = 200 px, and the thesis' generator of frames 50 us
 apart on 32 x 32 pixels. Parameters are the defaults and the presets of `voting.Params`, which were
-chosen on seeds 0 to 9. Errors are means over a sequence after its start-up of 150 ms (100 frames),
+chosen on seeds 0 to 9. Errors are means over a sequence after its start-up of 200 ms (100 frames),
 in three readings: "at once", as the filter tells it; "fixed lag", when what is told counts for the
 time that the candidates show; "smoothed", after a backward pass over the whole sequence
 (`voting.smoothed`). A run is lost if the filter says so at any time after the start-up, or if its
@@ -37,7 +37,7 @@ from jaxevent.simulate.motion import MovingCamera, frame_events
 Row = dict[str, Any]
 Table = tuple[str, list[Row]]
 
-SIZE, DURATION, SETTLE = (160, 120), 0.6, 0.15  # px, s, s
+SIZE, DURATION, SETTLE = (160, 120), 0.6, 0.2  # px, s, s
 STEP = 50e-6  # s, of frames
 FRAMES, SETTLE_FRAMES = 300, 100
 TEXTURES = ("noise", "shapes")

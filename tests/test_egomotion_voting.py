@@ -123,7 +123,7 @@ def test_too_many_candidates_are_thinned_evenly():
 
 
 def test_candidates_about_an_expected_flow():
-    recording = scattered(number=3000)
+    recording = scattered(number=1500)
     rng = np.random.default_rng(0)
     youngest, oldest = rng.uniform([[100]], 500, (7, 9)), rng.uniform(1000, 3000, (7, 9))
     gate = candidates.Expected(
@@ -146,7 +146,7 @@ def test_candidates_about_an_expected_flow():
         ages = min(np.floor(oldest[y, x]), since) - np.ceil(youngest[y, x])
         np.testing.assert_allclose(c.rate[b, k], len(every) / ages * 1e6 if ages > 0 else 0)
         some += len(every) - len(near)
-    assert some > 1000
+    assert some > 500
 
 
 def listed(c, b, k):
@@ -404,10 +404,10 @@ FAST = voting.Params.of({"every": 2, "candidates": 48})
 def test_planar_motion_is_found():
     truth = np.array([130.0, -70.0])
     recording = moved(lambda at: truth, 0.5, 120, seed=3)
-    for seed in range(3):
+    for seed in range(2):
         motion = voting.estimate(recording, FAST, seed=seed)
         assert relative_error(motion, truth) < 0.03
-    again = voting.estimate(recording, FAST, seed=2)
+    again = voting.estimate(recording, FAST, seed=1)
     np.testing.assert_array_equal(motion.mean, again.mean)
     truth = np.array([-40.0, -260.0])  # another speed
     assert relative_error(voting.estimate(moved(lambda at: truth, 0.4, 120, 4), FAST), truth) < 0.03
@@ -416,7 +416,7 @@ def test_planar_motion_is_found():
 def test_rotation_is_found():
     truth = np.array([0.5, 1.5, -1.2])
     recording = moved(turning(truth), 0.6, 150, seed=5, camera=CAMERA)
-    for seed in range(3):
+    for seed in range(2):
         motion = voting.estimate(recording, FAST, model="rotation", seed=seed)
         assert relative_error(motion, truth) < 0.05
 

@@ -123,7 +123,7 @@ class Params(Parameters):
     sigma_x = Positive(0.6, "px", "spread of a candidate; from 0.5 the pixel grid does not show")
     s0 = Positive(10.0, "", "score from which an event's vote grows like its logarithm")
     alpha = Positive(5.0, "", "weight of one event's vote; larger with larger `every`")
-    noise = Positive(0.25, "1/sqrt(s)", "planar: change of the velocity, in shares of the speed")
+    noise = Positive(0.2, "1/sqrt(s)", "planar: change of the velocity, in shares of the speed")
     noise_rotation = Positive(1.0, "rad/s/sqrt(s)", "change of the angular velocity")
     noise_heading = Positive(1.0, "1/sqrt(s)", "general: change of the heading")
     resample_below = Number(0.5, "", "resample when so many of the particles are effective; 0: not")
@@ -674,6 +674,9 @@ def run(
 
 
 _run, _begin, _draw = eqx.filter_jit(run), eqx.filter_jit(begin), eqx.filter_jit(draw)
+_diffusions = eqx.filter_jit(
+    lambda model, params, means: jax.vmap(model.diffusion, (None, 0))(params, means)
+)
 
 
 def _default(model: str) -> Params:
@@ -858,7 +861,9 @@ def smoothed(motion: Motion, params: Params | None = None) -> Motion:
     if not len(motion):
         return motion
     m, P = motion.mean.astype(float), motion.covariance.astype(float)
-    noise = np.asarray(jax.vmap(lambda mean: kind.diffusion(params, mean))(jnp.asarray(m)))
+    padded = np.zeros((1 << (len(m) - 1).bit_length(), kind.dimension))  # compiles for few sizes
+    padded[: len(m)] = m
+    noise = np.asarray(_diffusions(kind, params, jnp.asarray(padded)))[: len(m)]
     dt = np.diff(motion.t, append=motion.t[-1]) * 1e-6
     Q = np.eye(kind.dimension) * (noise**2 * dt[:, None])[:, None, :]
     # Covariances of headings have no spread along them, and those of few particles none at all.
