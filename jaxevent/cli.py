@@ -7,11 +7,14 @@ command that needs them, so that help appears at once.
 import argparse
 import contextlib
 import dataclasses
+import hashlib
 import math
 import os
+import platform
 import sys
 import textwrap
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -30,6 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = vars(_parser().parse_args(argv))
     command = arguments.pop("command")
+    _keep_compiled()
     try:
         command(**arguments)
         sys.stdout.flush()
@@ -44,6 +48,33 @@ def main(argv: Sequence[str] | None = None) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return 0
+
+
+def _keep_compiled() -> None:
+    """Have JAX keep what it compiles in the user's cache folder; JAX's own variables win.
+
+    By the variables, because the processes of `evaluate --workers` inherit them. The folder is
+    named by the processor, whose instructions compiled programs use: homes are shared by machines.
+    """
+    if {"JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE"} & os.environ.keys():
+        return
+    from platformdirs import user_cache_path
+
+    about = platform.machine()
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        about += next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    name = hashlib.blake2b(about.encode(), digest_size=6).hexdigest()
+    folder = user_cache_path("jaxevent", appauthor=False) / "compiled" / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:  # no home, as in some containers: everything works without
+        return
+    if os.access(folder, os.W_OK):
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+        # What cannot be kept, or was damaged, is compiled again.
+        warnings.filterwarnings("ignore", "Error (read|writ)ing persistent compilation cache")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -327,9 +358,11 @@ def _parser() -> argparse.ArgumentParser:
         fit,
         "Fit parameters of methods to recordings. It writes them with tables of the errors before "
         "and after, and prints the errors of images that it did not use. An interrupted fit goes "
-        "on with --resume.",
+        "on with --resume. Several processes, on one machine or many, fit together: each is started "
+        "with the same arguments and its number.",
         "configs/fit_slider_depth.toml --out fitted",
         "configs/fit_slider_depth.toml --recording mine.h5 --out mine --resume",
+        "mine.toml --out fitted --coordinator host1:4321 --processes 2 --process 0",
     )
     one.add_argument("config", metavar="CONFIG.toml", type=Path, help="what to fit, and to what")
     one.add_argument(
@@ -343,6 +376,16 @@ def _parser() -> argparse.ArgumentParser:
         help="fitted to instead of those in the file; may be repeated",
     )
     one.add_argument("--resume", action="store_true", help="go on from the checkpoint in DIR")
+    one.add_argument(
+        "--coordinator", metavar="HOST:PORT", help="a free port of the machine of process 0"
+    )
+    one.add_argument("--processes", metavar="N", type=int, help="how many fit together")
+    one.add_argument("--process", metavar="I", type=int, help="which of them this is, from 0")
+    one.add_argument(
+        "--distributed",
+        action="store_true",
+        help="the same, found by JAX: under SLURM, Open MPI, Kubernetes",
+    )
 
     one = add(
         simulate,
@@ -498,10 +541,31 @@ def evaluate(
         print(f"jaxevent: {failed} of {len(rows)} rows failed, see below them", file=sys.stderr)
 
 
-def fit(config: Path, out: Path, recordings: list[str] | None, resume: bool) -> None:
+def fit(
+    config: Path,
+    out: Path,
+    recordings: list[str] | None,
+    resume: bool,
+    coordinator: str | None,
+    processes: int | None,
+    process: int | None,
+    distributed: bool,
+) -> None:
+    from jaxevent import devices
+
+    parts = (coordinator, processes, process)
+    if distributed and parts != (None, None, None):
+        raise InputError(
+            "--distributed finds the coordinator and the processes itself; give one or the other"
+        )
+    if distributed or parts != (None, None, None):
+        devices.join(*parts)
+
     from jaxevent.fit import fit as run
 
     run(config, out, recordings, resume, _progress())
+    if not devices.first():
+        return
     print((out / "results.md").read_text(), end="")
     files = "params.toml, results.json, results.md, loss.csv, loss.png, config.toml"
     print(f"\nwritten to {out}: {files}")

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from jaxevent.colour import apply_chrominance, chrominance, luminance
 from jaxevent.errors import InputError
 from jaxevent.evaluate import values_of
-from jaxevent.io.output import complete
+from jaxevent.io.output import complete, complete_hdf5
 from jaxevent.reconstruction.video import BATCH, Video
 from jaxevent.recording import Recording
 from jaxevent.report import display_limits, tone_map, video_writer, write_png
@@ -55,8 +55,6 @@ def writer(out: Path) -> Writer:
 def write_hdf5(
     video: Video, times: NDArray, out: Path, tone: str, name: str, colours: Colours
 ) -> str:
-    import h5py
-
     shape = (len(times), video.recording.height, video.recording.width)
     what = "linear intensity" if colours is None else "linear Rec. 709 red, green, blue"
     units = {"image": f"{what}: 0 is the frames' black, 1 their white"}
@@ -64,7 +62,7 @@ def write_hdf5(
         units["variance"] = "(ln I)^2, of ln(intensity + I0); NaN: not estimated"
     else:
         shape = (*shape, 3)
-    with complete(out) as partial, h5py.File(partial, "w") as file:
+    with complete_hdf5(out) as (file, check):
         file.attrs["method"] = video.estimator.name
         file.attrs["params"] = json.dumps(values_of(video.params), allow_nan=False)
         file.attrs["recording"] = name
@@ -80,6 +78,7 @@ def write_hdf5(
         for batch, values in _batches(video, times, colours):
             for field, images in values.items():
                 fields[field][row : row + len(batch)] = images
+            check()
             row += len(batch)
     return ""
 

@@ -147,7 +147,8 @@ def video_writer(path: str | Path, fps: float | int) -> Iterator[Callable[[NDArr
         def failure() -> InputError:
             log.seek(0)
             said = " ".join(log.read().decode(errors="replace").split())[-300:]
-            return InputError(f"{path}: ffmpeg failed ({said}); check the free space and the rate")
+            why = f" ({said})" if said else ""
+            return InputError(f"{path}: ffmpeg failed{why}; check the free space and the rate")
 
         def write(image: NDArray) -> None:
             nonlocal shape, ffmpeg

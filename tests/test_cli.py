@@ -1,10 +1,14 @@
 """The command line: what it writes, and that bad input is said in one line and leaves nothing."""
 
+import contextlib
 import json
 import os
 import re
+import resource
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import h5py
@@ -227,17 +231,22 @@ def test_help_and_version(capsys, monkeypatch):
         assert set(named.get(command, ())) <= set(re.findall(r"[\w-]+", text))
 
 
-def test_as_a_process(tmp_path):
+def as_process(*arguments: object, env: dict[str, str] | None = None) -> subprocess.Popen:
     root = str(Path(jaxevent.__file__).parents[1])
-    done = subprocess.run(
-        [sys.executable, "-m", "jaxevent.cli", "convert", "none.npz", "out.h5"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": root},
-        capture_output=True,
+    return subprocess.Popen(
+        [sys.executable, "-m", "jaxevent.cli", *map(str, arguments)],
+        env={**(os.environ if env is None else env), "PYTHONPATH": root},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
     )
-    assert (done.returncode, done.stdout) == (2, "")
-    assert re.fullmatch(r"jaxevent: none\.npz: .*\n", done.stderr)
+
+
+def test_as_a_process(tmp_path):
+    process = as_process("convert", tmp_path / "none.npz", tmp_path / "out.h5")
+    out, error = process.communicate()
+    assert (process.returncode, out) == (2, "")
+    assert re.fullmatch(r"jaxevent: .*none\.npz: .*\n", error)
     assert not list(tmp_path.iterdir())
 
 
@@ -249,6 +258,94 @@ def test_interrupted_and_broken_pipe(error, status, monkeypatch, capsys):
     monkeypatch.setattr(cli, "info", info)
     assert cli.main(["info", "a"]) == status
     assert capsys.readouterr().err == ""
+
+
+def test_interrupted_while_it_writes(folder):
+    """And what it compiles is kept, by default in the user's cache."""
+    env = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    env |= {
+        "XDG_CACHE_HOME": str(folder / "cache"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+    out = folder / "out"
+    out.mkdir()
+    words = ("--method", "akf", "--rate", 2e5, "--out", out / "images.h5")
+    process = as_process("reconstruct", folder / "small.h5", *words, env=env)
+    while not any(path.stat().st_size > 1e6 for path in out.iterdir()):
+        assert process.poll() is None
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    assert process.communicate() == ("", "")
+    assert process.returncode == 130
+    assert not list(out.iterdir())
+    if sys.platform == "linux":
+        assert list((folder / "cache").glob("jaxevent/compiled/*/*-cache"))
+
+
+@contextlib.contextmanager
+def room(size: int):
+    """Files cannot grow beyond so many bytes."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize("size", [100, 3000])
+@pytest.mark.parametrize("name", ["images.h5", "images.mp4", "images", "recording.h5"])
+def test_full_disk(name, size, folder, capsys):
+    out = folder / "out"
+    out.mkdir()
+    words = ["reconstruct", folder / "small.h5", "--method", "blend", "--rate", 3000, "--out"]
+    if name == "recording.h5":
+        words = ["convert", folder / "small.h5"]
+    elif name == "images":
+        size //= 20
+    with room(size):
+        fails(capsys, [*words, out / name], out / name)
+    assert not list(out.iterdir())
+
+
+def test_full_disk_is_no_crash_at_exit(tmp_path):
+    """HDF5's own flush at exit crashes where it fails."""
+    code = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from jaxevent.errors import InputError
+from jaxevent.io.output import complete_hdf5
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
+try:
+    with complete_hdf5(Path(sys.argv[1])) as (file, check):
+        stored = file.create_dataset("a", (100, 1000), "f4", chunks=(1, 1000))
+        for row in range(100):
+            stored[row] = 1
+            if sys.argv[2]:
+                check()
+except InputError as error:
+    sys.exit(f"said: {error}")
+"""
+    for how in ("", "early"):
+        words = [sys.executable, "-c", code, tmp_path / "a.h5", how]
+        done = subprocess.run(words, capture_output=True)
+        assert (done.returncode, done.stderr[:5]) == (1, b"said:")
+        assert not list(tmp_path.iterdir())
+
+
+def test_import_is_lazy():
+    """Nothing is loaded or computed before it is used; no device is opened by any import."""
+    code = """
+import importlib, pkgutil, sys
+import jaxevent
+assert not {"jax", "numba", "pandas", "scipy", "h5py"} & sys.modules.keys()
+for module in pkgutil.walk_packages(jaxevent.__path__, "jaxevent."):
+    importlib.import_module(module.name)
+from jax._src import xla_bridge
+assert not xla_bridge.backends_are_initialized()
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_info(tmp_path, capsys, monkeypatch):

@@ -26,7 +26,7 @@ from tqdm import tqdm
 from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_range
 from jaxevent.blob.tracker import Tracks
 from jaxevent.errors import InputError, require
-from jaxevent.io.output import complete
+from jaxevent.io.output import complete, complete_hdf5
 from jaxevent.recording import Recording, Times, microseconds
 from jaxevent.report import video_writer
 
@@ -73,7 +73,7 @@ def track_writer(path: str | Path) -> Iterator[Callable[..., None]]:
             f"{path}: tracks cannot be stored as {path.suffix or 'a file without suffix'}; end the "
             "name in .csv or .h5"
         )
-    with complete(path) as partial, kinds[path.suffix.lower()](partial) as append:
+    with kinds[path.suffix.lower()](path) as append:
 
         def write(
             times: Times,
@@ -93,7 +93,7 @@ def track_writer(path: str | Path) -> Iterator[Callable[..., None]]:
 
 @contextlib.contextmanager
 def _csv_writer(path: Path) -> Iterator[Callable[..., None]]:
-    with path.open("w", newline="") as file:
+    with complete(path) as partial, partial.open("w", newline="") as file:
         names = ("t", "id", *COLUMNS, *(f"std_{name}" for name in COLUMNS))
         file.write(",".join(names) + "\n")
 
@@ -108,7 +108,7 @@ def _csv_writer(path: Path) -> Iterator[Callable[..., None]]:
 
 @contextlib.contextmanager
 def _hdf5_writer(path: Path) -> Iterator[Callable[..., None]]:
-    with h5py.File(path, "w") as file:
+    with complete_hdf5(path) as (file, check):
         file.attrs["format"] = "jaxevent tracks"
         row = 0
 
@@ -126,6 +126,7 @@ def _hdf5_writer(path: Path) -> Iterator[Callable[..., None]]:
                 stored.resize(row + len(array), axis=0)
                 stored[row:] = array
             row += len(arrays[0])
+            check()
 
         yield append
         if "t" not in file:

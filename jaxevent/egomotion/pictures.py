@@ -10,7 +10,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import h5py
 import jax
 import numpy as np
 import pandas as pd
@@ -33,7 +32,7 @@ from jaxevent.egomotion.truth import (
 )
 from jaxevent.egomotion.warped import blur, contrast, splat
 from jaxevent.errors import InputError, require
-from jaxevent.io.output import complete
+from jaxevent.io.output import complete, complete_hdf5
 from jaxevent.recording import Events, Recording
 
 UNITS = {"vx": "px/s", "vy": "px/s", "wx": "rad/s", "wy": "rad/s", "wz": "rad/s"}
@@ -82,7 +81,7 @@ def write_motion(path: str | Path, motion: Motion, about: Mapping[str, Any] | No
 
     The attributes are model, components, units, and what `about` holds, of numbers and texts.
     """
-    with complete(Path(path)) as partial, h5py.File(partial, "w") as file:
+    with complete_hdf5(Path(path)) as (file, _):
         file.attrs["format"] = "jaxevent motion"
         file.attrs["model"] = motion.model
         file.attrs["components"] = COMPONENTS[motion.model]
@@ -682,7 +681,7 @@ def _write_flow(path: Path, recording: Recording, motion: Motion, progress: bool
     total = len(recording.events)
     params = event_flow.Params.of({})
     kinds = {"t": np.int64, "u": np.float32, "v": np.float32, "valid": np.bool_}
-    with complete(path) as partial, h5py.File(partial, "w") as file:
+    with complete_hdf5(path) as (file, check):
         file.attrs["format"] = "jaxevent event flow"
         stored = {name: file.create_dataset(name, (total,), kind) for name, kind in kinds.items()}
         for part in event_flow.iterate(recording, motion, params, progress=progress):
@@ -693,6 +692,7 @@ def _write_flow(path: Path, recording: Recording, motion: Motion, progress: bool
             }  # fmt: skip
             for name, column in columns.items():
                 stored[name][row:stop] = column
+            check()
             known = ~np.isnan(part.residual)
             known_count += int(known.sum())
             over += int((part.residual[known] > float(params.limit)).sum())

@@ -27,7 +27,7 @@ refused before any memory is asked for.
 import dataclasses
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ from tqdm import tqdm
 
 from jaxevent.errors import InputError, require
 from jaxevent.io import checked_events, pinhole, reading, times, vectors
-from jaxevent.io.output import complete
+from jaxevent.io.output import complete_hdf5
 from jaxevent.recording import Events, EventSource, Frames, ImageSource, Imu, Poses, Recording
 
 VERSION = 1
@@ -354,7 +354,7 @@ def write(
     if compression not in (None, "gzip"):
         raise InputError(f'{path}: compression {compression!r} is unknown; use None or "gzip"')
     recording.check()
-    with complete(path) as partial, h5py.File(partial, "w") as file:
+    with complete_hdf5(path) as (file, check):
         file.attrs.update(
             format="jaxevent",
             version=VERSION,
@@ -362,7 +362,7 @@ def write(
             width=recording.width,
             height=recording.height,
         )
-        _write_events(file, recording.events, compression, recording.name, progress)
+        _write_events(file, recording.events, compression, recording.name, progress, check)
         for group, part in (
             ("frames", recording.frames),
             ("poses", recording.poses),
@@ -383,6 +383,7 @@ def _write_events(
     compression: str | None,
     source: str,
     progress: bool,
+    check: Callable[[], None],
 ) -> None:
     count = len(events)
     offset = int(events[:1].t[0]) if count else 0
@@ -408,6 +409,7 @@ def _write_events(
         since = block.t - offset
         rows = slice(row, row + len(block))
         t[rows], x[rows], y[rows], p[rows] = since, block.x, block.y, block.p
+        check()
         # The milliseconds that begin after the last block and not after this one's last event.
         end = int(since[-1]) // 1000 + 1
         for first in range(ms, end, _BLOCK):

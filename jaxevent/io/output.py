@@ -1,12 +1,17 @@
 """Output that appears complete or not at all."""
 
 import contextlib
+import io
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from jaxevent.errors import InputError
+
+if TYPE_CHECKING:
+    import h5py
 
 
 @contextlib.contextmanager
@@ -36,6 +41,10 @@ def complete(path: Path, directory: bool = False) -> Iterator[Path]:
         if directory and path.exists():
             path.rmdir()
         partial.replace(path)
+    except InputError as error:  # of a file in a folder that has its final name only now
+        if str(partial) in str(error):
+            raise InputError(str(error).replace(str(partial), str(path))) from error
+        raise
     except OSError as error:
         reason = " ".join((error.strerror or str(error)).split())
         raise InputError(
@@ -47,6 +56,61 @@ def complete(path: Path, directory: bool = False) -> Iterator[Path]:
         else:
             with contextlib.suppress(OSError):
                 partial.unlink()
+
+
+@contextlib.contextmanager
+def complete_hdf5(path: Path) -> Iterator[tuple["h5py.File", Callable[[], None]]]:
+    """An HDF5 file to write, with what `complete` promises, and `check()` for long writers.
+
+    Where the disk is full nothing is said before `check()` or the end of the block: HDF5 cannot
+    recover from a failed write, and crashes at exit.
+    """
+    import h5py
+
+    with complete(path) as partial, partial.open("r+b", buffering=0) as raw:
+        sink = _Sink(raw)
+        with h5py.File(sink, "w") as file:
+            yield file, sink.check
+        sink.check()
+
+
+class _Sink:
+    """A file for HDF5 whose writes always seem to succeed."""
+
+    def __init__(self, raw: io.FileIO):
+        self.raw = raw
+        self.error: OSError | None = None
+        self.read, self.seek, self.tell, self.flush = raw.read, raw.seek, raw.tell, raw.flush
+
+    def check(self) -> None:
+        """Raise the OSError of the first failed write."""
+        if self.error is not None:
+            raise self.error
+
+    def readinto(self, buffer: Any) -> int:
+        """Fill the buffer, with zeros after the end."""
+        view, done = memoryview(buffer).cast("B"), 0
+        while done < len(view) and (count := self.raw.readinto(view[done:])):
+            done += count
+        view[done:] = bytes(len(view) - done)
+        return len(view)
+
+    def write(self, data: Any) -> int:
+        view, done = memoryview(data).cast("B"), 0
+        try:
+            while done < len(view) and self.error is None:
+                done += self.raw.write(view[done:]) or 0
+        except OSError as error:
+            self.error = error
+        return len(view)
+
+    def truncate(self, size: int) -> int:
+        try:
+            if self.error is None:
+                self.raw.truncate(size)
+        except OSError as error:
+            self.error = error
+        return size
 
 
 def _refuse(path: Path, directory: bool) -> None:
