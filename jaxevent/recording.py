@@ -36,6 +36,12 @@ def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
     return np.asarray(np.rint(time.astype(np.float64) * 1e6), np.int64)
 
 
+def _span(what: str, count: int, t: Any) -> str:
+    """As in "2 events from 0.1 to 0.2 s"."""
+    text = f"{count:,} {what}{'s' * (count != 1)}"
+    return f"{text} from {t[0] / 1e6:g} to {t[-1] / 1e6:g} s" if count else text
+
+
 @runtime_checkable
 class EventSource(Protocol):
     """Events that can be read piece by piece; `Events` in memory, or stored in a file."""
@@ -51,7 +57,7 @@ class EventSource(Protocol):
         ...
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Events:
     """Events in memory, sorted by time, one array per field, each of shape (events,)."""
 
@@ -64,6 +70,9 @@ class Events:
     def empty(cls) -> "Events":
         none = np.empty(0, np.uint16)
         return cls(none.astype(np.int64), none, none, none.astype(bool))
+
+    def __repr__(self) -> str:
+        return f"<{_span('event', len(self), self.t)}>"
 
     def __len__(self) -> int:
         return len(self.t)
@@ -207,7 +216,7 @@ class Imu:
         return Imu(self.t[rows], self.gyro[rows], self.acc[rows])
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Recording:
     """One recording of one sensor; see the module for the conventions.
 
@@ -225,6 +234,15 @@ class Recording:
     poses: Poses | None = None
     imu: Imu | None = None
     extra: Mapping[str, NDArray] = dataclasses.field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        count = len(self.events)
+        ends = [self.events[row : row + 1].t[0] for row in ((0, count - 1) if count else ())]
+        parts = [f"{self.name}: {self.width}x{self.height}", _span("event", count, ends)]
+        if self.frames is not None:
+            parts.append(_span("frame", len(self.frames), self.frames.t))
+        parts += [n for n in ("camera", "poses", "imu") if getattr(self, n) is not None]
+        return f"<{', '.join([*parts, *self.extra])}>"
 
     @property
     def start(self) -> int:

@@ -929,3 +929,13 @@ def test_stored_images_are_read_when_asked_for(tmp_path):
     again = io.load(copy).frames
     assert again is not None and isinstance(again.images, np.ndarray)
     np.testing.assert_array_equal(again.images, images)
+
+
+def test_a_recording_is_shown_in_a_line():
+    none = Events.empty()
+    two = Events(np.array([5, 2_000_000]), *(np.zeros(2, np.uint16),) * 2, np.zeros(2, bool))
+    assert repr(two[1:]) == "<1 event from 2 to 2 s>"
+    extra = {"hdr": np.zeros(3)}
+    shown = repr(Recording("two", 3, 4, two, extra=extra))
+    assert shown == "<two: 3x4, 2 events from 5e-06 to 2 s, hdr>"
+    assert repr(Recording("none", 3, 4, none)) == "<none: 3x4, 0 events>"
