@@ -1,17 +1,20 @@
-"""Reconstructions compared with images they have not seen, for every recording and method.
+"""Methods compared with what is known, for every recording: images, motion or tracks.
 
     recordings = ["slider_depth.zip", "more/*.h5"]  # paths or globs; $NAME is expanded
-    protocol = "held-out"                           # the default; or "reference"
+    protocol = "held-out"                           # or "reference", "motion" or "tracks"
     size = [240, 180]                               # only for recordings that do not tell it
-    metrics = ["lpips"]                             # further ones, by their names in MEASURES
+    metrics = ["lpips"]                             # of images; further ones, named in MEASURES
 
     [[method]]
-    name = "akf"                                    # a key of jaxevent.METHODS
+    name = "akf"                                    # a key of jaxevent.METHODS, or of egomotion's
     params = { c_on = 0.08, clock_offset = 0.0075 } # or the path of a TOML file; omitted: defaults
                                                     # { file = "PATH", c_on = 0.08 }: both
     label = "akf, by hand"                          # in the table; omitted: the name
     grid = { c_on = [0.05, 0.1], kappa = [1, 2] }   # each combination, added to params and label
     normalise = "affine"                            # fit each image's brightness to the truth
+
+The protocols "motion" and "tracks", with settings of their own beside it, are described in
+`jaxevent.egomotion.scores` and `jaxevent.blob.scores`; the others ask for images.
 
 A method of the name "external" scores images of another program: `jaxevent.external`. Paths are
 relative to the folder of this file. The protocol "held-out" gives the methods frames 0, 2, 4, ...
@@ -40,16 +43,19 @@ import contextlib
 import dataclasses
 import glob
 import hashlib
+import importlib
 import itertools
 import json
 import math
 import os
 import re
 import shutil
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from types import ModuleType
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -58,6 +64,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 import jaxevent
+from jaxevent.devices import local
 from jaxevent.errors import InputError, require
 from jaxevent.external import External, Normalise, check_normalise, fit_brightness
 from jaxevent.io import load
@@ -183,6 +190,17 @@ def reference(recording: Recording) -> tuple[Recording, Reference]:
 
 Protocol = Callable[[Recording], tuple[Recording, Frames]]
 PROTOCOLS: dict[str, Protocol] = {"held-out": held_out, "reference": reference}
+
+# Protocols of other things than images: where they are described and their rows made.
+OTHERS = {"motion": "jaxevent.egomotion.scores", "tracks": "jaxevent.blob.scores"}
+
+
+class Named(NamedTuple):
+    """A method of another protocol."""
+
+    name: str
+    Params: type[Parameters]
+
 
 # Further measures of an image and the truth, each a number per image. They cost more time, and the
 # first two need an extra.
@@ -499,7 +517,7 @@ Estimates = Iterator[tuple[int, NDArray[np.floating], NDArray[np.floating]]]
 def _estimates(
     given: Recording, hidden: Frames, method: Estimator, params: FrameParams, progress: bool
 ) -> Estimates:
-    video = method.reconstruct(given, params, progress=progress)
+    video = method.reconstruct(given, params, progress=progress, devices=local())
     first = 0
     for _, images, variances in video.batches(frame_times(hidden, params)):
         yield first, images, variances
@@ -542,7 +560,7 @@ def evaluate(
     scheduler_file: str | Path | None = None,
     retries: int = 2,
 ) -> list[dict[str, Any]]:
-    """Run an evaluation that a TOML file describes: one row, as of `score`, per recording, method.
+    """Run an evaluation that a TOML file describes: a row per recording and method, as of `score`.
 
     The file's layout is in the text of this module. In a row, `recording` is the path as the file
     gives it and `method` is the label. Where a method cannot be run on a recording, the row has
@@ -628,6 +646,7 @@ def _tasks(plan: "Plan", folder: Path | None, progress: bool, here: bool) -> lis
             "size": plan.size,
             "double": double,
             "version": f"{jaxevent.__version__}, results {RESULTS_VERSION}",
+            **({} if plan.other is None else {"options": plan.options}),
         }
         key = None
         if contents is not None:
@@ -639,6 +658,9 @@ def _tasks(plan: "Plan", folder: Path | None, progress: bool, here: bool) -> lis
                     files = entry.method.find(_name(path)).files
                     whole["images"] = [contents.of(file) for file in files]
                     whole["params"] = entry.method.values()
+                elif plan.other is not None:
+                    truths = plan.other.files(path, plan.options)
+                    whole["truths"] = [contents.of(file) for file in truths]
                 text = json.dumps(whole, sort_keys=True)
                 key = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
         arguments = {"path": str(path), **about, "progress": progress and here}
@@ -659,6 +681,7 @@ def _compute(
     double: bool,
     version: str,
     progress: bool,
+    options: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The task: {"row", "picture"} of a recording and a method, on whichever machine."""
     from jaxevent.page import picture
@@ -670,6 +693,13 @@ def _compute(
         )
     with jax.enable_x64(double):
         recording = _opened.load(Path(path), size, progress)
+        if options is not None:
+            kind = other(protocol)
+            assert kind is not None
+            chosen = kind.find(method, options).of(params)
+            scores = kind.score(recording, method, chosen, options, progress)
+            about = {"recording": recording.name, "method": method}
+            return {"row": {**about, **scores, "params": values_of(chosen)}, "picture": None}
         source = External(**params) if method == "external" else find_method(method)
         values = None if isinstance(source, External) else source.Params.of(params)
         name = _name(Path(path))
@@ -684,7 +714,7 @@ def _name(path: Path) -> str:
     return path.name if path.is_dir() else path.stem
 
 
-class _Opened:
+class _Opened(threading.local):
     """The recording last loaded: methods are run on it one after another."""
 
     def __init__(self):
@@ -840,6 +870,17 @@ class Plan:
     protocol: str
     size: tuple[int, int] | None
     metrics: tuple[str, ...] = ()
+    options: dict[str, Any] = dataclasses.field(default_factory=dict)  # of another protocol
+
+    @property
+    def other(self) -> ModuleType | None:
+        """Of a protocol of other things than images."""
+        return other(self.protocol)
+
+
+def other(protocol: str) -> ModuleType | None:
+    """The module of a protocol of other things than images."""
+    return importlib.import_module(OTHERS[protocol]) if protocol in OTHERS else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -847,8 +888,8 @@ class Entry:
     """A method of a configuration with one set of parameters; `External` has none."""
 
     label: str
-    method: Estimator | External
-    params: FrameParams | None
+    method: Estimator | External | Named
+    params: Parameters | None
     normalise: str
 
     def settings(self) -> dict[str, Any]:
@@ -870,11 +911,20 @@ def read_plan(config: Path) -> Plan:
     """Read and check a configuration; raises `InputError` naming the file and the setting."""
     table = read_toml(config)
     try:
-        _refuse_unknown(table, ("recordings", "protocol", "size", "metrics", "method"))
         protocol = table.get("protocol", "held-out")
-        if protocol not in PROTOCOLS:
-            near = nearest(str(protocol), PROTOCOLS)
+        if protocol not in (every := [*PROTOCOLS, *OTHERS]):
+            near = nearest(str(protocol), every)
             raise InputError(f"there is no protocol {protocol!r}; {near}")
+        kind = other(protocol)
+        own = ("metrics",) if kind is None else tuple(kind.SETTINGS)
+        _refuse_unknown(table, ("recordings", "protocol", "size", "method", *own))
+        options = {name: table[name] for name in own if name in table and kind is not None}
+        if kind is not None:
+            for name, value in options.items():
+                fits, what = kind.SETTINGS[name]
+                if not fits(value):
+                    raise InputError(f"{name} is {value!r}; give {what}")
+            kind.check(options)
         size = table.get("size")
         if size is not None and not (
             isinstance(size, list) and len(size) == 2 and all(type(n) is int for n in size)
@@ -887,10 +937,11 @@ def read_plan(config: Path) -> Plan:
         recordings = find_recordings(table.get("recordings"), config.parent)
         return Plan(
             recordings,
-            _methods(table.get("method"), config.parent),
+            _methods(table.get("method"), config.parent, kind, options),
             protocol,
             None if size is None else (size[0], size[1]),
             tuple(metrics),
+            options,
         )
     except InputError as error:
         raise InputError(f"{config}: {error}") from None
@@ -917,13 +968,15 @@ def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path]]:
     return [(text, path) for path, text in found.items()]
 
 
-def _methods(given: Any, folder: Path) -> list[Entry]:
+def _methods(
+    given: Any, folder: Path, kind: ModuleType | None, options: Mapping[str, Any]
+) -> list[Entry]:
     if not (isinstance(given, list) and given and all(isinstance(one, dict) for one in given)):
         raise InputError('no method is given; add [[method]] with name = "akf"')
     entries: list[Entry] = []
     for number, table in enumerate(given, 1):
         try:
-            for entry in _entries(table, folder):
+            for entry in _entries(table, folder, kind, options):
                 if any(entry.label == other.label for other in entries):
                     raise InputError(f"another one is labelled {entry.label!r} too; add a label")
                 entries.append(entry)
@@ -932,20 +985,23 @@ def _methods(given: Any, folder: Path) -> list[Entry]:
     return entries
 
 
-def _entries(table: Mapping[str, Any], folder: Path) -> Iterator[Entry]:
+def _entries(
+    table: Mapping[str, Any], folder: Path, kind: ModuleType | None, options: Mapping[str, Any]
+) -> Iterator[Entry]:
     """The method of one table, once for each combination of its grid."""
     own = dict(table)
-    name, normalise = own.pop("name", None), own.pop("normalise", "none")
+    name = own.pop("name", None)
+    normalise = own.pop("normalise", "none") if kind is None else "none"
     label = own.pop("label", name)
     if not isinstance(name, str) or not isinstance(label, str):
         raise InputError('name and label must be text; give name = "akf"')
     check_normalise(normalise)
     fitted = "" if normalise == "none" else ", brightness fitted"
-    if name == External.name:
+    if name == External.name and kind is None:
         yield Entry(label + fitted, External.of(own, folder.absolute()), None, normalise)
         return
-    _refuse_unknown(own, ("name", "params", "label", "grid", "normalise"))
-    method = find_method(name)
+    _refuse_unknown(own, ("name", "params", "label", "grid", "normalise")[: 5 - (kind is not None)])
+    method = find_method(name) if kind is None else Named(name, kind.find(name, options))
     params = read_params(method.Params, method.name, own.get("params", {}), folder)
     grid = own.get("grid", {})
     if not isinstance(grid, dict) or not all(isinstance(v, list) and v for v in grid.values()):

@@ -34,7 +34,8 @@ prepared anew. Values omitted are those above, except where comments say otherwi
 
 The settings from `loss` on are those of reconstruction. `jaxevent.blob.objectives` tells those of
 the tracker, the method "blob", and `jaxevent.egomotion.objectives` those of egomotion, the method
-"voting". What the loop and the files need of a system is in `System`.
+"voting". What the loop and the files need of a system is in `System`. All local devices are used,
+and several processes fit together: `jaxevent.devices`.
 """
 
 import contextlib
@@ -61,6 +62,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 from tqdm import tqdm
 
+from jaxevent import devices
 from jaxevent.errors import InputError, require
 from jaxevent.evaluate import (
     PROTOCOLS,
@@ -233,7 +235,9 @@ def optimise(
         names: Parameters to follow the gradient of.
         batches: Pytrees, one compilation for each shape. A batch with an attribute `weight` counts
             that much in means over batches. Or a function `prepare(params)` that gives batches to
-            fit to and batches to validate on, for parameters that act when batches are made.
+            fit to and batches to validate on, for parameters that act when batches are made. Of
+            several processes (`devices.join`) all give the same list and each computes its share;
+            a function gives `devices.ELSEWHERE` in place of what other processes compute.
         validation: Batches for early stopping, if `batches` is a list; without any, the fit's.
         settings: See `Settings`.
         search: By name, (from, to, number of points): parameters searched without gradients, one
@@ -247,7 +251,11 @@ def optimise(
     Raises:
         InputError: A name does not exist, or the loss is not finite at the start.
     """
-    prepare = batches if callable(batches) else lambda _: (batches, validation)
+    if callable(batches):
+        prepare = batches
+    else:
+        shares = devices.shared_out(batches), devices.shared_out(validation)
+        prepare = lambda _: shares  # noqa: E731
     fresh = run is None
     run = begin(params, names, settings, search) if run is None else run
     loop = _Loop(loss, params, prepare, settings, search or {}, run, save or (lambda *_: None))
@@ -348,16 +356,32 @@ def _judge(
 
 
 def _mean(function: Callable[[Any], Any], batches: Sequence[Any]) -> Any:
-    """The mean of a function of batches (a pytree), weighted by the batches' `weight`."""
+    """The mean of a function of batches (a pytree), weighted by the batches' `weight`.
+
+    On several devices or in several processes the results are added in the same order as on one.
+    """
+    if devices.alone():
+        weights = [_weight(batch) for batch in batches]
+        parts = map(function, batches)
+    else:
+        own = ((k, batch) for k, batch in enumerate(batches) if batch is not devices.ELSEWHERE)
+        mine = {k: (batch, function(batch)) for k, batch in own}  # before any is waited for
+        said = {k: (_weight(batch), jax.device_get(part)) for k, (batch, part) in mine.items()}
+        told = {k: v for some in devices.gathered(said) for k, v in some.items()}
+        weights = [told[k][0] for k in range(len(batches))]
+        parts = (jax.tree.map(jnp.asarray, told[k][1]) for k in range(len(batches)))
     if len(batches) == 1:
-        return function(batches[0])
-    weights = [float(getattr(batch, "weight", 1.0)) for batch in batches]
+        return next(iter(parts))
     total = None
-    for batch, weight in zip(batches, weights, strict=True):
+    for part, weight in zip(parts, weights, strict=True):
         share = weight / sum(weights)
-        part = jax.tree.map(lambda leaf, share=share: share * leaf, function(batch))
+        part = jax.tree.map(lambda leaf, share=share: share * leaf, part)
         total = part if total is None else jax.tree.map(jnp.add, total, part)
     return total
+
+
+def _weight(batch: Any) -> float:
+    return float(getattr(batch, "weight", 1.0))
 
 
 class _Loop:
@@ -375,10 +399,20 @@ class _Loop:
         run: Run,
         save: Callable[[Run, bool], None],
     ):
-        self.function, self.params, self.prepare, self.settings = loss, params, prepare, settings
+        self.function, self.params, self.settings = loss, params, settings
+        self._prepare = prepare
+        self._places = devices.Places(settings.batch), devices.Places(None)
         self.intervals, self.run, self.save = intervals, run, save
         numbers = sum(leaf[0].size for leaf in run.position.raw.values())
         self.forward = numbers <= FORWARD if settings.forward is None else settings.forward
+
+    def prepare(self, params: Any) -> Batches:
+        """The batches to fit to and to validate on, on the devices that compute with them."""
+        if devices.alone():
+            return self._prepare(params)
+        with devices.on_host():
+            fit, validation = devices.in_step(lambda: self._prepare(params))
+        return self._places[0](fit), self._places[1](validation)
 
     def leader(self) -> Any:
         """The parameters of the best start."""
@@ -525,7 +559,9 @@ def fit(
     Writes the folder `out`, made if missing: params.toml (a table of physical values for each
     method), results.json ({"rows": [...]}), results.md (the table of the test images), loss.csv,
     loss.png and config.toml. While it runs, `out` holds a checkpoint at most a few seconds old, by
-    which an interrupted run goes on and ends with the same parameters, to the bit.
+    which an interrupted run goes on and ends with the same parameters, to the bit. Of several
+    processes (`devices.join`) all read the recordings and return the rows, and the first reads and
+    writes `out`.
 
     Args:
         config: The TOML file.
@@ -544,37 +580,53 @@ def fit(
         InputError: The file, a recording or a parameter cannot be used, `out` cannot be written or
             holds another run's checkpoint, or matplotlib is missing (extra "plot").
     """
-    require("matplotlib", "plot")
+    devices.in_step(lambda: require("matplotlib", "plot"))
     out = Path(out)
-    plan = read_plan(Path(config), recordings)
-    checkpoint = out / "checkpoint"
-    if checkpoint.exists() and not resume:
+    plan = devices.in_step(lambda: read_plan(Path(config), recordings))
+    checkpoint, writes = out / "checkpoint", devices.first()
+    progress = progress and writes
+
+    def finished() -> list[dict[str, Any]] | None:
+        """The rows of a run that had ended."""
+        if checkpoint.exists() and not resume:
+            raise InputError(
+                f"{out}: holds the checkpoint of an interrupted fit; go on with --resume, or "
+                "choose another folder"
+            )
+        if resume and not checkpoint.exists() and (out / "results.json").exists():
+            return _finished(out, plan)
+        return None
+
+    rows = devices.by_first(finished)
+    if rows is not None:
+        return rows
+    sources, digest = devices.in_step(lambda: (_sources(plan, progress), plan.digest()))
+    if len(set(devices.gathered(digest))) > 1:
         raise InputError(
-            f"{out}: holds the checkpoint of an interrupted fit; go on with --resume, or choose "
-            "another folder"
+            f"{config}: the processes see different configurations or recordings; give all the same"
         )
-    if resume and not checkpoint.exists() and (out / "results.json").exists():
-        return _finished(out, plan)
-    sources = {
-        split: [(given, _load(path, plan, progress)) for given, path in plan.recordings[split]]
-        for split in SPLITS
-    }
-    digest = plan.digest()
     done: list[Fitted] = []
     with contextlib.ExitStack() as new:
-        # `results` removes a folder that it made if the block raises. At the first checkpoint the
-        # block ends: from then on the folder stays.
-        write = new.enter_context(results(out))
-        run = None
-        if checkpoint.exists():
-            done, run = _restore(checkpoint, digest, plan)
-        for remains in out.glob(".*.part"):  # of a write during which the run was killed
-            remains.unlink(missing_ok=True)
-        saved = -math.inf
+
+        def begun() -> bytes | None:
+            """The checkpoint in the folder, which is made if missing."""
+            nonlocal write
+            # `results` removes a folder that it made if the block raises. At the first checkpoint
+            # the block ends: from then on the folder stays.
+            write = new.enter_context(results(out))
+            content = checkpoint.read_bytes() if checkpoint.exists() else None
+            for remains in out.glob(".*.part"):  # of a write during which the run was killed
+                remains.unlink(missing_ok=True)
+            return content
+
+        write: Any = None
+        content, run, saved = devices.by_first(begun), None, -math.inf
+        if content is not None:
+            done, run = _restore(content, checkpoint, digest, plan)
 
         def save(run: Run | None, certain: bool) -> None:
             nonlocal saved
-            if certain or time.monotonic() - saved > PERIOD:
+            if writes and (certain or time.monotonic() - saved > PERIOD):
                 _save(checkpoint, digest, done, run)
                 saved = time.monotonic()
             new.close()
@@ -593,12 +645,19 @@ def fit(
             done.append(one)
             save(None, True)
         new.close()
-    rows = [
-        row
+    scored = [
+        (task, label, params)
         for task, one in zip(plan.tasks, done, strict=True)
         for label, params in ((f"{task.label}, before", task.params), (task.label, one.params))
-        for row in _rows(task, label, params, sources, plan, progress)
     ]
+    mine = range(jax.process_index(), len(scored), jax.process_count())
+    found = devices.in_step(
+        lambda: {k: list(_rows(*scored[k], sources, plan, progress)) for k in mine}
+    )
+    told = {k: some for each in devices.gathered(found) for k, some in each.items()}
+    rows = [row for k in range(len(scored)) for row in told[k]]
+    if not writes:
+        return rows
     write("config.toml", plan.text)
     write("loss.csv", _losses(plan.tasks, done).encode())
     write("loss.png", _curves(plan.tasks, done))
@@ -1047,6 +1106,13 @@ class _Reconstructions:
 RECONSTRUCTION = _Reconstructions()
 
 
+def _sources(plan: Plan, progress: bool) -> Sources:
+    return {
+        split: [(given, _load(path, plan, progress)) for given, path in plan.recordings[split]]
+        for split in SPLITS
+    }
+
+
 def _load(path: Path, plan: Plan, progress: bool) -> Recording:
     recording = load(path, plan.size, in_memory=False, progress=progress)
     return dataclasses.replace(recording, name=str(path))  # for messages
@@ -1065,9 +1131,11 @@ def _save(path: Path, digest: str, done: Sequence[Fitted], run: Run | None) -> N
         eqx.tree_serialise_leaves(file, arrays)
 
 
-def _restore(path: Path, digest: str, plan: Plan) -> tuple[list[Fitted], Run | None]:
+def _restore(
+    content: bytes, path: Path, digest: str, plan: Plan
+) -> tuple[list[Fitted], Run | None]:
     """The methods done and the one under way, if any, of a checkpoint."""
-    with path.open("rb") as file:
+    with io.BytesIO(content) as file:
         try:
             header = json.loads(file.readline())
             if header["digest"] != digest:

@@ -23,7 +23,7 @@ STRIPS = 12  # recordings with pictures and plots over time; more would make the
 POINTS = 300  # of a curve over time, means of so many parts of it
 # Errors shown in full colour: of intensity, and of ln(I + 0.003) against an HDR reference.
 FULL = {False: 0.25, True: 2.0}
-HIGHER = {"ssim", "log_ssim", "global_ssim", "hdr_quality"}  # of these more is better
+HIGHER = {"ssim", "log_ssim", "global_ssim", "hdr_quality", "covered"}  # of these more is better
 
 STYLE = """
 :root { color-scheme: light; }
@@ -77,10 +77,11 @@ def page(
     if importlib.util.find_spec("matplotlib") is None:
         parts.append('<p class="note">Plots need <code>pip install jaxevent[plot]</code>.</p>')
     else:
-        shown = ["log_mse", "log_ssim"] if hdr else ["mse", "ssim"]
-        parts.append(_points(done, methods, shown))
-        parts += ["<h2>Errors over time</h2>", *_curves(done, recordings, methods, shown[0])]
-    parts += ["<h2>Pictures</h2>", *_strips(rows, pictures, recordings, hdr)]
+        means, over_time = _plotted(done)
+        parts.append(_points(done, methods, means))
+        parts += ["<h2>Errors over time</h2>", *_curves(done, recordings, methods, over_time)]
+    if any(one is not None for one in pictures):
+        parts += ["<h2>Pictures</h2>", *_strips(rows, pictures, recordings, hdr)]
     parts += ["<h2>Every recording and method</h2>", _table(rows, columns)]
     parts += ["<h2>Parameters</h2>", _parameters(rows, methods)]
     parts += ["<h2>How it was computed</h2>", _computed(hosts)]
@@ -301,7 +302,27 @@ def _more(recordings: Sequence[str]) -> list[str]:
     return [f'<p class="note">Of {len(recordings)} recordings the first {STRIPS} are shown.</p>']
 
 
-NAMES = {"mse": "MSE", "ssim": "SSIM", "log_mse": "log MSE", "log_ssim": "log SSIM"}
+NAMES = {
+    "mse": "MSE", "ssim": "SSIM", "log_mse": "log MSE", "log_ssim": "log SSIM",
+    "AEE_rel": "relative AEE (%)", "AAE_U": "AAE (degrees)", "AAE_T": "heading (degrees)",
+    "vector_error": "error of Omega (%)", "AME_rel": "relative AME (%)", "error": "error (%)",
+    "rmse": "RMSE (px)", "covered": "covered", "distance": "distance (px)",
+}  # fmt: skip
+
+
+def _plotted(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], str]:
+    """Two measures whose means are plotted, and that which is plotted over time."""
+    pairs = {
+        "log_mse": (["log_mse", "log_ssim"], "log_mse"),
+        "rmse": (["rmse", "covered"], "distance"),
+        "AAE_T": (["AAE_T", "vector_error"], "error"),
+        "AEE_rel": (["AEE_rel", "AAE_U"], "error"),
+        "vector_error": (["vector_error", "AME_rel"], "error"),
+    }
+    for name, pair in pairs.items():
+        if any(name in row for row in rows):
+            return pair
+    return ["mse", "ssim"], "mse"
 
 
 def _points(
@@ -344,8 +365,9 @@ def _curves(
         for row in rows:
             if row["recording"] != recording:
                 continue
-            t = np.array(row["per_frame"]["t"], np.float64) / 1e6
-            values = np.array(row["per_frame"][measure], np.float64)  # None becomes NaN
+            series = row.get("per_frame") or row["per_time"]
+            t = np.array(series["t"], np.float64) / 1e6
+            values = np.array(series[measure], np.float64)  # None becomes NaN
             pieces = [
                 (float(np.mean(a)), float(np.mean(b)))
                 for a, b in zip(

@@ -281,7 +281,7 @@ Column = tuple[str, str, float | int, int]
 
 
 # What a row of an evaluation is shown by: title, place in the row, factor, digits.
-ALWAYS = {"mse", "ssim", "frames", "seconds"}
+ALWAYS = {"mse", "ssim", "frames", "seconds"}  # of images, None too
 COLUMNS: list[Column] = [
     ("MSE x 1e-2", "mse", 100, 3),
     ("SSIM", "ssim", 1, 3),
@@ -295,25 +295,37 @@ COLUMNS: list[Column] = [
     ("global SSIM", "global_ssim", 1, 3),
     ("frames", "frames", 1, 0),
     ("missing", "missing", 1, 0),
+    ("AEE %", "AEE_rel", 1, 2),
+    ("AAE deg", "AAE_U", 1, 2),
+    ("heading deg", "AAE_T", 1, 2),
+    ("Omega %", "vector_error", 1, 2),
+    ("AAE Omega deg", "AAE_Omega", 1, 2),
+    ("AME %", "AME_rel", 1, 2),
+    ("lost", "lost", 1, 3),
+    ("start-up s", "startup", 1, 3),
+    ("RMSE px", "rmse", 1, 3),
+    ("median px", "median", 1, 3),
+    ("covered", "covered", 1, 3),
+    ("times", "times", 1, 0),
     ("seconds", "seconds", 1, 2),
 ]
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]]) -> list[Column]:
-    """Those of `COLUMNS` that any of the rows has, and those of `ALWAYS`."""
+    """Those of `COLUMNS` that any of the rows has, and of images those of `ALWAYS`."""
+    always = set() if any("per_time" in row for row in rows) else ALWAYS
     return [
         column
         for column in COLUMNS
-        if column[1] in ALWAYS or any(find(row, column[1]) is not None for row in rows)
+        if column[1] in always or any(find(row, column[1]) is not None for row in rows)
     ]
 
 
 def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
     """The results of an evaluation as a Markdown table, its columns aligned as plain text too.
 
-    Each row has the keys recording, method, mse, ssim, frames and seconds, and may have those of
-    `evaluate.score` against HDR references and of further metrics, which get columns where a row
-    has them; others are not shown. A number that is None, NaN or absent appears as "-". MSE is
+    Each row has the keys recording, method and, of images, mse, ssim, frames and seconds. Others of
+    `COLUMNS` get columns where a row has them; what is not there is not shown. A number that is None, NaN or absent appears as "-". MSE is
     multiplied by 100 where its column says so; seconds are those of computing. The `error` of rows
     that have one follows the table, each once.
     """

@@ -15,16 +15,21 @@ import json
 import multiprocessing
 import multiprocessing.connection
 import os
+import queue
 import signal
 import socket
 import threading
 import traceback
 from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 from tqdm import tqdm
 
+from jaxevent.devices import local
 from jaxevent.errors import InputError, require
 
 CONNECT = 30  # s that a scheduler has to answer
@@ -55,6 +60,9 @@ class Outcome:
 @dataclasses.dataclass(frozen=True)
 class Place:
     """Where tasks run: in this process; in `workers` processes; on a Dask cluster.
+
+    Of several devices of this process each has a task at a time; of too few tasks for that, each
+    may use all. Processes take one device each, in turn.
 
     `cluster` is the address of its scheduler, `scheduler_file` the file that tells it. Raises
     `InputError` if more than one is given, for less than one worker and without the extra.
@@ -130,6 +138,8 @@ def run(
         done = _in_processes(function, todo, folder, retries, place.workers)
     elif place.remote:
         done = _on_cluster(function, todo, folder, retries, place)
+    elif len(todo) >= len(devices := local()) > 1:
+        done = _on_devices(function, todo, folder, retries, devices)
     else:
         done = _here(function, todo, folder, retries)
     with (
@@ -227,14 +237,49 @@ def _here(
     function: Callable[..., Any], tasks: Sequence[Task], folder: Path | None, retries: int
 ) -> Records:
     for number, task in enumerate(tasks):
-        record: dict[str, Any] = {}
-        for _ in range(1 + retries):
-            try:
-                record = attempt(function, task, folder)
-                break
-            except Exception as error:
-                record = _said(error)
-        yield number, record
+        yield number, _tried(function, task, folder, retries)
+
+
+def _tried(
+    function: Callable[..., Any], task: Task, folder: Path | None, retries: int
+) -> dict[str, Any]:
+    record: dict[str, Any] = {}
+    for _ in range(1 + retries):
+        try:
+            return attempt(function, task, folder)
+        except Exception as error:
+            record = _said(error)
+    return record
+
+
+def _on_devices(
+    function: Callable[..., Any],
+    tasks: Sequence[Task],
+    folder: Path | None,
+    retries: int,
+    devices: Sequence[Any],
+) -> Records:
+    """A thread for each device; a task finds it as JAX's default device."""
+    idle: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    for device in devices:
+        idle.put(device)
+    double = jnp.result_type(float) == jnp.float64  # as the default device, a thread's own
+
+    def work(task: Task) -> dict[str, Any]:
+        device = idle.get()
+        try:
+            with jax.default_device(device), jax.enable_x64(double):
+                return _tried(function, task, folder, retries)
+        finally:
+            idle.put(device)
+
+    with ThreadPoolExecutor(len(devices)) as pool:
+        numbers = {pool.submit(work, task): number for number, task in enumerate(tasks)}
+        try:
+            for future in as_completed(numbers):
+                yield numbers[future], future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _in_processes(
@@ -258,7 +303,8 @@ def _in_processes(
 
     def start() -> tuple[Any, Any]:
         ours, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(theirs, threads), daemon=True)
+        number = len(idle) + len(busy)
+        process = context.Process(target=_serve, args=(theirs, threads, number), daemon=True)
         process.start()
         theirs.close()  # else the end of the process would not end the pipe
         return ours, process
@@ -305,7 +351,7 @@ def _cores() -> int:
     return os.cpu_count() or 1
 
 
-def _serve(connection: multiprocessing.connection.Connection, threads: int) -> None:
+def _serve(connection: multiprocessing.connection.Connection, threads: int, number: int) -> None:
     """What a worker process does: answer tasks by (record, whether to try again)."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started it ends it
     os.environ["NPROC"] = str(threads)  # of XLA on the CPU, when it starts
@@ -317,6 +363,9 @@ def _serve(connection: multiprocessing.connection.Connection, threads: int) -> N
             os._exit(1)
 
     threading.Thread(target=leave, daemon=True).start()
+    devices = local()
+    if len(devices) > 1:
+        jax.config.update("jax_default_device", devices[number % len(devices)])
     while True:
         try:
             function, task, folder = connection.recv()

@@ -17,7 +17,7 @@ from test_cli import fails
 import jaxevent
 from jaxevent import cli, egomotion
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion import pictures, voting
+from jaxevent.egomotion import pictures, scores, voting
 from jaxevent.egomotion.motion import COMPONENTS, Motion, States
 from jaxevent.egomotion.truth import Known
 from jaxevent.errors import InputError
@@ -264,9 +264,9 @@ def test_errors_of_centred_estimates():
     truth = Known("planar", t, np.c_[1e-3 * t, 300 - 1e-3 * t])
     late = dataclasses.replace(motion_of(truth), t=t + 20_000, lag=np.full(len(t), 0.02))
     times = np.arange(40_000, 280_000, 1000)
-    told = pictures.errors(late, truth, times, centred=True)
+    told = scores.errors(late, truth, times, centred=True)
     assert told.figures["AEE"] < 1e-9 and told.count == len(times) and told.startup == 0
-    told = pictures.errors(late, truth, times, start=30_000)
+    told = scores.errors(late, truth, times, start=30_000)
     assert told.figures["AEE"] == pytest.approx(20 * np.sqrt(2)) and told.startup == 0.01
 
 

@@ -47,6 +47,7 @@ from jaxevent.blob.tracker import (
     prepare_positions,
     track,
 )
+from jaxevent.devices import shared_out
 from jaxevent.errors import InputError
 from jaxevent.evaluate import read_params, values_of
 from jaxevent.parameters import nearest
@@ -175,9 +176,9 @@ class Goal:
             if prepared[0] != fixed:
                 prepared = (None, None)  # so that two are never held at once
                 packed = jax.device_put(self._packed(found, params, self.loss.name))
+                pairs = list(zip(found, packed, strict=True))
                 by_split = tuple(
-                    [b for part, b in zip(found, packed, strict=True) if part.split == s]
-                    for s in (0, 1)
+                    shared_out([b for part, b in pairs if part.split == s]) for s in (0, 1)
                 )
                 prepared = fixed, by_split
             return prepared[1]
@@ -197,7 +198,7 @@ class Goal:
         for place, (given, recording) in (
             (place, source) for place, name in enumerate(SPLITS) for source in sources[name]
         ):
-            errors = self._errors(recording, params, progress)
+            errors = self.errors(recording, params, progress)
             of_this = [
                 (part, batch)
                 for part, batch in zip(found, packed, strict=True)
@@ -254,7 +255,7 @@ class Goal:
             return Known(known.t[inside], known.xi[inside])
         return None
 
-    def _errors(
+    def errors(
         self, recording: Recording, params: Params, progress: bool
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
         """Time (us) and distance (px) of all known positions; NaN where the track is not alive."""

@@ -37,9 +37,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
+from jaxevent.devices import along, mesh, shared_out
 from jaxevent.egomotion import voting
 from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.geometry import length
+from jaxevent.egomotion.scores import SETTINGS
 from jaxevent.egomotion.truth import (
     Known,
     axis_error,
@@ -78,6 +80,25 @@ class Batch(eqx.Module):
     counted: Float[Array | np.ndarray, " batches"]  # 1: the error counts
     weight: Float[Array | np.ndarray, ""]
     model: Model
+
+    def over(self, devices: Sequence[Any]) -> "Batch":
+        """The batch on several devices, runs shared out, or particles if runs are too few."""
+        runs, particles = self.noise.normal.shape[0], self.start.shape[0]
+        chosen = mesh(devices, runs)
+        by_run = chosen is not None and chosen.size == len(devices)
+        if not by_run:
+            chosen = mesh(devices, particles)
+        if chosen is None:
+            return jax.device_put(self, devices[0])
+        noise = self.noise
+        axes = (0, 0, 0, None) if by_run else (2, None, 1, 0)
+        arrays = (noise.normal, noise.uniform, noise.cloud, self.start)
+        placed = [along(chosen, v, axis) for v, axis in zip(arrays, axes, strict=True)]
+        return eqx.tree_at(
+            lambda b: (b.noise.normal, b.noise.uniform, b.noise.cloud, b.start),
+            along(chosen, self),
+            placed,
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,9 +182,9 @@ class Goal:
             if prepared[0] != fixed:
                 prepared = (None, None)  # so that two are never held at once
                 made = self.batches(found, params)
+                pairs = list(zip(found, made, strict=True))
                 by_split = tuple(
-                    [b for part, b in zip(found, made, strict=True) if part.split == s]
-                    for s in (0, 1)
+                    shared_out([b for part, b in pairs if part.split == s]) for s in (0, 1)
                 )
                 prepared = fixed, by_split
             return prepared[1]
@@ -314,30 +335,12 @@ def _number(value: Any) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _vector(value: Any) -> bool:
-    return (
-        isinstance(value, list)
-        and len(value) == 3
-        and all(type(n) in (int, float) and np.isfinite(n) for n in value)
-    )
-
-
 class _Voting:
     """The system of the method "voting", for `jaxevent.fit`."""
 
     settings: dict[str, tuple[Callable[[Any], bool], str]] = {
-        "model": (lambda value: isinstance(value, str), '"planar", "rotation" or "general"'),
-        "truth": (
-            lambda value: isinstance(value, str) and value != "",
-            'the name of tables beside the recordings, as "*.csv", or "poses", "gyro"',
-        ),
-        "centred": (lambda value: isinstance(value, bool), "true or false"),
+        **{name: SETTINGS[name] for name in ("model", "truth", "centred", "settle", "gyro_bias")},
         "runs": (lambda value: type(value) is int and value > 0, "a whole number, 1 or more"),
-        "settle": (
-            lambda value: type(value) in (int, float) and 0 <= value < np.inf,
-            "a number of seconds, 0 or more",
-        ),
-        "gyro_bias": (_vector, "three numbers, rad/s"),
     }
     own = ("model", "centred")
 

@@ -22,13 +22,13 @@ from jaxevent.egomotion.candidates import coordinates
 from jaxevent.egomotion.flow import Flow
 from jaxevent.egomotion.geometry import flow as flow_of_scene
 from jaxevent.egomotion.motion import COMPONENTS, Motion, States
+from jaxevent.egomotion.scores import Errors, errors
 from jaxevent.egomotion.truth import (
     Known,
     axis_error,
     endpoint_error,
     from_poses,
     known,
-    motion_errors,
 )
 from jaxevent.egomotion.warped import blur, contrast, splat
 from jaxevent.errors import InputError, require
@@ -36,10 +36,6 @@ from jaxevent.io.output import complete, complete_hdf5
 from jaxevent.recording import Events, Recording
 
 UNITS = {"vx": "px/s", "vy": "px/s", "wx": "rad/s", "wy": "rad/s", "wz": "rad/s"}
-FIGURES = {  # of `motion_errors`: their units
-    "AEE": "px/s", "AEE_rel": "%", "AAE_U": "deg", "AAE_T": "deg", "AAE_Omega": "deg",
-    "AME": "deg/s", "AME_rel": "%", "AME_N": "%", "vector_error": "%", "outliers": "%",
-}  # fmt: skip
 _PLOTTED = 4096  # most times of the plot
 _PARTICLES = 30_000  # most particles of a component in the plot
 _WAY, _SHORTEST, _LONGEST = 8.0, 0.02, 0.05  # px and s: of the window that is warped
@@ -94,61 +90,6 @@ def write_motion(path: str | Path, motion: Motion, about: Mapping[str, Any] | No
                 file[field.name] = value
         file["t"].attrs["unit"] = "us on the recording's clock"
         file["lag"].attrs["unit"] = "s"
-
-
-@dataclasses.dataclass(frozen=True)
-class Errors:
-    """How far a motion is from the truth: `figures` of `motion_errors` over `count` times.
-
-    Left out are the `startup` (s) before the motion was first found and the times at which it was
-    lost later, a share `lost` of all later ones. `truth` says in words what the truth is.
-    """
-
-    figures: Mapping[str, float]
-    startup: float
-    lost: float
-    count: int
-    truth: str
-
-    def rows(self) -> list[tuple[str, float, str]]:
-        """Names, values and units."""
-        rows = [(name, value, FIGURES[name]) for name, value in self.figures.items()]
-        return [*rows, ("lost", 100 * self.lost, "%"), ("startup", self.startup, "s")]
-
-    def table(self) -> list[str]:
-        """Lines to print."""
-        rows = [(name, f"{value:.4g}", unit) for name, value, unit in self.rows()]
-        wide = [max(len(row[i]) for row in rows) for i in range(2)]
-        lines = [f"{name:{wide[0]}}  {value:>{wide[1]}} {unit}" for name, value, unit in rows[:-2]]
-        return [
-            *(lines or ["the motion was never found where the truth is known"]),
-            f"of {self.count:,} times against {self.truth}; the first {self.startup:.3f} s and "
-            f"{100 * self.lost:.2f} % lost later are left out",
-        ]
-
-
-def errors(
-    motion: Motion, truth: Known, times: NDArray[np.int64], *, start: int | None = None,
-    centred: bool = False, named: str = "the truth",
-) -> Errors:  # fmt: skip
-    """The errors of a motion at those of the times (us) at which the truth is known.
-
-    `start` (us) is when the events begin, by default the first of the times.
-    """
-    times = times[truth.within(times)]
-    states = motion(times, centred=centred)
-    start = int(times[0]) if start is None and len(times) else start or 0
-    found = np.flatnonzero(~states.lost)
-    if not len(found):
-        span = (int(times[-1]) - start) * 1e-6 if len(times) else 0.0
-        return Errors({}, max(span, 0.0), 1.0, 0, named)
-    lost, began = states.lost[found[0] :], int(times[found[0]])
-    mean, true = states.mean[found], truth(times[found])
-    pairs = {"planar": {"U": slice(0, 2)}, "rotation": {"Omega": slice(0, 3)}}.get(
-        motion.model, {"T": slice(0, 3), "Omega": slice(3, 6)}
-    )
-    figures = motion_errors(**{name: (mean[:, c], true[:, c]) for name, c in pairs.items()})
-    return Errors(figures, max(began - start, 0) * 1e-6, float(lost.mean()), len(found), named)
 
 
 def write_errors(folder: Path, found: Errors) -> None:

@@ -221,12 +221,16 @@ class Filter(Estimator[P]):
 
     def scan(self, params: P, observer: Observer, tiles: Tiles, state: State) -> State:
         """The states after every event, (slots,)."""
+        path = tiles.each(self._scan, params, observer, state)
+        return State(path.L.ravel(), path.P.ravel())
+
+    def _scan(self, tiles: Tiles, params: P, observer: Observer, state: State) -> State:
+        """The states after every event, (tiles, slots)."""
         events = (jnp.asarray(tiles.since), jnp.asarray(tiles.near), jnp.asarray(tiles.polarity))
         frame = observer(tiles.points)
         place = Place(jnp.asarray(tiles.kind), jnp.asarray(tiles.lane))
         lanes = jax.tree.map(lambda s: s[tiles.pixel], state)
-        path = _path(self, params, frame, lanes, events, place)
-        return State(path.L.ravel(), path.P.ravel())
+        return _path(self, params, frame, lanes, events, place)
 
     def read(
         self, params: P, trajectory: "Trajectory", out: ReadOut
@@ -240,9 +244,12 @@ class Filter(Estimator[P]):
 def _over_tiles(step: Callable, lanes: Any, place: Place, slots: Any) -> Any:
     """Scan the tiles in order, and in each its ranks: `step(lanes, slots) -> lanes, output`.
 
-    `lanes` are arrays (lanes,), `slots` (tiles, slots). Returns the outputs, (tiles, slots).
+    `lanes` are arrays (lanes,), `slots` (tiles, slots). Returns the outputs, (tiles, slots). Of
+    tiles shared out among devices each has an equal share of the lanes of every block of `LANES`.
     """
-    widest = max(width for _, width in SHAPES)
+    share = SLOTS // jax.tree.leaves(slots)[0].shape[1]
+    shapes = [(ranks, width // share) for ranks, width in SHAPES]
+    widest = max(width for _, width in shapes)
 
     def use(ranks: int, width: int, lanes: Any, tile: Any) -> tuple[Any, Any]:
         tile = jax.tree.map(lambda v: v.reshape(ranks, width), tile)
@@ -251,19 +258,19 @@ def _over_tiles(step: Callable, lanes: Any, place: Place, slots: Any) -> Any:
         return lanes, jax.tree.map(jnp.ravel, out)
 
     def skip(lanes: Any, tile: Any) -> tuple[Any, Any]:
-        one = jax.tree.map(lambda s: s[:SLOTS], tile)
-        out = jax.eval_shape(lambda: use(*SHAPES[0], lanes, one)[1])
+        out = jax.eval_shape(lambda: use(*shapes[0], lanes, tile)[1])
         return lanes, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), out)
 
-    kinds = [functools.partial(use, *shape) for shape in SHAPES]
+    kinds = [functools.partial(use, *shape) for shape in shapes]
 
     # Branches see a tile's lanes, not all: XLA copies what goes through a branch. With all lanes
     # the filter took 22 ms for a million events, with a tile's 9 ms.
     def body(lanes: Any, tile: tuple[Place, Any]) -> tuple[Any, Any]:
         where, slots = tile
-        mine = jax.tree.map(lambda s: lax.dynamic_slice(s, (where.lane,), (widest,)), lanes)
+        lane = where.lane if share == 1 else where.lane // share
+        mine = jax.tree.map(lambda s: lax.dynamic_slice(s, (lane,), (widest,)), lanes)
         end, out = lax.switch(where.kind, [*kinds, skip], mine, slots)
-        lanes = jax.tree.map(lambda s, e: lax.dynamic_update_slice(s, e, (where.lane,)), lanes, end)
+        lanes = jax.tree.map(lambda s, e: lax.dynamic_update_slice(s, e, (lane,)), lanes, end)
         return lanes, out
 
     return lax.scan(body, lanes, (place, slots))[1]

@@ -16,11 +16,12 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
+from jaxevent.devices import ELSEWHERE
 from jaxevent.errors import InputError
 from jaxevent.evaluate import PROTOCOLS, Reference, frame_times
 from jaxevent.reconstruction.augment import PREPARED, FrameParams
 from jaxevent.reconstruction.estimator import Estimator, Filter
-from jaxevent.reconstruction.pixels import Numeric
+from jaxevent.reconstruction.pixels import Numeric, over_pixels, pixel_mesh
 from jaxevent.recording import Frames, Recording
 
 ERRORS = ("linear", "log", "nll")
@@ -38,12 +39,25 @@ class Images(eqx.Module):
     white: Float[Numeric, ""]  # the brightest intensity that the truth can show
     weight: Float[Numeric, ""]  # of this batch's mean among those of other batches
 
+    def over(self, devices: Sequence[Any]) -> "Images":
+        """The batch on several devices, pixels shared out."""
+        mesh = pixel_mesh(devices)
+        if mesh is None:
+            return self
+        rest = (self.truth, self.weights, self.white, self.weight)
+        placed = over_pixels(rest, mesh, self.truth.shape[1])
+        return Images(self.features.over(devices), self.out.over(devices), *placed)
+
 
 class Window(eqx.Module):
     """A batch for the likelihood: features, and the number of measured frame pixels."""
 
     features: Any
     weight: Float[Numeric, ""]
+
+    def over(self, devices: Sequence[Any]) -> "Window":
+        """The batch on several devices, pixels shared out."""
+        return Window(self.features.over(devices), self.weight)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,6 +213,9 @@ def parts(
 class Problem:
     """The batches of a method's fit and of its validation: `problem(params)`.
 
+    Of several processes each prepares its own parts; in place of the others' batches are
+    `devices.ELSEWHERE`.
+
     They are prepared when first asked for and again for params that differ in what preparation
     fixes (`augment.PREPARED`). `weights` are those of dark, well exposed and bright pixels of HDR
     references, told apart by their `clip`; omitted, 1.
@@ -229,31 +246,37 @@ class Problem:
         if self._prepared is None or self._prepared[0] != fixed:
             self._prepared = None  # so that two are never held at once
             batches: tuple[list[Any], list[Any]] = ([], [])
-            for part, splits in self._jobs:
-                for s, batch in self._batches(part, splits, params):
+            for number, (part, splits) in enumerate(self._jobs):
+                used = self._used(part, splits)
+                mine = number % jax.process_count() == jax.process_index()
+                made = self._batches(part, used, params) if mine and used else []
+                for s, batch in made if mine else [(s, ELSEWHERE) for s in used]:
                     batches[s].append(batch)
             self._prepared = fixed, batches
         return self._prepared[1]
+
+    def _used(self, part: Part, splits: Sequence[int]) -> Sequence[int]:
+        """Those of the splits that the part has a batch of."""
+        if self.objective.error is None:
+            # Only the frames given are measured, whatever the hidden ones are for.
+            return splits[: 1 if part.recording.frames else 0]
+        return [s for s in splits if (part.split == s).any()]
 
     def _batches(
         self, part: Part, splits: Sequence[int], params: FrameParams
     ) -> list[tuple[int, Any]]:
         method, dtype = self.objective.method, np.dtype(jnp.result_type(float))
         if self.objective.error is None:
-            # Only the frames given are measured, whatever the hidden ones are for.
             features, _ = method.prepare(part.recording, np.empty(0, np.int64), params)
-            frames = 0 if part.recording.frames is None else len(part.recording.frames)
+            assert part.recording.frames is not None
+            frames = len(part.recording.frames)
             count = np.asarray(frames * part.recording.width * part.recording.height, dtype)
-            return [(splits[0], Window(features, count))] if frames else []
-        if not any((part.split == s).any() for s in splits):
-            return []
+            return [(splits[0], Window(features, count))]
         times = frame_times(part.truth, params)[part.rows]
         features, out = method.prepare(part.recording, times, params)
         found = []
         for s in splits:
             places = np.flatnonzero(part.split == s)
-            if not len(places):
-                continue
             padded = np.resize(places, self._rooms[s])  # repeated images count nothing
             truth = _intensity(part.truth, part.rows[places]).astype(dtype)
             weights = self._weigh(part, truth)

@@ -14,6 +14,9 @@ before the first exposure, within exposure f, in the gap after it. In each piece
 is a blend of two integrations of events (`augment`), and a piece's event counts start at the left
 edge of its exposure.
 
+On several devices (`Features.over`) each has a share of the lanes of every block of 64, which all
+kinds of tile are made of: as much work for each, and none waits for another.
+
 A recording is prepared whole (`prepare`, for tuning) or window by window with carried state
 (`Windows`, for reading out video at constant memory); the result does not depend on the choice.
 """
@@ -24,7 +27,7 @@ import inspect
 import itertools
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -33,14 +36,18 @@ import jax
 import jax.numpy as jnp
 import numba
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
+from jaxevent.devices import AXIS, along
+from jaxevent.devices import mesh as devices_mesh
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording, Times, microseconds
 
 SHAPES = ((8, 4096), (64, 512), (512, 64))  # ranks, lanes of the three kinds of tile
 SLOTS = 8 * 4096
+LANES = 64  # of the narrowest tile; on several devices each has a part of every so many lanes
 THRESHOLDS = (128, 1024)  # events at a pixel from which the next, narrower kind serves it
 WINDOW_EVENTS = 1 << 20
 _count_rooms = itertools.count()
@@ -109,15 +116,68 @@ class ImagePoints(Points):
 
 
 class Tiles(eqx.Module):
-    """The events of a window; slots without an event have polarity 0 and change nothing."""
+    """The events of a window; slots without an event have polarity 0 and change nothing.
 
-    pixel: Int[Numeric, " lanes"]  # the pixel of each lane
+    Shared out over a mesh, the arrays' last axis is cut into blocks of `LANES`, which become the
+    last axis, and that is what is shared out.
+    """
+
+    pixel: Int[Numeric, "*lanes"]  # the pixel of each lane
     kind: Int[Numeric, " tiles"]  # the tile's place in SHAPES; len(SHAPES): the tile is not used
     lane: Int[Numeric, " tiles"]  # the tile's first lane
     points: EventPoints
-    since: Float[Numeric, "tiles slots"]  # s since the pixel's previous event
-    near: Float[Numeric, "tiles slots"]  # s since the 3x3 neighbourhood's previous event
-    polarity: Int[Numeric, "tiles slots"]  # +1, -1, or 0 where there is no event
+    since: Float[Numeric, "tiles *slots"]  # s since the pixel's previous event
+    near: Float[Numeric, "tiles *slots"]  # s since the 3x3 neighbourhood's previous event
+    polarity: Int[Numeric, "tiles *slots"]  # +1, -1, or 0 where there is no event
+    mesh: Mesh | None = eqx.field(static=True, default=None)
+
+    def over(self, mesh: Mesh) -> "Tiles":
+        """The same, lanes shared out over a mesh whose size divides `LANES`."""
+
+        def put(leaf: Any, spec: PartitionSpec) -> Any:
+            if len(spec):
+                leaf = leaf.reshape(*leaf.shape[:-1], -1, LANES)
+            return jax.device_put(leaf, NamedSharding(mesh, spec))
+
+        placed = jax.tree.map(put, self, self._specs())
+        return dataclasses.replace(placed, mesh=mesh)
+
+    def _specs(self) -> Any:
+        """How every array is shared out; empty: not at all."""
+        slots = PartitionSpec(None, None, AXIS)
+        others = {
+            "kind": PartitionSpec(),
+            "lane": PartitionSpec(),
+            "pixel": PartitionSpec(None, AXIS),
+        }
+        return jax.tree_util.tree_map_with_path(
+            lambda path, _: others.get(path[0].name, slots), self
+        )
+
+    def each(self, function: Callable[..., Any], *whole: Any) -> Any:
+        """`function(tiles, *whole)`, arrays (tiles, slots), on every device with its lanes.
+
+        Nothing passes between devices but, backwards, the sum of derivatives by `whole`.
+        """
+        if self.mesh is None:
+            return function(self, *whole)
+
+        def here(tiles: Tiles, *whole: Any) -> Any:
+            def flat(leaf: Array, spec: PartitionSpec) -> Array:
+                return leaf.reshape(*leaf.shape[:-2], -1) if len(spec) else leaf
+
+            mine = jax.tree.map(flat, tiles, tiles._specs())
+            out = function(dataclasses.replace(mine, mesh=None), *whole)
+            return jax.tree.map(lambda v: v.reshape(*v.shape[:-1], -1, lanes), out)
+
+        lanes = LANES // self.mesh.size
+        return jax.shard_map(
+            here,
+            mesh=self.mesh,
+            in_specs=(self._specs(), *[PartitionSpec()] * len(whole)),
+            out_specs=PartitionSpec(None, None, AXIS),
+            check_vma=False,  # branches that skip a tile give zeros, which are the same everywhere
+        )(self, *whole)
 
 
 class Segments(eqx.Module):
@@ -186,6 +246,28 @@ class Features(eqx.Module):
         """The features for a dead time near the one that they were made for."""
         return _grown(self, rho_ref)
 
+    def over(self, devices: Sequence[Any]) -> "Features":
+        """The features on several devices: lanes of tiles and pixels of images shared out."""
+        mesh = pixel_mesh(devices)
+        if mesh is None:
+            return self
+        pixels = self.last.shape[0]
+        growth = self.growth
+        if growth is not None:
+            counts = list(growth.counts)
+            if self.tiles is not None:
+                at = eqx.tree_at(lambda t: (t.points.on, t.points.off), self.tiles, counts[-2:])
+                points = at.over(mesh).points
+                counts[-2:] = [points.on, points.off]
+                counts[:-2] = over_pixels(counts[:-2], mesh, pixels)
+            else:
+                counts = over_pixels(counts, mesh, pixels)
+            growth = Growth(counts, over_pixels(growth.rho_ref, mesh, pixels))
+        rest = (self.frames, self.start, self.last)
+        frames, start, last = over_pixels(rest, mesh, pixels)
+        tiles = None if self.tiles is None else self.tiles.over(mesh)
+        return Features(frames, tiles, start, last, growth)
+
 
 class ReadOut(eqx.Module):
     """Images to be read: one time each, and for every pixel its last event before it."""
@@ -211,6 +293,25 @@ class ReadOut(eqx.Module):
     def at(self, rho_ref: Array) -> "ReadOut":
         """The read-out for a dead time near the one that it was made for."""
         return _grown(self, rho_ref)
+
+    def over(self, devices: Sequence[Any]) -> "ReadOut":
+        """The read-out on several devices, pixels shared out."""
+        mesh = pixel_mesh(devices)
+        return self if mesh is None else over_pixels(self, mesh, self.slot.shape[1])
+
+
+def pixel_mesh(devices: Sequence[Any]) -> Mesh | None:
+    """The mesh that pixels are shared out over; None where there is but one device."""
+    return devices_mesh(devices, LANES)
+
+
+def over_pixels(tree: Any, mesh: Mesh, pixels: int) -> Any:
+    """Arrays [..., pixels] shared out along pixels, all others whole on every device."""
+
+    def put(leaf: Any) -> Any:
+        return along(mesh, leaf, -1 if np.shape(leaf)[-1:] == (pixels,) else None)
+
+    return jax.tree.map(put, tree)
 
 
 Counting = TypeVar("Counting", Features, ReadOut)

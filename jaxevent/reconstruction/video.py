@@ -3,7 +3,7 @@
 import functools
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Generic, NamedTuple
 
 import jax
@@ -21,6 +21,8 @@ from jaxevent.reconstruction.pixels import (
     ReadOut,
     Timing,
     Windows,
+    over_pixels,
+    pixel_mesh,
 )
 from jaxevent.recording import Recording, Times, microseconds
 
@@ -62,7 +64,8 @@ class Video(Generic[P]):
     The recording is filtered in time windows of at most `window_events` events when images in them
     are asked for; windows before them are filtered first. One window is kept, and the state at
     every window's start, so memory does not grow with the recording's length. Images do not depend
-    on which other images were asked for, nor on the windows.
+    on which other images were asked for, nor on the windows. Given several `devices`, of this
+    process, they share out the pixels.
     """
 
     def __init__(
@@ -73,10 +76,12 @@ class Video(Generic[P]):
         *,
         window_events: int = WINDOW_EVENTS,
         progress: bool = False,
+        devices: Sequence[Any] = (),
     ):
         estimator.check(recording)
         self.estimator, self.recording, self.params = estimator, recording, params
-        self.progress = progress
+        self.progress, self._devices = progress, devices
+        self._mesh = pixel_mesh(devices)
         self._windows = Windows(
             recording,
             Timing.of(params),
@@ -138,8 +143,17 @@ class Video(Generic[P]):
             end = len(times) if stop is None else int(np.searchsorted(times, stop))
             for first in range(done, end, BATCH):
                 batch = times[first : min(first + BATCH, end)]
-                yield batch, _read(self.estimator, self.params, trajectory, reader(batch))
+                out = self._placed(reader(batch))
+                yield batch, _read(self.estimator, self.params, trajectory, out)
             done = end
+
+    def _placed(self, part: Any) -> Any:
+        """Features or a read-out on the devices."""
+        return part if self._mesh is None else part.over(self._devices)
+
+    def _shared_out(self, state: Any) -> Any:
+        """A state or message on the devices; else every change of how it lies would be compiled."""
+        return state if self._mesh is None else over_pixels(state, self._mesh, self._windows.pixels)
 
     def _check(self, times: NDArray[np.int64]) -> None:
         start, stop = self.recording.start, self.recording.stop
@@ -192,11 +206,13 @@ class Video(Generic[P]):
     def _filter(self, begin: Begin) -> tuple[tuple[Reader, Any], Begin]:
         """Prepare and filter the window that begins there; and where the next one begins."""
         window = self._windows.prepare(begin.start, begin.before)
-        features, window.features = window.features, None  # used once, and large
+        assert window.features is not None
+        features, window.features = self._placed(window.features), None  # used once, and large
         state = begin.state
         if state is None:
             state = _start(self.estimator, self.params, features)
         future = None if self._future is None else self._future[begin.start]
+        state, future = self._shared_out((state, future))
         trajectory, end = _run(self.estimator, self.params, features, state, future)
         jax.block_until_ready(trajectory)  # before the next window's tiles overwrite these
         following = Begin(window.stop, window.after, end)

@@ -1,0 +1,321 @@
+"""The same on one device, on four, and in two processes. Run as a program, it computes on four."""
+
+import dataclasses
+import json
+import os
+import pickle
+import socket
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from test_cli import fails
+
+import jaxevent
+from jaxevent import devices
+from jaxevent.egomotion.objectives import VOTING
+from jaxevent.egomotion.voting import Params
+from jaxevent.errors import InputError
+from jaxevent.evaluate import evaluate
+from jaxevent.fit import Settings, fit, optimise
+from jaxevent.reconstruction import METHODS
+from jaxevent.reconstruction.objectives import Objective, Problem, parts
+
+FOUR = "--xla_force_host_platform_device_count=4"
+
+# Eight windows, so that each of four devices, or of two processes, has several.
+FIT = """
+recordings = ["moving.h5"]
+split = [1, 1, 0]
+window = 0.063
+warm_up = 0.03
+iterations = 3
+every = 2
+rounds = 1
+[[method]]
+name = "edi"
+params = { c_on = 0.03 }
+fit = ["c_on", "c_off"]
+search = { clock_offset = [0, 0.01, 3] }
+"""
+EVALUATION = """
+recordings = ["moving.h5"]
+[[method]]
+name = "blend"
+[[method]]
+name = "last-frame"
+[[method]]
+name = "blend"
+label = "I0 of a half"
+params = { I0 = 0.5 }
+[[method]]
+name = "last-frame"
+label = "I0 of a quarter"
+params = { I0 = 0.25 }
+"""
+VOTES = {"particles": 20, "batch": 8, "every": 8, "tau_max": 0.03, "candidates": 16}
+SOURCE = "planar.h5"
+
+
+def written(folder: Path) -> None:
+    from test_egomotion_voting import moved
+    from test_fit import moving
+
+    jaxevent.save(moving(), folder / "moving.h5")
+    (folder / "fit.toml").write_text(FIT)
+    (folder / "evaluation.toml").write_text(EVALUATION)
+    velocity = (150.0, 80.0)
+    turning = moved(lambda at: np.broadcast_to(velocity, at.shape), 0.1, 40, 0)
+    jaxevent.save(turning, folder / SOURCE)
+    (folder / "planar.csv").write_text("t,vx,vy\n0,150,80\n0.3,150,80\n")
+
+
+def reconstructions(folder: Path) -> dict[str, Any]:
+    """Images of a filter, its loss and gradients; and a fit to a recording as a whole."""
+    recording = jaxevent.load(folder / "moving.h5")
+    found: dict[str, Any] = {}
+    method = METHODS["cf"]
+    params = method.Params(c_on=0.02, c_off=0.013, rho_ref=0.001)
+    objective = Objective(method)
+    batch = Problem(objective, parts(recording, "held-out"))(params)[0][0]
+    batch = batch if devices.alone() else batch.over(devices.local())
+    found["shared out"] = batch.features.tiles.since.sharding.num_devices
+
+    def loss(params):
+        trajectory, _ = method.run(params, batch.features)
+        return objective(params, batch), method.read(params, trajectory, batch.out)[0]
+
+    (value, images), slope = jax.jit(jax.value_and_grad(loss, has_aux=True))(params)
+    found["cf"] = images
+    found["loss"] = value, *(slope.raw[name] for name in ("c_on", "c_off", "rho_ref", "alpha"))
+
+    edi = METHODS["edi"]
+    problem = Problem(Objective(edi), parts(recording, "held-out", (1, 1, 0)))
+    settings = Settings(iterations=2, rounds=1)
+    fitted = optimise(Objective(edi), edi.Params(), ["c_on"], problem, (), settings)
+    found["whole"] = fitted.params.raw["c_on"], fitted.loss
+
+    # The smoother looks at neighbours too.
+    aks = METHODS["aks"]
+    features, out = aks.prepare(recording, np.linspace(0.05, 0.45, 5))
+    if not devices.alone():
+        features, out = (part.over(devices.local()) for part in (features, out))
+    params = aks.Params()
+    found["aks"] = jax.jit(lambda f, out: aks.read(params, aks.run(params, f)[0], out))(
+        features, out
+    )
+    return found
+
+
+def video(folder: Path) -> dict[str, Any]:
+    """Images of windows one after another."""
+    recording = jaxevent.load(folder / "moving.h5")
+    akf = METHODS["akf"].reconstruct(recording, window_events=4000, devices=devices.local())
+    return {"akf": akf(np.linspace(0.05, 0.45, 5))}
+
+
+def motions(folder: Path) -> dict[str, Any]:
+    """The loss of voting, of a number of runs that four does not divide, but it does particles."""
+    recording = dataclasses.replace(jaxevent.load(folder / SOURCE), name=str(folder / SOURCE))
+    params = Params.of(VOTES)
+    goal = VOTING.goal("voting", params, {"truth": "*.csv", "runs": 4, "settle": 0.02})
+    problem = goal.problem({"fit": [("", recording)], "validation": [], "test": []}, None, None)
+    four = problem(params)[0][0]
+    three = dataclasses.replace(four, noise=jax.tree.map(lambda leaf: leaf[:3], four.noise))
+    if not devices.alone():
+        four, three = (batch.over(devices.local()) for batch in (four, three))
+    return {
+        "4 runs": four.noise.normal.addressable_shards[0].data.shape,
+        "3 runs": three.noise.normal.addressable_shards[0].data.shape,
+        "votes": jax.jit(goal.loss)(params, three),
+    }
+
+
+def computed(folder: Path, out: Path) -> dict[str, Any]:
+    """All that is compared, in NumPy."""
+    meshes = [devices.mesh(devices.local(), n) for n in (64, 6, 9, 7)]
+    found = {**reconstructions(folder), **video(folder), **motions(folder)}
+    found["meshes"] = [mesh and mesh.size for mesh in meshes]
+    fit(folder / "fit.toml", out / "fitted")
+    found["fit"] = (out / "fitted" / "params.toml").read_text()
+    found["history"] = (out / "fitted" / "loss.csv").read_text()
+    rows = evaluate(folder / "evaluation.toml", out / "evaluated")
+    found["rows"] = [{k: v for k, v in row.items() if k != "seconds"} for row in rows]
+    return jax.device_get(found)
+
+
+def started(argv: list[Any], **environment: str) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, *map(str, argv)],
+        env={**os.environ, "JAX_ENABLE_X64": "1", "JAX_PLATFORMS": "cpu", **environment},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def ended(processes: list[subprocess.Popen], seconds: float = 300) -> list[str]:
+    """What they said; none outlives this."""
+    try:
+        said = [process.communicate(timeout=seconds) for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    for process, (_, errors) in zip(processes, said, strict=True):
+        assert process.returncode == 0, errors
+    return [out for out, _ in said]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("devices")
+    written(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def both(folder) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What one device computes, and what four do."""
+    (folder / "one").mkdir()
+    (folder / "four").mkdir()
+    four = started([__file__, folder, folder / "four"], XLA_FLAGS=FOUR)
+    try:
+        one = computed(folder, folder / "one")
+    finally:
+        ended([four])
+    return one, pickle.loads((folder / "four" / "found").read_bytes())
+
+
+def test_pixels_are_the_same_on_four_devices(both):
+    one, four = both
+    assert (one["shared out"], four["shared out"]) == (1, 4)
+    assert np.array_equal(one["cf"], four["cf"])
+    for name in ("akf", "aks"):
+        # How the compiler contracts a b + c depends on what it fuses: the last bit or two.
+        for a, b in zip(one[name], four[name], strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-15)
+    np.testing.assert_allclose(one["loss"], four["loss"], rtol=1e-12)
+
+
+def test_runs_or_particles_are_shared_out(both):
+    one, four = both
+    assert (one["4 runs"][0], four["4 runs"][0]) == (4, 1)
+    assert (one["3 runs"][2], four["3 runs"][2]) == (VOTES["particles"], VOTES["particles"] // 4)
+    np.testing.assert_allclose(one["votes"], four["votes"], rtol=1e-12)
+
+
+def test_fits_on_four_devices_end_the_same(both):
+    one, four = both
+    np.testing.assert_allclose(one["whole"], four["whole"], rtol=1e-12)
+    # Windows, of which each device had its own, are added in the same order.
+    assert one["fit"] == four["fit"] and one["history"] == four["history"]
+
+
+def test_evaluation_on_four_devices_has_the_same_rows(both):
+    one, four = both
+    assert one["rows"] == four["rows"]
+
+
+class Placed:
+    """A batch that tells where it was put."""
+
+    def over(self, places):
+        return len(places)
+
+
+def test_few_batches_are_spread_and_many_are_shared_out(monkeypatch):
+    monkeypatch.setattr(devices, "local", lambda: ["a", "b", "c"])
+    monkeypatch.setattr(jax, "device_put", lambda batch, device: device)
+    batches: list[Any] = [Placed() for _ in range(5)]
+    assert devices.Places(None)(batches) == ["a", "b", "c", "a", "b"]
+    assert devices.Places(2)(batches) == [3] * 5  # two at a time
+    assert devices.Places(None)(batches[:2]) == [3, 3]
+    assert devices.Places(None)([0, 1]) == ["a", "b"]  # these cannot be spread
+    there = devices.ELSEWHERE
+    mine: list[Any] = [there, batches[0], there, batches[1], there, batches[2]]
+    assert devices.Places(None)(mine) == [there, "a", there, "b", there, "c"]
+    assert devices.Places(4)(mine) == [there, 3, there, 3, there, 3]
+    places = devices.Places(None)
+    assert places(mine) is places(mine)
+
+
+def test_meshes_take_as_many_devices_as_divide(both):
+    one, four = both
+    assert one["meshes"] == [None] * 4 and four["meshes"] == [4, 3, 3, None]
+
+
+def test_an_error_of_one_process_is_one_of_all(monkeypatch):
+    def refuse():
+        raise InputError("no such file")
+
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    for index, mine in ((0, refuse), (1, lambda: 5)):
+        monkeypatch.setattr(jax, "process_index", lambda index=index: index)
+        monkeypatch.setattr(devices, "gathered", lambda said: ["no such file", None])
+        with pytest.raises(InputError, match="no such file"):
+            devices.in_step(mine)
+        monkeypatch.setattr(devices, "gathered", lambda said: [("error", "no such file"), ("", 0)])
+        with pytest.raises(InputError, match="no such file"):
+            devices.by_first(mine)
+    monkeypatch.setattr(devices, "gathered", lambda said: [("value", 7), said])
+    assert devices.by_first(refuse) == 7  # what process 1 would say is not asked
+    assert devices.shared_out([10, 11, 12]) == [devices.ELSEWHERE, 11, devices.ELSEWHERE]
+
+
+def test_each_process_prepares_its_own_windows(monkeypatch):
+    from test_fit import moving
+
+    windows = parts(moving(), "held-out", (1, 1, 0), 0.126)
+    edi = METHODS["edi"]
+    monkeypatch.setattr(jax, "process_count", lambda: 3)
+    owners: list[list[int]] = [[], []]
+    for index in range(3):
+        monkeypatch.setattr(jax, "process_index", lambda index=index: index)
+        for s, batches in enumerate(Problem(Objective(edi), windows)(edi.Params())):
+            owners[s] += [k for k, batch in enumerate(batches) if batch is not devices.ELSEWHERE]
+            assert len(batches) == 4
+    assert [sorted(each) for each in owners] == [[0, 1, 2, 3]] * 2
+    assert owners[0] == [0, 3, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["--coordinator", "here:1"], "--processes N"),
+        (["--coordinator", "here", "--processes", "2", "--process", "0"], "HOST:PORT"),
+        (["--coordinator", "here:1", "--processes", "2", "--process", "2"], "from 0 to 1"),
+        (["--distributed", "--process", "0"], "one or the other"),
+    ],
+)
+def test_processes_that_make_no_sense(given, said, tmp_path, capsys):
+    fails(capsys, ["fit", "fit.toml", "--out", tmp_path / "out", *given], said)
+    assert not list(tmp_path.iterdir())
+
+
+def test_two_processes_fit_as_one(folder, both):
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    program = "from jaxevent.cli import main; raise SystemExit(main())"
+    out = folder / "two"
+    argv = ["-c", program, "fit", folder / "fit.toml", "--out", out]
+    argv += ["--coordinator", f"localhost:{port}", "--processes", "2", "--process"]
+    said = ended([started([*argv, k]) for k in (0, 1)])
+    assert "edi" in said[0] and "edi" not in said[1]
+    one = folder / "one" / "fitted"
+    for name in ("params.toml", "loss.csv"):
+        assert (out / name).read_text() == (one / name).read_text()
+    a, b = (tomllib.loads((at / "params.toml").read_text())["edi"]["c_on"] for at in (one, out))
+    assert a == pytest.approx(b, rel=1e-6) and abs(a - 0.03) > 1e-3
+    rows = [json.loads((at / "results.json").read_text())["rows"] for at in (one, out)]
+    for row in [*rows[0], *rows[1]]:
+        row.pop("seconds")
+    assert rows[0] == rows[1]
+
+
+if __name__ == "__main__":
+    place = Path(sys.argv[2])
+    (place / "found").write_bytes(pickle.dumps(computed(Path(sys.argv[1]), place)))
