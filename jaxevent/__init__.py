@@ -9,7 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxevent import blob, camera, colour, egomotion, fit, metrics, simulate
+    from jaxevent import blob, camera, colour, egomotion, fit, metrics, register, simulate
     from jaxevent.errors import InputError
     from jaxevent.io import load, save
     from jaxevent.reconstruction import (
@@ -48,7 +48,7 @@ _HOME = {
         "last_frame",
     ),
 }
-_MODULES = ("blob", "camera", "colour", "egomotion", "fit", "metrics", "simulate")
+_MODULES = ("blob", "camera", "colour", "egomotion", "fit", "metrics", "register", "simulate")
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
@@ -74,6 +74,7 @@ __all__ = [
     "load",
     "metrics",
     "prepare",
+    "register",
     "save",
     "simulate",
 ]

@@ -70,14 +70,13 @@ class Registration:
     `grid` as the module says; `offset` (s) is added to their time stamps; `homography` (3, 3) where
     the grid is that of one. `agreement` is the correlation, over pixels and frames, of the change
     of ln intensity between frames with what the events say of it (1: all the same), None where
-    nothing was estimated. `matches` is the number of features that agreed.
+    nothing was estimated.
     """
 
     grid: Grid
     offset: float
     homography: NDArray[np.float64] | None = None
     agreement: float | None = None
-    matches: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -477,7 +476,7 @@ def estimate(
 
     Simulated rigs of 2.5 decades (`experiments/register.py`): 0.04 to 0.16 px rms, clock to 0.6 ms
     or, where images move 20 to 40 px/s, to 2.4 ms. Where frames clip most of what moves (4.5
-    decades) up to 1.1 px and 12 ms were seen: take a recording of a scene that frames resolve.
+    decades) up to 1.1 px and 15 ms were seen: take a recording of a scene that frames resolve.
 
     Raises `InputError` for too few matches, and if the changes of frames and events do not agree in
     the end: correlation below 0.25.

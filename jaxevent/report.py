@@ -325,9 +325,9 @@ def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
     """The results of an evaluation as a Markdown table, its columns aligned as plain text too.
 
     Each row has the keys recording, method and, of images, mse, ssim, frames and seconds. Others of
-    `COLUMNS` get columns where a row has them; what is not there is not shown. A number that is None, NaN or absent appears as "-". MSE is
-    multiplied by 100 where its column says so; seconds are those of computing. The `error` of rows
-    that have one follows the table, each once.
+    `COLUMNS` get columns where a row has them; what is not there is not shown. A number that is
+    None, NaN or absent appears as "-". MSE is multiplied by 100 where its column says so; seconds
+    are those of computing. The `error` of rows that have one follows the table, each once.
     """
     rows = list(rows)
     errors = [" ".join(row["error"].split()) for row in rows if "error" in row]

@@ -51,7 +51,7 @@ from jaxevent.devices import shared_out
 from jaxevent.errors import InputError
 from jaxevent.evaluate import read_params, values_of
 from jaxevent.parameters import nearest
-from jaxevent.reconstruction.objectives import SPLITS, interleave
+from jaxevent.reconstruction.objectives import SPLITS, windows
 from jaxevent.recording import Recording
 from jaxevent.report import aligned
 
@@ -287,16 +287,9 @@ class Goal:
         ):
             known = self._known(recording)
             first, stop = _reach(recording)
-            length = stop - first
-            if window is not None:
-                length = round(window * 1e6)
-            elif split is not None:
-                length = -(-length // 8)
-            begins = np.arange(first, stop, max(length, 1))
-            whose = np.full(len(begins), place) if split is None else interleave(split, len(begins))
-            cuts = self._seeds(recording, known, begins)
-            for begin, s, seeds in zip(begins.tolist(), whose.tolist(), cuts, strict=True):
-                end = min(begin + length, stop)
+            spans = windows(first, stop, window, split, place)
+            cuts = self._seeds(recording, known, np.array([begin for begin, _, _ in spans]))
+            for (begin, end, s), seeds in zip(spans, cuts, strict=True):
                 index = recording.events.index
                 if index(begin) < index(end):
                     found.append(_part(recording, begin, end, seeds, known, s))

@@ -52,7 +52,7 @@ from jaxevent.egomotion.voting import Model, Noise, Params
 from jaxevent.errors import InputError
 from jaxevent.evaluate import read_params, values_of
 from jaxevent.parameters import nearest
-from jaxevent.reconstruction.objectives import SPLITS, interleave
+from jaxevent.reconstruction.objectives import SPLITS, windows
 from jaxevent.recording import Recording
 from jaxevent.report import aligned
 
@@ -317,15 +317,7 @@ class Goal:
                     f"{recording.name}: its events and the true motion are not of one time; times "
                     "are seconds on the recording's clock"
                 )
-            span = stop - first
-            if window is not None:
-                span = round(window * 1e6)
-            elif split is not None:
-                span = -(-span // 8)
-            begins = np.arange(first, stop, max(span, 1))
-            whose = np.full(len(begins), place) if split is None else interleave(split, len(begins))
-            for begin, s in zip(begins.tolist(), whose.tolist(), strict=True):
-                end = min(begin + span, stop)
+            for begin, end, s in windows(first, stop, window, split, place):
                 if events.index(begin) < events.index(end):
                     found.append(Part(recording, begin, end, truth, s))
         return found

@@ -177,6 +177,26 @@ def interleave(split: Sequence[int], count: int) -> NDArray[np.int64]:
     return np.resize(pattern, count)
 
 
+def windows(
+    first: int, stop: int, window: float | int | None, split: Sequence[int] | None, place: int
+) -> list[tuple[int, int, int]]:
+    """Start, end (us) and place in SPLITS of the windows from `first` to `stop`.
+
+    They last `window` seconds, by default an eighth of it if a recording is `split`, else all of
+    it, for `place`.
+    """
+    length = stop - first
+    if window is not None:
+        length = round(window * 1e6)
+    elif split is not None:
+        length = -(-length // 8)
+    begins = np.arange(first, stop, max(length, 1))
+    whose = np.full(len(begins), place) if split is None else interleave(split, len(begins))
+    return [
+        (b, min(b + length, stop), s) for b, s in zip(begins.tolist(), whose.tolist(), strict=True)
+    ]
+
+
 def parts(
     recording: Recording,
     protocol: str,
