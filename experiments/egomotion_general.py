@@ -42,7 +42,7 @@ def window(scene: str, motion: str, seed: int, params: batch.Params) -> dict[str
         "heading sigma": float(np.degrees(spread[0])),
         "Omega sigma": 100 * float(spread[1] / np.linalg.norm(Omega)),
         "agreement": fit.agreement,
-        "score": fit.score,
+        "cost": fit.cost,
         "seconds": seconds,
     }
 

@@ -269,7 +269,7 @@ def test_interrupted_while_it_writes(folder):
     }
     out = folder / "out"
     out.mkdir()
-    words = ("--method", "akf", "--rate", 2e5, "--out", out / "images.h5")
+    words = ("--method", "akf", "--rate", 1e6, "--out", out / "images.h5")
     process = as_process("reconstruct", folder / "small.h5", *words, env=env)
     while not any(path.stat().st_size > 1e6 for path in out.iterdir()):
         assert process.poll() is None

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.sparse.linalg
 from scipy.spatial.transform import Rotation
 
 from jaxevent.camera import PinholeCamera
@@ -23,36 +24,51 @@ SECONDS = 0.3
 
 @functools.cache
 def seen() -> Recording:
-    """Points on a bent surface, 1 to 2 m away, each an event at every pixel that it enters.
+    """A roof of two textured planes, 1 to 2 m away: events where log intensity passes levels.
 
     The poses are exp(t (T, Omega)) by the closed form, t from the middle.
     """
     rng = np.random.default_rng(0)
-    n = 1500
-    at = rng.uniform([-20, -20], [WIDTH + 20, HEIGHT + 20], (n, 2)) - (CAMERA.cx, CAMERA.cy)
-    depth = 1.5 + 0.5 * np.sin(at[:, 0] / 25) * np.cos(at[:, 1] / 30)
-    points = np.concatenate([at / F, np.ones((n, 1))], 1) * depth[:, None]
-    sign, cell, rows = rng.random(n) < 0.5, None, []
-    steps = np.linspace(-SECONDS / 2, SECONDS / 2, 600)
+    wave = 2 * np.pi * rng.uniform(2, 9, (20, 1)) * rng.normal(size=(20, 2)) / 1.5
+    phase = rng.uniform(0, 2 * np.pi, 20)
+    y, x = np.mgrid[:HEIGHT, :WIDTH].reshape(2, -1)
+    rays = np.stack([(x - CAMERA.cx) / F, (y - CAMERA.cy) / F, np.ones(len(x))], 1)
+    planes = np.array([[-0.5, 0.1, 1], [0.6, 0.3, 1]]), np.array([1.6, 1.5])
+
+    def seen_at(pose: np.ndarray) -> np.ndarray:
+        R, C = pose[:3, :3], pose[:3, 3]
+        depth = ((planes[1] - planes[0] @ C) / (rays @ R.T @ planes[0].T)).min(1)
+        P = C + depth[:, None] * (rays @ R.T)
+        return 0.17 * np.sin(P[:, :2] @ wave.T + phase).sum(1)
+
+    steps = np.linspace(-SECONDS / 2, SECONDS / 2, 151)
     poses = np.asarray(geometry.twist_exp(steps[:, None] * np.r_[T, OMEGA]))
+    level, rows = None, []
+    C = 0.25
     for t, pose in zip(steps, poses, strict=True):
-        local = (points - pose[:3, 3]) @ pose[:3, :3]
-        xy = np.floor(F * local[:, :2] / local[:, 2:] + (CAMERA.cx + 0.5, CAMERA.cy + 0.5))
-        inside = (xy >= 0).all(1) & (xy < (WIDTH, HEIGHT)).all(1)
-        if cell is not None:
-            new = np.flatnonzero(inside & (xy != cell).any(1))
-            when = 1e6 * (t + SECONDS / 2) - 1e6 * SECONDS / 599 * rng.random(len(new))
-            rows.append(np.stack([when, *xy[new].T, sign[new]], 1))
-        cell = xy
+        new = seen_at(pose)
+        if level is None:
+            level, before = new + C * rng.uniform(-0.5, 0.5, len(new)), new
+            continue
+        while True:
+            sign = np.sign(new - level)
+            crossed = np.flatnonzero(np.abs(new - level) >= C)
+            if not len(crossed):
+                break
+            level[crossed] += C * sign[crossed]
+            share = (level - before)[crossed] / (new - before)[crossed]
+            when = t - (1 - share) * (steps[1] - steps[0]) + SECONDS / 2
+            rows.append(np.stack([1e6 * when, x[crossed], y[crossed], sign[crossed] > 0], 1))
+        before = new
     table = np.concatenate(rows)
     t, x, y, p = table[np.argsort(table[:, 0], kind="stable")].T
     events = Events(
         np.rint(t).astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), p.astype(bool)
     )
-    return Recording("points", WIDTH, HEIGHT, events, camera=CAMERA)
+    return Recording("roof", WIDTH, HEIGHT, events, camera=CAMERA)
 
 
-GIVEN = {"events": 8192, "fewest": 500, "starts": 1, "flow_max": 120.0, "cell": 16}
+GIVEN = {"events": 8192, "fewest": 500, "starts": 3, "rivals": 1, "flow_max": 120.0, "cell": 16}
 PARAMS = batch.Params.of(GIVEN)
 
 
@@ -103,34 +119,118 @@ def test_the_motion_of_a_window_is_found():
     heading, Omega = (part[0] for part in fit.path.twist(0.0))
     assert np.degrees(np.arccos(heading @ T / np.linalg.norm(T))) < 15
     assert np.linalg.norm(Omega - OMEGA) < 0.35 * np.linalg.norm(OMEGA)
-    assert fit.agreement > 0.7 and np.isfinite(fit.covariance).all()
+    assert fit.agreement > 0.5 and np.isfinite(fit.covariance).all()
+    assert (np.linalg.eigvalsh(fit.covariance) > -1e-12).all()
 
 
-def test_the_gradient_of_the_disagreement():
-    windows, fit = fitted()
-    window = windows.cut(150_000, 0.15, 2048)
-    path = jax.tree.map(lambda leaf: leaf + 1e-3, fit.path)
-    value = jax.jit(
-        lambda O0: batch.disagreement(  # noqa: E731
-            dataclasses.replace(path, O=path.O.at[0].set(O0)), window
+def scene_of(fit: batch.Fit) -> batch.Scene:
+    return batch.Scene(fit.path, jnp.asarray(fit.map), jnp.zeros(()))
+
+
+def test_tracks_are_the_events_of_pixels():
+    windows, _ = fitted()
+    tracks = windows.tracks(150_000, 0.15, 3000)
+    events, n = seen().events, int(tracks.on.sum())
+    assert 2000 < n <= 3000
+    pixel, level, number = (np.asarray(a)[:n] for a in (tracks.pixel, tracks.level, tracks.number))
+    where = events.y.astype(int) * WIDTH + events.x
+    for one in np.unique(pixel)[::20]:
+        at = np.flatnonzero(where == one)
+        np.testing.assert_array_equal(level[pixel == one], np.cumsum(2.0 * events.p[at] - 1))
+        np.testing.assert_array_equal(number[pixel == one], np.arange(len(at)) + 1)
+        np.testing.assert_allclose(
+            np.asarray(tracks.tau)[:n][pixel == one], (events.t[at] - 150_000) * 1e-6, atol=1e-12
         )
+
+
+def test_the_map_is_the_least_squares_one():
+    """For a path held fixed, against a sparse solver on bilinear weights written out."""
+    windows, fit = fitted()
+    tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    scene = scene_of(fit)._replace(map=jnp.zeros(tracks.shape))
+    # All events' weights are 1.
+    prior = prior._replace(alike=jnp.asarray(1e-6), flat=jnp.asarray(0.02))
+    for _ in range(2):
+        scene, _ = batch.adjust(tracks, scene, prior, float(batch.NODE), 1e3, 4, 100, 8)
+    left = np.asarray(batch.misfits(scene, tracks, batch.NODE))
+    n = int(tracks.on.sum())
+    X, Y = (np.asarray(a)[:n] for a in batch.placed(scene.path, tracks, batch.NODE))
+    i, j = X - tracks.corner[0], Y - tracks.corner[1]
+    height, width = tracks.shape
+    inside = (i >= 0) & (i < width - 1) & (j >= 0) & (j < height - 1)
+    i, j, e = i[inside], j[inside], np.arange(inside.sum())
+    low, top = np.floor(i).astype(int), np.floor(j).astype(int)
+    parts = [
+        (e, (top + v) * width + low + u, (1 - abs(i - low - u)) * (1 - abs(j - top - v)))
+        for u in (0, 1)
+        for v in (0, 1)
+    ]
+    rows, columns, values = (np.concatenate(part) for part in zip(*parts, strict=True))
+    pixel = np.unique(np.asarray(tracks.pixel)[:n][inside], return_inverse=True)[1]
+    offsets = scipy.sparse.csr_array((-np.ones(len(e)), (e, pixel)), (len(e), pixel.max() + 1))
+    events = scipy.sparse.csr_array((values, (rows, columns)), (len(e), height * width))
+    number = np.arange(height * width).reshape(height, width)
+    one = scipy.sparse.eye_array(height * width).tocsr()
+    apart = [one[number[1:].ravel()] - one[number[:-1].ravel()],
+             one[number[:, 1:].ravel()] - one[number[:, :-1].ravel()]]  # fmt: skip
+    prior_rows = scipy.sparse.vstack([np.sqrt(0.02) * part for part in apart])
+    none = scipy.sparse.csr_array((prior_rows.shape[0], offsets.shape[1]))
+    matrix = scipy.sparse.vstack(
+        [scipy.sparse.hstack([events, offsets]), scipy.sparse.hstack([prior_rows, none])]
     )
-    slope = jax.jit(jax.grad(value))(path.O[0])
-    h = 1e-6
+    level = np.asarray(tracks.level)[:n][inside]
+    side = np.append(level, np.zeros(prior_rows.shape[0]))
+    found = scipy.sparse.linalg.lsqr(matrix, side, iter_lim=300)
+    cost = np.linalg.norm(left) ** 2 + ((prior_rows @ np.asarray(scene.map).ravel()) ** 2).sum()
+    assert np.sqrt(cost) == pytest.approx(found[3], rel=0.01)
+    assert found[3] < 0.5 * np.linalg.norm(level)
+
+
+def test_the_photometric_fit_ends_at_the_truth():
+    """From 6 degrees beside it, and depths of a plane that faces the camera."""
+    windows, _ = fitted()
+    tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    O, D = np.zeros((batch.ROWS, 3)), np.zeros((batch.ROWS, 3))  # noqa: E741
+    O[0], D[0] = OMEGA, T / np.linalg.norm(T) + [0.1, 0, 0]
+    depths = np.full(tracks.nodes[0] * tracks.nodes[1], np.log(np.linalg.norm(T) / 1.5))
+    path = batch.normalised(batch.Path(*(jnp.asarray(part) for part in (O, D, depths))))
+    scene = batch.Scene(path, jnp.zeros(tracks.shape), jnp.zeros(()))
+    for sigma, settle, steps in ((0.3, 2, 12), (0.2, 0, 15), (0.05, 0, 15)):
+        scene, report = batch.adjust(
+            tracks, scene, prior, float(batch.NODE), sigma, batch.ROWS - 1, settle, steps
+        )
+    heading, Omega = (part[0] for part in scene.path.twist(0.0))
+    assert np.degrees(np.arccos(heading @ T / np.linalg.norm(T))) < 3
+    assert np.linalg.norm(Omega - OMEGA) < 0.06 * np.linalg.norm(OMEGA)
+    assert report.rms < 0.05 and report.inliers > 0.9
+
+
+def test_the_gradient_of_misfits():
+    windows, fit = fitted()
+    tracks = windows.tracks(150_000, 0.15, 8192)
+    scene = scene_of(fit)
+
+    @jax.jit
+    def value(O0):
+        path = dataclasses.replace(fit.path, O=fit.path.O.at[0].set(O0))
+        return jnp.mean(batch.misfits(scene._replace(path=path), tracks, batch.NODE) ** 2)
+
+    at = fit.path.O[0] + 0.01
+    slope = jax.jit(jax.grad(value))(at)
+    h = 1e-7
     for axis in np.eye(3):
-        difference = (value(path.O[0] + h * axis) - value(path.O[0] - h * axis)) / (2 * h)
+        difference = (value(at + h * axis) - value(at - h * axis)) / (2 * h)
         assert slope @ axis == pytest.approx(float(difference), rel=1e-3, abs=1e-5)
-    still = batch.Path(0 * path.O, 0 * path.D, path.log_rho)
-    assert batch.disagreement(fit.path, window) < 0.9 * batch.disagreement(still, window)
+    assert value(fit.path.O[0]) < 0.9 * value(fit.path.O[0] + 0.2)
 
 
 def test_priors_pull():
     windows, fit = fitted()
-    window = windows.cut(150_000, 0.15, batch.LAST)
-    weak = windows.prior(150_000, 0.15)
-    strong = weak._replace(omega=jnp.asarray(1e9))
-    path, _ = batch.refine(window, fit.path, strong, 2, 2, PARAMS.iterations)
-    assert np.linalg.norm(path.O[0]) < 0.1 * np.linalg.norm(fit.path.O[0])
+    tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    strong = prior._replace(omega=jnp.asarray(1e9))
+    spacing = float(batch.NODE)
+    scene, _ = batch.adjust(tracks, scene_of(fit), strong, spacing, 0.1, 4, 0, 8)
+    assert np.linalg.norm(scene.path.O[0]) < 0.1 * np.linalg.norm(fit.path.O[0])
     t = np.array([0, 300_000])
     wrong = OMEGA + [0.0, 0.2, 0.0]
     windows = batch.Windows(
@@ -138,8 +238,9 @@ def test_priors_pull():
         Twists(t, np.stack([wrong, wrong]), None, 0, 300_000),
     )  # fmt: skip
     prior = windows.prior(150_000, 0.15)
-    path, _ = batch.refine(window, fit.path, prior, 2, 2, PARAMS.iterations)
-    np.testing.assert_allclose(path.twist(0.0)[1][0], wrong, atol=1e-2)
+    scene, report = batch.adjust(tracks, scene_of(fit), prior, spacing, 0.1, 4, 0, 8, True)
+    np.testing.assert_allclose(scene.path.twist(0.0)[1][0], wrong, atol=1e-2)
+    assert np.sqrt(np.diag(report.covariance)[3:]).max() < 1e-4
 
 
 def test_a_recording_from_end_to_end():
@@ -152,6 +253,10 @@ def test_a_recording_from_end_to_end():
     np.testing.assert_array_equal(again.mean, motion.mean)
     few = batch.estimate(seen()[0.0:0.01], PARAMS)
     assert few.lost.all() and np.isfinite(few.mean).all()
+    at_once = seen().events[:3000]
+    at_once = dataclasses.replace(at_once, t=np.full(3000, 150_000))
+    instant = batch.estimate(dataclasses.replace(seen(), events=at_once), PARAMS)
+    assert all(np.isfinite(part).all() for part in (instant.mean, instant.covariance))
     empty = dataclasses.replace(seen(), events=seen().events[:0])
     assert len(batch.estimate(empty, PARAMS)) == 0
 

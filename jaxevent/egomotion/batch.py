@@ -2,45 +2,58 @@
 
 In a window around t_r, with tau = t - t_r, the pose of camera(t) in camera(t_r) is
 
-    phi(tau) = O0 tau + O1 tau^2 / 2 + O2 tau^3 / 6,  R = exp[phi]x
-    C(tau) = C1 tau + C2 tau^2 / 2 + C3 tau^3 / 6,  |C1| = 1
+    phi(tau) = O0 tau + O1 tau^2 / 2 + ... + O4 tau^5 / 120,  R = exp[phi]x
+    C(tau) = C1 tau + C2 tau^2 / 2 + ... + C5 tau^5 / 120,  |C1| = 1
 
 (a constant twist has C2 = O0 x C1, so the unknowns are D2 = C2 - O0 x C1 and so on), and a point of
-inverse depth rho, constant in cells of the reference view, is moved there by the exact warp
+inverse depth rho in the reference view is moved there by the exact warp
 
     r = pi(R x),  x_ref = r + rho (f C_xy - C_z r),
 
-which is linear in rho. The window is divided into segments of time; I_s is the signed image of the
-warped events of one, and the path sought makes the segments' images agree:
+which is linear in rho. The fit is photometric (cf. Guo & Gallego, "Event-based photometric bundle
+adjustment", there for rotation). Log intensity at a pixel u at its event e is known from its
+polarities but for the pixel's beginning b_u, and is that of the scene where the warp takes u: with
+L the map of log intensity in the reference view in units of the contrast threshold,
 
-    min sum_s |I_s - k_s T_s|^2,  T_s = sum of the other segments' images.
+    L(x_ref(u, t_e)) = b_u + s_e,   s_e = sum of the polarities of u's events up to and with e,
 
-As |sum_s I_s|^2 = sum_s |I_s|^2 + sum_s <I_s, T_s>, that maximises the signed contrast without each
-segment's own part of it: nothing is gained by squeezing events together, and only what the sensor
-sees in each segment is compared. Gauss-Newton solves it: displacements of every cell in every
-segment with their information (Lucas & Kanade's equations, k_s per cell and segment), then one
-linear system for path and depths, the assignment to cells held fixed. L-BFGS on the contrast itself
-crawls along the valley in which sideways motion and panning look alike: after 240 evaluations it
-was still 8 to 16 degrees away from where 20 of these steps end.
+is linear in L and b_u. Minimised over L, b_u, path and depths is the sum of the squared
+differences, robustly (Geman & McClure, 3 sigma), with weak priors on differences of L and of log
+depth between neighbours and on changes of the twist. b_u is eliminated exactly (differences less
+their mean over the pixel's events), all else is one linear system a step, solved by conjugate
+gradients, without the matrix: the map's diagonal, and path with lumped depths exactly, precondition
+it. Steps extrapolate (Nesterov): reweighting alone is slow. Depth is interpolated between nodes 24
+px apart where that explains the events, else 8 px: events beside edges of depth are what remains
+unexplained. Nothing is gained by squeezing events together, which biases contrast, and no event is
+compared that tells only the gradient along the flow.
+
+Where events are noisy, sigma is not made smaller than their misfit. An ON threshold C (1 + skew)
+and an OFF one of C (1 - skew) are allowed for.
+
+Before it, segments of the window are aligned: I_s is the signed image of the warped events of one,
+
+    min sum_s |I_s - k_s T_s|^2,  T_s = sum of the other segments' images,
+
+by Gauss-Newton on displacements of every cell in every segment with their information (Lucas &
+Kanade's equations, k_s per cell and segment), the assignment to cells held fixed. It comes within
+some ten degrees from most starts; its own optimum is some degrees off.
 
 Starts, coarse to fine: the best pure rotation; flows of patches of the derotated events with their
 uncertainty; a robust fit of the rest of the rotation for every heading of a hemisphere, both signs
 of T told apart by depths > 0. Each start is followed with a constant twist, then over longer
-windows with degrees 1 and 2. The mean over blocks of n (log S - 1.5 log n) / N, S the contrast and
-n the number of events of a block, selects: plain contrast prefers squeezed solutions.
-
-Simulated, an error of about 3 degrees along that valley remains, ten times what noise explains: the
-images of segments also differ because events only tell the gradient along the flow, and the flow
-turns. `inflation` widens the covariance accordingly.
+windows. The mean over blocks of n (log S - 1.5 log n) / N, S the contrast and n the number of
+events of a block, selects those that go on; of these the photometric cost selects.
 """
 
 import functools
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.ndimage
 import scipy.optimize
 from jax import lax
 from jaxtyping import Array, Float, Int
@@ -64,9 +77,21 @@ BORDER = 3  # px at the sensor's border that are not compared
 DIRECTIONS = 600  # headings of a hemisphere that are tried
 HOP, PATCH = 16, 24  # px between patches whose flow is measured, and their size
 BLOCK = 12  # px, of the score
+APART = np.cos(np.radians(6))  # headings of rivals
+TURN = 0.1  # rad/s, likewise
 COARSE = 15000  # events of short windows
 MIDDLE = 30000
 LAST = 60000
+ROWS = 5  # of a path: T and Omega are polynomials of the fourth degree
+NODE = 8  # px between nodes of depth
+WIDE = 24  # px, the same where there are no edges
+BEND = 0.1  # a larger difference of log depth between nodes is an edge
+SOLVE = 40  # steps of conjugate gradients
+# Sigma (C) and steps: of the map alone, of rivals, of the best of them.
+FIRST = ((0.3, 2),)
+TRIAL = {WIDE: ((0.4, 40), (0.1, 8)), NODE: ((0.2, 14), (0.1, 10))}
+FINAL = ((0.05, 20), (0.02, 10))
+SMOOTH = 0.95  # share of events that widely spaced depths explain where there are no edges
 
 
 class Params(Parameters):
@@ -74,20 +99,23 @@ class Params(Parameters):
 
     half_window = Positive(0.15, "s", "half the length of the last window; earlier: 1/3, 2/3")
     step = Positive(0.1, "s", "from one window to the next")
-    events = Count(160000, "", "most events of a window, taken at random")
+    events = Count(60000, "", "most events of a window, of pixels taken at random")
     fewest = Count(2000, "", "events that a window needs")
     fresh = Count(5, "", "every so many windows new starts compete with the window before")
     starts = Count(3, "", "headings that are followed, of each of two short windows")
     cell = Count(24, "px", "of one depth")
-    iterations = Count(14, "", "steps on the last window")
+    iterations = Count(8, "", "steps of the alignment of segments on the whole window")
+    rivals = Count(3, "", "aligned starts, some degrees apart, that go on to the photometric fit")
 
     smooth = Positive(1.0, "", "weight of differences of log depth between cells")
     relief = Positive(0.1, "", "weight of differences of log depth from its mean")
     change = Positive(0.02, "1/px^2", "weight of changes of the twist, in px at the window's end")
+    bond = Positive(1.0, "", "weight of differences of log depth between nodes")
+    flat = Positive(0.001, "1/C^2", "weight of differences of log intensity between pixels")
+    alike = Positive(10.0, "", "how many events together tell as much as one: errors are alike")
     omega_scale = Number(0.0, "rad/s", "prior: |Omega| is about so much or less; 0: not known")
     gyro_std = Positive(0.03, "rad/s", "of a gyro, if one is given")
     flow_max = Positive(220.0, "px/s", "flows of patches that are tried, without the rotation")
-    inflation = Positive(60.0, "", "of the covariance, which knows of noise alone")
 
 
 class Window(eqx.Module):
@@ -111,17 +139,19 @@ class Window(eqx.Module):
 
 
 class Path(eqx.Module):
-    """The unknowns: rows O0, O1, O2 (rad/s^k), and C1, D2, D3 in units of |T|; log depths."""
+    """The unknowns: rows O0, O1, ... (rad/s^k), and C1, D2, D3, ... in units of |T|; log depths."""
 
-    O: Float[Array, "3 3"]  # noqa: E741
-    D: Float[Array, "3 3"]
-    log_rho: Float[Array, " cells"]  # 1/m in units of 1/|T|
+    O: Float[Array, "rows 3"]  # noqa: E741
+    D: Float[Array, "rows 3"]
+    log_rho: Float[Array, " depths"]  # 1/m in units of 1/|T|, of cells or at nodes
 
     def coefficients(self) -> tuple[Array, Array]:
         """O and C."""
-        first = jnp.cross(self.O[0], self.D[0])
-        second = jnp.cross(self.O[0], first)
-        return self.O, jnp.stack([self.D[0], self.D[1] + first, self.D[2] + second])
+        C, constant = [self.D[0]], self.D[0]
+        for D in self.D[1:]:
+            constant = jnp.cross(self.O[0], constant)
+            C.append(D + constant)
+        return self.O, jnp.stack(C)
 
     def twist(self, tau: float | int | NDArray) -> tuple[NDArray, NDArray]:
         """Unit heading R' C' and Omega to second order, (times, 3) each, at times tau (s)."""
@@ -129,23 +159,18 @@ class Path(eqx.Module):
 
         O, C = (np.asarray(part, np.float64) for part in self.coefficients())  # noqa: E741
         tau = np.atleast_1d(np.asarray(tau, np.float64))
-        powers = np.stack([tau, tau**2 / 2, tau**3 / 6], 1)
-        slopes = np.stack([np.ones_like(tau), tau, tau**2 / 2], 1)
+        slopes = np.stack([tau**k / math.factorial(k) for k in range(len(O))], 1)
+        powers = np.stack([tau**k / math.factorial(k) for k in range(1, len(O) + 1)], 1)
         T = Rotation.from_rotvec(powers @ O).apply(slopes @ C, inverse=True)
         return T / np.linalg.norm(T, axis=1, keepdims=True), slopes @ O
 
 
-class Told(NamedTuple):
-    """Of a step: how well segments agree, its size in px, the covariance of C1 and O0."""
-
-    agreement: Array
-    step: Array
-    covariance: Array
-
-
 def _along(coefficients: Array, tau: Array) -> list[Array]:
-    a, b, c = coefficients
-    return [a[i] * tau + b[i] * tau**2 / 2 + c[i] * tau**3 / 6 for i in range(3)]
+    """sum_k c_k tau^k / k!, k from 1: three components."""
+    sums = [jnp.zeros_like(tau)] * 3
+    for k in range(len(coefficients), 0, -1):
+        sums = [(sums[i] + coefficients[k - 1, i]) * tau / k for i in range(3)]
+    return sums
 
 
 def _rotated(phi: list[Array], x: Array, y: Array, z: Array) -> tuple[Array, Array, Array]:
@@ -200,16 +225,6 @@ def segments(path: Path, window: Window, cell: Int[Array, " E"]) -> Float[Array,
     return stack.reshape(SEGMENTS, tall, width)[:, :height]
 
 
-def disagreement(path: Path, window: Window, blurs: int = 2) -> Float[Array, ""]:
-    """1 - sum <I_s, T_s> / ((S - 1) sum |I_s|^2): 0 where all segments show the same.
-
-    Pure and differentiable in the path; cells are assigned as it says and held fixed.
-    """
-    images = blur(segments(path, window, assigned(path, window)), blurs)
-    own, all_ = jnp.sum(images**2), jnp.sum(images.sum(0) ** 2)
-    return 1 - (all_ - own) / ((SEGMENTS - 1) * jnp.maximum(own, 1e-9))
-
-
 def _sums(image: Array, window: Window) -> Array:
     """Sums over cells (..., cells)."""
     (rows, columns), n = window.cells, window.cell
@@ -233,19 +248,30 @@ class Prior(NamedTuple):
     omega: Array  # 1 / (rad/s)^2
     gyro: Array
     gyro_weight: Array  # 1 / (rad/s)^2, 0: none
+    bond: Array  # of the photometric fit, as smooth
+    flat: Array
+    alike: Array
 
 
-@functools.partial(jax.jit, static_argnums=3)
+@jax.jit
 def refine(
-    window: Window, path: Path, prior: Prior, degree: int, blurs: int | Array, steps: int | Array
-) -> tuple[Path, Told]:
-    """So many Gauss-Newton steps from a path; of O and D the rows up to `degree` move.
+    window: Window,
+    path: Path,
+    prior: Prior,
+    degree: int | Array,
+    blurs: int | Array,
+    steps: int | Array,
+) -> tuple[Path, Array]:
+    """So many Gauss-Newton steps from a path; of O and D the rows up to `degree` (<= 2) move.
 
-    Images are blurred `blurs` times by [1 2 1] / 4. What is told is of the last step.
+    Images are blurred `blurs` times by [1 2 1] / 4. The second result is how well segments agreed
+    before the last step: 1 where all show the same.
     """
-    k, f, h = degree + 1, window.f, window.half
+    k, f, h = 3, window.f, window.half
     rows, columns = window.cells
-    cells, free = rows * columns, 6 * (degree + 1)
+    cells, free = rows * columns, 6 * k
+    still = jnp.repeat(jnp.tile(jnp.arange(k) > degree, 2), 3)
+    still = jnp.append(still, jnp.zeros(cells, bool))
     j, i = jnp.divmod(jnp.arange(cells), columns)
     middle = (window.cell - 1) / 2
     X0 = jnp.broadcast_to(window.corner[0] + i * window.cell + middle, (SEGMENTS, cells))
@@ -271,7 +297,7 @@ def refine(
         values = values.reshape(2 * k, 3)
         return Path(path.O.at[:k].set(values[:k]), path.D.at[:k].set(values[k:]), path.log_rho)
 
-    def one(_: Any, state: tuple[Path, Told]) -> tuple[Path, Told]:
+    def one(_: Any, state: tuple[Path, Array]) -> tuple[Path, Array]:
         path, _ = state
         rho = jnp.broadcast_to(jnp.exp(path.log_rho), (SEGMENTS, cells))
         images = segments(path, window, assigned(path, window))
@@ -360,6 +386,8 @@ def refine(
         )
         H = H + 100 * jnp.trace(upper) / free * gauge[:, None] * gauge
         H = H + jnp.diag(1e-3 * jnp.diag(H) + 1e-6)
+        H = jnp.where(still[:, None] | still, 0, H) + jnp.diag(still.astype(H.dtype))
+        g = jnp.where(still, 0, g)
 
         change = -jnp.linalg.solve(H, g)
         change = jnp.where(jnp.isfinite(change).all(), change, 0)
@@ -369,14 +397,9 @@ def refine(
         path = Path(path.O, path.D, path.log_rho + jnp.clip(change[free:], -0.5, 0.5))
         path = normalised(path)
         own = jnp.maximum((_sums(images**2, window) * share).sum(), 1e-6)
-        inverse = jnp.linalg.inv(H)[:free, :free] * unit[:, None] * unit
-        chosen = jnp.concatenate([jnp.arange(3 * k, 3 * k + 3), jnp.arange(3)])
-        told = Told((gain * both * share).sum() / own, largest, inverse[chosen][:, chosen])
-        return path, told
+        return path, (gain * both * share).sum() / own
 
-    zero = jnp.zeros((), window.x.dtype)
-    nothing = Told(zero, zero, jnp.zeros((6, 6), window.x.dtype))
-    return lax.fori_loop(0, steps, one, (path, nothing))
+    return lax.fori_loop(0, steps, one, (path, jnp.zeros((), window.x.dtype)))
 
 
 def normalised(path: Path) -> Path:
@@ -399,6 +422,384 @@ def score(window: Window, path: Path) -> Float[Array, ""]:
     S, n = parts.sum((2, 4))
     told = jnp.log(jnp.where(n > 5, S, 1) + 1e-6) - 1.5 * jnp.log(jnp.where(n > 5, n, 1))
     return jnp.where(n > 5, n * told, 0).sum() / jnp.maximum(jnp.abs(window.p).sum(), 1)
+
+
+# The photometric fit
+
+
+class Tracks(eqx.Module):
+    """Events of a window, pixel by pixel, filled up with events of no weight."""
+
+    x: Float[Array, " E"]  # px, undistorted, from the principal point
+    y: Float[Array, " E"]
+    tau: Float[Array, " E"]  # s from the reference time
+    level: Float[Array, " E"]  # sum of the pixel's polarities up to and with this event's
+    number: Float[Array, " E"]  # how many these are
+    on: Float[Array, " E"]  # 1; 0 where there is no event
+    pixel: Int[Array, " E"]
+    f: Float[Array, ""]  # px
+    half: Float[Array, ""]  # s
+    shape: tuple[int, int] = eqx.field(static=True)  # of the map
+    corner: tuple[float, float] = eqx.field(static=True)  # px, where its pixel [0, 0] lies
+    pixels: int = eqx.field(static=True)
+    node: int = eqx.field(static=True)  # px between the closest nodes of depth
+
+    @property
+    def nodes(self) -> tuple[int, int]:
+        """Rows and columns of the closest nodes."""
+        return tuple((n - 2) // self.node + 2 for n in self.shape)  # pyright: ignore
+
+
+class Scene(NamedTuple):
+    """The unknowns: path with log depths at nodes, map of log intensity, difference of thresholds.
+
+    The map is in units of the mean threshold C; C (1 + skew) is that of ON, C (1 - skew) of OFF.
+    """
+
+    path: Path
+    map: Array  # (height, width)
+    skew: Array
+
+
+class Report(NamedTuple):
+    """Of a step: the rms of inliers (C), the robust cost per event (C^2), the share of inliers."""
+
+    rms: Array
+    cost: Array
+    inliers: Array
+    step: Array  # px at the window's end
+    covariance: Array  # (6, 6) of C1 and O0, 0 unless it was asked for
+
+
+class _Corners(NamedTuple):
+    """Four neighbours of points on a lattice, as rows of 4: bilinear shares and their slopes."""
+
+    first: Array
+    share: Array
+    along_x: Array
+    along_y: Array
+    inside: Array
+
+
+def _corners(
+    X: Array, Y: Array, corner: tuple, size: Array | float | int, shape: tuple
+) -> _Corners:
+    i, j = (X - corner[0]) / size, (Y - corner[1]) / size
+    inside = (i >= 0) & (i < shape[1] - 1) & (j >= 0) & (j < shape[0] - 1)
+    i, j = jnp.clip(i, 0, shape[1] - 1.001), jnp.clip(j, 0, shape[0] - 1.001)
+    low, top = jnp.floor(i), jnp.floor(j)
+    u, v = i - low, j - top
+    return _Corners(
+        (top * shape[1] + low).astype(jnp.int32),
+        jnp.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], 1),
+        jnp.stack([v - 1, 1 - v, -v, v], 1) / size,
+        jnp.stack([u - 1, -u, 1 - u, u], 1) / size,
+        inside,
+    )
+
+
+def _gathered(values: Array, corners: _Corners, shape: tuple) -> Array:
+    """The four values (E, 4) around points, of values (height, width)."""
+    wide = jnp.pad(values.reshape(shape), ((0, 1), (0, 1)))
+    four = jnp.stack([wide[:-1, :-1], wide[:-1, 1:], wide[1:, :-1], wide[1:, 1:]], -1)
+    return four.reshape(-1, 4)[corners.first]
+
+
+def _scattered(values: Array, corners: _Corners, shape: tuple) -> Array:
+    """The transpose of gathering: (E, 4) to (height * width)."""
+    rows = jnp.zeros((shape[0] * shape[1], 4), values.dtype)
+    rows = rows.at[corners.first].add(values, mode="promise_in_bounds").reshape(*shape, 4)
+    wide = jnp.zeros((shape[0] + 1, shape[1] + 1), values.dtype)
+    wide = wide.at[:-1, :-1].add(rows[..., 0]).at[:-1, 1:].add(rows[..., 1])
+    wide = wide.at[1:, :-1].add(rows[..., 2]).at[1:, 1:].add(rows[..., 3])
+    return wide[:-1, :-1].ravel()
+
+
+def _laplacian(values: Array) -> Array:
+    """Minus the sum of differences to the neighbours, of a map."""
+    down, right = values[1:] - values[:-1], values[:, 1:] - values[:, :-1]
+    out = jnp.zeros_like(values).at[1:].add(down).at[:-1].add(-down)
+    return out.at[:, 1:].add(right).at[:, :-1].add(-right)
+
+
+def placed(path: Path, tracks: Tracks, spacing: Array | float | int) -> tuple[Array, Array]:
+    """Where events are in the reference view: depth is that of the place they are warped to."""
+    X, Y = tracks.x, tracks.y
+    for _ in range(4):
+        at = _corners(X, Y, tracks.corner, spacing, tracks.nodes)
+        log_rho = (_gathered(path.log_rho, at, tracks.nodes) * at.share).sum(1)
+        X, Y = warp(path, tracks.f, tracks.x, tracks.y, tracks.tau, jnp.exp(log_rho))
+    return X, Y
+
+
+def misfits(scene: Scene, tracks: Tracks, spacing: Array | float | int) -> Float[Array, " E"]:
+    """L(x_e) - s_e less its mean over the pixel's events, in units of C.
+
+    Pure and differentiable in the scene. 0 where there is no event or it leaves the map.
+    """
+    X, Y = placed(scene.path, tracks, spacing)
+    at = _corners(X, Y, tracks.corner, 1, tracks.shape)
+    value = (_gathered(scene.map, at, tracks.shape) * at.share).sum(1)
+    on = tracks.on * at.inside
+    left = value - tracks.level - scene.skew * tracks.number
+    return on * _less_mean(left, on, tracks)
+
+
+def _less_mean(values: Array, weight: Array, tracks: Tracks) -> Array:
+    both = jnp.zeros((tracks.pixels, 2), values.dtype)
+    both = both.at[tracks.pixel].add(jnp.stack([weight * values, weight], 1))
+    return values - (both[:, 0] / jnp.maximum(both[:, 1], 1e-3))[tracks.pixel]
+
+
+@functools.partial(jax.jit, static_argnums=5)
+def adjust(
+    tracks: Tracks,
+    scene: Scene,
+    prior: Prior,
+    spacing: Array | float | int,
+    sigma: Array | float | int,
+    degree: int,
+    settle: Array | int,
+    steps: Array | int,
+    tell: Array | bool = False,
+) -> tuple[Scene, Report]:
+    """So many steps of the photometric fit; of O and D the rows up to `degree` move.
+
+    Depths are given at nodes `spacing` px apart. `sigma` (C) scales what counts as an outlier. The
+    first `settle` steps move the map alone. The report is of the last step, the covariance is
+    computed if `tell`.
+    """
+    k, f, h = degree + 1, tracks.f, tracks.half
+    real, free = tracks.x.dtype, 6 * k + 1
+    rows, columns = tracks.nodes
+    number = jnp.arange(rows * columns).reshape(rows, columns)
+    a, b = jnp.concatenate(
+        [
+            jnp.stack([number[:, :-1].ravel(), number[:, 1:].ravel()]),
+            jnp.stack([number[:-1].ravel(), number[1:].ravel()]),
+        ],
+        1,
+    )
+    sigma = jnp.asarray(sigma, real)
+    powers = jnp.stack([math.factorial(m) / (f * h**m) for m in range(1, k + 1)])
+    times = ((jnp.arange(SEGMENTS) + 0.5) / SEGMENTS * 2 - 1) * h
+    slopes = jnp.stack([times**m / math.factorial(m) for m in range(k)], 1).astype(real)
+
+    def rows_of(path: Path) -> Array:
+        return jnp.concatenate([path.O[:k], path.D[:k]]).ravel()
+
+    def with_rows(path: Path, values: Array) -> Path:
+        values = values.reshape(2 * k, 3)
+        return Path(path.O.at[:k].set(values[:k]), path.D.at[:k].set(values[k:]), path.log_rho)
+
+    def one(n: Any, state: tuple) -> tuple:
+        scene, last, weight, _ = state
+        # Nesterov's extrapolation: reweighting alone closes a tenth of what is left in a step.
+        ahead = jnp.where(n > settle, (n - settle) / (n - settle + 2), 0).astype(real)
+        last, scene = scene, jax.tree.map(lambda new, old: new + ahead * (new - old), scene, last)
+        path = normalised(scene.path)
+
+        X, Y = placed(path, tracks, spacing)
+        at = _corners(X, Y, tracks.corner, 1, tracks.shape)
+        node = _corners(X, Y, tracks.corner, spacing, tracks.nodes)
+        four = _gathered(path.log_rho, node, tracks.nodes)
+        rho = jnp.exp((four * node.share).sum(1))
+        lx, ly = (four * node.along_x).sum(1), (four * node.along_y).sum(1)
+        four = _gathered(scene.map, at, tracks.shape)
+        gx, gy = (four * at.along_x).sum(1), (four * at.along_y).sum(1)
+        on = tracks.on * at.inside
+        e = (four * at.share).sum(1) - tracks.level - scene.skew * tracks.number
+        limit = (3 * sigma) ** 2
+        for _ in range(2):
+            left = _less_mean(e, weight, tracks)
+            weight = on / (1 + left**2 / limit) ** 2
+        total = jnp.zeros(tracks.pixels, real).at[tracks.pixel].add(weight)
+        total = jnp.maximum(total, 1e-3)
+
+        def less_mean(z: Array) -> Array:
+            sums = jnp.zeros(tracks.pixels, real).at[tracks.pixel].add(weight * z)
+            return z - (sums / total)[tracks.pixel]
+
+        left = less_mean(e)
+
+        # x = r + rho(x) d: (1 - d grad rho') dx = what it is with rho held, d = rho (f C - C_z r).
+        now = rows_of(path)
+        unit = jnp.concatenate([powers, powers / jnp.exp(jnp.median(path.log_rho))])
+        unit = jnp.repeat(unit, 3)
+        J = jax.jacfwd(
+            lambda values: jnp.stack(
+                warp(with_rows(path, values), f, tracks.x, tracks.y, tracks.tau, rho)
+            )
+        )(now)
+        O, C = path.coefficients()  # noqa: E741
+        rx, ry, rz = _rotated(_along(O, tracks.tau), tracks.x, tracks.y, f)
+        cx, cy, cz = _along(C, tracks.tau)
+        dx, dy = rho * (f * cx - cz * rx * f / rz), rho * (f * cy - cz * ry * f / rz)
+        squeezed = 1 - lx * dx - ly * dy
+        squeezed = jnp.where(jnp.abs(squeezed) < 0.3, 0.3 * jnp.sign(squeezed + 1e-9), squeezed)
+        slope = (gx * dx + gy * dy) / squeezed
+        hx, hy = gx + slope * lx, gy + slope * ly
+        Jt = jnp.concatenate(
+            [(hx[:, None] * J[0] + hy[:, None] * J[1]) * unit, -tracks.number[:, None]], 1
+        )
+        free_now = (on > 0) & (n >= settle)
+        Jt = jnp.where(free_now[:, None], Jt, 0)
+        Jd = jnp.where(free_now, hx * dx + hy * dy, 0)
+        now = jnp.append(now / unit, scene.skew)
+
+        # Priors, of the path's rows and of depths.
+        later = jnp.append(jnp.repeat(jnp.tile(jnp.arange(k) > 0, 2), 3), False)
+        known = jnp.diag(jnp.where(later, prior.change, 1e-3))
+        pull = jnp.where(later, prior.change, 0) * now
+        known = known.at[-1, -1].set(10.0)
+        pull = pull.at[-1].set(10.0 * scene.skew)
+        turn = jnp.zeros(free, real).at[:3].set(prior.omega * unit[:3] ** 2)
+        known, pull = known + jnp.diag(turn), pull + turn * now
+        G = slopes[:, None, :, None] * jnp.eye(3, dtype=real)[None, :, None, :]
+        G = G.reshape(3 * SEGMENTS, 3 * k) * unit[: 3 * k]
+        off = (slopes @ path.O[:k] - prior.gyro).ravel()
+        known = known.at[: 3 * k, : 3 * k].add(prior.gyro_weight / SEGMENTS * G.T @ G)
+        pull = pull.at[: 3 * k].add(prior.gyro_weight / SEGMENTS * G.T @ off)
+        # |C1| = 1
+        fixed = slice(3 * k, 3 * k + 3)
+        gauge = jnp.zeros(free, real).at[fixed].set(path.D[0] * unit[fixed])
+        known = known + 1e4 * gauge[:, None] * gauge
+        apart = path.log_rho[a] - path.log_rho[b]
+        bond = prior.bond / (1 + (apart / BEND) ** 2)
+
+        # Information of events: neighbours see the same, which counts as one.
+        w = weight / (prior.alike * sigma**2)
+
+        def times_H(v: tuple) -> tuple:
+            image, t, q = v
+            y = (_gathered(image, at, tracks.shape) * at.share).sum(1) + Jt @ t
+            y = y + Jd * (_gathered(q, node, tracks.nodes) * node.share).sum(1)
+            z = w * less_mean(y)
+            flat = prior.flat * _laplacian(image.reshape(tracks.shape)).ravel() + 1e-5 * image
+            apart = bond * (q[a] - q[b])
+            return (
+                _scattered(z[:, None] * at.share, at, tracks.shape) + flat,
+                Jt.T @ z + known @ t,
+                _scattered((Jd * z)[:, None] * node.share, node, tracks.nodes)
+                + 1e-3 * q
+                + jnp.zeros_like(q).at[a].add(apart).at[b].add(-apart),
+            )
+
+        z = w * left
+        flat = prior.flat * _laplacian(scene.map) + 1e-5 * scene.map
+        gradient = (
+            _scattered(z[:, None] * at.share, at, tracks.shape) + flat.ravel(),
+            Jt.T @ z + pull,
+            _scattered((Jd * z)[:, None] * node.share, node, tracks.nodes)
+            + jnp.zeros_like(path.log_rho).at[a].add(bond * apart).at[b].add(-bond * apart),
+        )
+
+        # Preconditioner: the diagonal for the map; path with depths, these lumped, exactly.
+        diagonal = _scattered(w[:, None] * at.share**2, at, tracks.shape)
+        diagonal = 0.7 * diagonal + 4 * prior.flat + 1e-5
+        centred = jax.vmap(less_mean, 1, 1)(Jt)
+        upper = Jt.T @ (w[:, None] * centred) + known
+        mixed = jax.vmap(
+            lambda c: _scattered((Jd * w * c)[:, None] * node.share, node, tracks.nodes), 1, 1
+        )(centred)
+        lumped = _scattered((w * Jd**2)[:, None] * node.share, node, tracks.nodes) + 1e-2
+        lumped = lumped.at[a].add(2 * bond).at[b].add(2 * bond)
+        small = upper - mixed.T @ (mixed / lumped[:, None])
+        small = (small + small.T) / 2 + 1e-3 * jnp.diag(jnp.diag(upper))
+        factor = jax.scipy.linalg.cho_factor(small)
+
+        def eased(v: tuple) -> tuple:
+            q = v[2] / lumped
+            t = jax.scipy.linalg.cho_solve(factor, v[1] - mixed.T @ q)
+            return v[0] / diagonal, t, q - (mixed @ t) / lumped
+
+        solve = functools.partial(_conjugate_gradients, times_H, eased)
+        image, t, q = solve(jax.tree.map(jnp.negative, gradient), SOLVE)
+        sound = jnp.isfinite(t).all() & jnp.isfinite(q).all() & jnp.isfinite(image).all()
+        image, t, q = (jnp.where(sound, part, 0) for part in (image, t, q))
+        largest = jnp.abs(t[:-1]).max()
+        moved = jnp.where(n >= settle, jnp.minimum(1, 4 / jnp.maximum(largest, 1e-9)), 0)
+        path = with_rows(path, (now + moved * t)[:-1] * unit)
+        path = Path(path.O, path.D, path.log_rho + jnp.clip(moved * q, -0.5, 0.5))
+        path = normalised(path)
+        scene = Scene(path, scene.map + image.reshape(tracks.shape), scene.skew + moved * t[-1])
+
+        def covariance(_: Any) -> Array:
+            chosen = jnp.concatenate([jnp.arange(3 * k, 3 * k + 3), jnp.arange(3)])
+            zero = jax.tree.map(jnp.zeros_like, gradient)
+
+            def column(i: Array) -> Array:
+                return solve((zero[0], zero[1].at[i].set(1), zero[2]), 2 * SOLVE)[1][chosen]
+
+            inverse = lax.map(column, chosen) * unit[chosen][:, None] * unit[chosen]
+            return (inverse + inverse.T) / 2
+
+        told = Report(
+            jnp.sqrt((weight * left**2).sum() / jnp.maximum(weight.sum(), 1)),
+            (on * left**2 / (1 + left**2 / limit)).sum() / jnp.maximum(on.sum(), 1),
+            weight.sum() / jnp.maximum(on.sum(), 1),
+            largest,
+            lax.cond(
+                jnp.asarray(tell) & (n == steps - 1),
+                covariance,
+                lambda _: jnp.zeros((6, 6), real),
+                None,
+            ),
+        )
+        return scene, last, jnp.where(on > 0, weight, tracks.on), told
+
+    zero = jnp.zeros((), real)
+    nothing = Report(zero, zero, zero, zero, jnp.zeros((6, 6), real))
+    state = lax.fori_loop(0, steps, one, (scene, scene, tracks.on, nothing))
+    return Scene(normalised(state[0].path), *state[0][1:]), state[3]
+
+
+def _conjugate_gradients(times_H: Any, eased: Any, side: tuple, steps: int) -> tuple:
+    def dot(u: tuple, v: tuple) -> Array:
+        return sum((jnp.vdot(p, q) for p, q in zip(u, v, strict=True)), jnp.zeros(()))
+
+    def plus(u: tuple, scale: Array, v: tuple) -> tuple:
+        return jax.tree.map(lambda p, q: p + (scale * q).astype(p.dtype), u, v)
+
+    def one(_: Any, state: tuple) -> tuple:
+        found, left, direction, size = state
+        image = times_H(direction)
+        length = size / jnp.maximum(dot(direction, image), 1e-30)
+        found, left = plus(found, length, direction), plus(left, -length, image)
+        better = eased(left)
+        new = dot(left, better)
+        return found, left, plus(better, new / jnp.maximum(size, 1e-30), direction), new
+
+    better = eased(side)
+    state = (jax.tree.map(jnp.zeros_like, side), side, better, dot(side, better))
+    return lax.fori_loop(0, steps, one, state)[0]
+
+
+@jax.jit
+def respaced(
+    log_rho: Array, tracks: Tracks, old: Array | float | int, new: Array | float | int
+) -> Array:
+    """Log depths at nodes of another spacing."""
+    rows, columns = tracks.nodes
+    j, i = jnp.divmod(jnp.arange(rows * columns), columns)
+    X, Y = tracks.corner[0] + i * new, tracks.corner[1] + j * new
+    at = _corners(
+        X.astype(log_rho.dtype), Y.astype(log_rho.dtype), tracks.corner, old, tracks.nodes
+    )
+    return (_gathered(log_rho, at, tracks.nodes) * at.share).sum(1)
+
+
+def on_nodes(path: Path, window: Window, tracks: Tracks) -> Path:
+    """A path with the depths of cells, with depths at the closest nodes and all rows."""
+    rows, columns = tracks.nodes
+    j, i = np.divmod(np.arange(rows * columns), columns)
+    middle = (window.cell - 1) / 2
+    u = (tracks.corner[0] + i * tracks.node - window.corner[0] - middle) / window.cell
+    v = (tracks.corner[1] + j * tracks.node - window.corner[1] - middle) / window.cell
+    cells = np.asarray(path.log_rho, np.float64).reshape(window.cells)
+    log_rho = scipy.ndimage.map_coordinates(cells, [v, u], order=1, mode="nearest")
+    real = path.O.dtype
+    return Path(path.O, path.D, jnp.asarray(log_rho, real))
 
 
 # Starts
@@ -568,18 +969,22 @@ def start(
     share = np.exp(-far / (2 * PATCH**2)) * weight / max(weight.mean(), 1e-12) + 1e-6
     depth = (share * np.clip(rho, 0.15 * usual, 6 * usual)).sum(1) / share.sum(1)
     real = window.x.dtype
-    O, D = np.zeros((3, 3)), np.zeros((3, 3))  # noqa: E741
+    O, D = np.zeros((ROWS, 3)), np.zeros((ROWS, 3))  # noqa: E741
     O[0], D[0] = Omega, T
     return Path(*(jnp.asarray(part, real) for part in (O, D, np.log(depth))))
 
 
 class Fit(NamedTuple):
-    """A fitted window: the path, its covariance (6, 6) of heading and Omega, agreement, score."""
+    """A fitted window: path with depths at nodes, covariance (6, 6) of heading and Omega.
+
+    `agreement` is the share of events that the fit explains, `cost` the robust cost per event.
+    """
 
     path: Path
     covariance: NDArray[np.float64]
     agreement: float
-    score: float
+    cost: float
+    map: NDArray[np.floating]
 
 
 class Windows:
@@ -646,6 +1051,7 @@ class Windows:
             at = np.clip(np.rint(times), self.gyro.start, self.gyro.stop).astype(np.int64)
             gyro, weight = self.gyro(at)[1], 1 / float(params.gyro_std) ** 2
         values = (params.smooth, params.relief, params.change, self.omega_weight, gyro, weight)
+        values += (params.bond, params.flat, params.alike)
         return Prior(*(jnp.asarray(value, real) for value in values))
 
     @property
@@ -677,31 +1083,155 @@ class Windows:
                 found.append(path)
         return found
 
-    def fit(self, centre: int, paths: list[Path], warm: Path | None = None) -> Fit | None:
-        """The best of some starts, and of a path that is about right already."""
-        params, half = self.params, float(self.params.half_window)
+    def tracks(self, centre: int, half: float, most: int) -> Tracks:
+        """All of a window's events of as many pixels as have so many in total, the rest empty."""
+        most = min(most, self.params.events)
+        first, last = self.rows(centre, half)
+        events = self.recording.events[first:last]
+        width, pixels = self.recording.width, self.recording.width * self.recording.height
+        pixel = events.y.astype(np.int64) * width + events.x
+        count = np.bincount(pixel, minlength=pixels)
+        # One event alone tells nothing.
+        order = np.random.default_rng([self.seed, abs(centre), most]).permutation(pixels)
+        order = order[count[order] > 1]
+        taken = np.zeros(pixels, bool)
+        taken[order[np.cumsum(count[order]) <= most]] = True
+        keep = np.flatnonzero(taken[pixel])
+        keep = keep[np.argsort(pixel[keep], kind="stable")]
+        n, where = len(keep), pixel[keep]
+        begins = np.append(True, where[1:] != where[:-1])[:n]
+        begin = np.maximum.accumulate(np.where(begins, np.arange(n), 0))
+        p = np.where(events.p[keep], 1, -1)
+        total = np.cumsum(p)
+        real = np.dtype(jnp.result_type(float))
+        data = np.zeros((6, most), real)
+        data[:2, :n] = self.xi.reshape(-1, 2)[where].T
+        data[2, :n] = (events.t[keep] - centre) * 1e-6
+        data[3, :n] = total - (total - p)[begin]
+        data[4, :n] = np.arange(n) - begin + 1
+        data[5, :n] = 1
+        which = np.full(most, pixels, np.int32)
+        which[:n] = where
+        lower, upper = np.array(self.box[::2]) - MARGIN, np.array(self.box[1::2]) + MARGIN
+        lower = np.floor(lower)
+        across, down = (np.ceil(upper - lower).astype(int) + 1).tolist()
+        x, y, tau, level, number, on = (jnp.asarray(part) for part in data)
+        return Tracks(
+            x,
+            y,
+            tau,
+            level,
+            number,
+            on,
+            jnp.asarray(which),
+            jnp.asarray(self.f, real),
+            jnp.asarray(half, real),
+            (down, across),
+            (float(lower[0]), float(lower[1])),
+            pixels + 1,
+            NODE,
+        )
+
+    def aligned(self, centre: int, paths: list[Path]) -> list[Path]:
+        """Starts followed by the alignment of segments, the best first, some degrees apart."""
+        half = float(self.params.half_window)
         middle, last = self.cut(centre, 2 * half / 3, MIDDLE), self.cut(centre, half, LAST)
+        found = []
+        for path in paths:
+            path, _ = refine(middle, path, self.prior(centre, 2 * half / 3), 1, 2, 8)
+            path, _ = refine(last, path, self.prior(centre, half), 2, 2, self.params.iterations)
+            if all(np.isfinite(np.asarray(part)).all() for part in jax.tree.leaves(path)):
+                value = float(score(last, path))
+                value -= 0.5 * self.omega_weight * float((path.O[0] ** 2).sum()) / LAST
+                found.append((value, path))
+        found.sort(key=lambda pair: -pair[0])
+        best: list[Path] = []
+        for _, path in found:
+            other = [
+                float(path.D[0] @ near.D[0]) > APART
+                and float(((path.O[0] - near.O[0]) ** 2).sum()) < TURN**2
+                for near in best
+            ]
+            if not any(other) and len(best) < self.params.rivals:
+                best.append(path)
+        return best
+
+    def fit(self, centre: int, paths: list[Path], warm: Path | None = None) -> Fit | None:
+        """The best of some starts, and of a path with depths at nodes that is about right."""
+        half = float(self.params.half_window)
         prior = self.prior(centre, half)
-        followed = [
-            refine(middle, path, self.prior(centre, 2 * half / 3), 1, 2, 8)[0] for path in paths
-        ]
-        followed += [] if warm is None else [warm]
-        best: tuple[float, Path] | None = None
-        for path in followed:
-            path, _ = refine(last, path, prior, 2, 2, params.iterations)
-            if not all(np.isfinite(np.asarray(part)).all() for part in jax.tree.leaves(path)):
-                continue
-            value = float(score(last, path))
-            value -= 0.5 * self.omega_weight * float((path.O[0] ** 2).sum()) / LAST
-            if best is None or value > best[0]:
-                best = value, path
+        window = self.cut(centre, half, LAST)
+        tracks = self.tracks(centre, half, self.params.events)
+        rivals = [on_nodes(path, window, tracks) for path in self.aligned(centre, paths)]
+        rivals += [] if warm is None else [warm]
+        best: tuple[float, Scene, Report, int] | None = None
+        for path in rivals:
+            scene, report, spacing = _tried(tracks, path, prior)
+            value = float(report.cost)
+            value += 0.5 * self.omega_weight * float((scene.path.O[0] ** 2).sum()) / LAST
+            if np.isfinite(value) and (best is None or value < best[0]):
+                best = value, scene, report, spacing
         if best is None:
             return None
-        path, told = refine(
-            self.cut(centre, half, params.events), best[1], prior, 2, 2, params.iterations
+        _, scene, report, spacing = best
+        scene, report = _adjusted(
+            tracks, scene, prior, FINAL, spacing, float(report.rms), tell=True
         )
-        spread = np.asarray(told.covariance, np.float64) * float(params.inflation)
-        return Fit(path, spread, float(told.agreement), best[0])
+        path = scene.path
+        log_rho = respaced(path.log_rho, tracks, float(spacing), float(NODE))
+        covariance = np.asarray(report.covariance, np.float64)
+        return Fit(
+            Path(path.O, path.D, log_rho),
+            covariance,
+            float(report.inliers),
+            float(report.cost),
+            np.asarray(scene.map),
+        )
+
+
+def _tried(tracks: Tracks, path: Path, prior: Prior) -> tuple[Scene, Report, int]:
+    """A rival followed, with depths at wide nodes if there are no edges, and their spacing."""
+    found = []
+    for spacing in (WIDE, NODE):
+        log_rho = respaced(path.log_rho, tracks, float(NODE), float(spacing))
+        empty = jnp.zeros(tracks.shape, tracks.x.dtype)
+        scene = Scene(Path(path.O, path.D, log_rho), empty, jnp.zeros((), tracks.x.dtype))
+        scene, report = _adjusted(tracks, scene, prior, FIRST, spacing, settle=2)
+        scene, report = _adjusted(tracks, scene, prior, TRIAL[spacing], spacing, float(report.rms))
+        found.append((scene, report, spacing))
+        if float(report.inliers) > SMOOTH:
+            break
+    return min(found, key=lambda one: float(one[1].cost))
+
+
+def _adjusted(
+    tracks: Tracks,
+    scene: Scene,
+    prior: Prior,
+    stages: tuple[tuple[float, int], ...],
+    spacing: int,
+    rms: float = 0.0,
+    settle: int = 0,
+    tell: bool = False,
+) -> tuple[Scene, Report]:
+    """Through stages; sigma is not less than the noise (C) that is seen."""
+    report = None
+    for stage, (sigma, steps) in enumerate(stages):
+        covariance = tell and stage == len(stages) - 1
+        scene, report = adjust(
+            tracks,
+            scene,
+            prior,
+            float(spacing),
+            max(sigma, rms),
+            ROWS - 1,
+            settle,
+            steps,
+            covariance,
+        )
+        rms = float(report.rms)
+    assert report is not None
+    return scene, report
 
 
 def advanced(path: Path, tau: float) -> Path:
@@ -709,7 +1239,8 @@ def advanced(path: Path, tau: float) -> Path:
     T, Omega = path.twist(tau)
     real = path.O.dtype
     O, D = np.asarray(path.O, np.float64).copy(), np.asarray(path.D, np.float64).copy()  # noqa: E741
-    O[0], O[1] = Omega[0], O[1] + O[2] * tau
+    for k in range(len(O) - 1, -1, -1):
+        O[k] = sum(O[m] * tau ** (m - k) / math.factorial(m - k) for m in range(k, len(O)))
     D[0] = T[0]
     return Path(jnp.asarray(O, real), jnp.asarray(D, real), path.log_rho)
 
