@@ -152,14 +152,14 @@ def evbench(data: Path) -> Rows:
 def slider(data: Path) -> Rows:
     recording = jaxevent.load(data / "slider_depth.zip")
     rows: Rows = []
-    motion = voting.estimate(recording, model="planar")
+    motion = voting.estimate(recording, model="planar", smooth=True)
     times = np.arange(recording.start + 400_000, 3_200_000, 20_000)
     mean, _, lost = motion(times, centred=True)
     direction = np.degrees(np.arctan2(mean[:, 1], -mean[:, 0]))
     rows.append(
         {
             "recording": "slider, planar",
-            "method": "voting",
+            "method": "voting, smoothed",
             "windows": len(times),
             "mean velocity px/s": " ".join(f"{v:+.1f}" for v in mean[~lost].mean(0)),
             "direction of the mean, deg off": np.degrees(

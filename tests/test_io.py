@@ -933,7 +933,8 @@ def test_stored_images_are_read_when_asked_for(tmp_path):
 
 def test_a_recording_is_shown_in_a_line():
     none = Events.empty()
-    two = Events(np.array([5, 2_000_000]), *(np.zeros(2, np.uint16),) * 2, np.zeros(2, bool))
+    place = np.zeros(2, np.uint16)
+    two = Events(np.array([5, 2_000_000]), place, place, np.zeros(2, bool))
     assert repr(two[1:]) == "<1 event from 2 to 2 s>"
     extra = {"hdr": np.zeros(3)}
     shown = repr(Recording("two", 3, 4, two, extra=extra))
