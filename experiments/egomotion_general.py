@@ -5,7 +5,8 @@
 Scenes are those of `simulate.motion_scene`, 240x180, f = 200 px, 0.5 s of an ideal camera, constant
 and varying motion. A window of 300 ms at the middle is fitted from nothing. Errors are those of
 heading (degrees) and of Omega (vector, %) at its centre; "flipped" counts headings off by more than
-90 degrees, "both" the share with heading within 5 degrees and Omega within 8 %.
+90 degrees, "both" the share with heading within 5 degrees and Omega within 8 %. What general.csv
+holds already is not computed again.
 """
 
 import argparse
@@ -55,12 +56,18 @@ def main() -> None:
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     params, rows = batch.Params.of({}), []
+    stored = arguments.out / "general.csv"
+    if stored.exists():
+        rows = pd.read_csv(stored).to_dict("records")
+    done = {(row["scene"], row["seed"]) for row in rows}
     for scene in arguments.scenes:
         for motion in ("constant", "varying"):
             for seed in arguments.seeds:
+                if (f"{scene} {motion}", seed) in done:
+                    continue
                 rows.append(window(scene, motion, seed, params))
                 print(rows[-1], flush=True)
-                pd.DataFrame(rows).to_csv(arguments.out / "general.csv", index=False)
+                pd.DataFrame(rows).to_csv(stored, index=False)
     table = pd.DataFrame(rows)
     lines = [
         "| scene | windows | heading deg, mean / median / max | Omega %, the same | both "

@@ -233,8 +233,11 @@ def test_help_and_version(capsys, monkeypatch):
 
 def as_process(*arguments: object, env: dict[str, str] | None = None) -> subprocess.Popen:
     root = str(Path(jaxevent.__file__).parents[1])
+    # Jobs in the background of a shell inherit that interrupts are ignored.
+    code = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    code += "from jaxevent import cli; sys.exit(cli.main())"
     return subprocess.Popen(
-        [sys.executable, "-m", "jaxevent.cli", *map(str, arguments)],
+        [sys.executable, "-c", code, *map(str, arguments)],
         env={**(os.environ if env is None else env), "PYTHONPATH": root},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -269,7 +272,7 @@ def test_interrupted_while_it_writes(folder):
     }
     out = folder / "out"
     out.mkdir()
-    words = ("--method", "akf", "--rate", 1e6, "--out", out / "images.h5")
+    words = ("--method", "akf", "--rate", 2e5, "--out", out / "images.h5")
     process = as_process("reconstruct", folder / "small.h5", *words, env=env)
     while not any(path.stat().st_size > 1e6 for path in out.iterdir()):
         assert process.poll() is None
