@@ -1309,16 +1309,21 @@ def estimate(
 def _blended(
     centres: NDArray, fits: list[Fit | None], half: int, step: int, first: int, last: int
 ) -> Motion:
-    """The motion of overlapping windows; lost where none tells it."""
-    t = np.arange(centres[0], centres[-1] + 1, max(step // 5, 1))
+    """The motion of overlapping windows; lost where none tells it.
+
+    Of a window the middle two thirds count, those beyond `reach` where no other tells more.
+    """
+    end = 2 * half // 3
+    t = np.arange(max(centres[0] - end, first), min(centres[-1] + end, last) + 1, max(step // 5, 1))
     heading, Omega = np.zeros((len(t), 3)), np.zeros((len(t), 3))
     covariance, total, contrast = np.zeros((len(t), 6, 6)), np.zeros(len(t)), np.zeros(len(t))
-    reach = min(2 * half // 3, step) if len(centres) > 1 else half
+    reach = min(end, step)
     for centre, fit in zip(centres, fits, strict=True):
-        near = np.abs(t - centre) < reach
+        near = np.abs(t - centre) <= end
         if fit is None or not near.any():
             continue
-        weight = np.cos(np.pi / 2 * (t[near] - centre) / reach) ** 2
+        far = np.minimum(np.abs(t[near] - centre) / max(reach, 1), 1)
+        weight = np.maximum(np.cos(np.pi / 2 * far) ** 2, 1e-3)
         T, turn = fit.path.twist((t[near] - centre) * 1e-6)
         heading[near] += weight[:, None] * T
         Omega[near] += weight[:, None] * turn
