@@ -240,7 +240,7 @@ def values_of(params: Parameters) -> dict[str, Any]:
             return bool(value) if isinstance(value, np.bool_) else value
         if np.ndim(value):
             return [plain(one) for one in value]
-        return _finite(float(f"{float(value):.6g}"))
+        return finite(float(f"{float(value):.6g}"))
 
     return {name: plain(value) for name, value in params.values().items()}
 
@@ -336,7 +336,7 @@ def _listed(scores: list[Scores]) -> dict[str, Any]:
     def gather(values: list[Any]) -> Any:
         if isinstance(values[0], dict):
             return {name: gather([value[name] for value in values]) for name in values[0]}
-        return [_finite(value) for value in values]
+        return [finite(value) for value in values]
 
     return gather(scores)
 
@@ -350,7 +350,7 @@ def _means(per_frame: Mapping[str, Any]) -> dict[str, Any]:
         counted = weight > 0
         if not counted.any():
             return None
-        return _finite(float(np.average(numbers[counted], weights=weight[counted])))
+        return finite(float(np.average(numbers[counted], weights=weight[counted])))
 
     means: dict[str, Any] = {}
     for name, values in per_frame.items():
@@ -1000,7 +1000,7 @@ def _entries(
     if name == External.name and kind is None:
         yield Entry(label + fitted, External.of(own, folder.absolute()), None, normalise)
         return
-    _refuse_unknown(own, ("name", "params", "label", "grid", "normalise")[: 5 - (kind is not None)])
+    _refuse_unknown(own, ("name", "params", "label", "grid", *(["normalise"] * (kind is None))))
     method = find_method(name) if kind is None else Named(name, kind.find(name, options))
     params = read_params(method.Params, method.name, own.get("params", {}), folder)
     grid = own.get("grid", {})
@@ -1048,5 +1048,6 @@ def _refuse_unknown(table: Mapping[str, Any], known: tuple[str, ...]) -> None:
             raise InputError(f"there is no setting {name!r}; {nearest(name, known)}")
 
 
-def _finite(value: float | int) -> float | int | None:
+def finite(value: float | int) -> float | int | None:
+    """The value, None where JSON has no number."""
     return value if math.isfinite(value) else None

@@ -49,7 +49,7 @@ from jaxevent.blob.tracker import (
 )
 from jaxevent.devices import shared_out
 from jaxevent.errors import InputError
-from jaxevent.evaluate import read_params, values_of
+from jaxevent.evaluate import finite, read_params, values_of
 from jaxevent.parameters import nearest
 from jaxevent.reconstruction.objectives import SPLITS, windows
 from jaxevent.recording import Recording
@@ -213,7 +213,7 @@ class Goal:
                 row: dict[str, Any] = {
                     "recording": given,
                     "split": name,
-                    "nll": _number(np.average(nll, weights=weights)),
+                    "nll": finite(float(np.average(nll, weights=weights))),
                 }
                 if errors is not None:
                     t, distance = errors
@@ -221,8 +221,8 @@ class Goal:
                     for part, _ in mine:
                         inside |= (part.start <= t) & (t < part.stop)
                     alive = distance[inside & np.isfinite(distance)]
-                    row["rmse"] = _number(np.sqrt(np.mean(alive**2))) if len(alive) else None
-                    row["median"] = _number(np.median(alive)) if len(alive) else None
+                    row["rmse"] = finite(float(np.sqrt(np.mean(alive**2)))) if len(alive) else None
+                    row["median"] = finite(float(np.median(alive))) if len(alive) else None
                     row["covered"] = len(alive) / inside.sum() if inside.any() else None
                 row["windows"] = len(mine)
                 row["events"] = int(weights.sum())
@@ -356,10 +356,6 @@ class Goal:
             used = [max(pair) for pair in zip(used, shape, strict=True)]
             batches.append((batch, features, np.asarray(weight, features.xi.dtype)))
         return [Batch(_filled(b, f, used), weight) for b, f, weight in batches]
-
-
-def _number(value: Any) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _reach(recording: Recording) -> tuple[int, int]:

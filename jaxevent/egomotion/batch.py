@@ -789,19 +789,6 @@ def respaced(
     return (_gathered(log_rho, at, tracks.nodes) * at.share).sum(1)
 
 
-def on_nodes(path: Path, window: Window, tracks: Tracks) -> Path:
-    """A path with the depths of cells, with depths at the closest nodes and all rows."""
-    rows, columns = tracks.nodes
-    j, i = np.divmod(np.arange(rows * columns), columns)
-    middle = (window.cell - 1) / 2
-    u = (tracks.corner[0] + i * tracks.node - window.corner[0] - middle) / window.cell
-    v = (tracks.corner[1] + j * tracks.node - window.corner[1] - middle) / window.cell
-    cells = np.asarray(path.log_rho, np.float64).reshape(window.cells)
-    log_rho = scipy.ndimage.map_coordinates(cells, [v, u], order=1, mode="nearest")
-    real = path.O.dtype
-    return Path(path.O, path.D, jnp.asarray(log_rho, real))
-
-
 # Starts
 
 
@@ -1063,8 +1050,9 @@ class Windows:
         """Paths of constant twist to begin with, followed for a third of the window."""
         params, half = self.params, float(self.params.half_window) / 3
         short = self.cut(centre, half, COARSE)
-        Omega = rotation(short)
-        if self.gyro is not None:
+        if self.gyro is None:
+            Omega = rotation(short)
+        else:
             middle = np.clip(centre, self.gyro.start, self.gyro.stop)
             Omega = self.gyro(np.array([middle], np.int64))[1][0]
         found: list[Path] = []
@@ -1156,13 +1144,25 @@ class Windows:
                 best.append(path)
         return best
 
+    def on_nodes(self, path: Path, tracks: Tracks) -> Path:
+        """A path with the depths of cells, with depths at the closest nodes and all rows."""
+        rows, columns = tracks.nodes
+        cell = self.params.cell
+        j, i = np.divmod(np.arange(rows * columns), columns)
+        middle = (cell - 1) / 2
+        u = (tracks.corner[0] + i * tracks.node - self.corner[0] - middle) / cell
+        v = (tracks.corner[1] + j * tracks.node - self.corner[1] - middle) / cell
+        cells = np.asarray(path.log_rho, np.float64)
+        cells = cells.reshape(self.shape[0] // cell, self.shape[1] // cell)
+        log_rho = scipy.ndimage.map_coordinates(cells, [v, u], order=1, mode="nearest")
+        return Path(path.O, path.D, jnp.asarray(log_rho, path.O.dtype))
+
     def fit(self, centre: int, paths: list[Path], warm: Path | None = None) -> Fit | None:
         """The best of some starts, and of a path with depths at nodes that is about right."""
         half = float(self.params.half_window)
         prior = self.prior(centre, half)
-        window = self.cut(centre, half, LAST)
         tracks = self.tracks(centre, half, self.params.events)
-        rivals = [on_nodes(path, window, tracks) for path in self.aligned(centre, paths)]
+        rivals = [self.on_nodes(path, tracks) for path in self.aligned(centre, paths)]
         rivals += [] if warm is None else [warm]
         best: tuple[float, Scene, Report, int] | None = None
         for path in rivals:

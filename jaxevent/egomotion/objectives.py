@@ -38,20 +38,17 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.devices import along, mesh, shared_out
-from jaxevent.egomotion import voting
+from jaxevent.egomotion import scores, voting
 from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.geometry import length
-from jaxevent.egomotion.scores import SETTINGS
 from jaxevent.egomotion.truth import (
     Known,
     axis_error,
-    known,
     relative_error,
 )
 from jaxevent.egomotion.voting import Model, Noise, Params
 from jaxevent.errors import InputError
-from jaxevent.evaluate import read_params, values_of
-from jaxevent.parameters import nearest
+from jaxevent.evaluate import finite, read_params, values_of
 from jaxevent.reconstruction.objectives import SPLITS, windows
 from jaxevent.recording import Recording
 from jaxevent.report import aligned
@@ -165,10 +162,7 @@ class Goal:
     forward = True
 
     def files(self, recording: Path) -> list[Path]:
-        if self.truth in ("poses", "gyro"):
-            return []
-        name = recording.name if recording.is_dir() else recording.stem
-        return [recording.with_name(self.truth.replace("*", name))]
+        return scores.files(recording, {"truth": self.truth})
 
     def problem(
         self, sources: Sources, split: Share, window: float | int | None
@@ -281,10 +275,10 @@ class Goal:
                 rates = slice(3, 6) if self.model == "general" else slice(None)
                 if usable.any():
                     errors = relative_error(mean[usable, rates], truth[usable, rates])
-                    row["error"] = _number(100 * errors.mean())
+                    row["error"] = finite(float(100 * errors.mean()))
                     if self.model == "general":
                         heading = axis_error(mean[usable, :3], truth[usable, :3])
-                        row["heading"] = _number(heading.mean())
+                        row["heading"] = finite(float(heading.mean()))
                 row["lost"] = float(lost[inside].mean())
                 row["windows"] = len(chosen)
                 yield {**row, "params": values_of(params)}
@@ -297,9 +291,8 @@ class Goal:
 
     def known(self, recording: Recording) -> Known:
         """What is true of the motion of a recording, whose name is its path."""
-        path = Path(recording.name)
-        source = self.truth if self.truth in ("poses", "gyro") else self.files(path)[0]
-        return known(recording, self.model, source, np.asarray(self.gyro_bias))
+        settings = {"model": self.model, "truth": self.truth, "gyro_bias": self.gyro_bias}
+        return scores.true_motion(recording, settings)
 
     def _parts(self, sources: Sources, split: Share, window: float | int | None) -> list[Part]:
         """The windows of all recordings whose truth is known and that hold events."""
@@ -323,15 +316,14 @@ class Goal:
         return found
 
 
-def _number(value: Any) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
 class _Voting:
     """The system of the method "voting", for `jaxevent.fit`."""
 
     settings: dict[str, tuple[Callable[[Any], bool], str]] = {
-        **{name: SETTINGS[name] for name in ("model", "truth", "centred", "settle", "gyro_bias")},
+        **{
+            name: scores.SETTINGS[name]
+            for name in ("model", "truth", "centred", "settle", "gyro_bias")
+        },
         "runs": (lambda value: type(value) is int and value > 0, "a whole number, 1 or more"),
     }
     own = ("model", "centred")
@@ -340,20 +332,12 @@ class _Voting:
         return read_params(Params, name, given, folder)
 
     def goal(self, name: str, params: Any, given: Mapping[str, Any]) -> Goal:
-        model = given.get("model", "planar")
-        if model not in voting.MODELS:
-            raise InputError(f"there is no motion model {model!r}; {nearest(model, voting.MODELS)}")
-        truth = given.get("truth")
-        if truth is None:
-            raise InputError(
-                'the true motion is not given; add truth = "*.csv" (tables beside the recordings), '
-                '"poses" or "gyro"'
-            )
+        scores.check(given)
         return Goal(
             params,
             Loss(given.get("centred", False)),
-            model,
-            truth,
+            given.get("model", "planar"),
+            given["truth"],
             given.get("runs", 4),
             given.get("settle", 0.05),
             tuple(map(float, given.get("gyro_bias", (0.0, 0.0, 0.0)))),

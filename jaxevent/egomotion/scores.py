@@ -161,6 +161,16 @@ def files(path: Path, options: Mapping[str, Any]) -> list[Path]:
     return [path.with_name(truth.replace("*", path.name if path.is_dir() else path.stem))]
 
 
+def true_motion(recording: Recording, options: Mapping[str, Any]) -> Known:
+    """What is true of the motion of a recording, whose name is its path."""
+    source = (files(Path(recording.name), options) or [options["truth"]])[0]
+    return known(recording, options.get("model", "planar"), source, _bias(options))
+
+
+def _bias(options: Mapping[str, Any]) -> NDArray[np.float64]:
+    return np.asarray(options.get("gyro_bias", (0.0, 0.0, 0.0)), np.float64)
+
+
 def score(
     recording: Recording,
     name: str,
@@ -169,12 +179,10 @@ def score(
     progress: bool = False,
 ) -> dict[str, Any]:
     """A row without the names; raises `InputError` where there is no truth or no events."""
-    model = options.get("model", "planar")
-    bias = np.asarray(options.get("gyro_bias", (0.0, 0.0, 0.0)), np.float64)
+    model, bias = options.get("model", "planar"), _bias(options)
     if not len(recording.events):
         raise InputError(f"{recording.name}: holds no events; choose another recording")
-    source = (files(Path(recording.name), options) or [options["truth"]])[0]
-    truth = known(recording, model, source, bias)
+    truth = true_motion(recording, options)
     estimate = find_method(name, model).estimate
     takes = inspect.signature(estimate).parameters
     settings: dict[str, Any] = {}
