@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.interpolate
 import scipy.sparse.linalg
 from scipy.spatial.transform import Rotation
 
@@ -143,27 +144,80 @@ def test_tracks_are_the_events_of_pixels():
         )
 
 
+def true_path(log_rho: np.ndarray) -> batch.Path:
+    O, D = np.zeros((batch.ROWS, 3)), np.zeros((batch.ROWS, 3))  # noqa: E741
+    O[0], D[0] = OMEGA, T / np.linalg.norm(T)
+    return batch.Path(*(jnp.asarray(part) for part in (O, D, log_rho)))
+
+
+def test_events_are_placed_on_the_nearest_surface():
+    """Against the largest of the inverse depths that a fine search finds on each ray."""
+    windows, _ = fitted()
+    tracks = windows.tracks(150_000, 0.15, 3000)
+    rows, columns = tracks.nodes
+    # A near square before a far wall.
+    depths = np.full((rows, columns), np.log(0.3))
+    depths[rows // 3 : 2 * rows // 3, columns // 3 : 2 * columns // 3] = np.log(1.8)
+    path = true_path(depths.ravel())
+    placed = np.stack(jax.jit(batch.placed)(path, tracks), 1)
+    lattice = [
+        tracks.corner[axis] + batch.NODE * np.arange(n) for axis, n in ((1, rows), (0, columns))
+    ]
+    there = scipy.interpolate.RegularGridInterpolator(lattice, depths, bounds_error=False)
+    tried = np.linspace(np.log(1.9), np.log(0.28), 1000)
+    far, near = (
+        np.stack(batch.warp(path, tracks.f, tracks.x, tracks.y, tracks.tau, rho + 0 * tracks.x), 1)
+        for rho in (0.0, 1.0)
+    )
+    seen_at = far + np.exp(tried)[:, None, None] * (near - far)
+    off = tried[:, None] - there(seen_at[..., ::-1])
+    first = np.argmax(off <= 0, 0)
+    expected = seen_at[first, np.arange(len(first))]
+    n = int(tracks.on.sum())
+    right = np.linalg.norm(placed - expected, axis=1)[:n] < 0.05
+    hidden = ((off[1:] * off[:-1] < 0).sum(0) > 1)[:n]
+    # So many depths are looked at; surfaces that a ray only grazes lie between them.
+    assert right.mean() > 0.95
+    assert hidden.sum() > 20 and right[hidden].mean() > 0.7
+
+
+def test_depths_of_a_known_path():
+    """The roof's, where events tell them, from a plane at half the distance."""
+    windows, _ = fitted()
+    tracks = windows.tracks(150_000, 0.15, 8192)
+    rows, columns = tracks.nodes
+    flat = true_path(np.full(rows * columns, np.log(1.2)))
+    found = np.asarray(batch.depths(flat, tracks)).reshape(rows, columns)
+    j, i = np.mgrid[:rows, :columns] * batch.NODE
+    rays = np.stack([(i + tracks.corner[0]) / F, (j + tracks.corner[1]) / F, np.ones(i.shape)], -1)
+    normals, distances = np.array([[-0.5, 0.1, 1], [0.6, 0.3, 1]]), np.array([1.6, 1.5])
+    exact = np.log(np.linalg.norm(T) * (rays @ normals.T / distances).max(-1))
+    middle = (abs(rays[..., 0]) < 0.4) & (abs(rays[..., 1]) < 0.3)
+    assert np.median(abs(found - exact)[middle]) < 0.06
+
+
 def test_the_map_is_the_least_squares_one():
-    """For a path held fixed, against a sparse solver on bilinear weights written out."""
+    """For a path held fixed, against a sparse solver on splines' weights written out."""
     windows, fit = fitted()
     tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
     scene = scene_of(fit)._replace(map=jnp.zeros(tracks.shape))
     # All events' weights are 1.
     prior = prior._replace(alike=jnp.asarray(1e-6), flat=jnp.asarray(0.02))
     for _ in range(2):
-        scene, _ = batch.adjust(tracks, scene, prior, float(batch.NODE), 1e3, 4, 100, 8)
-    left = np.asarray(batch.misfits(scene, tracks, batch.NODE))
+        scene, _ = batch.adjust(tracks, scene, prior, 1e3, 100, 8)
+    left = np.asarray(batch.misfits(scene, tracks))
     n = int(tracks.on.sum())
-    X, Y = (np.asarray(a)[:n] for a in batch.placed(scene.path, tracks, batch.NODE))
+    X, Y = (np.asarray(a)[:n] for a in batch.placed(scene.path, tracks))
     i, j = X - tracks.corner[0], Y - tracks.corner[1]
     height, width = tracks.shape
-    inside = (i >= 0) & (i < width - 1) & (j >= 0) & (j < height - 1)
+    inside = (i >= 1) & (i < width - 2) & (j >= 1) & (j < height - 2)
     i, j, e = i[inside], j[inside], np.arange(inside.sum())
-    low, top = np.floor(i).astype(int), np.floor(j).astype(int)
+    column, row = np.rint(i).astype(int), np.rint(j).astype(int)
+    spline = scipy.interpolate.BSpline.basis_element([-1.5, -0.5, 0.5, 1.5])
     parts = [
-        (e, (top + v) * width + low + u, (1 - abs(i - low - u)) * (1 - abs(j - top - v)))
-        for u in (0, 1)
-        for v in (0, 1)
+        (e, (row + v) * width + column + u, spline(i - column - u) * spline(j - row - v))
+        for u in (-1, 0, 1)
+        for v in (-1, 0, 1)
     ]
     rows, columns, values = (np.concatenate(part) for part in zip(*parts, strict=True))
     pixel = np.unique(np.asarray(tracks.pixel)[:n][inside], return_inverse=True)[1]
@@ -196,9 +250,7 @@ def test_the_photometric_fit_ends_at_the_truth():
     path = batch.normalised(batch.Path(*(jnp.asarray(part) for part in (O, D, depths))))
     scene = batch.Scene(path, jnp.zeros(tracks.shape), jnp.zeros(()))
     for sigma, settle, steps in ((0.3, 2, 12), (0.2, 0, 15), (0.05, 0, 15)):
-        scene, report = batch.adjust(
-            tracks, scene, prior, float(batch.NODE), sigma, batch.ROWS - 1, settle, steps
-        )
+        scene, report = batch.adjust(tracks, scene, prior, sigma, settle, steps)
     heading, Omega = (part[0] for part in scene.path.twist(0.0))
     assert np.degrees(np.arccos(heading @ T / np.linalg.norm(T))) < 3
     assert np.linalg.norm(Omega - OMEGA) < 0.06 * np.linalg.norm(OMEGA)
@@ -213,7 +265,7 @@ def test_the_gradient_of_misfits():
     @jax.jit
     def value(O0):
         path = dataclasses.replace(fit.path, O=fit.path.O.at[0].set(O0))
-        return jnp.mean(batch.misfits(scene._replace(path=path), tracks, batch.NODE) ** 2)
+        return jnp.mean(batch.misfits(scene._replace(path=path), tracks) ** 2)
 
     at = fit.path.O[0] + 0.01
     slope = jax.jit(jax.grad(value))(at)
@@ -228,8 +280,7 @@ def test_priors_pull():
     windows, fit = fitted()
     tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
     strong = prior._replace(omega=jnp.asarray(1e9))
-    spacing = float(batch.NODE)
-    scene, _ = batch.adjust(tracks, scene_of(fit), strong, spacing, 0.1, 4, 0, 8)
+    scene, _ = batch.adjust(tracks, scene_of(fit), strong, 0.1, 0, 8)
     assert np.linalg.norm(scene.path.O[0]) < 0.1 * np.linalg.norm(fit.path.O[0])
     t = np.array([0, 300_000])
     wrong = OMEGA + [0.0, 0.2, 0.0]
@@ -238,7 +289,7 @@ def test_priors_pull():
         Twists(t, np.stack([wrong, wrong]), None, 0, 300_000),
     )  # fmt: skip
     prior = windows.prior(150_000, 0.15)
-    scene, report = batch.adjust(tracks, scene_of(fit), prior, spacing, 0.1, 4, 0, 8, True)
+    scene, report = batch.adjust(tracks, scene_of(fit), prior, 0.1, 0, 8, True)
     np.testing.assert_allclose(scene.path.twist(0.0)[1][0], wrong, atol=1e-2)
     assert np.sqrt(np.diag(report.covariance)[3:]).max() < 1e-4
 
