@@ -196,6 +196,29 @@ def test_depths_of_a_known_path():
     assert np.median(abs(found - exact)[middle]) < 0.06
 
 
+def test_the_dual_of_a_plane_has_the_same_flow():
+    windows, _ = fitted()
+    tracks = windows.tracks(150_000, 0.15, 3000)
+    rows, columns = tracks.nodes
+    j, i = (part.ravel() * batch.NODE for part in np.mgrid[:rows, :columns])
+    x, y = i + tracks.corner[0], j + tracks.corner[1]
+    rho = np.stack([x / F, y / F, np.ones(len(x))], 1) @ [0.1, -0.15, 0.6]
+    path = true_path(np.log(rho))
+    other = batch.dual(path, tracks)
+    assert other is not None and float(other.D[0] @ path.D[0]) < 0.9
+
+    def flow(one: batch.Path) -> np.ndarray:
+        a, b = (np.asarray(part(x, y, F)) for part in (geometry.A, geometry.B))
+        return (a @ one.D[0]) * np.exp(one.log_rho)[:, None] + b @ one.O[0]
+
+    ahead = np.stack([x / F, y / F, np.ones(len(x))], 1) @ np.asarray(path.D[0]) > 0.1
+    assert ahead.mean() > 0.5
+    np.testing.assert_allclose(flow(other)[ahead], flow(path)[ahead], atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(other.D[0]), 1)
+    steps = np.where(x > 0, 0.5, 1.0)
+    assert batch.dual(true_path(np.log(rho * steps)), tracks) is None
+
+
 def test_the_map_is_the_least_squares_one():
     """For a path held fixed, against a sparse solver on splines' weights written out."""
     windows, fit = fitted()

@@ -33,8 +33,8 @@ takes the depth at which the events around it have the highest contrast, the pat
 an edge of depth that is the nearer surface's, whose outline made the events. Adjusted from smooth
 depths instead, the path ends some 5 degrees beside the truth.
 
-Where events are noisy, sigma is not made smaller than their misfit. An ON threshold C (1 + skew)
-and an OFF one of C (1 - skew) are allowed for.
+Where events are noisy, sigma is not made much smaller than their misfit. An ON threshold
+C (1 + skew) and an OFF one of C (1 - skew) are allowed for.
 
 Before it, segments of the window are aligned: I_s is the signed image of the warped events of one,
 
@@ -49,7 +49,8 @@ uncertainty; a robust fit of the rest of the rotation for every heading of a hem
 of T told apart by depths > 0. Each start is followed with a constant twist, then over longer
 windows. The mean over blocks of n (log S - 1.5 log n) / N, S the contrast and n the number of
 events of a block, selects those that go on; of these the photometric cost selects, again and again
-as the fit proceeds: before a plane two motions explain the events to a few hundredths of C.
+as the fit proceeds. Before a plane two motions explain the events to some hundredths of C: of both
+the fit is tried.
 """
 
 import functools
@@ -100,15 +101,18 @@ LEVELS = 40  # log depths that are tried
 SPOT = 12  # px, of which each has its own
 SIDE = 4  # nodes about an event among whose depths its own is
 LOOKS = 16  # depths on its ray that are looked at
+PLANE = 0.1  # half the inverse depths of a plane are nearer to it than this share of themselves
 FOLD = 0.3  # the least slope, along the ray of an event, of log depth less that of the scene
 SOLVE = 40  # steps of conjugate gradients
 # Sigma (C), steps and how much flatter the map is, after each trial of depths, at the end, and
-# again if rivals remain that have nearly the least cost, this many times it. A flatter map leaves
-# less freedom, so the fit converges sooner.
+# again if rivals remain that have nearly the least cost: so many times it and so much more (C^2);
+# depths that are just looked for leave up to 0.03 C. A flatter map leaves less freedom, so the fit
+# converges sooner.
 ROUNDS = ((0.3, 6, 1), (0.2, 6, 1), (0.1, 8, 1))
 FINAL = ((0.05, 20, 10), (0.02, 10, 3))
 MORE = ((0.02, 10, 3),)
-CLOSE = 3.0, 1.25
+CLOSE = (3.0, 1e-3), (1.25, 1e-5)
+SHARP = 0.4  # sigma by the noise that is seen, at least: events beside edges are outliers
 
 
 class Params(Parameters):
@@ -1302,9 +1306,14 @@ class Windows:
         tracks = self.tracks(centre, half, TRIED)
         rivals = [self.on_nodes(path, tracks) for path in self.aligned(centre, paths)]
         rivals += [] if warm is None else [warm]
-        left = self.remaining(
-            _side_by_side(lambda path: _tried(tracks, path, prior), rivals), CLOSE[0]
-        )
+
+        def tried(paths: list[Path]) -> list[tuple[Scene, Report]]:
+            return _side_by_side(lambda path: _tried(tracks, path, prior), paths)
+
+        left = self.remaining(tried(rivals), CLOSE[0])
+        duals = [other for scene, _ in left if (other := dual(scene.path, tracks)) is not None]
+        new = [one for one in duals if not any(_near_to(one, scene.path) for scene, _ in left)]
+        left = self.remaining(left + tried(new), CLOSE[0])
         tracks = self.tracks(centre, half, self.params.events)
 
         def followed(stages: Any) -> list[tuple[Scene, Report]]:
@@ -1312,12 +1321,12 @@ class Windows:
             return self.remaining(new, CLOSE[1])
 
         left = followed(FINAL)
-        if len(left) > 1:
-            left = followed(MORE)
+        left = followed(MORE) if len(left) > 1 else left
         if not left:
             return None
-        sigma = max(MORE[0][0], float(left[0][1].rms))
-        scene, report = adjust(tracks, left[0][0], prior, sigma, 0, 1, True)
+        scene, report = left[0]
+        sigma = max(MORE[0][0], SHARP * float(report.rms))
+        scene, report = adjust(tracks, scene, prior, sigma, 0, 1, True)
         return Fit(
             scene.path,
             np.asarray(report.covariance, np.float64),
@@ -1327,14 +1336,15 @@ class Windows:
         )
 
     def remaining(
-        self, rivals: list[tuple[Scene, Report]], close: float
+        self, rivals: list[tuple[Scene, Report]], close: tuple[float, float]
     ) -> list[tuple[Scene, Report]]:
         """Rivals of about the least cost, that first, without those that came to a better one."""
         best: list[tuple[Scene, Report]] = []
         for scene, report in sorted(rivals, key=lambda one: self.cost(*one)):
             cost = self.cost(scene, report)
             if not any(_near_to(scene.path, other.path) for other, _ in best) and np.isfinite(cost):
-                best += [(scene, report)] if not best or cost < close * self.cost(*best[0]) else []
+                limit = np.inf if not best else close[0] * self.cost(*best[0]) + close[1]
+                best += [(scene, report)] if cost < limit else []
         return best
 
     def cost(self, scene: Scene, report: Report) -> float:
@@ -1353,6 +1363,36 @@ def _side_by_side(follow: Callable[[Any], Any], rivals: list[Any]) -> list[Any]:
 def _near_to(path: Path, other: Path) -> bool:
     turn = float(((path.O[0] - other.O[0]) ** 2).sum())
     return bool(path.D[0] @ other.D[0] > APART) and turn < TURN**2
+
+
+def dual(path: Path, tracks: Tracks) -> Path | None:
+    """The other motion before a plane that explains the same flow; None if depths are no plane's.
+
+    With rho = n . (x, y, f) / f points move by -(T n' + [Omega]x) X, and so they do if T and n
+    change places and n x T is added to Omega (cf. Longuet-Higgins, "The visual ambiguity of a
+    moving plane", 1984). Only perspective and time tell the two from each other.
+    """
+    rows, columns = tracks.nodes
+    f = float(tracks.f)
+    j, i = (part.ravel() * tracks.node for part in np.mgrid[:rows, :columns])
+    rays = np.stack([(i + tracks.corner[0]) / f, (j + tracks.corner[1]) / f, np.ones(len(i))], 1)
+    rho = np.exp(np.asarray(path.log_rho, np.float64))
+    weight = 1 / rho**2
+    for _ in range(4):
+        n = np.linalg.solve((rays.T * weight) @ rays, (rays.T * weight) @ rho)
+        off = np.abs(rays @ n / rho - 1)
+        weight = 1 / rho**2 / (1 + (off / PLANE) ** 2) ** 2
+    O, D = np.array(path.O, np.float64), np.zeros(path.D.shape)  # noqa: E741
+    T = np.asarray(path.D[0], np.float64)
+    depth = np.linalg.norm(n) * (rays @ T)
+    sign = np.sign(np.median(depth))
+    if np.median(off) > PLANE or not sign:
+        return None
+    O[0] += np.cross(n, T)
+    D[0] = sign * n / np.linalg.norm(n)
+    log_rho = np.log(np.maximum(sign * depth, 0.1 * abs(np.median(depth))))
+    real = path.O.dtype
+    return Path(*(jnp.asarray(part, real) for part in (O, D, log_rho)))
 
 
 def _tried(tracks: Tracks, path: Path, prior: Prior) -> tuple[Scene, Report]:
@@ -1375,10 +1415,10 @@ def _adjusted(
     prior: Prior,
     stages: tuple[tuple[float, int, float | int], ...],
 ) -> tuple[Scene, Report]:
-    """Through stages; sigma is not less than the noise (C) that was seen."""
+    """Through stages; sigma is not much less than the noise (C) that was seen."""
     for sigma, steps, flatter in stages:
         seen = prior._replace(flat=flatter * prior.flat)
-        scene, report = adjust(tracks, scene, seen, max(sigma, float(report.rms)), 0, steps)
+        scene, report = adjust(tracks, scene, seen, max(sigma, SHARP * float(report.rms)), 0, steps)
     return scene, report
 
 
