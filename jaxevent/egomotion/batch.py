@@ -1317,7 +1317,7 @@ class Windows:
         tracks = self.tracks(centre, half, self.params.events)
 
         def followed(stages: Any) -> list[tuple[Scene, Report]]:
-            new = _side_by_side(lambda one: _adjusted(tracks, *one, prior, stages), left)
+            new = _side_by_side(lambda one: _adjusted(tracks, one[0], one[1], prior, stages), left)
             return self.remaining(new, CLOSE[1])
 
         left = followed(FINAL)
