@@ -267,10 +267,10 @@ def test_the_photometric_fit_ends_at_the_truth():
     """From 6 degrees beside it, and depths of a plane that faces the camera."""
     windows, _ = fitted()
     tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
-    O, D = np.zeros((batch.ROWS, 3)), np.zeros((batch.ROWS, 3))  # noqa: E741
-    O[0], D[0] = OMEGA, T / np.linalg.norm(T) + [0.1, 0, 0]
     depths = np.full(tracks.nodes[0] * tracks.nodes[1], np.log(np.linalg.norm(T) / 1.5))
-    path = batch.normalised(batch.Path(*(jnp.asarray(part) for part in (O, D, depths))))
+    path = true_path(depths)
+    beside = path.D.at[0].add(jnp.array([0.1, 0, 0]))
+    path = batch.normalised(dataclasses.replace(path, D=beside))
     scene = batch.Scene(path, jnp.zeros(tracks.shape), jnp.zeros(()))
     for sigma, settle, steps in ((0.3, 2, 12), (0.2, 0, 15), (0.05, 0, 15)):
         scene, report = batch.adjust(tracks, scene, prior, sigma, settle, steps)

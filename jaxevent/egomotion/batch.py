@@ -260,6 +260,13 @@ def _spread(values: Array, window: Window) -> Array:
     return jnp.repeat(jnp.repeat(values, window.cell, -2), window.cell, -1)
 
 
+def _pairs(rows: int, columns: int) -> Array:
+    """Neighbours on a lattice that is counted row by row, (2, pairs)."""
+    number = jnp.arange(rows * columns).reshape(rows, columns)
+    across = jnp.stack([number[:, :-1].ravel(), number[:, 1:].ravel()])
+    return jnp.concatenate([across, jnp.stack([number[:-1].ravel(), number[1:].ravel()])], 1)
+
+
 class Prior(NamedTuple):
     """What is known beside the events: weights, and Omega (S, 3) rad/s at the segments' times."""
 
@@ -302,14 +309,7 @@ def refine(
     X0, Y0, tau = (part.astype(window.x.dtype) for part in (X0, Y0, tau))
     px = window.corner[0] + jnp.arange(window.shape[1])
     py = window.corner[1] + jnp.arange(window.shape[0])
-    number = jnp.arange(cells).reshape(rows, columns)
-    pairs = jnp.concatenate(
-        [
-            jnp.stack([number[:, :-1].ravel(), number[:, 1:].ravel()]),
-            jnp.stack([number[:-1].ravel(), number[1:].ravel()]),
-        ],
-        1,
-    )
+    pairs = _pairs(rows, columns)
 
     def rows_of(path: Path) -> Array:
         return jnp.concatenate([path.O[:k], path.D[:k]]).ravel()
@@ -456,7 +456,6 @@ class Tracks(eqx.Module):
     tau: Float[Array, " E"]  # s from the reference time
     level: Float[Array, " E"]  # sum of the pixel's polarities up to and with this event's
     number: Float[Array, " E"]  # how many these are
-    on: Float[Array, " E"]  # 1; 0 where there is no event
     p: Float[Array, " E"]  # polarity +-1, 0 where there is no event
     pixel: Int[Array, " E"]
     f: Float[Array, ""]  # px
@@ -467,9 +466,21 @@ class Tracks(eqx.Module):
     node: int = eqx.field(static=True)  # px between nodes of depth
 
     @property
+    def on(self) -> Float[Array, " E"]:
+        """1; 0 where there is no event."""
+        return jnp.abs(self.p)
+
+    @property
     def nodes(self) -> tuple[int, int]:
         """Rows and columns of nodes."""
         return tuple((n - 2) // self.node + 2 for n in self.shape)  # pyright: ignore
+
+    @property
+    def places(self) -> tuple[NDArray, NDArray]:
+        """Where nodes lie in the reference view: x and y (px), row by row."""
+        rows, columns = self.nodes
+        j, i = np.divmod(np.arange(rows * columns), columns)
+        return self.corner[0] + i * self.node, self.corner[1] + j * self.node
 
 
 class Scene(NamedTuple):
@@ -575,6 +586,14 @@ def _laplacian(values: Array) -> Array:
     return out.at[:, 1:].add(right).at[:, :-1].add(-right)
 
 
+def _rays(path: Path, tracks: Tracks) -> tuple[Array, Array, Array, Array]:
+    """The rays of events in the reference view, x = r + rho d: r and d."""
+    none = jnp.zeros_like(tracks.x)
+    rx, ry = warp(path, tracks.f, tracks.x, tracks.y, tracks.tau, none)
+    dx, dy = warp(path, tracks.f, tracks.x, tracks.y, tracks.tau, none + 1)
+    return rx, ry, dx - rx, dy - ry
+
+
 def placed(path: Path, tracks: Tracks) -> tuple[Array, Array]:
     """Where events are in the reference view: on the nearest surface that their rays meet.
 
@@ -582,10 +601,7 @@ def placed(path: Path, tracks: Tracks) -> tuple[Array, Array]:
     log rho = log rho'(r + rho d): once if they are smooth, more often beside an edge, where the
     surface of the largest rho hides the others. Differentiable in the path (implicitly).
     """
-    none = jnp.zeros_like(tracks.x)
-    rx, ry = warp(path, tracks.f, tracks.x, tracks.y, tracks.tau, none)
-    dx, dy = warp(path, tracks.f, tracks.x, tracks.y, tracks.tau, none + 1)
-    dx, dy = dx - rx, dy - ry
+    rx, ry, dx, dy = _rays(path, tracks)
 
     def off(log_rho: Array) -> Array:
         rho = jnp.exp(log_rho)
@@ -593,14 +609,14 @@ def placed(path: Path, tracks: Tracks) -> tuple[Array, Array]:
         return log_rho - _mean(_gathered(path.log_rho, at, tracks.nodes), at.share)
 
     def newton(log_rho: Array) -> Array:
-        value, slope = jax.jvp(off, (log_rho,), (none + 1,))
+        value, slope = jax.jvp(off, (log_rho,), (jnp.ones_like(log_rho),))
         return log_rho - value / jnp.maximum(lax.stop_gradient(slope), FOLD)
 
     # From near to far, the first of some depths that is not nearer than the scene's.
-    depths = path.log_rho.reshape(tracks.nodes)
+    scene = path.log_rho.reshape(tracks.nodes)
     reach = (2 * SIDE + 1, 2 * SIDE + 1)
-    high = lax.reduce_window(depths, -jnp.inf, lax.max, reach, (1, 1), "SAME").ravel()
-    low = lax.reduce_window(depths, jnp.inf, lax.min, reach, (1, 1), "SAME").ravel()
+    high = lax.reduce_window(scene, -jnp.inf, lax.max, reach, (1, 1), "SAME").ravel()
+    low = lax.reduce_window(scene, jnp.inf, lax.min, reach, (1, 1), "SAME").ravel()
     first = _corners(tracks.x, tracks.y, tracks.corner, tracks.node, tracks.nodes).first
     high, low = high[first] + 0.02, low[first] - 0.02
 
@@ -654,22 +670,11 @@ def adjust(
     """
     k, f, h = ROWS, tracks.f, tracks.half
     real, free = tracks.x.dtype, 6 * k + 1
-    rows, columns = tracks.nodes
-    number = jnp.arange(rows * columns).reshape(rows, columns)
-    a, b = jnp.concatenate(
-        [
-            jnp.stack([number[:, :-1].ravel(), number[:, 1:].ravel()]),
-            jnp.stack([number[:-1].ravel(), number[1:].ravel()]),
-        ],
-        1,
-    )
+    a, b = _pairs(*tracks.nodes)
     sigma = jnp.asarray(sigma, real)
     powers = jnp.stack([math.factorial(m) / (f * h**m) for m in range(1, k + 1)])
     times = ((jnp.arange(SEGMENTS) + 0.5) / SEGMENTS * 2 - 1) * h
     slopes = jnp.stack([times**m / math.factorial(m) for m in range(k)], 1).astype(real)
-
-    def rows_of(path: Path) -> Array:
-        return jnp.concatenate([path.O, path.D]).ravel()
 
     def with_rows(path: Path, values: Array) -> Path:
         values = values.reshape(2 * k, 3)
@@ -700,32 +705,39 @@ def adjust(
         total = jnp.maximum(total, 1e-3)
 
         def less_mean(z: Array) -> Array:
-            sums = jnp.zeros(tracks.pixels, real).at[tracks.pixel].add(weight * z)
-            return z - (sums / total)[tracks.pixel]
+            """Of one value per event (E,), or of rows of them (E, n)."""
+            sums = jnp.zeros((tracks.pixels, *z.shape[1:]), real)
+            sums = sums.at[tracks.pixel].add((weight * z.T).T)
+            return z - (sums.T / total).T[tracks.pixel]
 
         left = less_mean(e)
 
         # x = r + rho(x) d: (1 - d grad rho') dx = what it is with rho held, d = rho (f C - C_z r).
-        now = rows_of(path)
+        now = jnp.concatenate([path.O, path.D]).ravel()
         unit = jnp.concatenate([powers, powers / jnp.exp(jnp.median(path.log_rho))])
         unit = jnp.repeat(unit, 3)
         # Where events go by phi and by C, and the rest by the chain rule.
         O, C = path.coefficients()  # noqa: E741
         phi, (cx, cy, cz) = _along(O, tracks.tau), _along(C, tracks.tau)
 
-        def moved_by(phi: list[Array]) -> tuple[Array, Array]:
+        def turned(phi: list[Array]) -> tuple[Array, Array]:
             rx, ry, rz = _rotated(phi, tracks.x, tracks.y, f)
-            rx, ry = rx * f / rz, ry * f / rz
-            return rx + rho * (f * cx - cz * rx), ry + rho * (f * cy - cz * ry)
+            return rx * f / rz, ry * f / rz
+
+        def parallax(rx: Array, ry: Array) -> tuple[Array, Array]:
+            return rho * (f * cx - cz * rx), rho * (f * cy - cz * ry)
+
+        def moved_by(phi: list[Array]) -> tuple[Array, Array]:
+            (rx, ry), (dx, dy) = turned(phi), parallax(*turned(phi))
+            return rx + dx, ry + dy
 
         one, none = jnp.ones_like(rho), jnp.zeros_like(rho)
         by_phi = [
             jax.jvp(moved_by, (phi,), ([one if i == axis else none for i in range(3)],))[1]
             for axis in range(3)
         ]
-        rx, ry, rz = _rotated(phi, tracks.x, tracks.y, f)
-        rx, ry = rx * f / rz, ry * f / rz
-        dx, dy = rho * (f * cx - cz * rx), rho * (f * cy - cz * ry)
+        rx, ry = turned(phi)
+        dx, dy = parallax(rx, ry)
         by_C = [(rho * f, none), (none, rho * f), (-rho * rx, -rho * ry)]
         squeezed = jnp.maximum(1 - lx * dx - ly * dy, FOLD)
         slope = (gx * dx + gy * dy) / squeezed
@@ -792,9 +804,7 @@ def adjust(
         diagonal = _scattered(w, at, at.share**2, tracks.shape)
         diagonal = 0.7 * diagonal + 4 * prior.flat + 1e-5
         # One row per event: 7 ms for 60 k events, 15 ms one column after the other.
-        weighed = weight * Jt
-        sums = jnp.zeros((tracks.pixels, free), real).at[tracks.pixel].add(weighed.T)
-        centred = w[:, None] * (Jt.T - (sums / total[:, None])[tracks.pixel])
+        centred = w[:, None] * less_mean(Jt.T)
         upper = Jt @ centred + known
         mixed = _scattered(Jd[:, None] * centred, node, node.share[..., None], tracks.nodes)
         lumped = _scattered(w * Jd**2, node, node.share, tracks.nodes) + 1e-2
@@ -870,30 +880,26 @@ def _conjugate_gradients(times_H: Any, eased: Any, side: tuple, steps: int) -> t
     return lax.fori_loop(0, steps, one, state)[0]
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def _tried_depths(path: Path, tracks: Tracks, count: int, low: Array, high: Array) -> tuple:
-    """Signed contrast and number of events about nodes, (count, rows, columns), by log depth."""
-    none = jnp.zeros_like(tracks.x)
-    rx, ry = warp(path, tracks.f, tracks.x, tracks.y, tracks.tau, none)
-    dx, dy = warp(path, tracks.f, tracks.x, tracks.y, tracks.tau, none + 1)
+@jax.jit
+def _tried_depths(path: Path, tracks: Tracks, low: Array, high: Array) -> tuple:
+    """Signed contrast and number of events about nodes, (LEVELS, rows, columns), by log depth."""
+    rx, ry, dx, dy = _rays(path, tracks)
     both, (rows, columns) = jnp.stack([tracks.p, tracks.on]), tracks.nodes
-    pad = SPOT // 2, rows * tracks.node + SPOT, columns * tracks.node + SPOT
+    (height, width), node, before = tracks.shape, tracks.node, SPOT // 2
+    pad = (before, rows * node + SPOT - height), (before, columns * node + SPOT - width)
 
     def about(image: Array) -> Array:
-        (height, width), (before, tall, wide) = image.shape, pad
-        image = jnp.pad(image, ((before, tall - height), (before, wide - width)))
-        sums = lax.reduce_window(
-            image, 0.0, lax.add, (SPOT, SPOT), (tracks.node, tracks.node), "VALID"
-        )
+        spots = (SPOT, SPOT), (node, node)
+        sums = lax.reduce_window(jnp.pad(image, pad), 0.0, lax.add, *spots, "VALID")
         return sums[:rows, :columns]
 
     def one(log_rho: Array) -> tuple[Array, Array]:
         rho = jnp.exp(log_rho)
-        at = jnp.stack([rx + rho * (dx - rx), ry + rho * (dy - ry)], 1)
+        at = jnp.stack([rx + rho * dx, ry + rho * dy], 1)
         images = splat(at, both, tracks.shape, tracks.corner)
         return about(blur(images[0], 1) ** 2), about(images[1])
 
-    return lax.map(one, low + (high - low) * jnp.arange(count) / (count - 1))
+    return lax.map(one, low + (high - low) * jnp.arange(LEVELS) / (LEVELS - 1))
 
 
 def depths(path: Path, tracks: Tracks) -> Array:
@@ -908,9 +914,7 @@ def depths(path: Path, tracks: Tracks) -> Array:
     real = tracks.x.dtype
     S, n = (
         scipy.ndimage.gaussian_filter(np.asarray(part, np.float64), (0, 1.5, 1.5))
-        for part in _tried_depths(
-            path, tracks, LEVELS, jnp.asarray(low, real), jnp.asarray(high, real)
-        )
+        for part in _tried_depths(path, tracks, jnp.asarray(low, real), jnp.asarray(high, real))
     )
     sharp = S / np.maximum(n, 20)
     best = sharp.argmax(0)
@@ -1237,26 +1241,24 @@ class Windows:
         p = np.where(events.p[keep], 1, -1)
         total = np.cumsum(p)
         real = np.dtype(jnp.result_type(float))
-        data = np.zeros((7, most), real)
+        data = np.zeros((6, most), real)
         data[:2, :n] = self.xi.reshape(-1, 2)[where].T
         data[2, :n] = (events.t[keep] - centre) * 1e-6
         data[3, :n] = total - (total - p)[begin]
         data[4, :n] = np.arange(n) - begin + 1
-        data[5, :n] = 1
-        data[6, :n] = p
+        data[5, :n] = p
         which = np.full(most, pixels, np.int32)
         which[:n] = where
         lower, upper = np.array(self.box[::2]) - MARGIN, np.array(self.box[1::2]) + MARGIN
         lower = np.floor(lower)
         across, down = (np.ceil(upper - lower).astype(int) + 1).tolist()
-        x, y, tau, level, number, on, p = (jnp.asarray(part) for part in data)
+        x, y, tau, level, number, p = (jnp.asarray(part) for part in data)
         return Tracks(
             x,
             y,
             tau,
             level,
             number,
-            on,
             p,
             jnp.asarray(which),
             jnp.asarray(self.f, real),
@@ -1276,24 +1278,17 @@ class Windows:
         def follow(path: Path) -> tuple[float, Path]:
             path, _ = refine(middle, path, priors[0], 1, 2, 8)
             path, _ = refine(last, path, priors[1], 2, 2, self.params.iterations)
-            value = float(score(last, path))
-            return value - 0.5 * self.omega_weight * float((path.O[0] ** 2).sum()) / LAST, path
+            return float(score(last, path)) - self.turning(path), path
 
         found = [pair for pair in _side_by_side(follow, paths) if np.isfinite(pair[0])]
-        best: list[Path] = []
-        for _, path in sorted(found, key=lambda pair: -pair[0]):
-            if not any(_near_to(path, near) for near in best) and len(best) < self.params.rivals:
-                best.append(path)
-        return best
+        best = [path for _, path in sorted(found, key=lambda pair: -pair[0])]
+        return _apart(best, lambda path: path)[: self.params.rivals]
 
     def on_nodes(self, path: Path, tracks: Tracks) -> Path:
         """A path with the depths of cells, with depths at nodes."""
-        rows, columns = tracks.nodes
-        cell = self.params.cell
-        j, i = np.divmod(np.arange(rows * columns), columns)
+        cell, (x, y) = self.params.cell, tracks.places
         middle = (cell - 1) / 2
-        u = (tracks.corner[0] + i * tracks.node - self.corner[0] - middle) / cell
-        v = (tracks.corner[1] + j * tracks.node - self.corner[1] - middle) / cell
+        u, v = (x - self.corner[0] - middle) / cell, (y - self.corner[1] - middle) / cell
         cells = np.asarray(path.log_rho, np.float64)
         cells = cells.reshape(self.shape[0] // cell, self.shape[1] // cell)
         log_rho = scipy.ndimage.map_coordinates(cells, [v, u], order=1, mode="nearest")
@@ -1339,19 +1334,18 @@ class Windows:
         self, rivals: list[tuple[Scene, Report]], close: tuple[float, float]
     ) -> list[tuple[Scene, Report]]:
         """Rivals of about the least cost, that first, without those that came to a better one."""
-        best: list[tuple[Scene, Report]] = []
-        for scene, report in sorted(rivals, key=lambda one: self.cost(*one)):
-            cost = self.cost(scene, report)
-            if not any(_near_to(scene.path, other.path) for other, _ in best) and np.isfinite(cost):
-                limit = np.inf if not best else close[0] * self.cost(*best[0]) + close[1]
-                best += [(scene, report)] if cost < limit else []
-        return best
+        ranked = sorted(((self.cost(*one), one) for one in rivals), key=lambda pair: pair[0])
+        limit = close[0] * ranked[0][0] + close[1] if ranked else 0.0
+        return _apart([one for cost, one in ranked if cost < limit], lambda one: one[0].path)
 
     def cost(self, scene: Scene, report: Report) -> float:
         """What selects among rivals: the cost per event, with the prior of |Omega|."""
-        turn = float((scene.path.O[0] ** 2).sum())
-        value = float(report.cost) + 0.5 * self.omega_weight * turn / LAST
+        value = float(report.cost) + self.turning(scene.path)
         return value if np.isfinite(value) else np.inf
+
+    def turning(self, path: Path) -> float:
+        """The prior of |Omega|, per event."""
+        return 0.5 * self.omega_weight * float((path.O[0] ** 2).sum()) / LAST
 
 
 def _side_by_side(follow: Callable[[Any], Any], rivals: list[Any]) -> list[Any]:
@@ -1365,6 +1359,15 @@ def _near_to(path: Path, other: Path) -> bool:
     return bool(path.D[0] @ other.D[0] > APART) and turn < TURN**2
 
 
+def _apart(ranked: list[Any], path: Callable[[Any], Path]) -> list[Any]:
+    """Those that are not near to an earlier one that is kept."""
+    best: list[Any] = []
+    for one in ranked:
+        if not any(_near_to(path(one), path(other)) for other in best):
+            best.append(one)
+    return best
+
+
 def dual(path: Path, tracks: Tracks) -> Path | None:
     """The other motion before a plane that explains the same flow; None if depths are no plane's.
 
@@ -1372,10 +1375,8 @@ def dual(path: Path, tracks: Tracks) -> Path | None:
     change places and n x T is added to Omega (cf. Longuet-Higgins, "The visual ambiguity of a
     moving plane", 1984). Only perspective and time tell the two from each other.
     """
-    rows, columns = tracks.nodes
-    f = float(tracks.f)
-    j, i = (part.ravel() * tracks.node for part in np.mgrid[:rows, :columns])
-    rays = np.stack([(i + tracks.corner[0]) / f, (j + tracks.corner[1]) / f, np.ones(len(i))], 1)
+    f, (x, y) = float(tracks.f), tracks.places
+    rays = np.stack([x / f, y / f, np.ones(len(x))], 1)
     rho = np.exp(np.asarray(path.log_rho, np.float64))
     weight = 1 / rho**2
     for _ in range(4):
