@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxevent.egomotion import batch, voting
 from jaxevent.egomotion.candidates import Candidates
+from jaxevent.egomotion.path import advanced
 from jaxevent.simulate import motion_scene
 
 PUBLISHED = 0.1  # M events/s, N = 100
@@ -152,15 +153,15 @@ def batch_bench() -> tuple[dict[str, float], dict[str, float]]:
         assert last - first > 100_000
 
         def whole(windows: batch.Windows = windows) -> batch.Fit:
-            fit = windows.fit(250_000, windows.starts(250_000))
+            fit = windows.fit(250_000)
             assert fit is not None
             return fit
 
-        warm = batch.advanced(whole().path, 0.0)
+        warm = advanced(whole().path, 0.0, 0.15)
         name = f"batch general motion, s per window, {events // 1000} k events"
         speed[f"{name}, from nothing"] = timed(whole, 2)
         speed[f"{name}, following"] = timed(
-            lambda windows=windows, warm=warm: windows.fit(250_000, [], warm), 2
+            lambda windows=windows, warm=warm: windows.fit(250_000, warm, False), 2
         )
     return speed, {}
 

@@ -29,7 +29,7 @@ def window(scene: str, motion: str, seed: int, params: batch.Params) -> dict[str
     assert recording.camera is not None
     clock = time.perf_counter()
     windows = batch.Windows(recording, params, recording.camera)
-    fit = windows.fit(CENTRE, windows.starts(CENTRE))
+    fit = windows.fit(CENTRE)
     seconds = time.perf_counter() - clock
     assert fit is not None
     T, Omega = source.twist(np.array([CENTRE]))
@@ -51,7 +51,7 @@ def window(scene: str, motion: str, seed: int, params: batch.Params) -> dict[str
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True, help="folder for the tables")
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(120, 130)))
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(130, 140)))
     parser.add_argument("--scenes", nargs="+", default=["wall", "shapes", "texture"])
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)

@@ -3,6 +3,7 @@
 - `motion`: what every estimator gives, at any time;
 - `METHODS`, the estimators: `voting` by particle filters, `batch` by a fit to many events at once,
   `contrast` of warped events, `planes` on the surface of active events, `frames` by optical flow;
+- `path`, `starts`, `alignment`, `photometric`: what `batch` is made of;
 - `flow`: the optical flow of each event, once the motion is known;
 - `pictures`: tables and pictures of a motion;
 - `candidates`: of each event its earlier neighbours, prepared once;

@@ -1,0 +1,565 @@
+"""The photometric fit of a window of events: path, depths and a map of log intensity in one.
+
+Cf. Guo & Gallego, "Event-based photometric bundle adjustment", there for rotation. Log intensity at
+a pixel u at its event e is known from its polarities but for the pixel's beginning b_u, and is that
+of the scene where the warp takes u: with L the map of log intensity in the reference view in units
+of the contrast threshold,
+
+    L(x_ref(u, t_e)) = b_u + s_e,   s_e = sum of the polarities of u's events up to and with e,
+
+is linear in L and b_u. Minimised over L, b_u, path and depths is the sum of the squared
+differences, robustly (Geman & McClure, 3 sigma), with weak priors on differences of L and of log
+depth between neighbours and on changes of the twist. L is a quadratic B-spline of 1 px: with
+bilinear interpolation the cost at the true motion is twice as high and more. b_u is
+eliminated exactly (differences less their mean over the pixel's events), all else is one linear
+system a step, solved by conjugate gradients, without the matrix: the map's diagonal, and path with
+lumped depths exactly, precondition it. Steps extrapolate (Nesterov): reweighting alone is slow.
+Nothing is gained by squeezing events together, which biases contrast, and no event is compared that
+tells only the gradient along the flow. An ON threshold C (1 + skew) and an OFF one of C (1 - skew)
+are allowed for.
+
+Depth is interpolated between nodes 4 px apart, and an event lies on the nearest surface that its
+ray meets: what is behind is hidden. `depths` gives every node the depth at which the events around
+it have the highest contrast, the path held fixed: beside an edge of depth that is the nearer
+surface's, whose outline made the events. Adjusted from smooth depths instead, the path ends some 5
+degrees beside the truth. Or all depths are those of a plane.
+"""
+
+import functools
+import math
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.ndimage
+from jax import lax
+from jaxtyping import Array, Float, Int
+from numpy.typing import NDArray
+
+from jaxevent.egomotion.path import (
+    LEAST,
+    ROWS,
+    SEGMENTS,
+    Path,
+    Prior,
+    along,
+    normalised,
+    pairs_of,
+    rays_of,
+    rotated,
+    warp,
+)
+from jaxevent.egomotion.warped import blur, splat
+
+NODE = 4  # px between nodes of depth
+BEND = 0.1  # a larger difference of log depth between nodes is an edge
+LEVELS = 40  # log depths that are tried
+SPOT = 12  # px, of which each has its own
+SIDE = 4  # nodes about an event among whose depths its own is
+LOOKS = 16  # depths on its ray that are looked at
+FOLD = 0.3  # the least slope, along the ray of an event, of log depth less that of the scene
+SOLVE = 40  # steps of conjugate gradients
+
+
+class Tracks(eqx.Module):
+    """Events of a window, pixel by pixel, filled up with events of no weight."""
+
+    x: Float[Array, " E"]  # px, undistorted, from the principal point
+    y: Float[Array, " E"]
+    tau: Float[Array, " E"]  # s from the reference time
+    level: Float[Array, " E"]  # sum of the pixel's polarities up to and with this event's
+    number: Float[Array, " E"]  # how many these are
+    p: Float[Array, " E"]  # polarity +-1, 0 where there is no event
+    pixel: Int[Array, " E"]
+    f: Float[Array, ""]  # px
+    half: Float[Array, ""]  # s
+    shape: tuple[int, int] = eqx.field(static=True)  # of the map
+    corner: tuple[float, float] = eqx.field(static=True)  # px, where its pixel [0, 0] lies
+    pixels: int = eqx.field(static=True)
+    node: int = eqx.field(static=True)  # px between nodes of depth
+
+    @property
+    def on(self) -> Float[Array, " E"]:
+        """1; 0 where there is no event."""
+        return jnp.abs(self.p)
+
+    @property
+    def nodes(self) -> tuple[int, int]:
+        """Rows and columns of nodes."""
+        return tuple((n - 2) // self.node + 2 for n in self.shape)  # pyright: ignore
+
+    @property
+    def places(self) -> tuple[NDArray, NDArray]:
+        """Where nodes lie in the reference view: x and y (px), row by row."""
+        rows, columns = self.nodes
+        j, i = np.divmod(np.arange(rows * columns), columns)
+        return self.corner[0] + i * self.node, self.corner[1] + j * self.node
+
+
+class Scene(NamedTuple):
+    """The unknowns: path with log depths at nodes, map of log intensity, difference of thresholds.
+
+    The map is in units of the mean threshold C; C (1 + skew) is that of ON, C (1 - skew) of OFF.
+    """
+
+    path: Path
+    map: Array  # (height, width)
+    skew: Array
+
+
+class Report(NamedTuple):
+    """Of a step: the noise (C), the robust cost per event (C^2), the share of inliers."""
+
+    noise: Array  # 1.48 times the median of the absolute misfits, of the last step
+    cost: Array
+    inliers: Array
+    step: Array  # px at the window's end
+    covariance: Array  # (6, 6) of C1 and O0, 0 unless it was asked for
+
+
+class _Near(NamedTuple):
+    """The n * n neighbours of points on a lattice (n * n, E): shares, and slopes of the shares."""
+
+    first: Array  # index of the one of the lowest row and column
+    share: Array
+    along_x: Array
+    along_y: Array
+    inside: Array
+
+
+def _corners(X: Array, Y: Array, corner: tuple, size: float | int, shape: tuple) -> _Near:
+    """Bilinear interpolation between lattice points `size` px apart."""
+    i, j = (X - corner[0]) / size, (Y - corner[1]) / size
+    inside = (i >= 0) & (i < shape[1] - 1) & (j >= 0) & (j < shape[0] - 1)
+    i, j = jnp.clip(i, 0, shape[1] - 1.001), jnp.clip(j, 0, shape[0] - 1.001)
+    low, top = jnp.floor(i), jnp.floor(j)
+    u, v = i - low, j - top
+    return _Near(
+        (top * shape[1] + low).astype(jnp.int32),
+        jnp.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v]),
+        jnp.stack([v - 1, 1 - v, -v, v]) / size,
+        jnp.stack([u - 1, -u, 1 - u, u]) / size,
+        inside,
+    )
+
+
+def _spline(X: Array, Y: Array, corner: tuple, shape: tuple) -> _Near:
+    """Quadratic B-splines a pixel apart."""
+    i, j = X - corner[0], Y - corner[1]
+    inside = (i >= 1) & (i < shape[1] - 2) & (j >= 1) & (j < shape[0] - 2)
+    i, j = jnp.clip(i, 1, shape[1] - 2), jnp.clip(j, 1, shape[0] - 2)
+    low, top = jnp.round(i), jnp.round(j)
+
+    def shares(t: Array) -> tuple[list[Array], list[Array]]:
+        return (
+            [(0.5 - t) ** 2 / 2, 0.75 - t**2, (0.5 + t) ** 2 / 2],
+            [t - 0.5, -2 * t, t + 0.5],
+        )
+
+    def product(rows: list[Array], columns: list[Array]) -> Array:
+        return jnp.stack([row * column for row in rows for column in columns])
+
+    (across, slope_x), (down, slope_y) = shares(i - low), shares(j - top)
+    first = ((top - 1) * shape[1] + low - 1).astype(jnp.int32)
+    return _Near(
+        first, product(down, across), product(down, slope_x), product(slope_y, across), inside
+    )
+
+
+def _steps(near: _Near, shape: tuple) -> list[int]:
+    """From the first of the neighbours to each of them."""
+    n = math.isqrt(len(near.share))
+    return [a * shape[1] + b for a in range(n) for b in range(n)]
+
+
+def _gathered(values: Array, near: _Near, shape: tuple) -> list[Array]:
+    """The neighbours' values, of values (height * width)."""
+    values = values.ravel()
+    return [
+        values.at[near.first + step].get(mode="promise_in_bounds") for step in _steps(near, shape)
+    ]
+
+
+def _mean(values: list[Array], share: Array) -> Array:
+    return sum((value * part for value, part in zip(values, share, strict=True)), jnp.zeros(()))
+
+
+def _scattered(values: Array, near: _Near, share: Array, shape: tuple) -> Array:
+    """The transpose of gathering with shares: (E, ...) to (height * width, ...)."""
+    found = jnp.zeros((shape[0] * shape[1], *values.shape[1:]), values.dtype)
+    for step, part in zip(_steps(near, shape), share, strict=True):
+        found = found.at[near.first + step].add(values * part, mode="promise_in_bounds")
+    return found
+
+
+def _laplacian(values: Array) -> Array:
+    """Minus the sum of differences to the neighbours, of a map."""
+    down, right = values[1:] - values[:-1], values[:, 1:] - values[:, :-1]
+    out = jnp.zeros_like(values).at[1:].add(down).at[:-1].add(-down)
+    return out.at[:, 1:].add(right).at[:, :-1].add(-right)
+
+
+def _rays(path: Path, tracks: Tracks) -> tuple[Array, Array, Array, Array]:
+    """The rays of events in the reference view, x = r + rho d: r and d."""
+    none = jnp.zeros_like(tracks.x)
+    rx, ry = warp(path, tracks.f, tracks.x, tracks.y, tracks.tau, none)
+    dx, dy = warp(path, tracks.f, tracks.x, tracks.y, tracks.tau, none + 1)
+    return rx, ry, dx - rx, dy - ry
+
+
+def placed(path: Path, tracks: Tracks) -> tuple[Array, Array]:
+    """Where events are in the reference view: on the nearest surface that their rays meet.
+
+    On the ray of an event x = r + rho d, which the depths of the scene, rho'(x), meet where
+    log rho = log rho'(r + rho d): once if they are smooth, more often beside an edge, where the
+    surface of the largest rho hides the others. Differentiable in the path (implicitly).
+    """
+    rx, ry, dx, dy = _rays(path, tracks)
+
+    def off(log_rho: Array) -> Array:
+        rho = jnp.exp(log_rho)
+        at = _corners(rx + rho * dx, ry + rho * dy, tracks.corner, tracks.node, tracks.nodes)
+        return log_rho - _mean(_gathered(path.log_rho, at, tracks.nodes), at.share)
+
+    def newton(log_rho: Array) -> Array:
+        value, slope = jax.jvp(off, (log_rho,), (jnp.ones_like(log_rho),))
+        return log_rho - value / jnp.maximum(lax.stop_gradient(slope), FOLD)
+
+    # From near to far, the first of some depths that is not nearer than the scene's.
+    scene = path.log_rho.reshape(tracks.nodes)
+    reach = (2 * SIDE + 1, 2 * SIDE + 1)
+    high = lax.reduce_window(scene, -jnp.inf, lax.max, reach, (1, 1), "SAME").ravel()
+    low = lax.reduce_window(scene, jnp.inf, lax.min, reach, (1, 1), "SAME").ravel()
+    first = _corners(tracks.x, tracks.y, tracks.corner, tracks.node, tracks.nodes).first
+    high, low = high[first] + 0.02, low[first] - 0.02
+
+    def look(k: Any, state: tuple) -> tuple:
+        done, root, before, value = state
+        log_rho = high + (low - high) * k / LOOKS
+        new = off(log_rho)
+        share = value / jnp.maximum(value - new, 1e-6)
+        root = jnp.where(~done & (new <= 0), before + share * (log_rho - before), root)
+        return done | (new <= 0), root, log_rho, new
+
+    value = off(high)
+    state = value <= 0, jnp.where(value <= 0, high, low), high, value
+    root = newton(lax.fori_loop(1, LOOKS + 1, look, state)[1])
+    rho = jnp.exp(newton(lax.stop_gradient(root)))
+    return rx + rho * dx, ry + rho * dy
+
+
+def misfits(scene: Scene, tracks: Tracks) -> Float[Array, " E"]:
+    """L(x_e) - s_e less its mean over the pixel's events, in units of C.
+
+    Pure and differentiable in the scene. 0 where there is no event or it leaves the map.
+    """
+    at = _spline(*placed(scene.path, tracks), tracks.corner, tracks.shape)
+    value = _mean(_gathered(scene.map, at, tracks.shape), at.share)
+    on = tracks.on * at.inside
+    left = value - tracks.level - scene.skew * tracks.number
+    return on * _less_mean(left, on, tracks)
+
+
+def _less_mean(values: Array, weight: Array, tracks: Tracks) -> Array:
+    both = jnp.zeros((tracks.pixels, 2), values.dtype)
+    both = both.at[tracks.pixel].add(jnp.stack([weight * values, weight], 1))
+    return values - (both[:, 0] / jnp.maximum(both[:, 1], 1e-3))[tracks.pixel]
+
+
+@jax.jit
+def adjust(
+    tracks: Tracks,
+    scene: Scene,
+    prior: Prior,
+    sigma: Array | float | int,
+    settle: Array | int,
+    steps: Array | int,
+    tell: Array | bool = False,
+    plane: Array | bool = False,
+) -> tuple[Scene, Report]:
+    """So many steps of the photometric fit.
+
+    `sigma` (C) scales what counts as an outlier. The first `settle` steps move the map alone. The
+    report is of the last step, the covariance is computed if `tell`. Depths that are a `plane`'s
+    remain one's: rho = n . (x, y, f) / f, of which n is unknown, instead of any at nodes.
+    """
+    k, f, h = ROWS, tracks.f, tracks.half
+    real, rows = tracks.x.dtype, 6 * ROWS
+    free = rows + 4  # of the path, the skew, n
+    rays = jnp.asarray(rays_of(*tracks.places, 1.0), real) / jnp.stack([f, f, jnp.ones_like(f)])
+    plane = jnp.asarray(plane)
+    a, b = pairs_of(*tracks.nodes)
+    sigma = jnp.asarray(sigma, real)
+    powers = jnp.stack([math.factorial(m) / (f * h**m) for m in range(1, k + 1)])
+    times = ((jnp.arange(SEGMENTS) + 0.5) / SEGMENTS * 2 - 1) * h
+    slopes = jnp.stack([times**m / math.factorial(m) for m in range(k)], 1).astype(real)
+
+    def with_rows(path: Path, values: Array) -> Path:
+        values = values.reshape(2 * k, 3)
+        return Path(values[:k], values[k:], path.log_rho)
+
+    def one(n: Any, state: tuple) -> tuple:
+        scene, last, weight, _ = state
+        # Nesterov's extrapolation: reweighting alone closes a tenth of what is left in a step.
+        ahead = jnp.where(n > settle, (n - settle) / (n - settle + 2), 0).astype(real)
+        last, scene = scene, jax.tree.map(lambda new, old: new + ahead * (new - old), scene, last)
+        path = normalised(scene.path)
+
+        X, Y = placed(path, tracks)
+        at = _spline(X, Y, tracks.corner, tracks.shape)
+        node = _corners(X, Y, tracks.corner, tracks.node, tracks.nodes)
+        four = _gathered(path.log_rho, node, tracks.nodes)
+        rho = jnp.exp(_mean(four, node.share))
+        lx, ly = _mean(four, node.along_x), _mean(four, node.along_y)
+        nine = _gathered(scene.map, at, tracks.shape)
+        gx, gy = _mean(nine, at.along_x), _mean(nine, at.along_y)
+        on = tracks.on * at.inside
+        e = _mean(nine, at.share) - tracks.level - scene.skew * tracks.number
+        limit = (3 * sigma) ** 2
+        for _ in range(2):
+            left = _less_mean(e, weight, tracks)
+            weight = on / (1 + left**2 / limit) ** 2
+        total = jnp.zeros(tracks.pixels, real).at[tracks.pixel].add(weight)
+        total = jnp.maximum(total, 1e-3)
+
+        def less_mean(z: Array) -> Array:
+            """Of one value per event (E,), or of rows of them (E, n)."""
+            sums = jnp.zeros((tracks.pixels, *z.shape[1:]), real)
+            sums = sums.at[tracks.pixel].add((weight * z.T).T)
+            return z - (sums.T / total).T[tracks.pixel]
+
+        left = less_mean(e)
+
+        # x = r + rho(x) d: (1 - d grad rho') dx = what it is with rho held, d = rho (f C - C_z r).
+        now = jnp.concatenate([path.O, path.D]).ravel()
+        unit = jnp.concatenate([powers, powers / jnp.exp(jnp.median(path.log_rho))])
+        unit = jnp.repeat(unit, 3)
+        # Where events go by phi and by C, and the rest by the chain rule.
+        O, C = path.coefficients()  # noqa: E741
+        phi, (cx, cy, cz) = along(O, tracks.tau), along(C, tracks.tau)
+
+        def turned(phi: list[Array]) -> tuple[Array, Array]:
+            rx, ry, rz = rotated(phi, tracks.x, tracks.y, f)
+            return rx * f / rz, ry * f / rz
+
+        def parallax(rx: Array, ry: Array) -> tuple[Array, Array]:
+            return rho * (f * cx - cz * rx), rho * (f * cy - cz * ry)
+
+        def moved_by(phi: list[Array]) -> tuple[Array, Array]:
+            (rx, ry), (dx, dy) = turned(phi), parallax(*turned(phi))
+            return rx + dx, ry + dy
+
+        one, none = jnp.ones_like(rho), jnp.zeros_like(rho)
+        by_phi = [
+            jax.jvp(moved_by, (phi,), ([one if i == axis else none for i in range(3)],))[1]
+            for axis in range(3)
+        ]
+        rx, ry = turned(phi)
+        dx, dy = parallax(rx, ry)
+        by_C = [(rho * f, none), (none, rho * f), (-rho * rx, -rho * ry)]
+        squeezed = jnp.maximum(1 - lx * dx - ly * dy, FOLD)
+        slope = (gx * dx + gy * dy) / squeezed
+        hx, hy = gx + slope * lx, gy + slope * ly
+        by = jnp.stack([hx * x + hy * y for x, y in by_phi + by_C])
+        growth = jnp.stack([tracks.tau**m / math.factorial(m) for m in range(1, k + 1)])
+        chain = jax.jacfwd(lambda v: jnp.concatenate(with_rows(path, v).coefficients()).ravel())
+        by = by.reshape(2, 1, 3, -1) * growth[:, None]
+        by = (chain(now) * unit).T @ by.reshape(rows, -1)
+        by_depth = hx * dx + hy * dy
+        usual = jnp.exp(jnp.median(path.log_rho))
+        by_plane = by_depth * usual / rho * jnp.stack([X / f, Y / f, one])
+        Jt = jnp.concatenate([by, -tracks.number[None], jnp.where(plane, by_plane, 0)])
+        free_now = (on > 0) & (n >= settle)
+        Jt = jnp.where(free_now, Jt, 0)
+        Jd = jnp.where(free_now & ~plane, by_depth, 0)
+        now = jnp.concatenate([now / unit, scene.skew[None], jnp.zeros(3, real)])
+
+        # Priors, of the path's rows and of depths.
+        later = jnp.append(jnp.repeat(jnp.tile(jnp.arange(k) > 0, 2), 3), jnp.zeros(4, bool))
+        known = jnp.diag(jnp.where(later, prior.change, 1e-3))
+        pull = jnp.where(later, prior.change, 0) * now
+        known = known.at[rows, rows].set(10.0)
+        pull = pull.at[rows].set(10.0 * scene.skew)
+        turn = jnp.zeros(free, real).at[:3].set(prior.omega * unit[:3] ** 2)
+        known, pull = known + jnp.diag(turn), pull + turn * now
+        G = slopes[:, None, :, None] * jnp.eye(3, dtype=real)[None, :, None, :]
+        G = G.reshape(3 * SEGMENTS, 3 * k) * unit[: 3 * k]
+        off = (slopes @ path.O - prior.gyro).ravel()
+        known = known.at[: 3 * k, : 3 * k].add(prior.gyro_weight / SEGMENTS * G.T @ G)
+        pull = pull.at[: 3 * k].add(prior.gyro_weight / SEGMENTS * G.T @ off)
+        # |C1| = 1
+        fixed = slice(3 * k, 3 * k + 3)
+        gauge = jnp.zeros(free, real).at[fixed].set(path.D[0] * unit[fixed])
+        known = known + 1e4 * gauge[:, None] * gauge
+        apart = path.log_rho[a] - path.log_rho[b]
+        bond = jnp.where(plane, 0, prior.bond / (1 + (apart / BEND) ** 2))
+
+        # Information of events: neighbours see the same, which counts as one.
+        w = weight / (prior.alike * sigma**2)
+
+        def times_H(v: tuple) -> tuple:
+            image, t, q = v
+            y = _mean(_gathered(image, at, tracks.shape), at.share) + t @ Jt
+            y = y + Jd * _mean(_gathered(q, node, tracks.nodes), node.share)
+            z = w * less_mean(y)
+            flat = prior.flat * _laplacian(image.reshape(tracks.shape)).ravel() + 1e-5 * image
+            apart = bond * (q[a] - q[b])
+            return (
+                _scattered(z, at, at.share, tracks.shape) + flat,
+                Jt @ z + known @ t,
+                _scattered(Jd * z, node, node.share, tracks.nodes)
+                + 1e-3 * q
+                + jnp.zeros_like(q).at[a].add(apart).at[b].add(-apart),
+            )
+
+        z = w * left
+        flat = prior.flat * _laplacian(scene.map) + 1e-5 * scene.map
+        gradient = (
+            _scattered(z, at, at.share, tracks.shape) + flat.ravel(),
+            Jt @ z + pull,
+            _scattered(Jd * z, node, node.share, tracks.nodes)
+            + jnp.zeros_like(path.log_rho).at[a].add(bond * apart).at[b].add(-bond * apart),
+        )
+
+        # Preconditioner: the diagonal for the map; path with depths, these lumped, exactly.
+        diagonal = _scattered(w, at, at.share**2, tracks.shape)
+        diagonal = 0.7 * diagonal + 4 * prior.flat + 1e-5
+        # One row per event: 7 ms for 60 k events, 15 ms one column after the other.
+        centred = w[:, None] * less_mean(Jt.T)
+        upper = Jt @ centred + known
+        mixed = _scattered(Jd[:, None] * centred, node, node.share[..., None], tracks.nodes)
+        lumped = _scattered(w * Jd**2, node, node.share, tracks.nodes) + 1e-2
+        lumped = lumped.at[a].add(2 * bond).at[b].add(2 * bond)
+        small = upper - mixed.T @ (mixed / lumped[:, None])
+        small = (small + small.T) / 2 + 1e-3 * jnp.diag(jnp.diag(upper))
+        factor = jax.scipy.linalg.cho_factor(small)
+
+        def eased(v: tuple) -> tuple:
+            q = v[2] / lumped
+            t = jax.scipy.linalg.cho_solve(factor, v[1] - mixed.T @ q)
+            return v[0] / diagonal, t, q - (mixed @ t) / lumped
+
+        solve = functools.partial(_conjugate_gradients, times_H, eased)
+        image, t, q = solve(jax.tree.map(jnp.negative, gradient), SOLVE)
+        sound = jnp.isfinite(t).all() & jnp.isfinite(q).all() & jnp.isfinite(image).all()
+        image, t, q = (jnp.where(sound, part, 0) for part in (image, t, q))
+        largest = jnp.abs(t[:rows]).max()
+        moved = jnp.where(n >= settle, jnp.minimum(1, 4 / jnp.maximum(largest, 1e-9)), 0)
+        path = with_rows(path, (now + moved * t)[:rows] * unit)
+        level = jnp.exp(path.log_rho) + moved * usual * (rays @ t[rows + 1 :])
+        level = jnp.log(jnp.maximum(level, LEAST * usual))
+        nodes = path.log_rho + jnp.clip(moved * q, -0.5, 0.5)
+        path = normalised(Path(path.O, path.D, jnp.where(plane, level, nodes)))
+        scene = Scene(path, scene.map + image.reshape(tracks.shape), scene.skew + moved * t[rows])
+
+        def covariance(_: Any) -> Array:
+            chosen = jnp.concatenate([jnp.arange(3 * k, 3 * k + 3), jnp.arange(3)])
+            zero = jax.tree.map(jnp.zeros_like, gradient)
+
+            def column(i: Array) -> Array:
+                return solve((zero[0], zero[1].at[i].set(1), zero[2]), SOLVE)[1][chosen]
+
+            inverse = lax.map(column, chosen) * unit[chosen][:, None] * unit[chosen]
+            return (inverse + inverse.T) / 2
+
+        def noise(_: Any) -> Array:
+            ordered = jnp.sort(jnp.where(on > 0, jnp.abs(left), jnp.inf))
+            middle = ordered[(on.sum() / 2).astype(jnp.int32)]
+            return jnp.where(jnp.isfinite(middle), 1.48 * middle, 0)
+
+        told = Report(
+            lax.cond(n == steps - 1, noise, lambda _: jnp.zeros((), real), None),
+            (on * left**2 / (1 + left**2 / limit)).sum() / jnp.maximum(on.sum(), 1),
+            weight.sum() / jnp.maximum(on.sum(), 1),
+            largest,
+            lax.cond(
+                jnp.asarray(tell) & (n == steps - 1),
+                covariance,
+                lambda _: jnp.zeros((6, 6), real),
+                None,
+            ),
+        )
+        return scene, last, jnp.where(on > 0, weight, tracks.on), told
+
+    zero = jnp.zeros((), real)
+    nothing = Report(zero, zero, zero, zero, jnp.zeros((6, 6), real))
+    state = lax.fori_loop(0, steps, one, (scene, scene, tracks.on, nothing))
+    return Scene(normalised(state[0].path), *state[0][1:]), state[3]
+
+
+def _conjugate_gradients(times_H: Any, eased: Any, side: tuple, steps: int) -> tuple:
+    def dot(u: tuple, v: tuple) -> Array:
+        return sum((jnp.vdot(p, q) for p, q in zip(u, v, strict=True)), jnp.zeros(()))
+
+    def plus(u: tuple, scale: Array, v: tuple) -> tuple:
+        return jax.tree.map(lambda p, q: p + (scale * q).astype(p.dtype), u, v)
+
+    def one(_: Any, state: tuple) -> tuple:
+        found, left, direction, size = state
+        image = times_H(direction)
+        length = size / jnp.maximum(dot(direction, image), 1e-30)
+        found, left = plus(found, length, direction), plus(left, -length, image)
+        better = eased(left)
+        new = dot(left, better)
+        return found, left, plus(better, new / jnp.maximum(size, 1e-30), direction), new
+
+    better = eased(side)
+    state = (jax.tree.map(jnp.zeros_like, side), side, better, dot(side, better))
+    return lax.fori_loop(0, steps, one, state)[0]
+
+
+@jax.jit
+def _tried_depths(path: Path, tracks: Tracks, low: Array, high: Array) -> tuple:
+    """Signed contrast and number of events about nodes, (LEVELS, rows, columns), by log depth."""
+    rx, ry, dx, dy = _rays(path, tracks)
+    both, (rows, columns) = jnp.stack([tracks.p, tracks.on]), tracks.nodes
+    (height, width), node, before = tracks.shape, tracks.node, SPOT // 2
+    pad = (before, rows * node + SPOT - height), (before, columns * node + SPOT - width)
+
+    def about(image: Array) -> Array:
+        spots = (SPOT, SPOT), (node, node)
+        sums = lax.reduce_window(jnp.pad(image, pad), 0.0, lax.add, *spots, "VALID")
+        return sums[:rows, :columns]
+
+    def one(log_rho: Array) -> tuple[Array, Array]:
+        rho = jnp.exp(log_rho)
+        at = jnp.stack([rx + rho * dx, ry + rho * dy], 1)
+        images = splat(at, both, tracks.shape, tracks.corner)
+        return about(blur(images[0], 1) ** 2), about(images[1])
+
+    return lax.map(one, low + (high - low) * jnp.arange(LEVELS) / (LEVELS - 1))
+
+
+def depths(path: Path, tracks: Tracks) -> Array:
+    """Log depths at nodes, each the one of highest contrast around it, for a path that is given.
+
+    They are looked for at those the path has and up to 2.5 times nearer and farther. Beside
+    an edge of depth the nearer surface's is found, to which the edge's events belong. Where there
+    are few events they are those of the surroundings.
+    """
+    low, high = (float(v) for v in jnp.percentile(path.log_rho, jnp.array([5.0, 95.0])))
+    low, high = low - np.log(2.5), high + np.log(2.5)
+    real = tracks.x.dtype
+    S, n = (
+        scipy.ndimage.gaussian_filter(np.asarray(part, np.float64), (0, 1.5, 1.5))
+        for part in _tried_depths(path, tracks, jnp.asarray(low, real), jnp.asarray(high, real))
+    )
+    sharp = S / np.maximum(n, 20)
+    best = sharp.argmax(0)
+    inner = np.clip(best, 1, LEVELS - 2)
+    before, here, after = (np.take_along_axis(sharp, (inner + k)[None], 0)[0] for k in (-1, 0, 1))
+    bend = np.minimum(before - 2 * here + after, -1e-9)
+    found = inner + np.where(best == inner, np.clip((before - after) / 2 / bend, -0.5, 0.5), 0)
+    found = low + (high - low) / (LEVELS - 1) * found
+    told = n.mean(0) * np.maximum(1 - sharp.mean(0) / np.maximum(here, 1e-9), 0)
+    told *= np.where(best == inner, 1, 1e-3)
+    told /= told + max(told.mean(), 1e-9)
+    total, weight = told * found, told
+    for k in range(6):
+        blurred = (scipy.ndimage.gaussian_filter(part, 2.0**k) for part in (told * found, told))
+        share = 0.1 ** (k + 1)
+        total, weight = (a + share * b for a, b in zip((total, weight), blurred, strict=True))
+    usual = float(jnp.median(path.log_rho))
+    return jnp.asarray(((total + 1e-9 * usual) / (weight + 1e-9)).ravel(), real)
