@@ -57,14 +57,14 @@ FINAL = ((0.05, 20, 10), (0.02, 10, 3))
 # Rivals remain whose cost is so many times the least, and so much more (C^2): depths that were just
 # looked for leave up to 0.03 C.
 CLOSE = 1.75, 5e-4
-# Of motions before a plane: the part of the window, and stages in it. What is no plane costs 1e-3
-# C^2 and more, a plane 5e-5 and less.
+# Of motions before a plane: the part of the window, the most that a plane costs (C^2), and stages.
+# What is no plane costs 1.5e-3 and more, a plane 5e-5 and less in the end.
 GROWING = (
-    (0.5, ((0.3, 5, 1), (0.1, 5, 1))),
-    (0.75, ((0.3, 4, 1), (0.1, 4, 1))),
-    (1.0, ((0.3, 4, 1), (0.1, 6, 1), (0.05, 12, 1))),
+    (0.5, 1e-3, ((0.3, 16, 1), (0.1, 6, 1))),
+    (0.75, 1e-3, ((0.3, 6, 1), (0.1, 5, 1))),
+    (1.0, 3e-4, ((0.3, 4, 1), (0.1, 6, 1), (0.05, 12, 1))),
 )
-PLAIN, DUAL = 3e-4, (2.0, 1e-5)
+DUAL = 2.0, 1e-5
 LOST = 4  # times the cost of the window before: the path is not followed
 SHARP = 0.4  # sigma by the noise that is seen, at least: events beside edges are outliers
 
@@ -298,7 +298,7 @@ class Windows:
         motions that explain a homography only one explains how it changes, if it is one plane.
         """
         paths, found = [], []
-        for share, stages in GROWING:
+        for share, most, stages in GROWING:
             half = share * float(self.params.half_window)
             tracks, prior = self.tracks(centre, half, TRIED), self.prior(centre, half)
             if not paths:
@@ -311,7 +311,7 @@ class Windows:
                 scene, report = _with_map(tracks, path, prior, True)
                 return _adjusted(tracks, scene, report, prior, stages, True)
 
-            found = [one for one in side_by_side(follow, paths) if float(one[1].cost) < PLAIN]
+            found = [one for one in side_by_side(follow, paths) if float(one[1].cost) < most]
             paths = [scene.path for scene, _ in found]
             if not paths:
                 break
