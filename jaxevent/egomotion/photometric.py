@@ -304,8 +304,12 @@ def adjust(
         scene, last, weight, _ = state
         # Nesterov's extrapolation: reweighting alone closes a tenth of what is left in a step.
         ahead = jnp.where(n > settle, (n - settle) / (n - settle + 2), 0).astype(real)
+        near, nearer = (jnp.exp(one.path.log_rho) for one in (last, scene))
         last, scene = scene, jax.tree.map(lambda new, old: new + ahead * (new - old), scene, last)
-        path = normalised(scene.path)
+        # Only inverse depths themselves, extrapolated, are a plane's again.
+        level = jnp.maximum(nearer + ahead * (nearer - near), LEAST * jnp.median(nearer))
+        level = jnp.where(plane, jnp.log(level), scene.path.log_rho)
+        path = normalised(Path(scene.path.O, scene.path.D, level))
 
         X, Y = placed(path, tracks)
         at = _spline(X, Y, tracks.corner, tracks.shape)
