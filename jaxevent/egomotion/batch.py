@@ -52,19 +52,18 @@ STARTED = 6  # paths at most that go on from the first
 TRIED = 30000  # of the photometric fit of rivals
 # Sigma (C), steps and how much flatter the map is: after each trial of depths, and at the end. A
 # flatter map leaves less freedom, so the fit converges sooner.
-ROUNDS = ((0.3, 6, 1), (0.2, 6, 1), (0.1, 8, 1))
-FINAL = ((0.05, 20, 10), (0.02, 10, 3))
+ROUNDS = ((1.0, 6, 1), (0.5, 6, 1), (0.2, 10, 1), (0.1, 10, 1))
+FINAL = ((0.05, 20, 10), (0.02, 20, 3))
 # Rivals remain whose cost is so many times the least, and so much more (C^2): depths that were just
 # looked for leave up to 0.03 C.
 CLOSE = 1.75, 5e-4
 # Of motions before a plane: the part of the window, the most that a plane costs (C^2), and stages.
 # What is no plane costs 1.5e-3 and more, a plane 5e-5 and less in the end.
 GROWING = (
-    (0.5, 1e-3, ((0.3, 16, 1), (0.1, 6, 1))),
-    (0.75, 1e-3, ((0.3, 6, 1), (0.1, 5, 1))),
-    (1.0, 3e-4, ((0.3, 4, 1), (0.1, 6, 1), (0.05, 12, 1))),
+    (0.5, 1e-3, ((2.0, 8, 1), (1.0, 8, 1), (0.3, 12, 1), (0.1, 6, 1))),
+    (0.75, 1e-3, ((1.0, 6, 1), (0.3, 6, 1), (0.1, 5, 1))),
+    (1.0, 2e-4, ((1.0, 6, 1), (0.3, 6, 1), (0.1, 6, 1), (0.05, 12, 1))),
 )
-DUAL = 2.0, 1e-5
 LOST = 4  # times the cost of the window before: the path is not followed
 SHARP = 0.4  # sigma by the noise that is seen, at least: events beside edges are outliers
 
@@ -85,7 +84,7 @@ class Params(Parameters):
     smooth = Positive(1.0, "", "weight of differences of log depth between cells")
     relief = Positive(0.1, "", "weight of differences of log depth from its mean")
     change = Positive(0.02, "1/px^2", "weight of changes of the twist, in px at the window's end")
-    bond = Positive(1.0, "", "weight of differences of log depth between nodes")
+    bond = Positive(10.0, "", "weight of differences of log depth between nodes")
     flat = Positive(0.01, "1/C^2", "weight of differences of log intensity between pixels")
     alike = Positive(10.0, "", "how many events together tell as much as one: errors are alike")
     omega_scale = Number(0.0, "rad/s", "prior: |Omega| is about so much or less; 0: not known")
@@ -292,7 +291,7 @@ class Windows:
         return Path(path.O, path.D, jnp.asarray(log_rho, path.O.dtype))
 
     def before_a_plane(self, centre: int, planes: list[Plane]) -> list[tuple[Scene, Report]]:
-        """Of some motions before a plane the best, if a plane explains the events; else nothing.
+        """Of motions before a plane those of least cost first, if a plane explains the events.
 
         Fitted to a growing part of the window, with the depths of a plane throughout: of the two
         motions that explain a homography only one explains how it changes, if it is one plane.
@@ -315,7 +314,7 @@ class Windows:
             paths = [scene.path for scene, _ in found]
             if not paths:
                 break
-        return self.remaining(found, DUAL)
+        return sorted(found, key=lambda one: self.cost(*one))
 
     def rivals(self, centre: int, warm: Path | None, anew: bool) -> list[tuple[Scene, Report]]:
         """What to follow to the end, the best first: of new starts, and of a path about right."""
@@ -327,7 +326,7 @@ class Windows:
             planes = side_by_side(lambda cut: before_a_plane(homography(cut, Omega)), cuts)
             found = self.before_a_plane(centre, planes[0])
             if found:
-                return found
+                return found[:1]
             starts = self.starts(centre, Omega, planes[0] + planes[1])
             paths += [self.on_nodes(path, tracks) for path in self.aligned(centre, starts)]
         tried = side_by_side(lambda path: _tried(tracks, path, prior), paths)
