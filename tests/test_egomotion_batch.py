@@ -319,6 +319,22 @@ def test_the_photometric_fit_ends_at_the_truth():
     assert report.noise < 0.05 and report.inliers > 0.9
 
 
+def test_steps_never_cost_more():
+    """Beside true depths, with a sigma rather small for how far they are."""
+    windows, _ = fitted()
+    tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    rng = np.random.default_rng(0)
+    depths = np.log(0.6) + 0.1 * rng.normal(size=tracks.nodes[0] * tracks.nodes[1])
+    scene = photometric.Scene(true_path(depths), jnp.zeros(tracks.shape), jnp.zeros(()))
+    scene, first = photometric.adjust(tracks, scene, prior, 0.1, 3, 3)
+    costs = [
+        float(photometric.adjust(tracks, scene, prior, 0.1, 0, steps)[1].cost)
+        for steps in (1, 2, 4, 8, 16, 32, 64)
+    ]
+    assert costs[-1] < 0.1 * first.cost
+    assert (np.diff(costs) <= 1e-3 * np.array(costs[:-1])).all()
+
+
 def test_the_gradient_of_misfits():
     """Before a smooth surface: beside edges of depth misfits jump from one surface to the other."""
     windows, fit = fitted()
