@@ -386,13 +386,15 @@ def _apart(ranked: list[Any], path: Callable[[Any], Path]) -> list[Any]:
 
 def _tried(tracks: Tracks, path: Path, prior: Prior) -> tuple[Scene, Report]:
     """A rival followed: depths are looked for, then adjusted with the path, in turns."""
-    found: list[tuple[Scene, Report]] = []
-    for stage in ROUNDS:
+
+    def after(path: Path, stage: Any) -> tuple[Scene, Report]:
         path = Path(path.O, path.D, depths(path, tracks))
-        scene, report = _with_map(tracks, path, prior)
-        scene, report = _adjusted(tracks, scene, report, prior, (stage,))
-        path, found = scene.path, [(scene, report)]
-    return found[-1]
+        return _adjusted(tracks, *_with_map(tracks, path, prior), prior, (stage,))
+
+    found = after(path, ROUNDS[0])
+    for stage in ROUNDS[1:]:
+        found = after(found[0].path, stage)
+    return found
 
 
 def _with_map(

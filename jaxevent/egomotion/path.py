@@ -14,7 +14,7 @@ which is linear in rho.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -33,6 +33,15 @@ class Path(eqx.Module):
     O: Float[Array, "rows 3"]  # noqa: E741
     D: Float[Array, "rows 3"]
     log_rho: Float[Array, " depths"]  # 1/m in units of 1/|T|, of cells or at nodes
+
+    @classmethod
+    def constant(
+        cls, heading: NDArray, Omega: NDArray, log_rho: NDArray | Array, real: Any
+    ) -> "Path":
+        """Of a constant twist: unit heading, Omega (rad/s)."""
+        O, D = np.zeros((ROWS, 3)), np.zeros((ROWS, 3))  # noqa: E741
+        O[0], D[0] = Omega, heading
+        return cls(*(jnp.asarray(part, real) for part in (O, D, log_rho)))
 
     def coefficients(self) -> tuple[Array, Array]:
         """O and C."""
@@ -120,6 +129,5 @@ def advanced(path: Path, tau: float, half: float) -> Path:
     of a path grow without bound.
     """
     T, Omega = path.twist(np.linspace(min(tau - half, half), half, 2 * SEGMENTS))
-    O, D = np.zeros(path.O.shape), np.zeros(path.D.shape)  # noqa: E741
-    O[0], D[0] = Omega.mean(0), T.mean(0) / np.linalg.norm(T.mean(0))
-    return Path(jnp.asarray(O, path.O.dtype), jnp.asarray(D, path.D.dtype), path.log_rho)
+    heading = T.mean(0) / np.linalg.norm(T.mean(0))
+    return Path.constant(heading, Omega.mean(0), path.log_rho, path.O.dtype)

@@ -121,7 +121,6 @@ class Report(NamedTuple):
     noise: Array  # 1.48 times the median of the absolute misfits, of the last step
     cost: Array
     inliers: Array
-    step: Array  # px at the window's end
     covariance: Array  # (6, 6) of C1 and O0, 0 unless it was asked for
 
 
@@ -520,10 +519,10 @@ def adjust(
             return (inverse + inverse.T) / 2
 
         nothing = jnp.zeros((6, 6), real)
-        return scene, largest, lax.cond(tell, covariance, lambda _: nothing, None)
+        return scene, lax.cond(tell, covariance, lambda _: nothing, None)
 
     def go(state: tuple) -> tuple:
-        n, scene, last, kept, momentum, damping, *told = state
+        n, scene, last, kept, momentum, damping, told = state
         # Nesterov's extrapolation: reweighting alone closes a tenth of what is left in a step.
         ahead = momentum / (momentum + 2)
         near, nearer = (jnp.exp(one.path.log_rho) for one in (last, scene))
@@ -539,23 +538,24 @@ def adjust(
         momentum = jnp.where(better & (n >= settle), momentum + 1, 0)
         damping = jnp.where(better, damping * SOFTER, jnp.maximum(damping * HARDER, DAMP))
         damping = jnp.where(damping < DAMP / 4, 0, damping)
-        new = lax.cond(n < steps, one, lambda *_: (scene, *told), kept, damping, n < settle)
-        done = better & (gain < ENOUGH * kept.energy)
-        return n + 1, new[0], last, kept, momentum, jnp.where(done, STUCK, damping), *new[1:]
+        damping = jnp.where(better & (gain < ENOUGH * kept.energy), STUCK, damping)
+        goes_on = (n < steps) & (damping < STUCK)
+        new = lax.cond(goes_on, one, lambda *_: (scene, told), kept, damping, n < settle)
+        return n + 1, new[0], last, kept, momentum, damping, new[1]
 
-    def goes_on(state: tuple) -> Array:
+    def unfinished(state: tuple) -> Array:
         return (state[0] <= steps) & (state[5] < STUCK)
 
     zero, none = jnp.zeros((), real), jnp.zeros_like(tracks.x)
     kept = _Seen(scene, none, none, none, none, tracks.on, zero + jnp.inf, zero)
-    state = (jnp.zeros((), int), scene, scene, kept, zero, zero, zero, jnp.zeros((6, 6), real))
-    _, _, _, kept, _, _, largest, covariance = lax.while_loop(goes_on, go, state)
+    state = (jnp.zeros((), int), scene, scene, kept, zero, zero, jnp.zeros((6, 6), real))
+    _, _, _, kept, _, _, covariance = lax.while_loop(unfinished, go, state)
     left = jnp.abs(_less_mean(kept.e, kept.weight, tracks))
     number = jnp.maximum(kept.on.sum(), 1)
     middle = jnp.sort(jnp.where(kept.on > 0, left, jnp.inf))[(number / 2).astype(jnp.int32)]
     noise = jnp.where(jnp.isfinite(middle), 1.48 * middle, 0)
     inliers = kept.weight.sum() / number
-    return kept.scene, Report(noise, kept.cost, inliers, largest, covariance)
+    return kept.scene, Report(noise, kept.cost, inliers, covariance)
 
 
 def _conjugate_gradients(times_H: Any, eased: Any, side: tuple, steps: int) -> tuple:

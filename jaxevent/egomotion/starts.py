@@ -26,18 +26,14 @@ from numpy.typing import NDArray
 
 from jaxevent.egomotion.alignment import Window
 from jaxevent.egomotion.geometry import A, B
-from jaxevent.egomotion.path import LEAST, ROWS, Path, rays_of
+from jaxevent.egomotion.path import LEAST, Path, rays_of
 from jaxevent.egomotion.warped import blur, splat
 
 DIRECTIONS = 600  # headings of a hemisphere that are tried
 HOP, PATCH = 16, 24  # px between patches whose flow is measured, and their size
 
 
-def _hat(w: NDArray) -> NDArray:
-    return np.cross(w, -np.eye(3))
-
-
-TURNS = np.stack([_hat(axis) for axis in np.eye(3)])
+TURNS = np.cross(np.eye(3)[:, None], -np.eye(3))
 STRAINS = np.array(
     [
         [[1, 0, 0], [0, -1, 0], [0, 0, 0]],
@@ -110,11 +106,9 @@ class Plane(NamedTuple):
 
     def path(self, x: NDArray, y: NDArray, f: float, real: Any) -> Path:
         """The path of this constant twist, with the plane's depths at some places (px)."""
-        O, D = np.zeros((ROWS, 3)), np.zeros((ROWS, 3))  # noqa: E741
-        O[0], D[0] = self.Omega, self.T / np.linalg.norm(self.T)
         rho = rays_of(x, y, f) @ self.normal * np.linalg.norm(self.T)
         log_rho = np.log(np.maximum(rho, LEAST * np.median(np.abs(rho))))
-        return Path(*(jnp.asarray(part, real) for part in (O, D, log_rho)))
+        return Path.constant(self.T / np.linalg.norm(self.T), self.Omega, log_rho, real)
 
 
 def homography(window: Window, Omega: NDArray) -> NDArray[np.float64]:
@@ -266,10 +260,7 @@ def start(
     usual = max(float(np.average(rho, weights=weight + 1e-12)), 1e-3)
     share = np.exp(-far / (2 * PATCH**2)) * weight / max(weight.mean(), 1e-12) + 1e-6
     depth = (share * np.clip(rho, 0.15 * usual, 6 * usual)).sum(1) / share.sum(1)
-    real = window.x.dtype
-    O, D = np.zeros((ROWS, 3)), np.zeros((ROWS, 3))  # noqa: E741
-    O[0], D[0] = Omega, T
-    return Path(*(jnp.asarray(part, real) for part in (O, D, np.log(depth))))
+    return Path.constant(T, Omega, np.log(depth), window.x.dtype)
 
 
 def side_by_side(follow: Callable[[Any], Any], rivals: list[Any]) -> list[Any]:
