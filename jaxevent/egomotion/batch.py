@@ -50,19 +50,30 @@ MIDDLE = 30000
 LAST = 60000
 STARTED = 6  # paths at most that go on from the first
 TRIED = 30000  # of the photometric fit of rivals
-# Sigma (C), steps and how much flatter the map is: after each trial of depths, and at the end. A
-# flatter map leaves less freedom, so the fit converges sooner.
-ROUNDS = ((1.0, 6, 1), (0.5, 6, 1), (0.2, 10, 1), (0.1, 10, 1))
-FINAL = ((0.05, 20, 10), (0.02, 20, 3))
+
+
+class Stage(NamedTuple):
+    """Steps of the photometric fit.
+
+    A flatter map leaves less freedom, so the fit converges sooner.
+    """
+
+    sigma: float  # C
+    steps: int
+    flatter: float | int = 1  # how much: times the prior's weight
+
+
+ROUNDS = Stage(1.0, 6), Stage(0.5, 6), Stage(0.2, 10), Stage(0.1, 10)  # after a trial of depths
+FINAL = Stage(0.05, 20, 10), Stage(0.02, 20, 3)
 # Rivals remain whose cost is so many times the least, and so much more (C^2): depths that were just
 # looked for leave up to 0.03 C.
 CLOSE = 1.75, 5e-4
 # Of motions before a plane: the part of the window, the most that a plane costs (C^2), and stages.
 # What is no plane costs 1.5e-3 and more, a plane 5e-5 and less in the end.
 GROWING = (
-    (0.5, 1e-3, ((2.0, 8, 1), (1.0, 8, 1), (0.3, 12, 1), (0.1, 6, 1))),
-    (0.75, 1e-3, ((1.0, 6, 1), (0.3, 6, 1), (0.1, 5, 1))),
-    (1.0, 2e-4, ((1.0, 6, 1), (0.3, 6, 1), (0.1, 6, 1), (0.05, 12, 1))),
+    (0.5, 1e-3, (Stage(2.0, 8), Stage(1.0, 8), Stage(0.3, 12), Stage(0.1, 6))),
+    (0.75, 1e-3, (Stage(1.0, 6), Stage(0.3, 6), Stage(0.1, 5))),
+    (1.0, 1e-4, (Stage(1.0, 6), Stage(0.3, 6), Stage(0.1, 6), Stage(0.05, 12))),
 )
 LOST = 4  # times the cost of the window before: the path is not followed
 SHARP = 0.4  # sigma by the noise that is seen, at least: events beside edges are outliers
@@ -84,7 +95,7 @@ class Params(Parameters):
     smooth = Positive(1.0, "", "weight of differences of log depth between cells")
     relief = Positive(0.1, "", "weight of differences of log depth from its mean")
     change = Positive(0.02, "1/px^2", "weight of changes of the twist, in px at the window's end")
-    bond = Positive(10.0, "", "weight of differences of log depth between nodes")
+    bond = Positive(1.0, "", "weight of differences of log depth between nodes")
     flat = Positive(0.01, "1/C^2", "weight of differences of log intensity between pixels")
     alike = Positive(10.0, "", "how many events together tell as much as one: errors are alike")
     omega_scale = Number(0.0, "rad/s", "prior: |Omega| is about so much or less; 0: not known")
@@ -305,16 +316,20 @@ class Windows:
                 paths = [plane.path(*tracks.places, self.f, real) for plane in planes]
 
             def follow(
-                path: Path, tracks: Tracks = tracks, prior: Prior = prior, stages: Any = stages
+                path: Path,
+                tracks: Tracks = tracks,
+                prior: Prior = prior,
+                stages: tuple[Stage, ...] = stages,
             ) -> tuple[Scene, Report]:
                 scene, report = _with_map(tracks, path, prior, True)
                 return _adjusted(tracks, scene, report, prior, stages, True)
 
             found = [one for one in side_by_side(follow, paths) if float(one[1].cost) < most]
+            found = _apart(sorted(found, key=lambda one: self.cost(*one)), lambda one: one[0].path)
             paths = [scene.path for scene, _ in found]
             if not paths:
                 break
-        return sorted(found, key=lambda one: self.cost(*one))
+        return found
 
     def rivals(self, centre: int, warm: Path | None, anew: bool) -> list[tuple[Scene, Report]]:
         """What to follow to the end, the best first: of new starts, and of a path about right."""
@@ -324,7 +339,7 @@ class Windows:
             Omega = self.rotation(centre)
             cuts = [self.cut(centre, share * half, MIDDLE) for share in (1 / 3, 2 / 3)]
             planes = side_by_side(lambda cut: before_a_plane(homography(cut, Omega)), cuts)
-            found = self.before_a_plane(centre, planes[0])
+            found = self.before_a_plane(centre, planes[0] + planes[1])
             if found:
                 return found[:1]
             starts = self.starts(centre, Omega, planes[0] + planes[1])
@@ -342,7 +357,7 @@ class Windows:
         if not left:
             return None
         scene, report = min(left, key=lambda one: self.cost(*one))
-        sigma = max(FINAL[-1][0], SHARP * float(report.noise))
+        sigma = max(FINAL[-1].sigma, SHARP * float(report.noise))
         scene, report = adjust(tracks, scene, prior, sigma, 0, 1, True)
         return Fit(
             scene.path,
@@ -387,7 +402,7 @@ def _apart(ranked: list[Any], path: Callable[[Any], Path]) -> list[Any]:
 def _tried(tracks: Tracks, path: Path, prior: Prior) -> tuple[Scene, Report]:
     """A rival followed: depths are looked for, then adjusted with the path, in turns."""
 
-    def after(path: Path, stage: Any) -> tuple[Scene, Report]:
+    def after(path: Path, stage: Stage) -> tuple[Scene, Report]:
         path = Path(path.O, path.D, depths(path, tracks))
         return _adjusted(tracks, *_with_map(tracks, path, prior), prior, (stage,))
 
@@ -403,7 +418,7 @@ def _with_map(
     """A path, and the map that it makes."""
     real = tracks.x.dtype
     scene = Scene(path, jnp.zeros(tracks.shape, real), jnp.zeros((), real))
-    return adjust(tracks, scene, prior, ROUNDS[0][0], 2, 2, plane=plane)
+    return adjust(tracks, scene, prior, ROUNDS[0].sigma, 2, 2, plane=plane)
 
 
 def _adjusted(
@@ -411,14 +426,14 @@ def _adjusted(
     scene: Scene,
     report: Report,
     prior: Prior,
-    stages: tuple[tuple[float, int, float | int], ...],
+    stages: tuple[Stage, ...],
     plane: bool = False,
 ) -> tuple[Scene, Report]:
     """Through stages; sigma is not much less than the noise (C) that was seen."""
-    for sigma, steps, flatter in stages:
-        seen = prior._replace(flat=flatter * prior.flat)
-        least = max(sigma, SHARP * float(report.noise))
-        scene, report = adjust(tracks, scene, seen, least, 0, steps, plane=plane)
+    for stage in stages:
+        seen = prior._replace(flat=stage.flatter * prior.flat)
+        sigma = max(stage.sigma, SHARP * float(report.noise))
+        scene, report = adjust(tracks, scene, seen, sigma, 0, stage.steps, plane=plane)
     return scene, report
 
 
