@@ -51,7 +51,7 @@ def window(scene: str, motion: str, seed: int, params: batch.Params) -> dict[str
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True, help="folder for the tables")
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(150, 160)))
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(160, 170)))
     parser.add_argument("--scenes", nargs="+", default=["wall", "shapes", "texture"])
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -60,9 +60,9 @@ def main() -> None:
     if stored.exists():
         rows = pd.read_csv(stored).to_dict("records")
     done = {(row["scene"], row["seed"]) for row in rows}
-    for scene in arguments.scenes:
-        for motion in ("constant", "varying"):
-            for seed in arguments.seeds:
+    for seed in arguments.seeds:
+        for scene in arguments.scenes:
+            for motion in ("constant", "varying"):
                 if (f"{scene} {motion}", seed) in done:
                     continue
                 rows.append(window(scene, motion, seed, params))
