@@ -324,8 +324,8 @@ class Windows:
                 scene, report = _with_map(tracks, path, prior, True)
                 return _adjusted(tracks, scene, report, prior, stages, True)
 
-            found = [one for one in side_by_side(follow, paths) if float(one[1].cost) < most]
-            found = _apart(sorted(found, key=lambda one: self.cost(*one)), lambda one: one[0].path)
+            found = side_by_side(follow, paths)
+            found = self.ranked([one for one in found if float(one[1].cost) < most])
             paths = [scene.path for scene, _ in found]
             if not paths:
                 break
@@ -367,13 +367,17 @@ class Windows:
             np.asarray(scene.map),
         )
 
+    def ranked(self, rivals: list[tuple[Scene, Report]]) -> list[tuple[Scene, Report]]:
+        """That of least cost first, without those that came to a better one."""
+        return _apart(sorted(rivals, key=lambda one: self.cost(*one)), lambda one: one[0].path)
+
     def remaining(
         self, rivals: list[tuple[Scene, Report]], close: tuple[float, float]
     ) -> list[tuple[Scene, Report]]:
-        """Rivals of about the least cost, that first, without those that came to a better one."""
-        ranked = sorted(((self.cost(*one), one) for one in rivals), key=lambda pair: pair[0])
-        limit = close[0] * ranked[0][0] + close[1] if ranked else 0.0
-        return _apart([one for cost, one in ranked if cost < limit], lambda one: one[0].path)
+        """Rivals of about the least cost, ranked."""
+        ranked = self.ranked(rivals)
+        limit = close[0] * self.cost(*ranked[0]) + close[1] if ranked else 0.0
+        return [one for one in ranked if self.cost(*one) < limit]
 
     def cost(self, scene: Scene, report: Report) -> float:
         """What selects among rivals: the cost per event, with the prior of |Omega|."""
