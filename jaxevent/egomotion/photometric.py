@@ -420,9 +420,10 @@ def adjust(
         hx, hy = gx + slope * lx, gy + slope * ly
         by = jnp.stack([hx * x + hy * y for x, y in by_phi + by_C])
         growth = jnp.stack([tracks.tau**m / math.factorial(m) for m in range(1, k + 1)])
-        chain = jax.jacfwd(lambda v: jnp.concatenate(with_rows(path, v).coefficients()).ravel())
-        by = by.reshape(2, 1, 3, -1) * growth[:, None]
-        by = (chain(now[:rows] * unit) * unit).T @ by.reshape(rows, -1)
+        # Mapped, since XLA else computes what moves events anew for every power: 20 ms, not 2.
+        by = lax.map(lambda power: power * by, growth).reshape(rows, -1)
+        chain = jax.jacfwd(lambda v: jnp.stack(with_rows(path, v).coefficients(), 1).ravel())
+        by = (chain(now[:rows] * unit) * unit).T @ by
         by_depth = hx * dx + hy * dy
         usual = jnp.exp(jnp.median(path.log_rho))
         by_plane = by_depth * usual / rho * jnp.stack([X / f, Y / f, one])
