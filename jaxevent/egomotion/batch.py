@@ -67,13 +67,15 @@ ROUNDS = Stage(1.0, 6), Stage(0.5, 6), Stage(0.2, 10), Stage(0.1, 10)  # after a
 FINAL = Stage(0.05, 20, 10), Stage(0.02, 20, 3)
 # Rivals remain whose cost is so many times the least, and so much more (C^2): depths that were just
 # looked for leave up to 0.03 C.
-CLOSE = 1.75, 5e-4
-# Of motions before a plane: the part of the window, the most that a plane costs (C^2), and stages.
-# What is no plane costs 1.5e-3 and more, a plane 5e-5 and less in the end.
+CLOSE = 1.5, 5e-4
+# Of motions before a plane: the part of the window, events, stages, the most that a plane costs
+# (C^2). What is no plane costs 1.8e-2 and more after the first of these, a plane 7e-3 and less; in
+# the end 1.5e-3 and more, 5e-5 and less.
 GROWING = (
-    (0.5, 1e-3, (Stage(2.0, 8), Stage(1.0, 8), Stage(0.3, 12), Stage(0.1, 6))),
-    (0.75, 1e-3, (Stage(1.0, 6), Stage(0.3, 6), Stage(0.1, 5))),
-    (1.0, 1e-4, (Stage(1.0, 6), Stage(0.3, 6), Stage(0.1, 6), Stage(0.05, 12))),
+    (0.5, TRIED // 2, (Stage(2.0, 8), Stage(1.0, 8)), 1e-2),
+    (0.5, TRIED, (Stage(0.3, 12), Stage(0.1, 6)), 1e-3),
+    (0.75, TRIED, (Stage(1.0, 6), Stage(0.3, 6), Stage(0.1, 5)), 1e-3),
+    (1.0, TRIED, (Stage(1.0, 6), Stage(0.3, 6), Stage(0.1, 6), Stage(0.05, 12)), 1e-4),
 )
 LOST = 4  # times the cost of the window before: the path is not followed
 SHARP = 0.4  # sigma by the noise that is seen, at least: events beside edges are outliers
@@ -308,9 +310,9 @@ class Windows:
         motions that explain a homography only one explains how it changes, if it is one plane.
         """
         paths, found = [], []
-        for share, most, stages in GROWING:
+        for share, events, stages, most in GROWING:
             half = share * float(self.params.half_window)
-            tracks, prior = self.tracks(centre, half, TRIED), self.prior(centre, half)
+            tracks, prior = self.tracks(centre, half, events), self.prior(centre, half)
             if not paths:
                 real = tracks.x.dtype
                 paths = [plane.path(*tracks.places, self.f, real) for plane in planes]
@@ -344,8 +346,19 @@ class Windows:
                 return found[:1]
             starts = self.starts(centre, Omega, planes[0] + planes[1])
             paths += [self.on_nodes(path, tracks) for path in self.aligned(centre, starts)]
-        tried = side_by_side(lambda path: _tried(tracks, path, prior), paths)
-        return self.remaining(tried, CLOSE)
+        found: list[tuple[Scene, Report]] = []
+        for stage in ROUNDS:
+
+            def follow(path: Path, stage: Stage = stage) -> tuple[Scene, Report]:
+                """Depths are looked for, then adjusted with the path."""
+                path = Path(path.O, path.D, depths(path, tracks))
+                return _adjusted(tracks, *_with_map(tracks, path, prior), prior, (stage,))
+
+            found = side_by_side(follow, paths)
+            limit = CLOSE[0] * min(self.cost(*one) for one in found) + CLOSE[1] if found else 0.0
+            found = [one for one in found if self.cost(*one) < limit]
+            paths = [scene.path for scene, _ in found]
+        return self.ranked(found)
 
     def fit(self, centre: int, warm: Path | None = None, anew: bool = True) -> Fit | None:
         """The best of new starts, and of a path with depths at nodes that is about right."""
@@ -371,14 +384,6 @@ class Windows:
         """That of least cost first, without those that came to a better one."""
         return _apart(sorted(rivals, key=lambda one: self.cost(*one)), lambda one: one[0].path)
 
-    def remaining(
-        self, rivals: list[tuple[Scene, Report]], close: tuple[float, float]
-    ) -> list[tuple[Scene, Report]]:
-        """Rivals of about the least cost, ranked."""
-        ranked = self.ranked(rivals)
-        limit = close[0] * self.cost(*ranked[0]) + close[1] if ranked else 0.0
-        return [one for one in ranked if self.cost(*one) < limit]
-
     def cost(self, scene: Scene, report: Report) -> float:
         """What selects among rivals: the cost per event, with the prior of |Omega|."""
         value = float(report.cost) + self.turning(scene.path)
@@ -401,19 +406,6 @@ def _apart(ranked: list[Any], path: Callable[[Any], Path]) -> list[Any]:
         if not any(_near_to(path(one), path(other)) for other in best):
             best.append(one)
     return best
-
-
-def _tried(tracks: Tracks, path: Path, prior: Prior) -> tuple[Scene, Report]:
-    """A rival followed: depths are looked for, then adjusted with the path, in turns."""
-
-    def after(path: Path, stage: Stage) -> tuple[Scene, Report]:
-        path = Path(path.O, path.D, depths(path, tracks))
-        return _adjusted(tracks, *_with_map(tracks, path, prior), prior, (stage,))
-
-    found = after(path, ROUNDS[0])
-    for stage in ROUNDS[1:]:
-        found = after(found[0].path, stage)
-    return found
 
 
 def _with_map(
