@@ -11,6 +11,7 @@
 - Windows overlap; every few of them new starts compete with the window before.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -310,24 +311,16 @@ class Windows:
         motions that explain a homography only one explains how it changes, if it is one plane.
         """
         paths, found = [], []
-        for share, events, stages, most in GROWING:
+        for row, (share, events, stages, most) in enumerate(GROWING):
             half = share * float(self.params.half_window)
             tracks, prior = self.tracks(centre, half, events), self.prior(centre, half)
             if not paths:
                 real = tracks.x.dtype
                 paths = [plane.path(*tracks.places, self.f, real) for plane in planes]
-
-            def follow(
-                path: Path,
-                tracks: Tracks = tracks,
-                prior: Prior = prior,
-                stages: tuple[Stage, ...] = stages,
-            ) -> tuple[Scene, Report]:
-                scene, report = _with_map(tracks, path, prior, True)
-                return _adjusted(tracks, scene, report, prior, stages, True)
-
-            found = side_by_side(follow, paths)
-            found = self.ranked([one for one in found if float(one[1].cost) < most])
+            follow = functools.partial(_begun, tracks, prior=prior, stages=stages, plane=True)
+            found = [one for one in side_by_side(follow, paths) if float(one[1].cost) < most]
+            # The first is too coarse to choose among motions that are alike.
+            found = self.ranked(found) if row else found
             paths = [scene.path for scene, _ in found]
             if not paths:
                 break
@@ -352,7 +345,7 @@ class Windows:
             def follow(path: Path, stage: Stage = stage) -> tuple[Scene, Report]:
                 """Depths are looked for, then adjusted with the path."""
                 path = Path(path.O, path.D, depths(path, tracks))
-                return _adjusted(tracks, *_with_map(tracks, path, prior), prior, (stage,))
+                return _begun(tracks, path, prior, (stage,))
 
             found = side_by_side(follow, paths)
             limit = CLOSE[0] * min(self.cost(*one) for one in found) + CLOSE[1] if found else 0.0
@@ -408,13 +401,14 @@ def _apart(ranked: list[Any], path: Callable[[Any], Path]) -> list[Any]:
     return best
 
 
-def _with_map(
-    tracks: Tracks, path: Path, prior: Prior, plane: bool = False
+def _begun(
+    tracks: Tracks, path: Path, prior: Prior, stages: tuple[Stage, ...], plane: bool = False
 ) -> tuple[Scene, Report]:
-    """A path, and the map that it makes."""
+    """Through stages, from a path alone: first the map is made."""
     real = tracks.x.dtype
     scene = Scene(path, jnp.zeros(tracks.shape, real), jnp.zeros((), real))
-    return adjust(tracks, scene, prior, ROUNDS[0].sigma, 2, 2, plane=plane)
+    scene, report = adjust(tracks, scene, prior, ROUNDS[0].sigma, 2, 2, plane=plane)
+    return _adjusted(tracks, scene, report, prior, stages, plane)
 
 
 def _adjusted(
