@@ -319,6 +319,22 @@ def test_the_photometric_fit_ends_at_the_truth():
     assert report.noise < 0.05 and report.inliers > 0.9
 
 
+def test_the_covariance_is_that_of_repeated_fits():
+    """Of the same events at times that are off by some ms, anew each time."""
+    windows, fit = fitted()
+    tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    rng = np.random.default_rng(0)
+    rows, told = [], []
+    for _ in range(6):
+        tau = tracks.tau + 5e-3 * rng.normal(size=len(tracks.tau))
+        noisy = dataclasses.replace(tracks, tau=tau)
+        scene, report = photometric.adjust(noisy, scene_of(fit), prior, 0.2, 1, 8, True)
+        rows.append(np.concatenate([part[0] for part in scene.path.twist(0.0)]))
+        told.append(np.diag(report.covariance))
+    ratio = np.var(rows, 0, ddof=1).sum() / np.mean(told, 0).sum()
+    assert 0.5**2 < ratio < 2**2, ratio
+
+
 def test_steps_never_cost_more():
     """Beside true depths, with a sigma rather small for how far they are."""
     windows, _ = fitted()
