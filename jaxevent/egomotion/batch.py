@@ -56,26 +56,28 @@ TRIED = 30000  # of the photometric fit of rivals
 class Stage(NamedTuple):
     """Steps of the photometric fit.
 
-    A flatter map leaves less freedom, so the fit converges sooner.
+    A flatter map and a stiffer path leave less freedom, so the fit converges sooner, and a short
+    window, which does not tell how motion changes, does not lead away from the truth.
     """
 
     sigma: float  # C
     steps: int
     flatter: float | int = 1  # how much: times the prior's weight
+    stiffer: float | int = 1  # likewise
 
 
 ROUNDS = Stage(1.0, 6), Stage(0.5, 6), Stage(0.2, 10), Stage(0.1, 10)  # after a trial of depths
 FINAL = Stage(0.05, 20, 10), Stage(0.02, 20, 3)
 # Rivals remain whose cost is so many times the least, and so much more (C^2): depths that were just
 # looked for leave up to 0.03 C.
-CLOSE = 1.5, 5e-4
+CLOSE = 1.75, 5e-4
 # Of motions before a plane: the part of the window, events, stages, the most that a plane costs
 # (C^2). What is no plane costs 1.8e-2 and more after the first of these, a plane 7e-3 and less; in
 # the end 1.5e-3 and more, 5e-5 and less.
 GROWING = (
     (0.5, TRIED // 2, (Stage(2.0, 8), Stage(1.0, 8)), 1e-2),
-    (0.5, TRIED, (Stage(0.3, 12), Stage(0.1, 6)), 1e-3),
-    (0.75, TRIED, (Stage(1.0, 6), Stage(0.3, 6), Stage(0.1, 5)), 1e-3),
+    (0.5, TRIED, (Stage(0.3, 12, 1, 100), Stage(0.1, 6, 1, 100)), 1e-3),
+    (0.75, TRIED, (Stage(1.0, 6, 1, 10), Stage(0.3, 6, 1, 10), Stage(0.1, 5, 1, 10)), 1e-3),
     (1.0, TRIED, (Stage(1.0, 6), Stage(0.3, 6), Stage(0.1, 6), Stage(0.05, 12)), 1e-4),
 )
 LOST = 4  # times the cost of the window before: the path is not followed
@@ -348,10 +350,10 @@ class Windows:
                 return _begun(tracks, path, prior, (stage,))
 
             found = side_by_side(follow, paths)
-            limit = CLOSE[0] * min(self.cost(*one) for one in found) + CLOSE[1] if found else 0.0
-            found = [one for one in found if self.cost(*one) < limit]
             paths = [scene.path for scene, _ in found]
-        return self.ranked(found)
+        found = self.ranked(found)
+        limit = CLOSE[0] * self.cost(*found[0]) + CLOSE[1] if found else 0.0
+        return [one for one in found if self.cost(*one) < limit]
 
     def fit(self, centre: int, warm: Path | None = None, anew: bool = True) -> Fit | None:
         """The best of new starts, and of a path with depths at nodes that is about right."""
@@ -421,7 +423,8 @@ def _adjusted(
 ) -> tuple[Scene, Report]:
     """Through stages; sigma is not much less than the noise (C) that was seen."""
     for stage in stages:
-        seen = prior._replace(flat=stage.flatter * prior.flat)
+        flat, change = stage.flatter * prior.flat, stage.stiffer * prior.change
+        seen = prior._replace(flat=flat, change=change)
         sigma = max(stage.sigma, SHARP * float(report.noise))
         scene, report = adjust(tracks, scene, seen, sigma, 0, stage.steps, plane=plane)
     return scene, report
