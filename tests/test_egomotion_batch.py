@@ -110,7 +110,12 @@ def test_twists_of_a_path():
     # Within 0.15 s it turns by 0.02 rad/s more, 0.1 s later by 0.16 rad/s.
     path = true_path(np.zeros(1))
     steep = dataclasses.replace(path, O=path.O.at[4].set(1e3))
-    np.testing.assert_allclose(advanced(steep, 0.1, 0.15).O[0], OMEGA, atol=0.01)
+    for tau in (0.1, -0.1):
+        np.testing.assert_allclose(advanced(steep, tau, 0.15).O[0], OMEGA, atol=0.01)
+    # Of a twist that grows, what both windows see is earlier by half of what they are apart.
+    grows = dataclasses.replace(path, O=path.O.at[1].set(1.0))
+    later, earlier = (advanced(grows, tau, 0.15).O[0] - OMEGA for tau in (0.1, -0.1))
+    np.testing.assert_allclose((later, earlier), ([0.05] * 3, [-0.05] * 3), atol=0.03)
 
 
 @functools.cache
@@ -423,6 +428,28 @@ def test_a_path_that_is_lost_is_not_followed(monkeypatch):
     batch.estimate(seen(), batch.Params.of({**GIVEN, "half_window": 0.05, "step": 0.05}))
     centres, anew = zip(*given, strict=True)
     assert anew == (True, False, False, True, False) and centres[2] == centres[3]
+
+
+@pytest.mark.parametrize("cheaper", [True, False])
+def test_a_wrong_beginning_is_fitted_again(monkeypatch, cheaper):
+    """What new starts find is followed back, where that costs less."""
+    right = true_path(np.zeros(4))
+    wrong = Path(right.O, -right.D, right.log_rho)
+
+    def fit(self, centre, warm=None, anew=True):
+        found = warm is not None and float(warm.D[0] @ right.D[0]) > 0
+        if anew:
+            found = warm is not None
+        cost = (5e-4 if cheaper else 2e-3) if found and not anew else 1e-3
+        return batch.Fit(right if found else wrong, np.eye(6), 1.0, cost, np.zeros((1, 1)))
+
+    monkeypatch.setattr(batch.Windows, "fit", fit)
+    params = batch.Params.of({**GIVEN, "half_window": 0.05, "step": 0.05, "fresh": 3})
+    motion = batch.estimate(seen(), params)
+    along = motion.mean[:, :3] @ right.twist(0.0)[0].ravel()
+    middle = (motion.t[0] + motion.t[-1]) / 2
+    assert (along[motion.t > middle + 50_000] > 0).all()
+    assert ((along[motion.t < middle - 50_000] > 0) == cheaper).all()
 
 
 def test_what_cannot_be_estimated_is_refused():

@@ -8,7 +8,8 @@
   block, selects those that go on.
 - Of these the cost of the photometric fit (`photometric`) selects, again and again as the fit
   proceeds. Where events are noisy, sigma is not made much smaller than that noise.
-- Windows overlap; every few of them new starts compete with the window before.
+- Windows overlap; every few of them new starts compete with the window before, and where they win
+  the windows before are fitted again from there.
 """
 
 import functools
@@ -81,7 +82,7 @@ GROWING = (
     (1.0, TRIED, tuple(Stage(sigma, 20, 10) for sigma in (1.0, 0.3, 0.1, 0.05)), 1e-3),
     (1.0, TRIED, (Stage(0.1, 10), Stage(0.05, 20)), 1e-4),
 )
-LOST = 4  # times the cost of the window before: the path is not followed
+LOST = 4  # times the least cost of the windows before: the path is not followed
 SHARP = 0.4  # sigma by the noise that is seen, at least: events beside edges are outliers
 
 
@@ -487,13 +488,41 @@ def estimate(
         anew = warm is None or since % params.fresh == 0
         fit = windows.fit(centre, warm, anew)
         if not anew and (fit is None or fit.cost > LOST * cost):
-            fit = windows.fit(centre, warm)
-        warm = None
-        if fit is not None:
-            since, cost = since + 1, fit.cost
-            warm = advanced(fit.path, step * 1e-6, half * 1e-6)
+            fit, anew = windows.fit(centre, warm), True
         fits.append(fit)
+        if fit is None:
+            warm = None
+            continue
+        if anew and warm is not None and not _near_to(fit.path, warm):
+            _revise(windows, centres[: len(fits)], fits, step, half)
+        since, cost = since + 1, fit.cost if anew else min(cost, fit.cost)
+        warm = advanced(fit.path, step * 1e-6, half * 1e-6)
     return _blended(centres, fits, half, step, first, last)
+
+
+def _revise(
+    windows: Windows, centres: NDArray, fits: list[Fit | None], step: int, half: int
+) -> None:
+    """The last window found a motion that was not followed to it: those before are fitted again.
+
+    Each starts from the one after it, back to where that ends at what was found before; the new
+    ones remain if together they cost less.
+    """
+    row, later, gained = len(fits) - 1, fits[-1], 0.0
+    new: dict[int, Fit] = {}
+    while row > 0 and later is not None:
+        row, old = row - 1, fits[row - 1]
+        later = windows.fit(
+            int(centres[row]), advanced(later.path, -step * 1e-6, half * 1e-6), False
+        )
+        if old is None or later is None or _near_to(later.path, old.path):
+            break
+        new[row] = later
+        gained += old.cost + windows.turning(old.path)
+        gained -= later.cost + windows.turning(later.path)
+    if gained > 0:
+        for row, fit in new.items():
+            fits[row] = fit
 
 
 def _blended(

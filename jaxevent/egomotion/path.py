@@ -123,11 +123,12 @@ def rays_of(x: NDArray, y: NDArray, f: float) -> NDArray[np.float64]:
 
 
 def advanced(path: Path, tau: float, half: float) -> Path:
-    """A path for a window that is tau s later, its depths those of the same cells.
+    """A path for a window that is tau s later, or earlier, its depths those of the same cells.
 
     Its twist is the mean of what both windows see, and constant: beyond its window the polynomials
     of a path grow without bound.
     """
-    T, Omega = path.twist(np.linspace(min(tau - half, half), half, 2 * SEGMENTS))
+    first, last = max(tau - half, -half), min(tau + half, half)
+    T, Omega = path.twist(np.linspace(min(first, half), max(last, -half), 2 * SEGMENTS))
     heading = T.mean(0) / np.linalg.norm(T.mean(0))
     return Path.constant(heading, Omega.mean(0), path.log_rho, path.O.dtype)
