@@ -52,7 +52,7 @@ def window(scene: str, motion: str, seed: int, params: batch.Params) -> dict[str
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True, help="folder for the tables")
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(186, 196)))
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(196, 206)))
     parser.add_argument("--scenes", nargs="+", default=["wall", "shapes", "texture"])
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)

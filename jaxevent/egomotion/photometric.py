@@ -16,6 +16,11 @@ system a step, solved by conjugate gradients, without the matrix: the map's diag
 lumped depths exactly, precondition it. Steps extrapolate (Nesterov): reweighting alone is slow. A
 step that costs more is taken back and damped (Levenberg & Marquardt): beside sharp edges, linear
 within 0.3 px, the cost grew to six times what it was in 100 steps without.
+Where an outline passes before another, their crossing moves as neither and the levels beside them
+change; without the events there, plain shapes' errors are a third to a half. Single misfits do not
+stand out there, but all of them are larger (three simulated scenes: the area under the ROC curve is
+0.67 to 0.89 for the mean within `PLACE`, 0.59 to 0.69 for single ones): where misfits are large on
+average, all events count less.
 Nothing is gained by squeezing events together, which biases contrast, and no event is compared that
 tells only the gradient along the flow. An ON threshold C (1 + skew) and an OFF one of C (1 - skew)
 are allowed for.
@@ -60,6 +65,7 @@ BEND = 0.1  # a larger difference of log depth between nodes is an edge
 CELL = 24  # px, whose errors are alike
 LEVELS = 40  # log depths that are tried
 SPOT = 12  # px, of which each has its own
+PLACE = 5  # px, where events' misfits tell of the same
 SIDE = 4  # nodes about an event among whose depths its own is
 LOOKS = 16  # depths on its ray that are looked at
 FOLD = 0.3  # the least slope, along the ray of an event, of log depth less that of the scene
@@ -213,6 +219,14 @@ def _scattered(values: Array, near: _Near, share: Array, shape: tuple) -> Array:
     return found
 
 
+def _around(values: Array, near: _Near, shape: tuple) -> Array:
+    """Of values of events (E,), the sum over those at the same place."""
+    middle = near.first + shape[1] + 1
+    image = jnp.zeros(shape[0] * shape[1], values.dtype).at[middle].add(values).reshape(shape)
+    sums = lax.reduce_window(image, 0.0, lax.add, (PLACE, PLACE), (1, 1), "SAME")
+    return sums.ravel()[middle]
+
+
 def _laplacian(values: Array) -> Array:
     """Minus the sum of differences to the neighbours, of a map."""
     down, right = values[1:] - values[:-1], values[:, 1:] - values[:, :-1]
@@ -338,7 +352,7 @@ def adjust(
         now = jnp.concatenate([scene.path.O, scene.path.D]).ravel()
         return jnp.concatenate([now / unit, scene.skew[None], jnp.zeros(3, real)])
 
-    def seen(scene: Scene, weight: Array) -> _Seen:
+    def seen(scene: Scene, weight: Array, usual: Array) -> _Seen:
         path = normalised(scene.path)
         scene = Scene(path, *scene[1:])
         X, Y = placed(path, tracks)
@@ -347,16 +361,23 @@ def adjust(
         e = _mean(_gathered(scene.map, at, tracks.shape), at.share)
         e = e - tracks.level - scene.skew * tracks.number
         limit = (3 * sigma) ** 2
+        # Events at a place of mean cost q cost 4 q / (1 + q / usual), of slope 1 at the usual q. A
+        # plane hides nothing of itself.
+        events = jnp.maximum(_around(on, at, tracks.shape), 1)
         for _ in range(2):
             left = _less_mean(e, weight, tracks)
-            weight = on / (1 + left**2 / limit) ** 2
-        cost = on * left**2 / (1 + left**2 / limit)
+            cost = on * left**2 / (1 + left**2 / limit)
+            q = _around(cost, at, tracks.shape) / events
+            counts = on * jnp.where(plane, 1, 4 / (1 + q / usual) ** 2) / events
+            counts = _around(counts, at, tracks.shape)
+            weight = on / (1 + left**2 / limit) ** 2 * counts
         apart = path.log_rho[a] - path.log_rho[b]
         energy = prior.bond * BEND**2 * jnp.where(plane, 0, jnp.log1p((apart / BEND) ** 2)).sum()
         energy += (
             prior.flat * (scene.map * _laplacian(scene.map)).sum() + 1e-5 * (scene.map**2).sum()
         )
-        energy += (cost / (prior.alike * sigma**2)).sum()
+        of_places = on * jnp.where(plane, q, 4 * q / (1 + q / usual))
+        energy += of_places.sum() / (prior.alike * sigma**2)
         unit = units(path)
         return _Seen(
             scene,
@@ -547,7 +568,7 @@ def adjust(
         # Only inverse depths themselves, extrapolated, are a plane's again.
         level = jnp.maximum(nearer + ahead * (nearer - near), LEAST * jnp.median(nearer))
         level = jnp.where(plane, jnp.log(level), tried.path.log_rho)
-        tried = seen(Scene(Path(tried.path.O, tried.path.D, level), *tried[1:]), kept.weight)
+        tried = seen(Scene(Path(tried.path.O, tried.path.D, level), *tried[1:]), kept.weight, usual)
         better = (tried.energy <= kept.energy) | (n <= settle)
         gain = jnp.where(n > settle, kept.energy - tried.energy, jnp.inf)
         last = jax.tree.map(lambda p, q: jnp.where(better, p, q), scene, kept.scene)
@@ -564,6 +585,7 @@ def adjust(
         return (state[0] <= steps) & (state[5] < STUCK)
 
     zero, none = jnp.zeros((), real), jnp.zeros_like(tracks.x)
+    usual = jnp.maximum(seen(scene, tracks.on, zero + jnp.inf).cost, 1e-3 * (3 * sigma) ** 2)
     kept = _Seen(scene, none, none, none, none, tracks.on, zero + jnp.inf, zero)
     state = (jnp.zeros((), int), scene, scene, kept, zero, zero, jnp.zeros((6, 6), real))
     _, _, _, kept, _, _, covariance = lax.while_loop(unfinished, go, state)
@@ -571,7 +593,7 @@ def adjust(
     number = jnp.maximum(kept.on.sum(), 1)
     middle = jnp.sort(jnp.where(kept.on > 0, left, jnp.inf))[(number / 2).astype(jnp.int32)]
     noise = jnp.where(jnp.isfinite(middle), 1.48 * middle, 0)
-    inliers = kept.weight.sum() / number
+    inliers = (kept.on / (1 + left**2 / (3 * sigma) ** 2) ** 2).sum() / number
     return kept.scene, Report(noise, kept.cost, inliers, covariance)
 
 
