@@ -113,6 +113,8 @@ class Params(Parameters):
 class Fit(NamedTuple):
     """A fitted window: path with depths at nodes, covariance (6, 6) of heading and Omega.
 
+    The covariance counts errors that differ from one part of the image to another (24 px). Beside
+    plain shapes, where they do not, errors are far larger than it tells.
     `agreement` is the share of events that the fit explains, `cost` the robust cost per event.
     """
 

@@ -537,8 +537,8 @@ def adjust(
             # H^-1 (sum_c g_c g_c' + the priors') H^-1, with c cells, within which errors are
             # alike. H counts the weights w of misfits e, the curvature of their robust cost is
             # less: the mean of d(w e)/de = w (1 - 3 u) / (1 + u), u = (e / 3 sigma)^2 (Huber).
-            # Errors are then 1 to 4 times sigma before walls, but beside edges of depth, where
-            # they are alike everywhere, 1 to 8 times (textures) and 5 to 40 (plain shapes).
+            # Errors are then 1 to 3 times sigma before walls and textures, but 7 to 35 times before
+            # plain shapes, where they are alike everywhere.
             u = left**2 / (3 * sigma) ** 2
             curved = (weight * (1 - 3 * u) / (1 + u)).sum() / jnp.maximum(weight.sum(), 1)
             less = 1 / jnp.maximum(curved, 0.1) ** 2
