@@ -1,6 +1,7 @@
 """General motion of simulated scenes: the batch estimator's errors, scene by scene.
 
     python experiments/egomotion_general.py --out general [--seeds 100 101 ...] [--scenes wall ...]
+    python experiments/egomotion_general.py --out whole --seconds 1.2 --seeds 210 --scenes texture
 
 Scenes are those of `simulate.motion_scene`, 240x180, f = 200 px, 0.5 s of an ideal camera, constant
 and varying motion. A window of 300 ms at the middle is fitted from nothing. Errors are those of
@@ -8,6 +9,9 @@ heading (degrees) and of Omega (vector, %) at its centre; "flipped" counts headi
 90 degrees, "both" the share with heading within 5 degrees and Omega within 8 %, "per sigma"
 medians of errors by what the covariance tells. What general.csv holds already is not computed
 again.
+
+With `--seconds` recordings of varying motion, so long each, are estimated as a whole instead, from
+window to window; errors are those of all estimates.
 """
 
 import argparse
@@ -49,14 +53,45 @@ def window(scene: str, motion: str, seed: int, params: batch.Params) -> dict[str
     }
 
 
+def whole(scene: str, seed: int, params: batch.Params, seconds: float) -> dict[str, Any]:
+    recording, source = motion_scene(scene, "varying", seed, duration=seconds)
+    clock = time.perf_counter()
+    found = batch.estimate(recording, params)
+    spent = time.perf_counter() - clock
+    kept = ~found.lost
+    T, Omega = source.twist(found.t[kept])
+    heading = truth.axis_error(found.mean[kept, :3], T)
+    turn = 100 * truth.relative_error(found.mean[kept, 3:], Omega)
+    return {
+        "scene": f"{scene} varying",
+        "seed": seed,
+        "estimates": len(heading),
+        "lost": int(found.lost.sum()),
+        "heading deg, median": float(np.median(heading)),
+        "max": float(heading.max()),
+        "Omega %, median": float(np.median(turn)),
+        "max ": float(turn.max()),
+        "both": float(((heading <= 5) & (turn <= 8)).mean()),
+        "s": spent,
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True, help="folder for the tables")
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(196, 206)))
     parser.add_argument("--scenes", nargs="+", default=["wall", "shapes", "texture"])
+    parser.add_argument("--seconds", type=float, help="of whole recordings, instead of windows")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     params, rows = batch.Params.of({}), []
+    if arguments.seconds:
+        for seed in arguments.seeds:
+            for scene in arguments.scenes:
+                rows.append(whole(scene, seed, params, arguments.seconds))
+                print(rows[-1], flush=True)
+                pd.DataFrame(rows).to_csv(arguments.out / "recordings.csv", index=False)
+        return
     stored = arguments.out / "general.csv"
     if stored.exists():
         rows = pd.read_csv(stored).to_dict("records")
