@@ -28,15 +28,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import expm
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 import jaxevent
 from jaxevent import egomotion
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import batch, contrast, voting
+from jaxevent.egomotion.geometry import rotation_exp, twist_exp
 from jaxevent.errors import InputError, require
 
 Rows = list[dict[str, Any]]
@@ -161,37 +162,35 @@ def board(recording: jaxevent.Recording, T: np.ndarray, omega: np.ndarray) -> Ro
         cv2 = require("cv2", "vision")
     except InputError:
         return []
-    assert recording.frames is not None
-    columns, rows_of = 9, 6
+    assert recording.frames is not None and recording.camera is not None
+    middle = recording.camera.cx, recording.camera.cy
+    size = across, down = 9, 6
     seen = []
     for image in np.asarray(recording.frames.images):
-        large = cv2.resize(np.asarray(image), None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
-        found, corners = cv2.findChessboardCornersSB(large, (columns, rows_of))
+        large = cv2.resize(image, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+        found, corners = cv2.findChessboardCornersSB(large, size)
         if found:
-            seen.append((corners.reshape(-1, 2) + 0.5) / 4 - 0.5 - (94.5, 89.5))
+            seen.append((corners.reshape(-1, 2) + 0.5) / 4 - 0.5 - middle)
     seen = np.array(seen)
-    grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows_of)), -1).reshape(-1, 2)
-    grid = np.pad(grid - ((columns - 1) / 2, (rows_of - 1) / 2), ((0, 0), (0, 1)))
+    grid = np.stack(np.meshgrid(np.arange(across), np.arange(down)), -1).reshape(-1, 2)
+    grid = np.pad(grid - ((across - 1) / 2, (down - 1) / 2), ((0, 0), (0, 1)))
     times = np.arange(len(seen)) - (len(seen) - 1) / 2
 
-    def projected(q: np.ndarray, f: float) -> np.ndarray:
-        """Of the board's pose and the camera's twist, in squares and frames."""
-        x = Rotation.from_rotvec(q[:3]).apply(grid) + q[3:6]
-        twist = np.zeros((4, 4))
-        twist[:3, :3], twist[:3, 3] = np.cross(np.eye(3), q[9:]), q[6:9]
-        moved = expm(-times[:, None, None] * twist)
-        x = np.einsum("kij,nj->kni", moved[:, :3, :3], x) + moved[:, None, :3, 3]
-        return f * x[..., :2] / x[..., 2:]
+    @jax.jit
+    def left(q: jax.Array, f: float) -> jax.Array:
+        """px, of the board's pose and the camera's twist, in squares and frames."""
+        x = grid @ rotation_exp(q[:3]).T + q[3:6]
+        moved = twist_exp(-times[:, None] * q[6:])
+        x = jnp.einsum("kij,nj->kni", moved[:, :3, :3], x) + moved[:, None, :3, 3]
+        return (f * x[..., :2] / x[..., 2:] - seen).ravel()
 
     rows: Rows = []
     for f in (170.0, 211.0, 250.0):
         first = np.zeros(12)
         first[3:6] = *seen.mean((0, 1)) / f * 30, 30
-
-        def left(q: np.ndarray, f: float = f) -> np.ndarray:
-            return (projected(q, f) - seen).ravel()
-
-        fit = least_squares(left, first)
+        with jax.enable_x64(True):
+            slopes: Any = jax.jit(jax.jacfwd(left))
+            fit = least_squares(left, first, jac=slopes, args=(f,))
         rows.append(
             {
                 "recording": "evbench_seq3",

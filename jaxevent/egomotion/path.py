@@ -53,14 +53,23 @@ class Path(eqx.Module):
 
     def twist(self, tau: float | int | NDArray) -> tuple[NDArray, NDArray]:
         """Unit heading R' C' and Omega to second order, (times, 3) each, at times tau (s)."""
+        T, Omega = self._motion(tau)
+        return T / np.linalg.norm(T, axis=1, keepdims=True), Omega
+
+    def _motion(self, tau: float | int | NDArray) -> tuple[NDArray, NDArray]:
+        """As `twist`, but the velocity in units of |C1|."""
         from scipy.spatial.transform import Rotation
 
         O, C = (np.asarray(part, np.float64) for part in self.coefficients())  # noqa: E741
         tau = np.atleast_1d(np.asarray(tau, np.float64))
-        slopes = np.stack([tau**k / math.factorial(k) for k in range(len(O))], 1)
-        powers = np.stack([tau**k / math.factorial(k) for k in range(1, len(O) + 1)], 1)
-        T = Rotation.from_rotvec(powers @ O).apply(slopes @ C, inverse=True)
-        return T / np.linalg.norm(T, axis=1, keepdims=True), slopes @ O
+        slopes = _powers(tau, 0, len(O))
+        turns = Rotation.from_rotvec(_powers(tau, 1, len(O)) @ O)
+        return turns.apply(slopes @ C, inverse=True), slopes @ O
+
+
+def _powers(tau: NDArray, first: int, number: int) -> NDArray[np.float64]:
+    """tau^k / k! for so many k, (times, number)."""
+    return np.stack([tau**k / math.factorial(k) for k in range(first, first + number)], 1)
 
 
 def along(coefficients: Array, tau: Array) -> list[Array]:
@@ -131,19 +140,14 @@ def advanced(path: Path, tau: float, half: float) -> Path:
     """
     from scipy.spatial.transform import Rotation
 
-    O, C = (np.asarray(part, np.float64) for part in path.coefficients())  # noqa: E741
-    n = len(O)
-
-    def powers(t: NDArray, first: int) -> NDArray:
-        return np.stack([t**k / math.factorial(k) for k in range(first, first + n)], 1)
-
+    n = len(path.O)
     t = np.linspace(-half, half, 8 * SEGMENTS + 1)
-    seen = np.clip(t + tau, -half, half)
-    turns = Rotation.from_rotvec(powers(seen, 1) @ O)
-    velocity, Omega = turns.apply(powers(seen, 0) @ C, inverse=True), powers(seen, 0) @ O
-    O = np.linalg.lstsq(powers(t, 0), Omega, rcond=None)[0]  # noqa: E741
-    turned = Rotation.from_rotvec(powers(t, 1) @ O).apply(velocity)
-    C = np.linalg.lstsq(powers(t, 0), turned, rcond=None)[0]
+    velocity, Omega = path._motion(np.clip(t + tau, -half, half))
+    slopes = _powers(t, 0, n)
+    O = np.linalg.lstsq(slopes, Omega, rcond=None)[0]  # noqa: E741
+    turned = Rotation.from_rotvec(_powers(t, 1, n) @ O).apply(velocity)
+    C = np.linalg.lstsq(slopes, turned, rcond=None)[0]
+    # As `coefficients`, the other way.
     D, constant = [C[0]], C[0]
     for row in C[1:]:
         constant = np.cross(O[0], constant)

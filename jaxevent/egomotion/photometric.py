@@ -326,6 +326,7 @@ def adjust(
     plane, tell = jnp.asarray(plane), jnp.asarray(tell)
     a, b = pairs_of(*tracks.nodes)
     sigma = jnp.asarray(sigma, real)
+    limit = (3 * sigma) ** 2
     powers = jnp.stack([math.factorial(m) / (f * h**m) for m in range(1, k + 1)])
     times = ((jnp.arange(SEGMENTS) + 0.5) / SEGMENTS * 2 - 1) * h
     slopes = jnp.stack([times**m / math.factorial(m) for m in range(k)], 1).astype(real)
@@ -360,7 +361,6 @@ def adjust(
         on = tracks.on * at.inside
         e = _mean(_gathered(scene.map, at, tracks.shape), at.share)
         e = e - tracks.level - scene.skew * tracks.number
-        limit = (3 * sigma) ** 2
         # Events at a place of mean cost q cost 4 q / (1 + q / usual), of slope 1 at the usual q. A
         # plane hides nothing of itself.
         events = jnp.maximum(_around(on, at, tracks.shape), 1)
@@ -539,7 +539,7 @@ def adjust(
             # less: the mean of d(w e)/de = w (1 - 3 u) / (1 + u), u = (e / 3 sigma)^2 (Huber).
             # Errors are then 1 to 3 times sigma before walls and textures, but 7 to 35 times before
             # plain shapes, where they are alike everywhere.
-            u = left**2 / (3 * sigma) ** 2
+            u = left**2 / limit
             curved = (weight * (1 - 3 * u) / (1 + u)).sum() / jnp.maximum(weight.sum(), 1)
             less = 1 / jnp.maximum(curved, 0.1) ** 2
             rows_of, columns = (-(-n // CELL) for n in tracks.shape)
@@ -585,7 +585,7 @@ def adjust(
         return (state[0] <= steps) & (state[5] < STUCK)
 
     zero, none = jnp.zeros((), real), jnp.zeros_like(tracks.x)
-    usual = jnp.maximum(seen(scene, tracks.on, zero + jnp.inf).cost, 1e-3 * (3 * sigma) ** 2)
+    usual = jnp.maximum(seen(scene, tracks.on, zero + jnp.inf).cost, 1e-3 * limit)
     kept = _Seen(scene, none, none, none, none, tracks.on, zero + jnp.inf, zero)
     state = (jnp.zeros((), int), scene, scene, kept, zero, zero, jnp.zeros((6, 6), real))
     _, _, _, kept, _, _, covariance = lax.while_loop(unfinished, go, state)
@@ -593,7 +593,7 @@ def adjust(
     number = jnp.maximum(kept.on.sum(), 1)
     middle = jnp.sort(jnp.where(kept.on > 0, left, jnp.inf))[(number / 2).astype(jnp.int32)]
     noise = jnp.where(jnp.isfinite(middle), 1.48 * middle, 0)
-    inliers = (kept.on / (1 + left**2 / (3 * sigma) ** 2) ** 2).sum() / number
+    inliers = (kept.on / (1 + left**2 / limit) ** 2).sum() / number
     return kept.scene, Report(noise, kept.cost, inliers, covariance)
 
 
