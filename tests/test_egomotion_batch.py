@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import batch, geometry, photometric, starts
 from jaxevent.egomotion.path import ROWS, Path, advanced, normalised, warp
+from jaxevent.egomotion.photometric import Report, Scene
 from jaxevent.egomotion.truth import Twists
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
@@ -429,19 +430,76 @@ def test_a_recording_from_end_to_end():
     assert len(batch.estimate(empty, PARAMS)) == 0
 
 
+def a_fit(path, cost):
+    return batch.Fit(path, np.eye(6), 1.0, cost, np.zeros((1, 1)))
+
+
+def windows_that(monkeypatch, fit, follow):
+    """Windows whose fits are given, by centre and path; what was asked for, in order."""
+    asked = []
+
+    def anew(self, centre, warm=None):
+        asked.append(("anew", centre))
+        return a_fit(*fit(centre, warm))
+
+    def followed(self, centre, warm):
+        none = np.zeros(())
+        return Scene(warm, np.full((), centre), none), Report(none, none, none, np.eye(6))
+
+    def ended(self, centre, rivals, stages=()):
+        ((scene, _),) = rivals
+        assert scene.map == centre
+        asked.append(("followed", centre))
+        return a_fit(*follow(centre, scene.path))
+
+    for name, function in (("fit", anew), ("followed", followed), ("ended", ended)):
+        monkeypatch.setattr(batch.Windows, name, function)
+    return asked
+
+
 def test_a_path_that_is_lost_is_not_followed(monkeypatch):
-    """Where a window costs much more than the one before, new starts compete."""
-    path, given = true_path(np.zeros(4)), []
-    costs = iter([1e-3, 1e-3, 1e-2, 1e-3, 1e-3])
+    path = true_path(np.zeros(4))
+    # The third window costs much more, what the sixth costs cannot be told.
+    costs = {2: 2 * batch.LOST * 1e-3, 5: np.nan}
+    asked = windows_that(
+        monkeypatch,
+        lambda centre, warm: (path, 1e-3),
+        lambda centre, warm: (path, costs.get((centre - first) // 20_000, 1e-3)),
+    )
+    recording = seen()
+    first = int(recording.events.t[0]) + 20_000
+    short = {"half_window": 0.02, "step": 0.02, "fresh": 100}
+    batch.estimate(recording, batch.Params.of({**GIVEN, **short}))
+    assert [(kind, (centre - first) // 20_000) for kind, centre in asked][:10] == [
+        ("anew", 0),
+        ("followed", 1),
+        ("followed", 2),
+        ("anew", 2),
+        ("followed", 3),
+        ("followed", 4),
+        ("followed", 5),
+        ("anew", 5),
+        ("followed", 6),
+        ("followed", 7),
+    ]
 
-    def fit(self, centre, warm=None, anew=True):
-        given.append((centre, anew))
-        return batch.Fit(path, np.eye(6), 1.0, next(costs), np.zeros((1, 1)))
 
-    monkeypatch.setattr(batch.Windows, "fit", fit)
-    batch.estimate(seen(), batch.Params.of({**GIVEN, "half_window": 0.05, "step": 0.05}))
-    centres, anew = zip(*given, strict=True)
-    assert anew == (True, False, False, True, False) and centres[2] == centres[3]
+def test_new_starts_that_agree_are_made_less_often(monkeypatch):
+    path = true_path(np.zeros(4))
+    other = Path(path.O, -path.D, path.log_rho)
+    found = iter([path, path, path, other, other, other])
+    asked = windows_that(
+        monkeypatch,
+        lambda centre, warm: (next(found), 1e-3),
+        lambda centre, warm: (warm, 1e-3),
+    )
+    recording = seen()
+    first = int(recording.events.t[0]) + 10_000
+    short = {"half_window": 0.01, "step": 0.01, "fewest": 1, "fresh": 2}
+    batch.estimate(recording, batch.Params.of({**GIVEN, **short}))
+    anew = [(centre - first) // 10_000 for kind, centre in asked if kind == "anew"]
+    # 2 windows after the first, 4, 8, where they do not agree, again 2.
+    assert anew == [0, 2, 6, 14, 16, 20]
 
 
 @pytest.mark.parametrize("cheaper", [True, False])
@@ -450,14 +508,15 @@ def test_a_wrong_beginning_is_fitted_again(monkeypatch, cheaper):
     right = true_path(np.zeros(4))
     wrong = Path(right.O, -right.D, right.log_rho)
 
-    def fit(self, centre, warm=None, anew=True):
-        found = warm is not None and float(warm.D[0] @ right.D[0]) > 0
-        if anew:
-            found = warm is not None
-        cost = (5e-4 if cheaper else 2e-3) if found and not anew else 1e-3
-        return batch.Fit(right if found else wrong, np.eye(6), 1.0, cost, np.zeros((1, 1)))
+    def follow(centre, warm):
+        found = float(warm.D[0] @ right.D[0]) > 0
+        return warm, (5e-4 if cheaper else 2e-3) if found else 1e-3
 
-    monkeypatch.setattr(batch.Windows, "fit", fit)
+    windows_that(
+        monkeypatch,
+        lambda centre, warm: (wrong if warm is None else right, 1e-3),
+        follow,
+    )
     params = batch.Params.of({**GIVEN, "half_window": 0.05, "step": 0.05, "fresh": 3})
     motion = batch.estimate(seen(), params)
     along = motion.mean[:, :3] @ right.twist(0.0)[0].ravel()

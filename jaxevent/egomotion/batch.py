@@ -8,12 +8,13 @@
   block, selects those that go on.
 - Of these the cost of the photometric fit (`photometric`) selects, again and again as the fit
   proceeds. Where events are noisy, sigma is not made much smaller than that noise.
-- Windows overlap; every few of them new starts compete with the window before, and where they win
-  the windows before are fitted again from there.
+- Windows overlap, and the path of the one before is followed into the next. After some of them new
+  starts compete with it, and where they win the windows before are fitted again from there.
 """
 
 import functools
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -69,6 +70,7 @@ class Stage(NamedTuple):
 
 ROUNDS = Stage(1.0, 6), Stage(0.5, 6), Stage(0.2, 10), Stage(0.1, 10)  # after a trial of depths
 FINAL = Stage(0.05, 20, 10), Stage(0.02, 20, 3)
+FOLLOWED = 2  # a path that is about right needs not so many of the first rounds
 # Rivals remain whose cost is so many times the least, and so much more (C^2): depths that were just
 # looked for leave up to 0.03 C.
 CLOSE = 1.75, 5e-4
@@ -93,7 +95,7 @@ class Params(Parameters):
     step = Positive(0.1, "s", "from one window to the next")
     events = Count(60000, "", "most events of a window, of pixels taken at random")
     fewest = Count(2000, "", "events that a window needs")
-    fresh = Count(5, "", "every so many windows new starts compete with the window before")
+    fresh = Count(5, "", "windows until new starts compete; twice as many each time they agree")
     starts = Count(3, "", "headings that are followed, of each of two short windows")
     cell = Count(24, "px", "of one depth")
     iterations = Count(8, "", "steps of the alignment of segments on the whole window")
@@ -123,6 +125,9 @@ class Fit(NamedTuple):
     agreement: float
     cost: float
     map: NDArray[np.floating]
+
+
+Rival = tuple[Scene, Report]
 
 
 class Windows:
@@ -310,7 +315,7 @@ class Windows:
         log_rho = scipy.ndimage.map_coordinates(cells, [v, u], order=1, mode="nearest")
         return Path(path.O, path.D, jnp.asarray(log_rho, path.O.dtype))
 
-    def before_a_plane(self, centre: int, planes: list[Plane]) -> list[tuple[Scene, Report]]:
+    def before_a_plane(self, centre: int, planes: list[Plane]) -> list[Rival]:
         """Of motions before a plane those of least cost first, if a plane explains the events.
 
         Fitted to a growing part of the window, with the depths of a plane throughout: of the two
@@ -332,44 +337,60 @@ class Windows:
                 break
         return found
 
-    def rivals(self, centre: int, warm: Path | None, anew: bool) -> list[tuple[Scene, Report]]:
+    def rivals(self, centre: int, warm: Path | None = None) -> list[Rival]:
         """What to follow to the end, the best first: of new starts, and of a path about right."""
         half, paths = float(self.params.half_window), [] if warm is None else [warm]
-        tracks, prior = self.tracks(centre, half, TRIED), self.prior(centre, half)
-        if anew:
-            Omega = self.rotation(centre)
-            cuts = [self.cut(centre, share * half, MIDDLE) for share in (1 / 3, 2 / 3)]
-            planes = side_by_side(lambda cut: before_a_plane(homography(cut, Omega)), cuts)
-            found = self.before_a_plane(centre, planes[0] + planes[1])
-            if found:
-                return found[:1]
-            starts = self.starts(centre, Omega, planes[0] + planes[1])
-            paths += [self.on_nodes(path, tracks) for path in self.aligned(centre, starts)]
-        found: list[tuple[Scene, Report]] = []
-        for stage in ROUNDS:
+        Omega = self.rotation(centre)
+        cuts = [self.cut(centre, share * half, MIDDLE) for share in (1 / 3, 2 / 3)]
+        planes = side_by_side(lambda cut: before_a_plane(homography(cut, Omega)), cuts)
+        found = self.before_a_plane(centre, planes[0] + planes[1])
+        if found:
+            return found[:1]
+        tracks = self.tracks(centre, half, TRIED)
+        starts = self.starts(centre, Omega, planes[0] + planes[1])
+        paths += [self.on_nodes(path, tracks) for path in self.aligned(centre, starts)]
+        found = self.ranked(self.rounds(centre, tracks, paths, ROUNDS))
+        limit = CLOSE[0] * self.cost(*found[0]) + CLOSE[1] if found else 0.0
+        return [one for one in found if self.cost(*one) < limit]
 
-            def follow(path: Path, stage: Stage = stage) -> tuple[Scene, Report]:
-                """Depths are looked for, then adjusted with the path."""
+    def rounds(
+        self, centre: int, tracks: Tracks, paths: list[Path], stages: tuple[Stage, ...]
+    ) -> list[Rival]:
+        """Paths through stages of the photometric fit, depths looked for before each of them."""
+        prior = self.prior(centre, float(self.params.half_window))
+        found: list[Rival] = []
+        for stage in stages:
+
+            def follow(path: Path, stage: Stage = stage) -> Rival:
                 path = Path(path.O, path.D, depths(path, tracks))
                 return _begun(tracks, path, prior, (stage,))
 
             found = side_by_side(follow, paths)
             paths = [scene.path for scene, _ in found]
-        found = self.ranked(found)
-        limit = CLOSE[0] * self.cost(*found[0]) + CLOSE[1] if found else 0.0
-        return [one for one in found if self.cost(*one) < limit]
+        return found
 
-    def fit(self, centre: int, warm: Path | None = None, anew: bool = True) -> Fit | None:
-        """The best of new starts, and of a path with depths at nodes that is about right."""
+    def followed(self, centre: int, warm: Path) -> Rival:
+        """A path with depths at nodes that is about right, but for the last stage."""
         half = float(self.params.half_window)
-        prior = self.prior(centre, half)
-        left = self.rivals(centre, warm, anew)
-        tracks = self.tracks(centre, half, self.params.events)
-        left = side_by_side(lambda one: _adjusted(tracks, one[0], one[1], prior, FINAL), left)
+        tracks, prior = self.tracks(centre, half, TRIED), self.prior(centre, half)
+        ((scene, report),) = self.rounds(centre, tracks, [warm], ROUNDS[FOLLOWED:])
+        return _adjusted(tracks, scene, report, prior, FINAL[:-1])
+
+    def fit(self, centre: int, warm: Path | None = None) -> Fit | None:
+        """The best of new starts, and of a path with depths at nodes that is about right."""
+        return self.ended(centre, self.rivals(centre, warm), FINAL)
+
+    def ended(
+        self, centre: int, rivals: list[Rival], stages: tuple[Stage, ...] = FINAL[-1:]
+    ) -> Fit | None:
+        """The best rival after the last stages."""
+        half = float(self.params.half_window)
+        tracks, prior = self.tracks(centre, half, self.params.events), self.prior(centre, half)
+        left = side_by_side(lambda one: _adjusted(tracks, one[0], one[1], prior, stages), rivals)
         if not left:
             return None
         scene, report = min(left, key=lambda one: self.cost(*one))
-        sigma = max(FINAL[-1].sigma, SHARP * float(report.noise))
+        sigma = max(stages[-1].sigma, SHARP * float(report.noise))
         scene, report = adjust(tracks, scene, prior, sigma, 0, 1, True)
         return Fit(
             scene.path,
@@ -379,7 +400,7 @@ class Windows:
             np.asarray(scene.map),
         )
 
-    def ranked(self, rivals: list[tuple[Scene, Report]]) -> list[tuple[Scene, Report]]:
+    def ranked(self, rivals: list[Rival]) -> list[Rival]:
         """That of least cost first, without those that came to a better one."""
         return _apart(sorted(rivals, key=lambda one: self.cost(*one)), lambda one: one[0].path)
 
@@ -409,7 +430,7 @@ def _apart(ranked: list[Any], path: Callable[[Any], Path]) -> list[Any]:
 
 def _begun(
     tracks: Tracks, path: Path, prior: Prior, stages: tuple[Stage, ...], plane: bool = False
-) -> tuple[Scene, Report]:
+) -> Rival:
     """Through stages, from a path alone: first the map is made."""
     real = tracks.x.dtype
     scene = Scene(path, jnp.zeros(tracks.shape, real), jnp.zeros((), real))
@@ -424,7 +445,7 @@ def _adjusted(
     prior: Prior,
     stages: tuple[Stage, ...],
     plane: bool = False,
-) -> tuple[Scene, Report]:
+) -> Rival:
     """Through stages; sigma is not much less than the noise (C) that was seen."""
     for stage in stages:
         flat, change = stage.flatter * prior.flat, stage.stiffer * prior.change
@@ -479,31 +500,62 @@ def estimate(
     centres = np.arange(first + half, last - half + 1, step)
     if not len(centres):
         centres = np.array([(first + last) // 2])
-    fits: list[Fit | None] = []
-    warm, since, cost = None, 0, 0.0
-    for centre in tqdm(centres.tolist(), unit="window", disable=not progress, leave=False, delay=2):
-        a, b = windows.rows(centre, half * 1e-6)
-        if b - a < params.fewest:
-            warm = None
-            fits.append(None)
-            continue
-        anew = warm is None or since % params.fresh == 0
-        fit = windows.fit(centre, warm, anew)
-        if not anew and (fit is None or fit.cost > LOST * cost):
-            fit, anew = windows.fit(centre, warm), True
-        fits.append(fit)
-        if fit is None:
-            warm = None
-            continue
-        if anew and warm is not None and not _near_to(fit.path, warm):
-            _revise(windows, centres[: len(fits)], fits, step, half)
-        since, cost = since + 1, fit.cost if anew else min(cost, fit.cost)
-        warm = advanced(fit.path, step * 1e-6, half * 1e-6)
+    fits = _followed(windows, centres.tolist(), step, half, progress)
     return _blended(centres, fits, half, step, first, last)
 
 
+def _followed(
+    windows: Windows, centres: list[int], step: int, half: int, progress: bool
+) -> list[Fit | None]:
+    """The windows one after the other, each from where the one before goes on.
+
+    One is followed while the one before is at its last stage: steps of one keep about one core
+    busy, and that stage changes little.
+    """
+    fits: list[Fit | None] = []
+    enough = [np.diff(windows.rows(c, half * 1e-6))[0] >= windows.params.fewest for c in centres]
+    warm: Path | None = None
+    ahead: Future[Rival] | None = None
+    since, wait, cost = 0, windows.params.fresh, 0.0
+
+    def onward(path: Path, steps: int = 1) -> Path:
+        return advanced(path, steps * step * 1e-6, half * 1e-6)
+
+    bar = tqdm(centres, unit="window", disable=not progress, leave=False, delay=2)
+    with ThreadPoolExecutor(1) as beside:
+        for row, centre in enumerate(bar):
+            if not enough[row]:
+                warm = ahead = None
+                fits.append(None)
+                continue
+            since, fit = since + 1, None
+            anew = warm is None or since >= wait
+            if warm is not None and not anew:
+                rival = ahead.result() if ahead else windows.followed(centre, warm)
+                ahead = None
+                if since + 1 < wait and row + 1 < len(centres) and enough[row + 1]:
+                    path = onward(rival[0].path)
+                    ahead = beside.submit(windows.followed, centres[row + 1], path)
+                fit = windows.ended(centre, [rival])
+                anew = fit is None or not fit.cost <= LOST * cost
+            if anew:
+                ahead, fit = None, windows.fit(centre, warm)
+            fits.append(fit)
+            if fit is None:
+                warm = None
+                continue
+            if anew:
+                agreed = warm is not None and _near_to(fit.path, warm)
+                if warm is not None and not agreed:
+                    _revise(windows, centres[: len(fits)], fits, onward)
+                since, wait = 0, 2 * wait if agreed else windows.params.fresh
+            cost = fit.cost if anew else min(cost, fit.cost)
+            warm = onward(fit.path)
+    return fits
+
+
 def _revise(
-    windows: Windows, centres: NDArray, fits: list[Fit | None], step: int, half: int
+    windows: Windows, centres: list[int], fits: list[Fit | None], onward: Callable[..., Path]
 ) -> None:
     """The last window found a motion that was not followed to it: those before are fitted again.
 
@@ -514,9 +566,8 @@ def _revise(
     new: dict[int, Fit] = {}
     while row > 0 and later is not None:
         row, old = row - 1, fits[row - 1]
-        later = windows.fit(
-            int(centres[row]), advanced(later.path, -step * 1e-6, half * 1e-6), False
-        )
+        before = windows.followed(centres[row], onward(later.path, -1))
+        later = windows.ended(centres[row], [before])
         if old is None or later is None or _near_to(later.path, old.path):
             break
         new[row] = later
