@@ -70,7 +70,6 @@ class Stage(NamedTuple):
 
 ROUNDS = Stage(1.0, 6), Stage(0.5, 6), Stage(0.2, 10), Stage(0.1, 10)  # after a trial of depths
 FINAL = Stage(0.05, 20, 10), Stage(0.02, 20, 3)
-FOLLOWED = 2  # a path that is about right needs not so many of the first rounds
 # Rivals remain whose cost is so many times the least, and so much more (C^2): depths that were just
 # looked for leave up to 0.03 C.
 CLOSE = 1.75, 5e-4
@@ -349,17 +348,15 @@ class Windows:
         tracks = self.tracks(centre, half, TRIED)
         starts = self.starts(centre, Omega, planes[0] + planes[1])
         paths += [self.on_nodes(path, tracks) for path in self.aligned(centre, starts)]
-        found = self.ranked(self.rounds(centre, tracks, paths, ROUNDS))
+        found = self.ranked(self.rounds(centre, tracks, paths))
         limit = CLOSE[0] * self.cost(*found[0]) + CLOSE[1] if found else 0.0
         return [one for one in found if self.cost(*one) < limit]
 
-    def rounds(
-        self, centre: int, tracks: Tracks, paths: list[Path], stages: tuple[Stage, ...]
-    ) -> list[Rival]:
-        """Paths through stages of the photometric fit, depths looked for before each of them."""
+    def rounds(self, centre: int, tracks: Tracks, paths: list[Path]) -> list[Rival]:
+        """Paths through the first stages, depths looked for before each of them."""
         prior = self.prior(centre, float(self.params.half_window))
         found: list[Rival] = []
-        for stage in stages:
+        for stage in ROUNDS:
 
             def follow(path: Path, stage: Stage = stage) -> Rival:
                 path = Path(path.O, path.D, depths(path, tracks))
@@ -373,7 +370,7 @@ class Windows:
         """A path with depths at nodes that is about right, but for the last stage."""
         half = float(self.params.half_window)
         tracks, prior = self.tracks(centre, half, TRIED), self.prior(centre, half)
-        ((scene, report),) = self.rounds(centre, tracks, [warm], ROUNDS[FOLLOWED:])
+        ((scene, report),) = self.rounds(centre, tracks, [warm])
         return _adjusted(tracks, scene, report, prior, FINAL[:-1])
 
     def fit(self, centre: int, warm: Path | None = None) -> Fit | None:
@@ -559,8 +556,8 @@ def _revise(
 ) -> None:
     """The last window found a motion that was not followed to it: those before are fitted again.
 
-    Each starts from the one after it, back to where that ends at what was found before; the new
-    ones remain if together they cost less.
+    Each starts from the one after it, back to where that ends at what was found before; of the new
+    ones so many of the last remain as together save most.
     """
     row, later, gained = len(fits) - 1, fits[-1], 0.0
     new: dict[int, Fit] = {}
@@ -573,9 +570,10 @@ def _revise(
         new[row] = later
         gained += old.cost + windows.turning(old.path)
         gained -= later.cost + windows.turning(later.path)
-    if gained > 0:
-        for row, fit in new.items():
-            fits[row] = fit
+        if gained > 0:
+            for at, fit in new.items():
+                fits[at] = fit
+            new, gained = {}, 0.0
 
 
 def _blended(
