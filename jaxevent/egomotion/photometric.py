@@ -227,6 +227,47 @@ def _around(values: Array, near: _Near, shape: tuple) -> Array:
     return sums.ravel()[middle]
 
 
+class Jacobian(NamedTuple):
+    """Misfits before their means are taken, to first order in map, path (and the like) and depths.
+
+    `of` a change of these three it is one of misfits, and `back` its transpose.
+    """
+
+    tracks: Tracks
+    at: _Near  # of the map
+    node: _Near
+    by_path: Array  # (n, E)
+    by_depth: Array  # (E,)
+    weight: Array  # (E,), in means
+    total: Array  # of the weights, by pixel
+
+    @classmethod
+    def made(
+        cls, tracks: Tracks, near: tuple[_Near, _Near], slopes: tuple[Array, Array], weight: Array
+    ) -> "Jacobian":
+        total = jnp.zeros(tracks.pixels, weight.dtype).at[tracks.pixel].add(weight)
+        return cls(tracks, *near, *slopes, weight, jnp.maximum(total, 1e-3))
+
+    def of(self, v: tuple[Array, Array, Array]) -> Array:
+        image, path, depth = v
+        value = _mean(_gathered(image, self.at, self.tracks.shape), self.at.share)
+        nodes = _mean(_gathered(depth, self.node, self.tracks.nodes), self.node.share)
+        return value + path @ self.by_path + self.by_depth * nodes
+
+    def back(self, z: Array) -> tuple[Array, Array, Array]:
+        depth = _scattered(self.by_depth * z, self.node, self.node.share, self.tracks.nodes)
+        return self.on_map(z, self.at.share), self.by_path @ z, depth
+
+    def on_map(self, z: Array, share: Array) -> Array:
+        return _scattered(z, self.at, share, self.tracks.shape).reshape(self.tracks.shape)
+
+    def less_mean(self, z: Array) -> Array:
+        """Less its mean over the pixel's events, of one value per event (E,), or of rows (E, n)."""
+        sums = jnp.zeros((self.tracks.pixels, *z.shape[1:]), z.dtype)
+        sums = sums.at[self.tracks.pixel].add((self.weight * z.T).T)
+        return z - (sums.T / self.total).T[self.tracks.pixel]
+
+
 def _laplacian(values: Array) -> Array:
     """Minus the sum of differences to the neighbours, of a map."""
     zero = jnp.zeros((), values.dtype)
@@ -406,20 +447,6 @@ def adjust(
         lx, ly = _mean(four, node.along_x), _mean(four, node.along_y)
         nine = _gathered(scene.map, at, tracks.shape)
         gx, gy = _mean(nine, at.along_x), _mean(nine, at.along_y)
-        total = jnp.zeros(tracks.pixels, real).at[tracks.pixel].add(weight)
-        total = jnp.maximum(total, 1e-3)
-
-        def less_mean(z: Array) -> Array:
-            """Of one value per event (E,), or of rows of them (E, n)."""
-            sums = jnp.zeros((tracks.pixels, *z.shape[1:]), real)
-            sums = sums.at[tracks.pixel].add((weight * z.T).T)
-            return z - (sums.T / total).T[tracks.pixel]
-
-        def on_map(values: Array, share: Array) -> Array:
-            return _scattered(values, at, share, tracks.shape).reshape(tracks.shape)
-
-        left = less_mean(e)
-
         # x = r + rho(x) d: (1 - d grad rho') dx = what it is with rho held, d = rho (f C - C_z r).
         unit = units(path)
         now = values(scene, unit)
@@ -462,6 +489,8 @@ def adjust(
         free_now = (on > 0) & ~settling
         Jt = jnp.where(free_now, Jt, 0)
         Jd = jnp.where(free_now & ~plane, by_depth, 0)
+        jacobian = Jacobian.made(tracks, (at, node), (Jt, Jd), weight)
+        left = jacobian.less_mean(e)
 
         # Priors, of the path's rows and of depths.
         pull, known = jax.grad(pulled)(now, unit), jax.hessian(pulled)(now, unit)
@@ -477,10 +506,10 @@ def adjust(
         w = weight / (prior.alike * sigma**2)
 
         # Preconditioner: the diagonal for the map; path with depths, these lumped, exactly.
-        diagonal = on_map(w, at.share**2)
+        diagonal = jacobian.on_map(w, at.share**2)
         diagonal = 0.7 * diagonal + 4 * prior.flat + 1e-5
         # One row per event: 7 ms for 60 k events, 15 ms one column after the other.
-        centred = w[:, None] * less_mean(Jt.T)
+        centred = w[:, None] * jacobian.less_mean(Jt.T)
         upper = Jt @ centred + known + held
         stiff = jnp.diag(upper)
         mixed = _scattered(Jd[:, None] * centred, node, node.share[..., None], tracks.nodes)
@@ -490,40 +519,34 @@ def adjust(
         small = upper + damping * jnp.diag(stiff) - mixed.T @ (mixed / (eased_by * lumped)[:, None])
         small = (small + small.T) / 2 + 1e-3 * jnp.diag(stiff)
 
-        def effect(v: tuple) -> Array:
-            image, t, q = v
-            y = _mean(_gathered(image, at, tracks.shape), at.share) + t @ Jt
-            return y + Jd * _mean(_gathered(q, node, tracks.nodes), node.share)
-
         def times_H(v: tuple) -> tuple:
             image, t, q = v
-            z = w * less_mean(effect(v))
+            of_map, of_path, of_depth = jacobian.back(w * jacobian.less_mean(jacobian.of(v)))
             flat = prior.flat * _laplacian(image) + (1e-5 + damping * diagonal) * image
             apart = bond * (q[a] - q[b])
             return (
-                on_map(z, at.share) + flat,
-                Jt @ z + (known + held) @ t + damping * stiff * t,
-                _scattered(Jd * z, node, node.share, tracks.nodes)
+                of_map + flat,
+                of_path + (known + held) @ t + damping * stiff * t,
+                of_depth
                 + (1e-3 + damping * lumped) * q
                 + jnp.zeros_like(q).at[a].add(apart).at[b].add(-apart),
             )
 
-        z = w * left
-        flat = prior.flat * _laplacian(scene.map) + 1e-5 * scene.map
+        of_map, of_path, of_depth = jacobian.back(w * left)
         gradient = (
-            on_map(z, at.share) + flat,
-            Jt @ z + pull,
-            _scattered(Jd * z, node, node.share, tracks.nodes)
+            of_map + prior.flat * _laplacian(scene.map) + 1e-5 * scene.map,
+            of_path + pull,
+            of_depth
             + jnp.zeros_like(path.log_rho).at[a].add(bond * apart).at[b].add(-bond * apart),
         )
 
         factor = jax.scipy.linalg.cho_factor(small)
-        of_map, of_nodes = 1 / (eased_by * diagonal), 1 / (eased_by * lumped)
+        on_map, on_nodes = 1 / (eased_by * diagonal), 1 / (eased_by * lumped)
 
         def eased(v: tuple) -> tuple:
-            q = v[2] * of_nodes
+            q = v[2] * on_nodes
             t = jax.scipy.linalg.cho_solve(factor, v[1] - q @ mixed)
-            return v[0] * of_map, t, q - (mixed @ t) * of_nodes
+            return v[0] * on_map, t, q - (mixed @ t) * on_nodes
 
         solve = functools.partial(_conjugate_gradients, times_H, eased)
         image, t, q = solve(jax.tree.map(jnp.negative, gradient), SOLVE)
@@ -559,7 +582,7 @@ def adjust(
 
             def column(i: Array) -> tuple[Array, Array]:
                 v = solve((zero[0], zero[1].at[i].set(1), zero[2]), SOLVE)
-                told = jnp.zeros(rows_of * columns, real).at[cell].add(w * left * effect(v))
+                told = jnp.zeros(rows_of * columns, real).at[cell].add(w * left * jacobian.of(v))
                 return told * unit[i], v[1] * unit[i]
 
             told, own = lax.map(column, chosen)
