@@ -227,7 +227,8 @@ def normal_bench() -> tuple[dict[str, float], dict[str, float]]:
 
     slopes, v = (drawn(n, E), drawn(E)), (drawn(*tracks.shape), drawn(n), drawn(len(depths)))
     weight = tracks.on * at.inside
-    jacobian = photometric.Jacobian.made(tracks, (at, node), slopes, weight)
+    total = photometric.totals(weight, tracks)
+    jacobian = photometric.Jacobian(tracks, at, node, *slopes, weight, total)
 
     def product(jacobian: photometric.Jacobian, v: tuple) -> tuple:
         return jacobian.back(weight * jacobian.less_mean(jacobian.of(v)))
@@ -243,7 +244,7 @@ def normal_bench() -> tuple[dict[str, float], dict[str, float]]:
         steps = np.array(photometric._steps(near, shape), np.int32)
         arguments += [np.asarray(near.first), steps, np.ascontiguousarray(near.share.T)]
     arguments += [np.ascontiguousarray(slopes[0].T)]
-    arguments += map(np.asarray, (slopes[1], weight, tracks.pixel, jacobian.total))
+    arguments += map(np.asarray, (slopes[1], weight, tracks.pixel, total))
     for ours, its in zip(product(jacobian, v), normal_loop(*arguments), strict=True):
         its = its.reshape(ours.shape)
         np.testing.assert_allclose(ours, its, rtol=0, atol=1e-4 * np.abs(its).max())
@@ -256,8 +257,8 @@ def normal_bench() -> tuple[dict[str, float], dict[str, float]]:
 
 
 def motion_bench() -> tuple[dict[str, float], dict[str, float]]:
-    speed, ratio = voting_bench()
-    for part in (normal_bench, batch_bench):
+    speed, ratio = {}, {}
+    for part in (voting_bench, normal_bench, batch_bench):
         more, ratios = part()
         speed, ratio = speed | more, ratio | ratios
     return speed, ratio

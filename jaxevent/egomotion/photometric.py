@@ -227,6 +227,18 @@ def _around(values: Array, near: _Near, shape: tuple) -> Array:
     return sums.ravel()[middle]
 
 
+def totals(weight: Array, tracks: Tracks) -> Array:
+    """Of the weights of events (E,), the sum over each pixel's (pixels,)."""
+    return jnp.maximum(jnp.zeros(tracks.pixels, weight.dtype).at[tracks.pixel].add(weight), 1e-3)
+
+
+def _less_mean(values: Array, weight: Array, total: Array, tracks: Tracks) -> Array:
+    """Less its mean over the pixel's events, of one value per event (E,), or of rows (E, n)."""
+    sums = jnp.zeros((tracks.pixels, *values.shape[1:]), values.dtype)
+    sums = sums.at[tracks.pixel].add((weight * values.T).T)
+    return values - (sums.T / total).T[tracks.pixel]
+
+
 class Jacobian(NamedTuple):
     """Misfits before their means are taken, to first order in map, path (and the like) and depths.
 
@@ -239,14 +251,7 @@ class Jacobian(NamedTuple):
     by_path: Array  # (n, E)
     by_depth: Array  # (E,)
     weight: Array  # (E,), in means
-    total: Array  # of the weights, by pixel
-
-    @classmethod
-    def made(
-        cls, tracks: Tracks, near: tuple[_Near, _Near], slopes: tuple[Array, Array], weight: Array
-    ) -> "Jacobian":
-        total = jnp.zeros(tracks.pixels, weight.dtype).at[tracks.pixel].add(weight)
-        return cls(tracks, *near, *slopes, weight, jnp.maximum(total, 1e-3))
+    total: Array  # of the weights, by pixel: `totals`
 
     def of(self, v: tuple[Array, Array, Array]) -> Array:
         image, path, depth = v
@@ -262,10 +267,7 @@ class Jacobian(NamedTuple):
         return _scattered(z, self.at, share, self.tracks.shape).reshape(self.tracks.shape)
 
     def less_mean(self, z: Array) -> Array:
-        """Less its mean over the pixel's events, of one value per event (E,), or of rows (E, n)."""
-        sums = jnp.zeros((self.tracks.pixels, *z.shape[1:]), z.dtype)
-        sums = sums.at[self.tracks.pixel].add((self.weight * z.T).T)
-        return z - (sums.T / self.total).T[self.tracks.pixel]
+        return _less_mean(z, self.weight, self.total, self.tracks)
 
 
 def _laplacian(values: Array) -> Array:
@@ -339,13 +341,7 @@ def misfits(scene: Scene, tracks: Tracks) -> Float[Array, " E"]:
     value = _mean(_gathered(scene.map, at, tracks.shape), at.share)
     on = tracks.on * at.inside
     left = value - tracks.level - scene.skew * tracks.number
-    return on * _less_mean(left, on, tracks)
-
-
-def _less_mean(values: Array, weight: Array, tracks: Tracks) -> Array:
-    both = jnp.zeros((tracks.pixels, 2), values.dtype)
-    both = both.at[tracks.pixel].add(jnp.stack([weight * values, weight], 1))
-    return values - (both[:, 0] / jnp.maximum(both[:, 1], 1e-3))[tracks.pixel]
+    return on * _less_mean(left, on, totals(on, tracks), tracks)
 
 
 @jax.jit
@@ -412,7 +408,7 @@ def adjust(
         # plane hides nothing of itself.
         events = jnp.maximum(_around(on, at, tracks.shape), 1)
         for _ in range(2):
-            left = _less_mean(e, weight, tracks)
+            left = _less_mean(e, weight, totals(weight, tracks), tracks)
             cost = on * left**2 / (1 + left**2 / limit)
             q = _around(cost, at, tracks.shape) / events
             counts = on * jnp.where(plane, 1, 4 / (1 + q / usual) ** 2) / events
@@ -447,6 +443,7 @@ def adjust(
         lx, ly = _mean(four, node.along_x), _mean(four, node.along_y)
         nine = _gathered(scene.map, at, tracks.shape)
         gx, gy = _mean(nine, at.along_x), _mean(nine, at.along_y)
+
         # x = r + rho(x) d: (1 - d grad rho') dx = what it is with rho held, d = rho (f C - C_z r).
         unit = units(path)
         now = values(scene, unit)
@@ -489,7 +486,7 @@ def adjust(
         free_now = (on > 0) & ~settling
         Jt = jnp.where(free_now, Jt, 0)
         Jd = jnp.where(free_now & ~plane, by_depth, 0)
-        jacobian = Jacobian.made(tracks, (at, node), (Jt, Jd), weight)
+        jacobian = Jacobian(tracks, at, node, Jt, Jd, weight, totals(weight, tracks))
         left = jacobian.less_mean(e)
 
         # Priors, of the path's rows and of depths.
@@ -541,12 +538,12 @@ def adjust(
         )
 
         factor = jax.scipy.linalg.cho_factor(small)
-        on_map, on_nodes = 1 / (eased_by * diagonal), 1 / (eased_by * lumped)
+        ease_map, ease_nodes = 1 / (eased_by * diagonal), 1 / (eased_by * lumped)
 
         def eased(v: tuple) -> tuple:
-            q = v[2] * on_nodes
+            q = v[2] * ease_nodes
             t = jax.scipy.linalg.cho_solve(factor, v[1] - q @ mixed)
-            return v[0] * on_map, t, q - (mixed @ t) * on_nodes
+            return v[0] * ease_map, t, q - (mixed @ t) * ease_nodes
 
         solve = functools.partial(_conjugate_gradients, times_H, eased)
         image, t, q = solve(jax.tree.map(jnp.negative, gradient), SOLVE)
@@ -621,7 +618,7 @@ def adjust(
     kept = _Seen(scene, none, none, none, none, tracks.on, zero + jnp.inf, zero)
     state = (jnp.zeros((), int), scene, scene, kept, zero, zero, jnp.zeros((6, 6), real))
     _, _, _, kept, _, _, covariance = lax.while_loop(unfinished, go, state)
-    left = jnp.abs(_less_mean(kept.e, kept.weight, tracks))
+    left = jnp.abs(_less_mean(kept.e, kept.weight, totals(kept.weight, tracks), tracks))
     number = jnp.maximum(kept.on.sum(), 1)
     middle = jnp.sort(jnp.where(kept.on > 0, left, jnp.inf))[(number / 2).astype(jnp.int32)]
     noise = jnp.where(jnp.isfinite(middle), 1.48 * middle, 0)
