@@ -12,7 +12,7 @@ from pathlib import Path
 
 import ahdr
 
-from jaxevent.evaluate import evaluate
+from jaxevent.runs.evaluate import evaluate
 
 CONFIG = Path(__file__).parents[1] / "configs" / "ablations.toml"
 SHOWN = ("MSE", "log MSE", "bright MSE", "dark log MSE", "well-exposed MSE")

@@ -21,8 +21,8 @@ import numpy as np
 from tqdm import tqdm
 
 import jaxevent
-from jaxevent.evaluate import PROTOCOLS, Reference, frame_times, score
-from jaxevent.fit import fit
+from jaxevent.runs.evaluate import PROTOCOLS, Reference, frame_times, score
+from jaxevent.runs.fit import fit
 from jaxevent.simulate import FITTING, SENSORS, TESTING, Pan, scene, simulate
 from jaxevent.simulate.scenes import Speed
 

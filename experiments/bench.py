@@ -31,11 +31,11 @@ from bench_motion import motion_bench
 
 import jaxevent
 from jaxevent.blob.filters import Batch, _truncation, filter_of
-from jaxevent.fit import with_raw
 from jaxevent.io import load, save
-from jaxevent.reconstruction.estimator import Observation, Observer, State, Trajectory
+from jaxevent.reconstruction.filtering import Observation, Observer, State, Trajectory
 from jaxevent.reconstruction.pixels import Windows
 from jaxevent.recording import Events, Frames, Recording
+from jaxevent.runs.fit import with_raw
 from jaxevent.simulate import blob_scene
 
 WIDTH, HEIGHT = 346, 260

@@ -18,10 +18,12 @@ import jax.numpy as jnp
 import numba
 import numpy as np
 
-from jaxevent.egomotion import batch, photometric, voting
+from jaxevent.egomotion import particle_filter as voting
+from jaxevent.egomotion.batch_fit import photometric
+from jaxevent.egomotion.batch_fit import windows as batch
+from jaxevent.egomotion.batch_fit.path import ROWS, Path, advanced
 from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.motion import Motion
-from jaxevent.egomotion.path import ROWS, Path, advanced
 from jaxevent.simulate import motion_scene
 
 PUBLISHED = 0.1  # M events/s, N = 100

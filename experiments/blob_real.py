@@ -23,9 +23,9 @@ from scipy import ndimage, optimize
 
 import jaxevent
 from jaxevent.blob import Params, Tracks, track
-from jaxevent.blob.pictures import track_colour, track_frames
 from jaxevent.io.output import complete
 from jaxevent.recording import Events, Recording
+from jaxevent.show.tracks import track_colour, track_frames
 
 DOT_HZ, DOT_RADIUS = 19.39, 107.66  # of the circle that data/README.md gives
 DOT_PARTS = {"begin": (0.005, 0.015), "reported": (0.015, 0.05)}

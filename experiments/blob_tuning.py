@@ -3,9 +3,9 @@
     python experiments/blob_tuning.py [--iterations 30]
 
 From process noises that are wrong by factors of 10 to 100 the mean negative log-likelihood of each
-event, predicted before it is used, is minimised by `jaxevent.fit.optimise` on two recordings. The
-position's RMSE on other recordings stands beside that of the best point of a grid, which is chosen
-by the true positions of those recordings themselves.
+event, predicted before it is used, is minimised by `jaxevent.runs.fit.optimise` on two recordings.
+The position's RMSE on other recordings stands beside that of the best point of a grid, which is
+chosen by the true positions of those recordings themselves.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from jaxevent.blob import (
     position_error,
     prepare_positions,
 )
-from jaxevent.fit import Settings, optimise, with_raw
+from jaxevent.runs.fit import Settings, optimise, with_raw
 from jaxevent.simulate import blob_scene
 
 STEP = {"events_per_step": 32}

@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from jaxevent.egomotion import batch, truth
+from jaxevent.egomotion import truth
+from jaxevent.egomotion.batch_fit import windows as batch
 from jaxevent.simulate import motion_scene
 
 CENTRE = 250_000  # us

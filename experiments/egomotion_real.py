@@ -36,7 +36,9 @@ from scipy.optimize import least_squares
 import jaxevent
 from jaxevent import egomotion
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion import batch, contrast, voting
+from jaxevent.egomotion import particle_filter as voting
+from jaxevent.egomotion.baselines import contrast_maximisation as contrast
+from jaxevent.egomotion.batch_fit import windows as batch
 from jaxevent.egomotion.geometry import rotation_exp, twist_exp
 from jaxevent.errors import InputError, require
 

@@ -7,7 +7,7 @@ give an event at every pixel they enter, which is what it takes the world for: o
 whose edges give several events at once, it is locked (35 to 50 % at every r_t from 10 to 1e6). It
 starts with `r_t` ten times what a grid finds best on the sequences fitted to, and a tenth of it;
 the soft vote, on an ideal camera with both textures, with `noise` and `alpha` ten times too large
-and too small. The loss is that of `jaxevent.egomotion.objectives`; errors are its root, in % of the
+and too small. The loss is that of `jaxevent.runs.egomotion`; errors are its root, in % of the
 speed, of sequences of other seeds.
 """
 
@@ -20,11 +20,11 @@ import jax
 import numpy as np
 from bench import machine
 
-from jaxevent import fit
-from jaxevent.egomotion import voting
-from jaxevent.egomotion.objectives import Goal, Loss
+from jaxevent.egomotion import particle_filter as voting
 from jaxevent.egomotion.truth import Known
 from jaxevent.recording import Events, Recording
+from jaxevent.runs import fit
+from jaxevent.runs.egomotion import Goal, Loss
 from jaxevent.simulate import motion_scene
 
 GRID = 10.0 ** np.arange(1, 6.1, 0.5)  # px/s

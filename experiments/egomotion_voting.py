@@ -25,10 +25,10 @@ import numpy as np
 from bench import machine
 from numpy.typing import NDArray
 
-from jaxevent.egomotion import voting
+from jaxevent.egomotion import particle_filter as voting
 from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.particle_filter import Params
 from jaxevent.egomotion.truth import axis_error, relative_error, relative_magnitude_error
-from jaxevent.egomotion.voting import Params
 from jaxevent.io.output import complete
 from jaxevent.recording import Recording
 from jaxevent.simulate import motion_scene

@@ -9,9 +9,9 @@ a simulated sensor, where the thresholds, the dark offset and the frames' clock 
 import numpy as np
 
 import jaxevent
-from jaxevent.fit import Settings, optimise
-from jaxevent.reconstruction.objectives import Objective, Part, Problem
 from jaxevent.recording import Events, Frames, Recording
+from jaxevent.runs.fit import Settings, optimise
+from jaxevent.runs.reconstruction import Objective, Part, Problem
 from jaxevent.simulate import Pan, Sensor, scene, simulate
 
 TRUE = {

@@ -25,7 +25,7 @@ from bench import machine
 from jaxevent.io import save
 from jaxevent.io.output import complete
 from jaxevent.recording import Events, Frames, Recording
-from jaxevent.report import aligned
+from jaxevent.show.report import aligned
 
 WIDTH, HEIGHT, RATE, FPS = 346, 260, 10_000_000, 25
 BLOCK = 1_000_000  # events; drawn anew for each block, so that any can be had at any time

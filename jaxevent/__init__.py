@@ -9,7 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxevent import blob, camera, colour, egomotion, fit, metrics, register, simulate
+    from jaxevent import blob, camera, egomotion, metrics, register, simulate
     from jaxevent.errors import InputError
     from jaxevent.io import load, save
     from jaxevent.reconstruction import (
@@ -20,12 +20,14 @@ if TYPE_CHECKING:
         blend,
         cf,
         cf_augmented,
+        colour,
         edi,
         high_pass,
         last_frame,
     )
     from jaxevent.reconstruction.pixels import prepare
     from jaxevent.recording import Events, Frames, Recording
+    from jaxevent.runs import fit
 
 __version__ = "0.1.0"
 
@@ -48,7 +50,11 @@ _HOME = {
         "last_frame",
     ),
 }
-_MODULES = ("blob", "camera", "colour", "egomotion", "fit", "metrics", "register", "simulate")
+_MODULES = {
+    **{name: name for name in ("blob", "camera", "egomotion", "metrics", "register", "simulate")},
+    "colour": "reconstruction.colour",
+    "fit": "runs.fit",
+}
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
@@ -82,7 +88,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name in _MODULES:
-        return importlib.import_module(f"jaxevent.{name}")
+        return importlib.import_module(f"jaxevent.{_MODULES[name]}")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'jaxevent' has no attribute {name!r}")
     return getattr(importlib.import_module(_MODULE_OF[name]), name)

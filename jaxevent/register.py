@@ -288,11 +288,11 @@ def read_frames(
     """Another camera's frames, as a recording that need not hold events.
 
     `path` is anything that `jaxevent.load` reads, whose frames are taken, or images as of
-    `jaxevent.external`: a folder of PNG, TIFF, JPEG or .npy with timestamps.txt or images.txt of
-    lines "t name", or HDF5 of t and image. `exposure` (s) is that of the latter, which do not tell
-    it. With `reference`, of a recording its HDR images are taken if it holds any (`extra["hdr"]`
-    and `extra["hdr_t"]`), and `white` is the value of images that is intensity 1. Raises
-    `InputError` for what cannot be read and where there are no frames.
+    `jaxevent.runs.external`: a folder of PNG, TIFF, JPEG or .npy with timestamps.txt or images.txt
+    of lines "t name", or HDF5 of t and image. `exposure` (s) is that of the latter, which do not
+    tell it. With `reference`, of a recording its HDR images are taken if it holds any
+    (`extra["hdr"]` and `extra["hdr_t"]`), and `white` is the value of images that is intensity 1.
+    Raises `InputError` for what cannot be read and where there are no frames.
     """
     from jaxevent.io import load
 
@@ -1336,8 +1336,8 @@ def _is_series(path: Path) -> bool:
     """Whether these are images with times, not a recording."""
     import h5py
 
-    from jaxevent.external import SUFFIXES
     from jaxevent.io import reading
+    from jaxevent.runs.external import SUFFIXES
 
     with reading(str(path)):
         if path.is_dir():
@@ -1352,7 +1352,7 @@ def _is_series(path: Path) -> bool:
 def _series(
     path: Path, exposure: float | int | None, white: float | int | None, reference: bool
 ) -> Recording:
-    from jaxevent.external import External
+    from jaxevent.runs.external import External
 
     if exposure is not None and not 0 < exposure < math.inf:
         raise InputError(f"{path}: an exposure of {exposure} s is not possible; give seconds")

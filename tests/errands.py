@@ -1,6 +1,7 @@
 """Tasks for other processes to run; nothing here is slow to import."""
 
 import os
+import re
 import signal
 import time
 from pathlib import Path
@@ -24,3 +25,9 @@ def errand(folder: str, name: str, then: str = "", times: int = 1, seconds: floa
         if then == "not a number":
             return {"name": float("nan")}
     return {"name": name, "of": [1, 2.5, None]}
+
+
+def log(folder: Path, what: str) -> list[str]:
+    """The keys of the log's lines that say so."""
+    text = (folder / "log.txt").read_text()
+    return re.findall(rf"^\S+ \S+ \d+ (\S+) {what}", text, re.MULTILINE)

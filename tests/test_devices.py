@@ -14,17 +14,17 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from test_cli import fails
+from commands import fails
 
 import jaxevent
 from jaxevent import devices
-from jaxevent.egomotion.objectives import VOTING
-from jaxevent.egomotion.voting import Params
+from jaxevent.egomotion.particle_filter import Params
 from jaxevent.errors import InputError
-from jaxevent.evaluate import evaluate
-from jaxevent.fit import Settings, fit, optimise
 from jaxevent.reconstruction import METHODS
-from jaxevent.reconstruction.objectives import Objective, Problem, parts
+from jaxevent.runs.egomotion import VOTING
+from jaxevent.runs.evaluate import evaluate
+from jaxevent.runs.fit import Settings, fit, optimise
+from jaxevent.runs.reconstruction import Objective, Problem, parts
 
 FOUR = "--xla_force_host_platform_device_count=4"
 
@@ -63,8 +63,8 @@ SOURCE = "planar.h5"
 
 
 def written(folder: Path) -> None:
-    from test_egomotion_voting import moved
-    from test_fit import moving
+    from points import moved
+    from texture import moving
 
     jaxevent.save(moving(), folder / "moving.h5")
     (folder / "fit.toml").write_text(FIT)
@@ -266,7 +266,7 @@ def test_an_error_of_one_process_is_one_of_all(monkeypatch):
 
 
 def test_each_process_prepares_its_own_windows(monkeypatch):
-    from test_fit import moving
+    from texture import moving
 
     windows = parts(moving(), "held-out", (1, 1, 0), 0.126)
     edi = METHODS["edi"]

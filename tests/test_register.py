@@ -7,9 +7,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from commands import fails
 from PIL import Image
 from scipy.ndimage import gaussian_filter
-from test_cli import fails
 
 import jaxevent
 from jaxevent import cli, register

@@ -6,17 +6,15 @@ and windows are. Times are int32 us since the chunk's start, hence exact however
 """
 
 import dataclasses
-import inspect
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import numba
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
+from jaxevent.kernels import compiled
 from jaxevent.recording import Recording
 
 STEPS = (4, 8, 16, 32, 64, 128, 256)  # per chunk
@@ -178,12 +176,7 @@ class Windows:
         return kept
 
 
-def _compiled(function: Callable) -> Any:
-    """Compile with numba, without the argument checks that tests wrap around functions."""
-    return numba.njit(cache=True, nogil=True)(inspect.unwrap(function))
-
-
-@_compiled
+@compiled
 def _supported(t, x, y, last, reach, neighbours):
     """Events of which `neighbours` of the 8 pixels around fired at most `reach` us before."""
     kept = np.empty(len(t), np.bool_)
@@ -198,7 +191,7 @@ def _supported(t, x, y, last, reach, neighbours):
     return kept
 
 
-@_compiled
+@compiled
 def _pack(
     t_in, x, y, p, kept, row_in, final, origin, finish, period, seed_t, state,
     t, xi, polarity, row, start, elapsed, stop, cycle, seed,

@@ -3,9 +3,8 @@
 - `motion`: what every estimator gives, at any time;
 - `METHODS`, the estimators: `voting` by particle filters, `batch` by a fit to many events at once,
   `contrast` of warped events, `planes` on the surface of active events, `frames` by optical flow;
-- `path`, `starts`, `alignment`, `photometric`: what `batch` is made of;
+- `batch_fit`: what `batch` is made of;
 - `flow`: the optical flow of each event, once the motion is known;
-- `pictures`: tables and pictures of a motion;
 - `candidates`: of each event its earlier neighbours, prepared once;
 - `geometry`: the flow of a rigid scene, residuals of matched events, rotations and twists;
 - `truth`: the camera's twist from poses or a gyro, and the errors of an estimate.
@@ -21,16 +20,21 @@ from collections.abc import Iterator, Mapping
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from jaxevent.egomotion import geometry, truth, voting
+from jaxevent.egomotion import geometry, truth
+from jaxevent.egomotion import particle_filter as voting
 from jaxevent.egomotion.motion import COMPONENTS, Motion, States
+from jaxevent.egomotion.particle_filter import Params, prepare
 from jaxevent.egomotion.truth import Twists, from_gyro, from_poses, gyro_bias, motion_errors
-from jaxevent.egomotion.voting import Params, prepare
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters, nearest
 from jaxevent.recording import Recording
 
 if TYPE_CHECKING:
-    from jaxevent.egomotion import batch, contrast, flow, frames, pictures, planes
+    from jaxevent.egomotion import flow
+    from jaxevent.egomotion.baselines import contrast_maximisation as contrast
+    from jaxevent.egomotion.baselines import local_planes as planes
+    from jaxevent.egomotion.baselines import tracked_points as frames
+    from jaxevent.egomotion.batch_fit import windows as batch
 
 __all__ = [
     "COMPONENTS",
@@ -50,7 +54,6 @@ __all__ = [
     "geometry",
     "gyro_bias",
     "motion_errors",
-    "pictures",
     "planes",
     "prepare",
     "truth",
@@ -61,18 +64,22 @@ __all__ = [
 class _Methods(Mapping[str, ModuleType]):
     """Estimators by name, each loaded when it is first asked for."""
 
-    _names = ("voting", "batch", "contrast", "planes", "frames")
+    _homes = {
+        "voting": "particle_filter",
+        "batch": "batch_fit.windows",
+        "contrast": "baselines.contrast_maximisation",
+        "planes": "baselines.local_planes",
+        "frames": "baselines.tracked_points",
+    }
 
     def __getitem__(self, name: str) -> ModuleType:
-        if name not in self._names:
-            raise KeyError(name)
-        return importlib.import_module(f"{__name__}.{name}")
+        return importlib.import_module(f"{__name__}.{self._homes[name]}")
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
+        return iter(self._homes)
 
     def __len__(self) -> int:
-        return len(self._names)
+        return len(self._homes)
 
 
 METHODS: Mapping[str, ModuleType] = _Methods()
@@ -121,6 +128,8 @@ def estimate(
 
 
 def __getattr__(name: str) -> Any:
-    if name in METHODS or name in ("flow", "pictures"):
+    if name in METHODS:
+        return METHODS[name]
+    if name == "flow":
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

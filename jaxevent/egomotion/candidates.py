@@ -10,19 +10,17 @@ a burst is late, so a surface of latest events makes every motion too fast (by 4
 """
 
 import dataclasses
-import inspect
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import numba
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.geometry import undistorted
+from jaxevent.kernels import compiled
 from jaxevent.recording import Recording
 
 READ_ROWS = 65536  # events read from a file at a time
@@ -204,12 +202,7 @@ class Gatherer:
         return Batches(Candidates(**fields, reach=self.radius), t[:used], row[:used])
 
 
-def _compiled(function: Callable) -> Any:
-    """Compile with numba, without the argument checks that tests wrap around functions."""
-    return numba.njit(cache=True, nogil=True)(inspect.unwrap(function))
-
-
-@_compiled
+@compiled
 def _gather(
     t_in, x, y, p, row_in, every, longest, span, position, ring, head, radius, limits,
     gate, margin, scratch, state, clock, silence, d, age, xi, room, scale, rate, row, t, history,

@@ -14,18 +14,17 @@ atis.es to the same 1,326,017 events, and the same short files of every byte; it
 word where a file ends inside an event.
 """
 
-import inspect
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 
 from jaxevent.errors import InputError
 from jaxevent.io import reading
 from jaxevent.io.decoded import BLOCK, Columns, decoded
+from jaxevent.kernels import compiled
 from jaxevent.recording import Recording
 
 MAGIC = b"Event Stream"
@@ -83,12 +82,7 @@ def read(
     return Recording(path.stem, *size, events, extra=extra)
 
 
-def _compiled(function: Callable) -> Any:
-    """Compile with numba, without the argument checks that tests wrap around functions."""
-    return numba.njit(cache=True, nogil=True)(inspect.unwrap(function))
-
-
-@_compiled
+@compiled
 def _decode(data, t, is_atis):
     """Whole events at the start of `data`, their number, the crossings, the bytes used, the time.
 

@@ -20,7 +20,7 @@ from jaxevent.reconstruction.augment import (
     Nothing,
     event_change,
 )
-from jaxevent.reconstruction.estimator import (
+from jaxevent.reconstruction.filtering import (
     Event,
     Filter,
     Observation,

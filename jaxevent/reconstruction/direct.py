@@ -13,7 +13,7 @@ from jaxevent.reconstruction.augment import (
     Held,
     Level,
 )
-from jaxevent.reconstruction.estimator import (
+from jaxevent.reconstruction.filtering import (
     Filter,
     Observation,
     Observer,

@@ -21,7 +21,7 @@ from jaxevent.reconstruction.augment import (
     clipped_side,
     event_change,
 )
-from jaxevent.reconstruction.estimator import Event, Filter, Observation, Observer, State
+from jaxevent.reconstruction.filtering import Event, Filter, Observation, Observer, State
 from jaxevent.reconstruction.pixels import FrameFeatures, Points
 
 

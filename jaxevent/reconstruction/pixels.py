@@ -23,7 +23,6 @@ A recording is prepared whole (`prepare`, for tuning) or window by window with c
 
 import abc
 import dataclasses
-import inspect
 import itertools
 import math
 import os
@@ -34,7 +33,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numba
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
@@ -43,6 +41,7 @@ from numpy.typing import NDArray
 from jaxevent.devices import AXIS, along
 from jaxevent.devices import mesh as devices_mesh
 from jaxevent.errors import InputError
+from jaxevent.kernels import compiled
 from jaxevent.recording import Events, Recording, Times, microseconds
 
 SHAPES = ((8, 4096), (64, 512), (512, 64))  # ranks, lanes of the three kinds of tile
@@ -1058,12 +1057,7 @@ def prepare(
     return jax.device_put((features, out))
 
 
-def _compiled(function: Callable) -> Any:
-    """Compile with numba, without the argument checks that tests wrap around functions."""
-    return numba.njit(cache=True, nogil=True)(inspect.unwrap(function))
-
-
-@_compiled
+@compiled
 def _count(x, y, width, pixels):
     counts = np.zeros(pixels, np.int32)
     for i in range(len(x)):
@@ -1071,7 +1065,7 @@ def _count(x, y, width, pixels):
     return counts
 
 
-@_compiled
+@compiled
 def _busiest_first(counts):
     """Pixels by falling count, equal counts in pixel order: a counting sort."""
     top = counts.max() if len(counts) else 0
@@ -1088,7 +1082,7 @@ def _busiest_first(counts):
     return order
 
 
-@_compiled
+@compiled
 def _stands_for(gap, rho, growth):
     """How many events one after the gap (us) at its pixel stands for; `growth`: d / d rho, 1/s."""
     if rho == 0:
@@ -1099,13 +1093,13 @@ def _stands_for(gap, rho, growth):
     return 1e6 * gap / (rest * rest) if growth else gap / rest
 
 
-@_compiled
+@compiled
 def _latest(t, x, y, width, last):
     for i in range(len(t)):
         last[np.int64(y[i]) * width + x[i]] = t[i]
 
 
-@_compiled
+@compiled
 def _weights(t, x, y, width, last, rho, growth):
     """What each event stands for; `last` holds the times of the events before, at each pixel."""
     out = np.empty(len(t), np.float64)
@@ -1116,7 +1110,7 @@ def _weights(t, x, y, width, last, rho, growth):
     return out
 
 
-@_compiled
+@compiled
 def _snapshots(t, x, y, p, weight, edges, width, now):
     """ON and OFF events of each pixel earlier than each edge: [edges, 2, pixels]."""
     out = np.zeros((len(edges), 2, now.shape[1]), now.dtype)
@@ -1131,7 +1125,7 @@ def _snapshots(t, x, y, p, weight, edges, width, now):
     return out
 
 
-@_compiled
+@compiled
 def _spread(t, x, y, p, weight, edges, width, origin, reach, out):
     """Add to the counts at each edge the part of the pixel's next event that has happened."""
     last = np.full(out.shape[2], origin)
@@ -1146,7 +1140,7 @@ def _spread(t, x, y, p, weight, edges, width, origin, reach, out):
                 e += 1
 
 
-@_compiled
+@compiled
 def _exposure(t, x, y, p, weight, middle, row, edges, width, count):
     """Segments of constant brightness within one exposure; events `middle` on lie after its mid."""
     n, pixels = len(t), count.shape[1]
@@ -1182,7 +1176,7 @@ def _exposure(t, x, y, p, weight, middle, row, edges, width, count):
     return cell, share, edge, on, off
 
 
-@_compiled
+@compiled
 def _sort(t, x, y, p, width, top, bottom, origin, cursor, latest, key, near):
     """Events into pixel order, with the time since the 3x3 neighbourhood's previous event.
 
@@ -1209,7 +1203,7 @@ def _sort(t, x, y, p, width, top, bottom, origin, cursor, latest, key, near):
             latest[middle + 1] = t[i]
 
 
-@_compiled
+@compiled
 def _fill(
     first_job, step, jobs, ranks, width, lanes, first, round_tile, shape, offset, kind, lane_of,
     key, gap, origin, rho, growth, last, at_start, reference, breaks, piece_rate, mids,
@@ -1299,7 +1293,7 @@ def _fill(
             last[lanes[lane0 + k]] = before[k] + origin
 
 
-@_compiled
+@compiled
 def _read(
     t, x, y, p, own_events, origin, reach, width, row, filtering, times, frame, reference,
     at_start, count, last, at, rank, kind, lane, round_tile, round_first, shapes, rho, growth,

@@ -38,7 +38,7 @@ from jaxevent.reconstruction.augment import (
     late,
     unclipped,
 )
-from jaxevent.reconstruction.estimator import Estimator
+from jaxevent.reconstruction.filtering import Estimator
 from jaxevent.reconstruction.pixels import Features, FrameFeatures, Numeric, ReadOut
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from jaxevent.errors import InputError
-from jaxevent.reconstruction.estimator import Estimator, P
+from jaxevent.reconstruction.filtering import Estimator, P
 from jaxevent.reconstruction.pixels import (
     WINDOW_EVENTS,
     Carry,

@@ -7,17 +7,15 @@ starts at 0. What is not simulated: the photoreceptor's finite bandwidth, bus co
 """
 
 import dataclasses
-import inspect
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.camera import Response, SCurve
 from jaxevent.errors import InputError
+from jaxevent.kernels import compiled
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate.scenes import Source
 
@@ -299,12 +297,7 @@ def _events(
     return events, np.stack(np.divmod(hot, width)[::-1], 1)
 
 
-def _compiled(function: Callable) -> Any:
-    """Compile with numba, without the argument checks that tests wrap around functions."""
-    return numba.njit(cache=True, nogil=True)(inspect.unwrap(function))
-
-
-@_compiled
+@compiled
 def _cross(
     times, levels, on, off, refractory, reference, ready, noise_t, noise_p, following, last,
     out_t, out_pixel, out_p,

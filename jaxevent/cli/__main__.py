@@ -1,0 +1,7 @@
+"""python -m jaxevent.cli"""
+
+import sys
+
+from jaxevent.cli import main
+
+sys.exit(main())

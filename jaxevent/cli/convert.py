@@ -1,0 +1,37 @@
+"""The command `jaxevent convert`."""
+
+from pathlib import Path
+from typing import Any
+
+from jaxevent.cli import arguments
+from jaxevent.cli.arguments import command, print_stored, show_progress
+
+
+def add(commands: Any) -> None:
+    one = command(
+        commands,
+        run,
+        "Store a recording as HDF5. The file opens at once and need not fit in memory.",
+        "slider_depth.zip slider_depth.h5",
+        "stereo.bag left.h5 --stream /davis/left/events",
+        "slider_depth.zip small.h5 --compression gzip",
+    )
+    one.add_argument("source", metavar="SRC", type=Path, help="a recording")
+    one.add_argument("target", metavar="DST", type=Path, help="the HDF5 file to write")
+    one.add_argument("--compression", choices=["gzip"], help="smaller, but slower to read")
+    arguments.add_size(one)
+    arguments.add_stream(one)
+
+
+def run(
+    source: Path,
+    target: Path,
+    compression: str | None,
+    size: tuple[int, int] | None,
+    stream: str | None,
+) -> None:
+    from jaxevent.io import load, save
+
+    recording = load(source, size, in_memory=False, progress=show_progress(), stream=stream)
+    save(recording, target, compression, progress=show_progress())
+    print_stored(recording, target)

@@ -1,0 +1,77 @@
+"""The command `jaxevent evaluate`."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from jaxevent.cli.arguments import command, show_progress
+
+
+def add(commands: Any) -> None:
+    one = command(
+        commands,
+        run,
+        "Compare methods on recordings. It hides frames, reconstructs them and prints a table of "
+        "the errors. With --out, what is finished is kept: the same again goes on where it was "
+        "stopped, and computes only what is new. A recording or method that fails is said, and the "
+        "others go on; the exit status is 2 only if all fail.",
+        "configs/slider_depth.toml --out results",
+        "mine.toml --out results --workers 8",
+        "mine.toml --out results --cluster tcp://10.0.0.1:8786",
+    )
+    one.add_argument("config", metavar="CONFIG.toml", type=Path, help="recordings and methods")
+    one.add_argument(
+        "--out", metavar="DIR", type=Path, help="folder for report.html, results.json and others"
+    )
+    where = one.add_mutually_exclusive_group()
+    where.add_argument(
+        "--workers", metavar="N", type=int, help="compute in N processes instead of one"
+    )
+    where.add_argument(
+        "--cluster", metavar="ADDRESS", help="compute on the Dask cluster with this scheduler"
+    )
+    where.add_argument(
+        "--scheduler-file",
+        metavar="FILE",
+        type=Path,
+        help="the same, of the scheduler that wrote this file",
+    )
+    one.add_argument(
+        "--retries",
+        metavar="K",
+        type=int,
+        default=2,
+        help="further attempts where a worker dies or fails; default: %(default)s",
+    )
+
+
+def run(
+    config: Path,
+    out: Path | None,
+    workers: int | None,
+    cluster: str | None,
+    scheduler_file: Path | None,
+    retries: int,
+) -> None:
+    from jaxevent.runs.evaluate import evaluate
+    from jaxevent.show.report import markdown_table
+
+    rows = evaluate(
+        config,
+        out,
+        progress=show_progress(),
+        workers=workers,
+        cluster=cluster,
+        scheduler_file=scheduler_file,
+        retries=retries,
+    )
+    print(markdown_table(rows), end="")
+    if out is not None:
+        files = "report.html, results.json, results.md, results.parquet, config.toml"
+        if not (out / "results.parquet").exists():
+            files = files.replace("results.parquet, ", "")
+            files += "; results.parquet needs pip install 'jaxevent[parquet]'"
+        print(f"\nwritten to {out}: {files}")
+    failed = sum("error" in row for row in rows)
+    if failed:
+        print(f"jaxevent: {failed} of {len(rows)} rows failed, see below them", file=sys.stderr)

@@ -1,0 +1,73 @@
+"""The command `jaxevent fit`."""
+
+from pathlib import Path
+from typing import Any
+
+from jaxevent.cli.arguments import command, show_progress
+from jaxevent.errors import InputError
+
+
+def add(commands: Any) -> None:
+    one = command(
+        commands,
+        run,
+        "Fit parameters of methods to recordings. It writes them with tables of the errors before "
+        "and after, and prints the errors of images that it did not use. An interrupted fit goes "
+        "on with --resume. Several processes, on one machine or many, fit together: each is given "
+        "the same arguments and its number.",
+        "configs/fit_slider_depth.toml --out fitted",
+        "configs/fit_slider_depth.toml --recording mine.h5 --out mine --resume",
+        "mine.toml --out fitted --coordinator host1:4321 --processes 2 --process 0",
+    )
+    one.add_argument("config", metavar="CONFIG.toml", type=Path, help="what to fit, and to what")
+    one.add_argument(
+        "--out", metavar="DIR", type=Path, required=True, help="folder for params.toml, results.md"
+    )
+    one.add_argument(
+        "--recording",
+        metavar="PATH",
+        dest="recordings",
+        action="append",
+        help="fitted to instead of those in the file; may be repeated",
+    )
+    one.add_argument("--resume", action="store_true", help="go on from the checkpoint in DIR")
+    one.add_argument(
+        "--coordinator", metavar="HOST:PORT", help="a free port of the machine of process 0"
+    )
+    one.add_argument("--processes", metavar="N", type=int, help="how many fit together")
+    one.add_argument("--process", metavar="I", type=int, help="which of them this is, from 0")
+    one.add_argument(
+        "--distributed",
+        action="store_true",
+        help="the same, found by JAX: under SLURM, Open MPI, Kubernetes",
+    )
+
+
+def run(
+    config: Path,
+    out: Path,
+    recordings: list[str] | None,
+    resume: bool,
+    coordinator: str | None,
+    processes: int | None,
+    process: int | None,
+    distributed: bool,
+) -> None:
+    from jaxevent import devices
+
+    parts = (coordinator, processes, process)
+    if distributed and parts != (None, None, None):
+        raise InputError(
+            "--distributed finds the coordinator and the processes itself; give one or the other"
+        )
+    if distributed or parts != (None, None, None):
+        devices.join(*parts)
+
+    from jaxevent.runs.fit import fit
+
+    fit(config, out, recordings, resume, show_progress())
+    if not devices.first():
+        return
+    print((out / "results.md").read_text(), end="")
+    files = "params.toml, results.json, results.md, loss.csv, loss.png, config.toml"
+    print(f"\nwritten to {out}: {files}")

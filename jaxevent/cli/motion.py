@@ -1,0 +1,176 @@
+"""The command `jaxevent motion`."""
+
+import dataclasses
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+from jaxevent.cli import arguments
+from jaxevent.cli.arguments import command, show_progress
+from jaxevent.errors import InputError
+
+CLOUD = 64  # particles of an estimate that are kept for the plot
+
+
+def add(commands: Any) -> None:
+    one = command(
+        commands,
+        run,
+        "Estimate how the camera moved. It writes a folder of tables (motion.csv, motion.h5), "
+        "plots and an image of the events before and after they are moved back along the motion, "
+        "and with --truth the errors. The camera's axes are x to the right, y down, z forward.",
+        "slider_depth.zip --model planar --truth --out slider",
+        "spin.h5 --model rotation --truth spin.csv --flow --out spin",
+        "drone.h5 --model general --gyro --start 2 --stop 3 --out drone",
+    )
+    one.add_argument("path", metavar="PATH", type=Path, help="a recording; frames are not needed")
+    one.add_argument(
+        "--model",
+        metavar="MODEL",
+        required=True,
+        help="planar: image velocity vx, vy (px/s); rotation: angular velocity wx, wy, wz (rad/s); "
+        "general: heading tx, ty, tz, a unit vector, and angular velocity",
+    )
+    one.add_argument(
+        "--method",
+        metavar="NAME",
+        help="voting, batch, contrast, planes or frames; default: voting, for general motion batch",
+    )
+    one.add_argument(
+        "--params",
+        metavar="FILE",
+        type=Path,
+        help="TOML file of name = value lines, e.g. particles = 400, or params.toml of a fit",
+    )
+    one.add_argument("--seed", metavar="N", type=int, default=0, help="of all that is random")
+    one.add_argument(
+        "--truth",
+        metavar="CSV",
+        nargs="?",
+        const="auto",
+        help="compare with a table with columns as in motion.csv, or without a name with the "
+        "recording's poses or else its gyro",
+    )
+    one.add_argument(
+        "--gyro", action="store_true", help="let the recording's gyro help the method batch"
+    )
+    one.add_argument(
+        "--still",
+        metavar="S,S",
+        type=arguments.span,
+        help="from when to when the camera is still: what its gyro shows then is its bias",
+    )
+    one.add_argument(
+        "--rate", metavar="HZ", type=float, default=1000.0, help="rows per second; default: 1000"
+    )
+    one.add_argument(
+        "--centred",
+        action="store_true",
+        help="take every estimate for the time that what it saw shows, some ms earlier",
+    )
+    one.add_argument(
+        "--smooth", action="store_true", help="use the events that come later too, with voting"
+    )
+    one.add_argument("--start", metavar="S", type=float, help="on the recording's clock")
+    one.add_argument("--stop", metavar="S", type=float, help="its end")
+    one.add_argument(
+        "--flow", action="store_true", help="write the optical flow of each event too: flow.h5"
+    )
+    one.add_argument(
+        "--focal",
+        metavar="PX",
+        type=float,
+        help="focal length, for a recording without calibration; the centre is the sensor's",
+    )
+    arguments.add_size(one)
+    one.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
+
+
+def run(
+    path: Path,
+    model: str,
+    method: str | None,
+    params: Path | None,
+    seed: int,
+    truth: str | None,
+    gyro: bool,
+    still: tuple[float, float] | None,
+    rate: float | int,
+    centred: bool,
+    smooth: bool,
+    start: float | int | None,
+    stop: float | int | None,
+    flow: bool,
+    focal: float | int | None,
+    size: tuple[int, int] | None,
+    out: Path,
+) -> None:
+    import inspect
+    import json
+
+    from jaxevent.camera import PinholeCamera
+    from jaxevent.egomotion import METHODS, find_method, from_gyro, gyro_bias
+    from jaxevent.io import load
+    from jaxevent.show.motion import Output
+
+    estimator = find_method(method, model)
+    method = next(name for name, one in METHODS.items() if one is estimator)
+    values = estimator.Params.of({}) if params is None else estimator.Params.load(params, method)
+    if seed < 0:
+        raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
+    takes = inspect.signature(estimator.estimate).parameters
+    for option, used, other in (("gyro", gyro, "batch"), ("smooth", smooth, "voting")):
+        if used and option not in takes:
+            raise InputError(
+                f"--{option} is not for the method {method}; leave it out or use {other}"
+            )
+    output = Output(out, rate, truth, centred, flow)
+    recording = load(path, size, in_memory=False, progress=show_progress())
+    recording = dataclasses.replace(recording, name=str(path))  # for messages
+    if not len(recording.events):
+        raise InputError(f"{path}: holds no events; choose another recording")
+    if focal is not None:
+        if not 0 < focal < math.inf:
+            raise InputError(f"--focal {focal:g} is not possible; give pixels above 0")
+        if recording.camera is not None:
+            raise InputError(f"{path}: has a calibration; leave out --focal")
+        centre = (recording.width - 1) / 2, (recording.height - 1) / 2
+        recording = dataclasses.replace(recording, camera=PinholeCamera(focal, focal, *centre))
+    if model != "planar" and recording.camera is None:
+        raise InputError(
+            f"{path}: has no calibration, which {model} motion needs; give --focal or choose "
+            "--model planar"
+        )
+    imu = recording.imu
+    if imu is None and (gyro or still is not None):
+        raise InputError(
+            f"{path}: holds no IMU; leave out {'--gyro' if gyro else '--still'} or choose another "
+            "recording"
+        )
+    bias = None if imu is None or still is None else gyro_bias(imu, *still)
+    true = output.known(recording, model, bias)
+    settings: dict[str, Any] = {"cloud": CLOUD} if "cloud" in takes else {}
+    if smooth:
+        settings["smooth"] = True
+    if imu is not None and gyro:
+        settings["gyro"] = from_gyro(imu) if bias is None else from_gyro(imu, bias)
+    if start is not None or stop is not None:
+        poses, measured = recording.poses, recording.imu
+        recording = dataclasses.replace(recording[start:stop], poses=poses, imu=measured)
+        if not len(recording.events):
+            raise InputError(f"{path}: holds no events from --start to --stop; choose other times")
+    clock = time.perf_counter()
+    told = estimator.estimate(
+        recording, values, model=model, seed=seed, progress=show_progress(), **settings
+    )
+    seconds = time.perf_counter() - clock
+    about = {"method": method, "parameters": json.dumps(values.values()), "seed": seed}
+    about |= {"smooth": smooth, "gyro": gyro, "centred": centred}
+    written = output.write(recording, told, about, true, show_progress())
+    print("\n".join([f"{model} motion by {method}:", *written.summary()]))
+    count = len(recording.events)
+    print(
+        f"\n{', '.join(written.files)} in {out}: {count:,} events in {seconds:.2f} s, "
+        f"{count / seconds:,.0f} events/s"
+    )

@@ -1,0 +1,95 @@
+"""The command `jaxevent reconstruct`."""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+from jaxevent.cli import arguments
+from jaxevent.cli.arguments import command, show_progress
+from jaxevent.errors import InputError
+
+
+def add(commands: Any) -> None:
+    one = command(
+        commands,
+        run,
+        "Make images of a recording. The name of the output tells its kind: .h5 holds times, "
+        "linear intensity and its variance; .mp4 is a video; without suffix it is a folder of PNG "
+        "images with images.txt.",
+        "slider_depth.zip --method akf --rate 200 --out slider.mp4",
+        "slider_depth.zip --method akf --at frames --params mine.toml --out slider.h5",
+        "bike.h5 --method akf --colour --tone log --out bike",
+    )
+    one.add_argument("path", metavar="PATH", type=Path, help="a recording")
+    one.add_argument(
+        "--method",
+        metavar="NAME",
+        required=True,
+        help="akf, aks, cf, cf-augmented, high-pass, edi, augmented, blend or last-frame",
+    )
+    when = one.add_mutually_exclusive_group()
+    when.add_argument("--rate", metavar="HZ", type=float, help="images per second, evenly spaced")
+    when.add_argument("--at", choices=["frames"], help="one image where each frame is")
+    one.add_argument(
+        "--params",
+        metavar="FILE",
+        type=Path,
+        help="TOML file of name = value lines, e.g. c_on = 0.1, or params.toml of a fit",
+    )
+    one.add_argument(
+        "--tone",
+        choices=["linear", "log", "percentile", "clahe"],
+        help="how intensity becomes grey in PNG and MP4; default: linear",
+    )
+    one.add_argument(
+        "--colour",
+        action="store_true",
+        help="in the colours of the frames, for a recording that holds extra/rgb; in .h5 images "
+        "of red, green, blue without variance",
+    )
+    one.add_argument(
+        "--out", metavar="DIR_or_FILE", type=Path, required=True, help="name in .h5, .mp4 or none"
+    )
+    arguments.add_size(one)
+
+
+def run(
+    path: Path,
+    method: str,
+    rate: float | int | None,
+    at: str | None,
+    params: Path | None,
+    size: tuple[int, int] | None,
+    tone: str | None,
+    colour: bool,
+    out: Path,
+) -> None:
+    from jaxevent.io import load
+    from jaxevent.reconstruction.colour import colour_video
+    from jaxevent.runs.evaluate import find_method, frame_times
+    from jaxevent.show.export import evenly, write_hdf5, writer
+
+    write = writer(out)
+    if tone is not None and write is write_hdf5:
+        raise InputError(f"{out}: --tone is for images to look at; HDF5 holds linear intensity")
+    estimator = find_method(method)
+    values = estimator.Params() if params is None else estimator.Params.load(params, method)
+    recording = load(path, size, in_memory=False, progress=show_progress())
+    name = recording.name
+    recording = dataclasses.replace(recording, name=str(path))  # for messages
+    if at == "frames" and recording.frames is None:
+        raise InputError(f"{path}: holds no frames; give --rate instead of --at frames")
+    if rate is None and recording.frames is not None:
+        times = frame_times(recording.frames, values)
+    else:
+        times = evenly(recording, 100.0 if rate is None else rate)
+    clock = time.perf_counter()
+    video = estimator.reconstruct(recording, values, progress=show_progress())
+    colours = colour_video(video, recording) if colour else None
+    how = write(video, times, out, tone or "linear", name, colours)
+    seconds = time.perf_counter() - clock
+    print(
+        f"{out}: {len(times):,} images{how}, {seconds:.2f} s, "
+        f"{len(recording.events) / seconds:,.0f} events/s"
+    )

@@ -1,0 +1,153 @@
+"""The command `jaxevent register`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from jaxevent.cli import arguments
+from jaxevent.cli.arguments import command, print_stored, show_progress
+from jaxevent.errors import InputError
+
+
+def add(commands: Any) -> None:
+    one = command(
+        commands,
+        run,
+        "Bring the frames of a separate camera onto the event camera's pixels and clock, and store "
+        "both as one recording. From a calibration, or else by a homography, for scenes that are "
+        "far away or flat, which is estimated from the recordings, as is the offset of the clocks.",
+        "events.raw --frames camera --out both.h5",
+        "events.h5 --frames camera.bag --calibration rig.toml --depth 2.5 --out both.h5",
+        "both.h5 --reference hdr --homography H.csv --offset 0.0123 --out truth.h5",
+    )
+    one.add_argument("path", metavar="PATH", type=Path, help="a recording of the event camera")
+    source = one.add_mutually_exclusive_group(required=True)
+    source.add_argument(
+        "--frames",
+        metavar="OTHER",
+        type=Path,
+        help="the other camera: a recording, or a folder of images with timestamps.txt",
+    )
+    source.add_argument(
+        "--reference",
+        metavar="OTHER",
+        type=Path,
+        help="the same of HDR images, which become the reference of `jaxevent evaluate`",
+    )
+    one.add_argument(
+        "--homography",
+        metavar="CSV",
+        type=Path,
+        help="three lines of three numbers, from pixels of the event camera to the other's",
+    )
+    one.add_argument(
+        "--calibration",
+        metavar="TOML",
+        type=Path,
+        help="both cameras and the transform between them, see jaxevent.register.Rig.read",
+    )
+    one.add_argument(
+        "--depth",
+        metavar="M_or_NPY",
+        help="of the scene in m, one number or a map of the event camera's pixels; default: far",
+    )
+    one.add_argument(
+        "--plane",
+        metavar="A,B,C,D",
+        type=arguments.plane,
+        help="instead: the scene is a x + b y + c z = d (m); --plane=A,... where A is negative",
+    )
+    one.add_argument(
+        "--offset",
+        metavar="S",
+        type=float,
+        help="added to the other camera's time stamps; default: estimated",
+    )
+    one.add_argument(
+        "--search", metavar="S", type=float, help="the largest offset that is thought possible"
+    )
+    one.add_argument(
+        "--exposure", metavar="S", type=float, help="of images in a folder, which do not tell it"
+    )
+    one.add_argument(
+        "--white", metavar="V", type=float, help="their value of intensity 1; default: the largest"
+    )
+    one.add_argument(
+        "--crop", action="store_true", help="cut to a rectangle of pixels that both cameras see"
+    )
+    arguments.add_size(one)
+    arguments.add_stream(one)
+    one.add_argument(
+        "--out", metavar="FILE", type=Path, required=True, help="the HDF5 file to write"
+    )
+
+
+def run(
+    path: Path,
+    frames: Path | None,
+    reference: Path | None,
+    homography: Path | None,
+    calibration: Path | None,
+    depth: str | None,
+    plane: tuple[float, float, float, float] | None,
+    offset: float | int | None,
+    search: float | int | None,
+    exposure: float | int | None,
+    white: float | int | None,
+    crop: bool,
+    size: tuple[int, int] | None,
+    stream: str | None,
+    out: Path,
+) -> None:
+    from jaxevent import register as rig
+    from jaxevent.io import load, save
+    from jaxevent.io.output import complete
+
+    if homography is not None and calibration is not None:
+        raise InputError("--homography and --calibration say the same; leave one of them out")
+    for name, value in (("depth", depth), ("plane", plane)):
+        if value is not None and calibration is None:
+            raise InputError(f"--{name} needs --calibration; add it or leave --{name} out")
+    if depth is not None and plane is not None:
+        raise InputError("--depth and --plane say the same; leave one of them out")
+    if offset is not None and search is not None:
+        raise InputError("--search is for an offset that is not known; leave it out with --offset")
+    if crop and reference is not None:
+        raise InputError("--crop is for frames; leave it out with --reference")
+    source = frames or reference
+    assert source is not None
+    other = rig.read_frames(
+        source,
+        reference=reference is not None,
+        exposure=exposure,
+        white=white,
+        progress=show_progress(),
+    )
+    recording = load(path, size, in_memory=False, progress=show_progress(), stream=stream)
+    name = recording.name
+    recording = dataclasses.replace(recording, name=str(path))  # for messages
+    seen, grid = (recording.width, recording.height), None
+    if calibration is not None:
+        known = rig.Rig.read(calibration, recording.camera)
+        recording = dataclasses.replace(recording, camera=known.events)
+        far = {} if depth is None else {"depth": rig.read_depth(depth, seen)}
+        grid = known.grid(seen, (other.width, other.height), plane=plane, **far)
+    H = None if homography is None else rig.read_homography(homography)
+    # Opened first, so that a place that cannot be written is told before the work.
+    with complete(out) as partial:
+        found = rig.estimate(
+            recording, other, grid, homography=H, offset=offset, search=search,
+            progress=show_progress(),
+        )  # fmt: skip
+        both = rig.registered(recording, other, found, crop=crop, reference=reference is not None)
+        save(dataclasses.replace(both, name=name), partial, progress=show_progress())
+    if found.homography is not None and H is None:
+        print("homography from the event camera's pixels to the other's:")
+        for row in found.homography:
+            print("  " + ", ".join(f"{value:.9g}" for value in row))
+    how = "given" if offset is not None else "estimated"
+    print(f"offset added to the other camera's time stamps, {how}: {found.offset:.6f} s")
+    if found.agreement is not None:
+        print(f"correlation of the changes that frames and events show: {found.agreement:.3f}")
+    print(f"pixels that the other camera sees: {rig.seen(found.grid):.1%}")
+    print_stored(both, out)

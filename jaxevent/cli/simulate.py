@@ -1,0 +1,251 @@
+"""The command `jaxevent simulate`."""
+
+import contextlib
+import math
+from pathlib import Path
+from typing import Any
+
+from jaxevent.cli import arguments
+from jaxevent.cli.arguments import command, print_stored
+from jaxevent.errors import InputError
+
+
+def add(commands: Any) -> None:
+    one = command(
+        commands,
+        run,
+        "Make a recording whose truth is known, as HDF5. A simulated sensor looks at a drawn scene "
+        "of high dynamic range over which the camera moves, or at a video, of which the frames see "
+        "only the middle levels. Or events alone, of moving blobs. Or a camera that moves in a "
+        "rigid world.",
+        "--scene lake --speed fast --out lake.h5",
+        "--blobs lissajous --truth dot.csv --out dot.h5",
+        "--motion rotation --change varying --truth spin.csv --out spin.h5",
+        "bike.mp4 --cut 50 --speed 0.5 --out bike.h5",
+    )
+    source = one.add_mutually_exclusive_group(required=True)
+    source.add_argument(
+        "video", metavar="VIDEO", nargs="?", type=Path, help="a video, or a folder of images"
+    )
+    source.add_argument(
+        "--scene",
+        metavar="NAME",
+        help="room, forest, mountain, lake, night, tunnel, or a number for a variant of one",
+    )
+    source.add_argument(
+        "--blobs",
+        metavar="NAME",
+        help="lissajous, noise, growing, ttc, disc, crossing, dropout, flock or walk",
+    )
+    source.add_argument(
+        "--motion",
+        metavar="NAME",
+        help="of the camera: planar, rotation, or general before a wall, shapes or texture",
+    )
+    one.add_argument(
+        "--out", metavar="FILE", type=Path, required=True, help="the HDF5 file to write"
+    )
+    one.add_argument(
+        "--sensor",
+        metavar="NAME",
+        help="ideal, good, davis or poor; default: davis, with --motion an ideal one",
+    )
+    one.add_argument("--seed", metavar="N", type=int, default=0, help="of all that is random")
+    one.add_argument(
+        "--speed",
+        metavar="SPEED",
+        help="of the camera over a scene, slow (default) or fast; of a video, 2: twice as fast; of "
+        "--motion, px/s (planar), rad/s (rotation) or m/s",
+    )
+    one.add_argument(
+        "--duration",
+        metavar="S",
+        type=float,
+        help="seconds of a scene, default 1.5, or of --motion, default 0.5; of the video, before "
+        "--speed, or of blobs, default all",
+    )
+    one.add_argument(
+        "--truth",
+        metavar="CSV",
+        type=Path,
+        help="a table at 1000 Hz: of blobs their states, as that of `jaxevent track`, of --motion "
+        "the motion, as that of `jaxevent motion`",
+    )
+    one.add_argument(
+        "--size",
+        metavar="W,H",
+        type=arguments.size,
+        help="sensor size in pixels; default: 128,96 for a scene, 240,180 for --motion",
+    )
+    group = one.add_argument_group("only for --motion")
+    group.add_argument(
+        "--change",
+        metavar="HOW",
+        help="how the motion changes: constant (default), linear or varying",
+    )
+    group = one.add_argument_group("only for a video")
+    group.add_argument("--start", metavar="S", type=float, help="first second used; default: 0")
+    group.add_argument(
+        "--cut",
+        metavar="LEVELS",
+        type=float,
+        help="levels of 255 that the frames crop at either end, 0 to 127; default: 50",
+    )
+    group.add_argument(
+        "--max-size",
+        metavar="PIXELS",
+        type=int,
+        help="longer side, to which a larger video is scaled down; default: 346",
+    )
+
+
+def run(
+    video: Path | None,
+    scene: str | None,
+    blobs: str | None,
+    motion: str | None,
+    change: str | None,
+    truth: Path | None,
+    out: Path,
+    sensor: str | None,
+    seed: int,
+    speed: str | None,
+    duration: float | int | None,
+    size: tuple[int, int] | None,
+    start: float | int | None,
+    cut: float | int | None,
+    max_size: int | None,
+) -> None:
+    from jaxevent import simulate as sim
+    from jaxevent.io import save
+    from jaxevent.io.output import complete
+    from jaxevent.parameters import nearest
+    from jaxevent.simulate.scenes import SPEEDS
+
+    if seed < 0:
+        raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
+    if duration is not None and not 0 < duration < math.inf:
+        raise InputError(f"--duration {duration:g} is not possible; give seconds above 0")
+    if size is not None and min(size) < 1:
+        raise InputError(f"--size {size[0]},{size[1]} is not possible; give it in pixels")
+    if sensor is not None and sensor not in sim.SENSORS:
+        raise InputError(f"there is no sensor {sensor!r}; {nearest(sensor, sim.SENSORS)}")
+    if blobs is not None or motion is not None:
+        given = {"start": start, "cut": cut, "max-size": max_size}
+        if blobs is not None:
+            given |= {"sensor": sensor, "speed": speed, "size": size, "change": change}
+        for name, value in given.items():
+            if value is not None:
+                what = "blobs" if blobs is not None else "the motion of a camera"
+                raise InputError(f"--{name} is not for {what}; leave it out")
+        if blobs is not None:
+            _simulate_blobs(blobs, truth, out, seed, duration)
+        else:
+            assert motion is not None
+            how = {"change": change or "constant", "sensor": sensor, "speed": speed}
+            _simulate_motion(motion, truth, out, seed, duration or 0.5, size or (240, 180), **how)
+        return
+    if truth is not None:
+        raise InputError(
+            "--truth is that of --blobs and --motion; HDR scenes hold theirs, leave it out"
+        )
+    if change is not None:
+        raise InputError("--change is for --motion; leave it out")
+    sensor = sensor or "davis"
+    given: dict[str, Any] = {"start": start, "cut": cut, "max_size": max_size}
+    given = {name: value for name, value in given.items() if value is not None}
+    # Opened first, so that a place that cannot be written is told before the work.
+    with complete(out) as partial:
+        if scene is not None:
+            if given:
+                option = next(iter(given)).replace("_", "-")
+                raise InputError(f"--{option} is for a video; leave it out with --scene")
+            way: Any = speed or "slow"
+            if way not in SPEEDS:
+                raise InputError(f"--speed {way} is not possible for a scene; give slow or fast")
+            panorama = sim.scene(int(scene) if scene.isdecimal() else scene)
+            source = sim.Pan(panorama, size or (128, 96), duration or 1.5, way, seed)
+            recording = sim.simulate(source, sim.SENSORS[sensor], seed, f"{scene}-{way}")
+        else:
+            assert video is not None
+            if size is not None:
+                raise InputError("--size is for a scene; scale a video with --max-size")
+            try:
+                factor = float(speed or 1)
+            except ValueError:
+                raise InputError(
+                    f"--speed {speed} is for a scene; give a video a number, such as 0.5"
+                ) from None
+            stop = None if duration is None else (start or 0.0) + duration
+            recording = sim.from_video(
+                video, sim.SENSORS[sensor], speed=factor, stop=stop, seed=seed, **given
+            )
+        save(recording, partial)
+    print_stored(recording, out)
+
+
+def _simulate_blobs(
+    name: str, truth: Path | None, out: Path, seed: int, duration: float | int | None
+) -> None:
+    import numpy as np
+
+    from jaxevent.io import save
+    from jaxevent.io.output import complete
+    from jaxevent.show.tracks import write_states
+    from jaxevent.simulate import blob_scene
+
+    with contextlib.ExitStack() as stack:
+        partial = stack.enter_context(complete(out))
+        table = None if truth is None else stack.enter_context(complete(truth))
+        recording, states = blob_scene(name, seed)
+        if duration is not None and duration < states.duration:
+            recording = recording[: float(duration)]
+        save(recording, partial)
+        if table is not None:
+            times = np.arange(0, recording.stop + 1, 1000)
+            write_states(table, times, states(times), states.visible(times))
+    print_stored(recording, out)
+
+
+def _simulate_motion(
+    name: str,
+    truth: Path | None,
+    out: Path,
+    seed: int,
+    duration: float | int,
+    size: tuple[int, int],
+    *,
+    change: str,
+    sensor: str | None,
+    speed: str | None,
+) -> None:
+    import numpy as np
+
+    from jaxevent.io import save
+    from jaxevent.io.output import complete
+    from jaxevent.show.motion import write_known
+    from jaxevent.simulate import SENSORS, motion_scene
+
+    try:
+        pace = None if speed is None else float(speed)
+    except ValueError:
+        pace = math.nan
+    if pace is not None and not 0 < pace < math.inf:
+        raise InputError(f"--speed {speed} is not possible; give a number above 0, such as 1.5")
+    with contextlib.ExitStack() as stack:
+        partial = stack.enter_context(complete(out))
+        table = None if truth is None else stack.enter_context(complete(truth))
+        # The field of view is always that of 240 px and f = 200 px.
+        recording, source = motion_scene(
+            name, change, seed, size=size, focal=size[0] / 1.2, duration=duration, speed=pace,
+            sensor=None if sensor is None else SENSORS[sensor],
+        )  # fmt: skip
+        save(recording, partial)
+        if table is not None:
+            times = np.arange(0, round(1e6 * duration) + 1, 1000)
+            T, Omega = source.twist(times)
+            heading = T / np.maximum(np.linalg.norm(T, axis=1, keepdims=True), 1e-12)
+            kinds = {"planar": source.velocity, "rotation": lambda _: Omega}
+            values = kinds.get(name, lambda _: np.concatenate([heading, Omega], 1))(times)
+            write_known(table, name if name in kinds else "general", times, values)
+    print_stored(recording, out)

@@ -1,0 +1,126 @@
+"""The command `jaxevent track`."""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+from jaxevent.cli import arguments
+from jaxevent.cli.arguments import command, show_progress
+from jaxevent.errors import InputError
+
+
+def add(commands: Any) -> None:
+    one = command(
+        commands,
+        run,
+        "Track blobs: bright spots and other compact sources of events. Without suffix the output "
+        "is a folder of tracks.csv, tracks.h5, tracks.mp4 and tracks.png; with one it is the file "
+        "of that kind. Tables have a row for each track and time.",
+        "stars.h5 --params slow.toml --out stars",
+        "dot.h5 --seed 320,240,20 --rate 2000 --out dot.csv",
+        "car.h5 --seed 400,300,15 --seed 460,300,15 --pair 0,1 --out car",
+    )
+    one.add_argument("path", metavar="PATH", type=Path, help="a recording; frames are not needed")
+    one.add_argument(
+        "--params",
+        metavar="FILE",
+        type=Path,
+        help='TOML file of name = value lines, e.g. preset = "slow" or events_per_step = 16, or '
+        "params.toml of a fit",
+    )
+    one.add_argument(
+        "--seed",
+        metavar="X,Y,SIZE[,T]",
+        dest="seeds",
+        type=arguments.seed,
+        action="append",
+        help="where a blob is (px), how large (standard deviation of its events, px) and from when "
+        "(s, default: the start); may be repeated. Without, blobs are found",
+    )
+    one.add_argument(
+        "--detect", action="store_true", help="find further blobs where there are seeds"
+    )
+    when = one.add_mutually_exclusive_group()
+    when.add_argument(
+        "--rate", metavar="HZ", type=float, default=1000.0, help="rows per second; default: 1000"
+    )
+    when.add_argument("--at", choices=["events"], help="a row for each event of a track")
+    one.add_argument(
+        "--start", metavar="S", type=float, help="of tracking, on the recording's clock"
+    )
+    one.add_argument("--stop", metavar="S", type=float, help="its end")
+    one.add_argument(
+        "--background",
+        choices=["events", "high-pass"],
+        default="events",
+        help="behind the tracks in the video; default: events",
+    )
+    arguments.add_size(one)
+    group = one.add_argument_group("time to contact and range, in quantities.csv and the plot")
+    group.add_argument(
+        "--pair",
+        metavar="ID,ID",
+        type=arguments.pair,
+        help="two tracks whose distance tells 1 / TTC",
+    )
+    group.add_argument("--extent", metavar="M", type=float, help="the target's size in m")
+    group.add_argument("--focal", metavar="PX", type=float, help="focal length in px")
+    group.add_argument(
+        "--size-factor",
+        metavar="K",
+        type=float,
+        help="lambda over the diameter in the image; default: 0.354, of an even rim",
+    )
+    one.add_argument("--out", metavar="DIR_or_FILE", type=Path, required=True, help="what to write")
+
+
+def run(
+    path: Path,
+    params: Path | None,
+    seeds: list[tuple[float, ...]] | None,
+    detect: bool,
+    rate: float | int,
+    at: str | None,
+    start: float | int | None,
+    stop: float | int | None,
+    background: str,
+    size: tuple[int, int] | None,
+    pair: tuple[int, int] | None,
+    extent: float | int | None,
+    focal: float | int | None,
+    size_factor: float | int | None,
+    out: Path,
+) -> None:
+    from jaxevent.blob import Params, track
+    from jaxevent.io import load
+    from jaxevent.show.tracks import Output
+
+    values = Params.of({}) if params is None else Params.load(params, "blob")
+    each = None if at == "events" else rate
+    output = Output(out, each, background, pair, extent, focal, size_factor)
+    recording = load(path, size, in_memory=False, progress=show_progress())
+    recording = dataclasses.replace(recording, name=str(path))  # for messages
+    if not len(recording.events):
+        raise InputError(f"{path}: holds no events to track; choose another recording")
+    span: dict[str, Any] = {"start": start, "stop": stop}
+    clock = time.perf_counter()
+    tracks = track(
+        recording, values, seeds, **span, detect=detect or seeds is None, progress=show_progress()
+    )
+    seconds = time.perf_counter() - clock
+    written = output.write(tracks, show_progress())
+    count = recording.events.index(tracks.stop) - recording.events.index(tracks.start)
+    if len(tracks):
+        print("\n".join(written.summary()))
+    else:
+        print(
+            "no blob was found; say where one is with --seed X,Y,SIZE, or try --params with "
+            'preset = "slow" or "fast"'
+        )
+    how = ", ".join(written.files) + f" in {out}" if not out.suffix else str(out)
+    slow = "" if written.slow is None else f"; the video plays at {written.slow:.3g} of real time"
+    print(
+        f"\n{how}: {len(tracks):,} tracks, {count:,} events in {seconds:.2f} s, "
+        f"{count / seconds:,.0f} events/s{slow}"
+    )

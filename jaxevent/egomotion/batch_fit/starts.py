@@ -1,0 +1,269 @@
+"""Motions to begin with: of planes, and of patches whose flow is measured.
+
+- `rotation`: the pure rotation of the highest contrast;
+- `homography`, `before_a_plane`: the homography flow exp(M tau) of the highest contrast, taken
+  apart into the two motions before a plane that explain it;
+- `patch_flows`, `headings`: flows of patches of the derotated events with their uncertainty; a
+  robust fit of the rest of the rotation for every heading of a hemisphere, both signs of T told
+  apart by depths > 0.
+
+The two kinds fail on different scenes.
+"""
+
+import functools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+from jax import lax
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from jaxevent.egomotion.batch_fit.alignment import Window
+from jaxevent.egomotion.batch_fit.path import LEAST, Path, rays_of
+from jaxevent.egomotion.geometry import A, B
+from jaxevent.egomotion.warped import blur, splat
+
+DIRECTIONS = 600  # headings of a hemisphere that are tried
+HOP, PATCH = 16, 24  # px between patches whose flow is measured, and their size
+
+
+TURNS = np.cross(np.eye(3)[:, None], -np.eye(3))
+STRAINS = np.array(
+    [
+        [[1, 0, 0], [0, -1, 0], [0, 0, 0]],
+        [[1, 0, 0], [0, 1, 0], [0, 0, -2]],
+        [[0, 1, 0], [1, 0, 0], [0, 0, 0]],
+        [[0, 0, 1], [0, 0, 0], [1, 0, 0]],
+        [[0, 0, 0], [0, 0, 1], [0, 1, 0]],
+    ]
+)
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _contrast(values: Array, basis: Array, window: Window, blurs: int, scale: Array) -> tuple:
+    def loss(values: Array) -> Array:
+        X, Y = _moved(jnp.tensordot(values, basis, 1), window)
+        image = blur(splat(jnp.stack([X, Y], 1), window.p, window.shape, window.corner), blurs)
+        return -jnp.sum(image**2) / scale
+
+    return jax.value_and_grad(loss)(values)
+
+
+def _moved(M: Array, window: Window) -> tuple[Array, Array]:
+    """Where exp(M tau) takes the events, to the fifth order, M in 1/s."""
+    one = jnp.ones_like(window.x)
+    term = jnp.stack([window.x / window.f, window.y / window.f, one])
+    X = term
+    for k in range(1, 6):
+        term = M @ term * window.tau / k
+        X = X + term
+    return window.f * X[0] / X[2], window.f * X[1] / X[2]
+
+
+def _sharpest(
+    window: Window, basis: NDArray, values: NDArray, blurs: tuple[int, ...], steps: int
+) -> tuple[NDArray[np.float64], float]:
+    """Values of generators of the highest contrast, from some on, and minus that contrast."""
+    per_px, real, least = 1 / float(window.f * window.half), window.x.dtype, 0.0
+    shapes = jnp.asarray(basis, real)
+    for times in blurs:
+        one = jnp.ones((), real)
+        scale = -_contrast(jnp.asarray(values, real), shapes, window, times, one)[0]
+
+        def value(px: NDArray, times: int = times, scale: Array = scale) -> tuple[float, NDArray]:
+            at = jnp.asarray(px * per_px, real)
+            loss, slope = _contrast(at, shapes, window, times, scale)
+            return float(loss), np.asarray(slope, np.float64) * per_px
+
+        found = scipy.optimize.minimize(
+            value, values / per_px, jac=True, method="L-BFGS-B", options={"maxiter": steps}
+        )
+        values, least = found.x * per_px, float(found.fun) * float(scale)
+    return values, least
+
+
+def rotation(window: Window) -> NDArray[np.float64]:
+    """The pure rotation (rad/s) of the highest contrast; with parallax only a beginning."""
+    far = 8 / float(window.f * window.half)
+    first = [np.zeros(3), *(far * sign * axis for axis in np.eye(3) for sign in (1, -1))]
+    found = side_by_side(lambda at: _sharpest(window, TURNS, at, (8,), 4), first)
+    best = min(found, key=lambda pair: pair[1])[0]
+    return _sharpest(window, TURNS, best, (8, 2, 1), 12)[0]
+
+
+class Plane(NamedTuple):
+    """A motion before a plane: rho = normal . (x, y, f) / f, in 1/m if T is in m/s."""
+
+    T: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    Omega: NDArray[np.float64]
+
+    def path(self, x: NDArray, y: NDArray, f: float, real: Any) -> Path:
+        """The path of this constant twist, with the plane's depths at some places (px)."""
+        rho = rays_of(x, y, f) @ self.normal * np.linalg.norm(self.T)
+        log_rho = np.log(np.maximum(rho, LEAST * np.median(np.abs(rho))))
+        return Path.constant(self.T / np.linalg.norm(self.T), self.Omega, log_rho, real)
+
+
+def homography(window: Window, Omega: NDArray) -> NDArray[np.float64]:
+    """M (3, 3), 1/s, of the homographies exp(M tau) of highest contrast, from a rotation on.
+
+    Of a camera that moves before a plane M is [Omega]x + T n' but for a multiple of 1.
+    """
+    basis, values = np.concatenate([TURNS, STRAINS]), np.append(Omega, np.zeros(len(STRAINS)))
+    return np.tensordot(_sharpest(window, basis, values, (8, 4, 2, 1), 20)[0], basis, 1)
+
+
+def before_a_plane(M: NDArray) -> list[Plane]:
+    """The two motions before a plane that explain M: T and n change places, Omega + n x T.
+
+    Of the symmetric part of T n' the middle eigenvalue is 0, the others are
+    (T . n +- |T| |n|) / 2 (cf. Longuet-Higgins, "The visual ambiguity of a moving plane", 1984; Ma
+    et al., "An Invitation to 3-D Vision", section 5.3.4). Only perspective and time tell the two
+    from each other.
+    """
+    size, axes = np.linalg.eigh((M + M.T) / 2)
+    a = np.sqrt(max(size[2] - size[1], 1e-9)) * axes[:, 2]
+    b = np.sqrt(max(size[1] - size[0], 1e-9)) * axes[:, 0]
+    turn = np.array([M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1]]) / 2
+    found = []
+    for T, normal in ((a + b, a - b), (a - b, a + b)):
+        sign = 1.0 if normal[2] > 0 else -1.0
+        found.append(Plane(sign * T, sign * normal, turn - np.cross(normal, T) / 2))
+    return found
+
+
+@jax.jit
+def _flow_maps(window: Window, Omega: Array, flows: Float[Array, "n 2"]) -> tuple[Array, Array]:
+    """Contrast and number of events of all patches, (n, rows, columns), for flows (px/s)."""
+    x, y = _moved(jnp.tensordot(Omega, jnp.asarray(TURNS, Omega.dtype), 1), window)
+    height, width = (n // 8 * 8 for n in window.shape)
+
+    def patches(image: Array) -> Array:
+        image = image[:height, :width].reshape(height // 8, 8, width // 8, 8).sum((1, 3))
+        return lax.reduce_window(image, 0.0, lax.add, (3, 3), (2, 2), "VALID")
+
+    def one(U: Array) -> tuple[Array, Array]:
+        at = jnp.stack([x - U[0] * window.tau, y - U[1] * window.tau], 1)
+        both = splat(at, jnp.stack([window.p, jnp.abs(window.p)]), window.shape, window.corner)
+        return patches(blur(both[0], 1) ** 2), patches(both[1])
+
+    return lax.map(one, flows)
+
+
+class Flows(NamedTuple):
+    """Of patches: places (n, 2) px, flows (n, 2) px/s and their covariances."""
+
+    xi: NDArray[np.float64]
+    U: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+
+def patch_flows(window: Window, Omega: NDArray, flow_max: float) -> Flows | None:
+    """Flows of patches of the derotated events; None if fewer than 6 tell one."""
+    real = window.x.dtype
+    step = 0.6 / float(window.half)
+    count = int(np.ceil(flow_max / step))
+    grid = np.arange(-count, count + 1) * step
+    n = len(grid)
+    flows = np.stack(np.meshgrid(grid, grid, indexing="ij"), -1).reshape(-1, 2)
+    S, N = (
+        np.asarray(part, np.float64)
+        for part in _flow_maps(window, jnp.asarray(Omega, real), jnp.asarray(flows, real))
+    )
+    sharp = (S / np.maximum(N, 20)).reshape(n, n, *S.shape[1:])
+    N = N.reshape(sharp.shape)
+    a, b = (part.ravel() for part in np.mgrid[-1:2, -1:2].astype(float))
+    # Least squares of a quadratic on 3 x 3 values.
+    solve = np.linalg.pinv(np.stack([np.ones(9), a, b, a * a / 2, a * b, b * b / 2], 1))
+    found = []
+    for row, column in np.ndindex(*S.shape[1:]):
+        map_ = sharp[:, :, row, column]
+        i, j = np.unravel_index(np.argmax(map_), map_.shape)
+        events = N[i, j, row, column]
+        if not (0 < i < n - 1 and 0 < j < n - 1) or events < 40:
+            continue
+        _, ga, gb, aa, ab, bb = solve @ map_[i - 1 : i + 2, j - 1 : j + 2].ravel()
+        bend, axes = np.linalg.eigh(-np.array([[aa, ab], [ab, bb]]))
+        bend = np.maximum(bend, 1e-4 * map_[i, j] + 1e-9)
+        off = np.clip(axes @ (axes.T @ np.array([ga, gb]) / bend), -1, 1)
+        information = axes * bend @ axes.T * events / map_[i, j] / step**2
+        covariance = 16 * np.linalg.inv(information) + 4 * np.eye(2)
+        xi = np.array(window.corner) + np.array([column, row]) * HOP + (PATCH - 1) / 2
+        found.append((xi, np.array([grid[i], grid[j]]) + off * step, covariance))
+    if len(found) < 6:
+        return None
+    return Flows(*(np.array(part) for part in zip(*found, strict=True)))
+
+
+def headings(flows: Flows, f: float, Omega: NDArray, number: int, omega_weight: float) -> list:
+    """The best (heading, Omega, inverse depths, their weights), at least 32 degrees apart.
+
+    For every heading of a hemisphere the rest of the rotation is fitted to what flows are across
+    its epipolar lines, robustly (Geman & McClure, the limit falling from 64 to 2 deviations);
+    depths > 0 choose its sign.
+    """
+    k = np.arange(DIRECTIONS) + 0.5
+    z, azimuth = k / DIRECTIONS, np.pi * (1 + 5**0.5) * k
+    ring = np.sqrt(1 - z * z)
+    T = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], 1)
+    x, y = flows.xi.T
+    a = np.einsum("kij,tj->tki", np.asarray(A(x, y, f), np.float64), T)
+    turn = np.asarray(B(x, y, f), np.float64)
+    across = np.stack([-a[..., 1], a[..., 0]], -1)
+    across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
+    variance = np.einsum("tki,kij,tkj->tk", across, flows.covariance, across)
+    target = np.einsum("tki,ki->tk", across, flows.U)
+    basis = np.einsum("tki,kij->tkj", across, turn)
+    more = np.zeros((DIRECTIONS, 3))
+    damping = (1e-6 * f * f + omega_weight) * np.eye(3)
+    for turn_number in range(10):
+        left = target - np.einsum("tkj,tj->tk", basis, more)
+        limit = 4.0 * 4.0 ** max(0, 5 - turn_number)
+        weight = 1 / variance / (1 + left**2 / variance / limit) ** 2
+        H = np.einsum("tk,tki,tkj->tij", weight, basis, basis) + damping
+        side = np.einsum("tk,tki,tk->ti", weight, basis, target) - omega_weight * Omega
+        more = np.linalg.solve(H, side[..., None])[..., 0]
+    rest = flows.U - np.einsum("kij,tj->tki", turn, more)
+    information = np.linalg.inv(flows.covariance)
+    along = np.einsum("tki,kij,tkj->tk", a, information, a)
+    towards = np.einsum("tki,kij,tkj->tk", a, information, rest)
+    found = []
+    for sign in (1, -1):
+        rho = np.maximum(sign * towards / np.maximum(along, 1e-12), 0)
+        miss = rest - sign * rho[..., None] * a
+        e = np.einsum("tki,kij,tkj->tk", miss, information, miss)
+        cost = (e / (1 + e / 4)).sum(1) + omega_weight * ((more + Omega) ** 2).sum(1)
+        found += list(zip(cost, sign * T, more + Omega, rho, along, strict=True))
+    found.sort(key=lambda one: one[0])
+    best: list = []
+    for one in found:
+        if all(one[1] @ other[1] < 0.85 for other in best):
+            best.append(one)
+            if len(best) == number:
+                break
+    return [one[1:] for one in best]
+
+
+def start(
+    window: Window, flows: Flows, T: NDArray, Omega: NDArray, rho: NDArray, weight: NDArray
+) -> Path:
+    """A path of constant twist with depths that patches tell, the nearest ones most."""
+    x, y = window.places
+    far = (x[:, None] - flows.xi[:, 0]) ** 2 + (y[:, None] - flows.xi[:, 1]) ** 2
+    usual = max(float(np.average(rho, weights=weight + 1e-12)), 1e-3)
+    share = np.exp(-far / (2 * PATCH**2)) * weight / max(weight.mean(), 1e-12) + 1e-6
+    depth = (share * np.clip(rho, 0.15 * usual, 6 * usual)).sum(1) / share.sum(1)
+    return Path.constant(T, Omega, np.log(depth), window.x.dtype)
+
+
+def side_by_side(follow: Callable[[Any], Any], rivals: list[Any]) -> list[Any]:
+    """What comes of rivals, of some at a time: steps of one keep about one core busy."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(follow, rivals))

@@ -1,0 +1,608 @@
+"""General motion by fitting a whole window of events: the camera's path and the scene's depth.
+
+- Starts, from short windows (`starts`): motions before planes, and headings of patches' flows.
+- If a plane explains the events, the fit of a growing window with a plane's depths tells which of
+  two motions it is: to first order both explain them, over time only one.
+- Else each start is followed with a constant twist, then over longer windows (`alignment`). The
+  mean over blocks of n (log S - 1.5 log n) / N, S the contrast and n the number of events of a
+  block, selects those that go on.
+- Of these the cost of the photometric fit (`photometric`) selects, again and again as the fit
+  proceeds. Where events are noisy, sigma is not made much smaller than that noise.
+- Windows overlap, and the path of the one before is followed into the next. After some of them new
+  starts compete with it, and where they win the windows before are fitted again from there.
+"""
+
+import functools
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.ndimage
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from jaxevent.camera import PinholeCamera
+from jaxevent.egomotion.batch_fit.alignment import Window, refine, score
+from jaxevent.egomotion.batch_fit.path import SEGMENTS, Path, Prior, advanced
+from jaxevent.egomotion.batch_fit.photometric import NODE, Report, Scene, Tracks, adjust, depths
+from jaxevent.egomotion.batch_fit.starts import (
+    Plane,
+    before_a_plane,
+    headings,
+    homography,
+    patch_flows,
+    rotation,
+    side_by_side,
+    start,
+)
+from jaxevent.egomotion.candidates import coordinates
+from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.truth import Twists
+from jaxevent.errors import InputError
+from jaxevent.parameters import Count, Number, Parameters, Positive, nearest
+from jaxevent.recording import Recording
+
+MODELS = ("general",)
+MARGIN = 24  # px of the reference view around the sensor
+APART = np.cos(np.radians(6))  # headings of rivals
+TURN = 0.1  # rad/s, likewise
+COARSE = 15000  # events of short windows
+MIDDLE = 30000
+LAST = 60000
+STARTED = 6  # paths at most that go on from the first
+TRIED = 30000  # of the photometric fit of rivals
+
+
+class Stage(NamedTuple):
+    """Steps of the photometric fit.
+
+    A flatter map and a stiffer path leave less freedom, so the fit converges sooner, and a short
+    window, which does not tell how motion changes, does not lead away from the truth.
+    """
+
+    sigma: float  # C
+    steps: int
+    flatter: float | int = 1  # how much: times the prior's weight
+    stiffer: float | int = 1  # likewise
+
+
+ROUNDS = Stage(1.0, 6), Stage(0.5, 6), Stage(0.2, 10), Stage(0.1, 10)  # after a trial of depths
+FINAL = Stage(0.05, 20, 10), Stage(0.02, 20, 3)
+# Rivals remain whose cost is so many times the least, and so much more (C^2): depths that were just
+# looked for leave up to 0.03 C.
+CLOSE = 1.75, 5e-4
+# Of motions before a plane: the part of the window, events, stages, the most that a plane costs
+# (C^2). What is no plane costs 1.8e-2 and more after the first of these, a plane 7e-3 and less; in
+# the end 1.5e-3 and more, 5e-5 and less. Without the flatter maps of the third some fits end on the
+# way, 5 to 30 degrees off at 100 times the cost of the truth.
+GROWING = (
+    (0.5, TRIED // 2, (Stage(2.0, 8), Stage(1.0, 8)), 1e-2),
+    (0.5, TRIED, (Stage(0.3, 12, 1, 100), Stage(0.1, 6, 1, 100)), 1e-3),
+    (1.0, TRIED, tuple(Stage(sigma, 20, 10) for sigma in (1.0, 0.3, 0.1, 0.05)), 1e-3),
+    (1.0, TRIED, (Stage(0.1, 10), Stage(0.05, 20)), 1e-4),
+)
+LOST = 4  # times the least cost of the windows before: the path is not followed
+SHARP = 0.4  # sigma by the noise that is seen, at least: events beside edges are outliers
+
+
+class Params(Parameters):
+    """Parameters of the fit of a window, and of the sequence of windows."""
+
+    half_window = Positive(0.15, "s", "half the length of the last window; earlier: 1/3, 2/3")
+    step = Positive(0.1, "s", "from one window to the next")
+    events = Count(60000, "", "most events of a window, of pixels taken at random")
+    fewest = Count(2000, "", "events that a window needs")
+    fresh = Count(5, "", "windows until new starts compete; twice as many each time they agree")
+    starts = Count(3, "", "headings that are followed, of each of two short windows")
+    cell = Count(24, "px", "of one depth")
+    iterations = Count(8, "", "steps of the alignment of segments on the whole window")
+    rivals = Count(3, "", "aligned starts, some degrees apart, that go on to the photometric fit")
+
+    smooth = Positive(1.0, "", "weight of differences of log depth between cells")
+    relief = Positive(0.1, "", "weight of differences of log depth from its mean")
+    change = Positive(0.02, "1/px^2", "weight of changes of the twist, in px at the window's end")
+    bond = Positive(1.0, "", "weight of differences of log depth between nodes")
+    flat = Positive(0.01, "1/C^2", "weight of differences of log intensity between pixels")
+    alike = Positive(10.0, "", "how many events together tell as much as one: errors are alike")
+    omega_scale = Number(0.0, "rad/s", "prior: |Omega| is about so much or less; 0: not known")
+    gyro_std = Positive(0.03, "rad/s", "of a gyro, if one is given")
+    flow_max = Positive(220.0, "px/s", "flows of patches that are tried, without the rotation")
+
+
+class Fit(NamedTuple):
+    """A fitted window: path with depths at nodes, covariance (6, 6) of heading and Omega.
+
+    The covariance counts errors that differ from one part of the image to another (24 px). Beside
+    plain shapes, where they do not, errors are far larger than it tells.
+    `agreement` is the share of events that the fit explains, `cost` the robust cost per event.
+    """
+
+    path: Path
+    covariance: NDArray[np.float64]
+    agreement: float
+    cost: float
+    map: NDArray[np.floating]
+
+
+Rival = tuple[Scene, Report]
+
+
+class Windows:
+    """The windows of a recording, and how one is fitted."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        params: Params,
+        camera: PinholeCamera,
+        gyro: Twists | None = None,
+        seed: int = 0,
+    ):
+        self.recording, self.params, self.gyro, self.seed = recording, params, gyro, seed
+        self.xi, self.f = coordinates(recording.width, recording.height, camera)
+        flat = self.xi.reshape(-1, 2)
+        lower, upper = np.floor(flat.min(0)) - MARGIN, np.ceil(flat.max(0)) + MARGIN
+        cells = np.ceil((upper - lower + 1) / params.cell).astype(int)
+        corner = lower - (cells * params.cell - (upper - lower + 1)) // 2
+        self.corner = (float(corner[0]), float(corner[1]))
+        self.shape = (int(cells[1]) * params.cell, int(cells[0]) * params.cell)
+        self.box = (flat[:, 0].min(), flat[:, 0].max(), flat[:, 1].min(), flat[:, 1].max())
+
+    def rows(self, centre: int, half: float) -> tuple[int, int]:
+        """The events of a window."""
+        span, index = round(half * 1e6), self.recording.events.index
+        return index(centre - span), index(centre + span)
+
+    def cut(self, centre: int, half: float, most: int) -> Window:
+        """At most so many of a window's events, the rest empty."""
+        most = min(most, self.params.events)
+        first, last = self.rows(centre, half)
+        events = self.recording.events[first:last]
+        rng = np.random.default_rng([self.seed, abs(centre), most])
+        keep = np.arange(len(events))
+        if len(keep) > most:
+            keep = np.sort(rng.choice(len(keep), most, replace=False))
+        real = np.dtype(jnp.result_type(float))
+        data = np.zeros((4, most), real)
+        n = len(keep)
+        data[:2, :n] = self.xi[events.y[keep], events.x[keep]].T
+        data[2, :n] = (events.t[keep] - centre) * 1e-6
+        data[3, :n] = np.where(events.p[keep], 1, -1)
+        x, y, tau, p = (jnp.asarray(part) for part in data)
+        return Window(
+            x,
+            y,
+            tau,
+            p,
+            jnp.asarray(self.f, real),
+            jnp.asarray(half, real),
+            jnp.asarray(self.box, real),
+            self.shape,
+            self.corner,
+            self.params.cell,
+        )
+
+    def prior(self, centre: int, half: float) -> Prior:
+        real = np.dtype(jnp.result_type(float))
+        params = self.params
+        gyro, weight = np.zeros((SEGMENTS, 3)), 0.0
+        if self.gyro is not None:
+            times = centre + ((np.arange(SEGMENTS) + 0.5) / SEGMENTS * 2 - 1) * half * 1e6
+            at = np.clip(np.rint(times), self.gyro.start, self.gyro.stop).astype(np.int64)
+            gyro, weight = self.gyro(at)[1], 1 / float(params.gyro_std) ** 2
+        values = (params.smooth, params.relief, params.change, self.omega_weight, gyro, weight)
+        values += (params.bond, params.flat, params.alike)
+        return Prior(*(jnp.asarray(value, real) for value in values))
+
+    @property
+    def omega_weight(self) -> float:
+        scale = float(self.params.omega_scale)
+        return 1 / scale**2 if scale > 0 else 0.0
+
+    def rotation(self, centre: int) -> NDArray[np.float64]:
+        """The rotation (rad/s) about the middle of a window, a gyro's if there is one."""
+        if self.gyro is None:
+            return rotation(self.cut(centre, float(self.params.half_window) / 3, COARSE))
+        middle = np.clip(centre, self.gyro.start, self.gyro.stop)
+        return self.gyro(np.array([middle], np.int64))[1][0]
+
+    def starts(self, centre: int, Omega: NDArray, planes: list[Plane]) -> list[Path]:
+        """Paths of constant twist to begin with, followed for a third of the window."""
+        params, half = self.params, float(self.params.half_window) / 3
+        window, prior = self.cut(centre, half, MIDDLE), self.prior(centre, half)
+        real = window.x.dtype
+        found = [plane.path(*window.places, self.f, real) for plane in planes]
+        cuts = [self.cut(centre, length, COARSE) for length in (half / 2, half)]
+        for flows in side_by_side(
+            lambda cut: patch_flows(cut, Omega, float(params.flow_max)), cuts
+        ):
+            if flows is None:
+                continue
+            best = headings(flows, self.f, Omega, params.starts, self.omega_weight)
+            found += [start(window, flows, *one) for one in best]
+
+        def follow(path: Path) -> Path:
+            path, _ = refine(window, path, prior, 0, 4, 6)
+            return refine(window, path, prior, 0, 1, 6)[0]
+
+        ranked = side_by_side(lambda path: self.scored(window, follow(path)), found)
+        return self.best(ranked)[:STARTED]
+
+    def tracks(self, centre: int, half: float, most: int) -> Tracks:
+        """All of a window's events of as many pixels as have so many in total, the rest empty."""
+        most = min(most, self.params.events)
+        first, last = self.rows(centre, half)
+        events = self.recording.events[first:last]
+        width, pixels = self.recording.width, self.recording.width * self.recording.height
+        pixel = events.y.astype(np.int64) * width + events.x
+        count = np.bincount(pixel, minlength=pixels)
+        # One event alone tells nothing.
+        order = np.random.default_rng([self.seed, abs(centre), most]).permutation(pixels)
+        order = order[count[order] > 1]
+        taken = np.zeros(pixels, bool)
+        taken[order[np.cumsum(count[order]) <= most]] = True
+        keep = np.flatnonzero(taken[pixel])
+        keep = keep[np.argsort(pixel[keep], kind="stable")]
+        n, where = len(keep), pixel[keep]
+        begins = np.append(True, where[1:] != where[:-1])[:n]
+        begin = np.maximum.accumulate(np.where(begins, np.arange(n), 0))
+        p = np.where(events.p[keep], 1, -1)
+        total = np.cumsum(p)
+        real = np.dtype(jnp.result_type(float))
+        data = np.zeros((6, most), real)
+        data[:2, :n] = self.xi.reshape(-1, 2)[where].T
+        data[2, :n] = (events.t[keep] - centre) * 1e-6
+        data[3, :n] = total - (total - p)[begin]
+        data[4, :n] = np.arange(n) - begin + 1
+        data[5, :n] = p
+        which = np.full(most, pixels, np.int32)
+        which[:n] = where
+        lower, upper = np.array(self.box[::2]) - MARGIN, np.array(self.box[1::2]) + MARGIN
+        lower = np.floor(lower)
+        across, down = (np.ceil(upper - lower).astype(int) + 1).tolist()
+        x, y, tau, level, number, p = (jnp.asarray(part) for part in data)
+        return Tracks(
+            x,
+            y,
+            tau,
+            level,
+            number,
+            p,
+            jnp.asarray(which),
+            jnp.asarray(self.f, real),
+            jnp.asarray(half, real),
+            (down, across),
+            (float(lower[0]), float(lower[1])),
+            pixels + 1,
+            NODE,
+        )
+
+    def aligned(self, centre: int, paths: list[Path]) -> list[Path]:
+        """Starts followed by the alignment of segments, the best first, some degrees apart."""
+        half = float(self.params.half_window)
+        middle, last = self.cut(centre, 2 * half / 3, MIDDLE), self.cut(centre, half, LAST)
+        priors = self.prior(centre, 2 * half / 3), self.prior(centre, half)
+
+        def follow(paths: list[Path], window: Window, prior: Prior, degree: int, n: int) -> list:
+            def one(path: Path) -> tuple[float, Path]:
+                return self.scored(window, refine(window, path, prior, degree, 2, n)[0])
+
+            return self.best(side_by_side(one, paths))
+
+        best = follow(paths, middle, priors[0], 1, 8)[: 2 * self.params.rivals]
+        best = follow(best, last, priors[1], 2, self.params.iterations)
+        return best[: self.params.rivals]
+
+    def scored(self, window: Window, path: Path) -> tuple[float, Path]:
+        """A path with what selects it among others."""
+        return float(score(window, path)) - self.turning(path), path
+
+    def best(self, paths: list[tuple[float, Path]]) -> list[Path]:
+        """The best first, without those near to a better one."""
+        sound = sorted((pair for pair in paths if np.isfinite(pair[0])), key=lambda pair: -pair[0])
+        return _apart([path for _, path in sound], lambda path: path)
+
+    def on_nodes(self, path: Path, tracks: Tracks) -> Path:
+        """A path with the depths of cells, with depths at nodes."""
+        cell, (x, y) = self.params.cell, tracks.places
+        middle = (cell - 1) / 2
+        u, v = (x - self.corner[0] - middle) / cell, (y - self.corner[1] - middle) / cell
+        cells = np.asarray(path.log_rho, np.float64)
+        cells = cells.reshape(self.shape[0] // cell, self.shape[1] // cell)
+        log_rho = scipy.ndimage.map_coordinates(cells, [v, u], order=1, mode="nearest")
+        return Path(path.O, path.D, jnp.asarray(log_rho, path.O.dtype))
+
+    def before_a_plane(self, centre: int, planes: list[Plane]) -> list[Rival]:
+        """Of motions before a plane those of least cost first, if a plane explains the events.
+
+        Fitted to a growing part of the window, with the depths of a plane throughout: of the two
+        motions that explain a homography only one explains how it changes, if it is one plane.
+        """
+        paths, found = [], []
+        for row, (share, events, stages, most) in enumerate(GROWING):
+            half = share * float(self.params.half_window)
+            tracks, prior = self.tracks(centre, half, events), self.prior(centre, half)
+            if not paths:
+                real = tracks.x.dtype
+                paths = [plane.path(*tracks.places, self.f, real) for plane in planes]
+            follow = functools.partial(_begun, tracks, prior=prior, stages=stages, plane=True)
+            found = [one for one in side_by_side(follow, paths) if float(one[1].cost) < most]
+            # The first is too coarse to choose among motions that are alike.
+            found = self.ranked(found) if row else found
+            paths = [scene.path for scene, _ in found]
+            if not paths:
+                break
+        return found
+
+    def rivals(self, centre: int, warm: Path | None = None) -> list[Rival]:
+        """What to follow to the end, the best first: of new starts, and of a path about right."""
+        half, paths = float(self.params.half_window), [] if warm is None else [warm]
+        Omega = self.rotation(centre)
+        cuts = [self.cut(centre, share * half, MIDDLE) for share in (1 / 3, 2 / 3)]
+        planes = side_by_side(lambda cut: before_a_plane(homography(cut, Omega)), cuts)
+        found = self.before_a_plane(centre, planes[0] + planes[1])
+        if found:
+            return found[:1]
+        tracks = self.tracks(centre, half, TRIED)
+        starts = self.starts(centre, Omega, planes[0] + planes[1])
+        paths += [self.on_nodes(path, tracks) for path in self.aligned(centre, starts)]
+        found = self.ranked(self.rounds(centre, tracks, paths))
+        limit = CLOSE[0] * self.cost(*found[0]) + CLOSE[1] if found else 0.0
+        return [one for one in found if self.cost(*one) < limit]
+
+    def rounds(self, centre: int, tracks: Tracks, paths: list[Path]) -> list[Rival]:
+        """Paths through the first stages, depths looked for before each of them."""
+        prior = self.prior(centre, float(self.params.half_window))
+        found: list[Rival] = []
+        for stage in ROUNDS:
+
+            def follow(path: Path, stage: Stage = stage) -> Rival:
+                path = Path(path.O, path.D, depths(path, tracks))
+                return _begun(tracks, path, prior, (stage,))
+
+            found = side_by_side(follow, paths)
+            paths = [scene.path for scene, _ in found]
+        return found
+
+    def followed(self, centre: int, warm: Path) -> Rival:
+        """A path with depths at nodes that is about right, but for the last stage."""
+        half = float(self.params.half_window)
+        tracks, prior = self.tracks(centre, half, TRIED), self.prior(centre, half)
+        ((scene, report),) = self.rounds(centre, tracks, [warm])
+        return _adjusted(tracks, scene, report, prior, FINAL[:-1])
+
+    def fit(self, centre: int, warm: Path | None = None) -> Fit | None:
+        """The best of new starts, and of a path with depths at nodes that is about right."""
+        return self.ended(centre, self.rivals(centre, warm), FINAL)
+
+    def ended(
+        self, centre: int, rivals: list[Rival], stages: tuple[Stage, ...] = FINAL[-1:]
+    ) -> Fit | None:
+        """The best rival after the last stages."""
+        half = float(self.params.half_window)
+        tracks, prior = self.tracks(centre, half, self.params.events), self.prior(centre, half)
+        left = side_by_side(lambda one: _adjusted(tracks, one[0], one[1], prior, stages), rivals)
+        if not left:
+            return None
+        scene, report = min(left, key=lambda one: self.cost(*one))
+        sigma = max(stages[-1].sigma, SHARP * float(report.noise))
+        scene, report = adjust(tracks, scene, prior, sigma, 0, 1, True)
+        return Fit(
+            scene.path,
+            np.asarray(report.covariance, np.float64),
+            float(report.inliers),
+            float(report.cost),
+            np.asarray(scene.map),
+        )
+
+    def ranked(self, rivals: list[Rival]) -> list[Rival]:
+        """That of least cost first, without those that came to a better one."""
+        return _apart(sorted(rivals, key=lambda one: self.cost(*one)), lambda one: one[0].path)
+
+    def cost(self, scene: Scene, report: Report) -> float:
+        """What selects among rivals: the cost per event, with the prior of |Omega|."""
+        value = float(report.cost) + self.turning(scene.path)
+        return value if np.isfinite(value) else np.inf
+
+    def turning(self, path: Path) -> float:
+        """The prior of |Omega|, per event."""
+        return 0.5 * self.omega_weight * float((path.O[0] ** 2).sum()) / LAST
+
+
+def _near_to(path: Path, other: Path) -> bool:
+    turn = float(((path.O[0] - other.O[0]) ** 2).sum())
+    return bool(path.D[0] @ other.D[0] > APART) and turn < TURN**2
+
+
+def _apart(ranked: list[Any], path: Callable[[Any], Path]) -> list[Any]:
+    """Those that are not near to an earlier one that is kept."""
+    best: list[Any] = []
+    for one in ranked:
+        if not any(_near_to(path(one), path(other)) for other in best):
+            best.append(one)
+    return best
+
+
+def _begun(
+    tracks: Tracks, path: Path, prior: Prior, stages: tuple[Stage, ...], plane: bool = False
+) -> Rival:
+    """Through stages, from a path alone: first the map is made."""
+    real = tracks.x.dtype
+    scene = Scene(path, jnp.zeros(tracks.shape, real), jnp.zeros((), real))
+    scene, report = adjust(tracks, scene, prior, ROUNDS[0].sigma, 2, 2, plane=plane)
+    return _adjusted(tracks, scene, report, prior, stages, plane)
+
+
+def _adjusted(
+    tracks: Tracks,
+    scene: Scene,
+    report: Report,
+    prior: Prior,
+    stages: tuple[Stage, ...],
+    plane: bool = False,
+) -> Rival:
+    """Through stages; sigma is not much less than the noise (C) that was seen."""
+    for stage in stages:
+        flat, change = stage.flatter * prior.flat, stage.stiffer * prior.change
+        seen = prior._replace(flat=flat, change=change)
+        sigma = max(stage.sigma, SHARP * float(report.noise))
+        scene, report = adjust(tracks, scene, seen, sigma, 0, stage.steps, plane=plane)
+    return scene, report
+
+
+def estimate(
+    recording: Recording,
+    params: Params | None = None,
+    *,
+    model: str = "general",
+    camera: PinholeCamera | None = None,
+    seed: int = 0,
+    gyro: Twists | None = None,
+    progress: bool = False,
+) -> Motion:
+    """The general motion of a camera, from windows that overlap.
+
+    The motion at a time is the mean of what the windows around it tell, of those nearer the more
+    (a raised cosine). Estimates are a fifth of a `step` apart.
+
+    Args:
+        recording: Events, and the calibration if no `camera` is given.
+        params: See `Params`.
+        model: "general"; (tx, ty, tz) is a unit vector, (wx, wy, wz) in rad/s.
+        camera: The calibration, by default the recording's.
+        seed: Chooses events where a window has more than `events`.
+        gyro: What a gyro measured (`truth.from_gyro`), which settles Omega.
+        progress: Show a bar on stderr.
+
+    Raises:
+        InputError: The model is another, or there is no calibration.
+    """
+    params = params or Params.of({})
+    if model not in MODELS:
+        raise InputError(
+            f"batch does not know the motion model {model!r}; {nearest(model, MODELS)}"
+        )
+    camera = camera or recording.camera
+    if camera is None:
+        raise InputError(
+            f"{recording.name}: has no calibration, which general motion needs; give a camera"
+        )
+    if not len(recording.events):
+        return Motion.nothing(model)
+    windows = Windows(recording, params, camera, gyro, seed)
+    first, last = int(recording.events[:1].t[0]), int(recording.events[-1:].t[0])
+    half, step = (round(1e6 * float(value)) for value in (params.half_window, params.step))
+    centres = np.arange(first + half, last - half + 1, step)
+    if not len(centres):
+        centres = np.array([(first + last) // 2])
+    fits = _followed(windows, centres.tolist(), step, half, progress)
+    return _blended(centres, fits, half, step, first, last)
+
+
+def _followed(
+    windows: Windows, centres: list[int], step: int, half: int, progress: bool
+) -> list[Fit | None]:
+    """The windows one after the other, each from where the one before goes on.
+
+    One is followed while the one before is at its last stage: steps of one keep about one core
+    busy, and that stage changes little.
+    """
+    fits: list[Fit | None] = []
+    enough = [np.diff(windows.rows(c, half * 1e-6))[0] >= windows.params.fewest for c in centres]
+    warm: Path | None = None
+    ahead: Future[Rival] | None = None
+    since, wait, cost = 0, windows.params.fresh, 0.0
+
+    def onward(path: Path, steps: int = 1) -> Path:
+        return advanced(path, steps * step * 1e-6, half * 1e-6)
+
+    bar = tqdm(centres, unit="window", disable=not progress, leave=False, delay=2)
+    with ThreadPoolExecutor(1) as beside:
+        for row, centre in enumerate(bar):
+            if not enough[row]:
+                warm = ahead = None
+                fits.append(None)
+                continue
+            since, fit = since + 1, None
+            anew = warm is None or since >= wait
+            if warm is not None and not anew:
+                rival = ahead.result() if ahead else windows.followed(centre, warm)
+                ahead = None
+                if since + 1 < wait and row + 1 < len(centres) and enough[row + 1]:
+                    path = onward(rival[0].path)
+                    ahead = beside.submit(windows.followed, centres[row + 1], path)
+                fit = windows.ended(centre, [rival])
+                anew = fit is None or not fit.cost <= LOST * cost
+            if anew:
+                ahead, fit = None, windows.fit(centre, warm)
+            fits.append(fit)
+            if fit is None:
+                warm = None
+                continue
+            if anew:
+                agreed = warm is not None and _near_to(fit.path, warm)
+                if warm is not None and not agreed:
+                    _revise(windows, centres[: len(fits)], fits, onward)
+                since, wait = 0, 2 * wait if agreed else windows.params.fresh
+            cost = fit.cost if anew else min(cost, fit.cost)
+            warm = onward(fit.path)
+    return fits
+
+
+def _revise(
+    windows: Windows, centres: list[int], fits: list[Fit | None], onward: Callable[..., Path]
+) -> None:
+    """The last window found a motion that was not followed to it: those before are fitted again.
+
+    Each starts from the one after it, back to where that ends at what was found before; of the new
+    ones so many of the last remain as together save most.
+    """
+    row, later, gained = len(fits) - 1, fits[-1], 0.0
+    new: dict[int, Fit] = {}
+    while row > 0 and later is not None:
+        row, old = row - 1, fits[row - 1]
+        before = windows.followed(centres[row], onward(later.path, -1))
+        later = windows.ended(centres[row], [before])
+        if old is None or later is None or _near_to(later.path, old.path):
+            break
+        new[row] = later
+        gained += old.cost + windows.turning(old.path)
+        gained -= later.cost + windows.turning(later.path)
+        if gained > 0:
+            for at, fit in new.items():
+                fits[at] = fit
+            new, gained = {}, 0.0
+
+
+def _blended(
+    centres: NDArray, fits: list[Fit | None], half: int, step: int, first: int, last: int
+) -> Motion:
+    """The motion of overlapping windows; lost where none tells it.
+
+    Of a window the middle two thirds count, those beyond `reach` where no other tells more.
+    """
+    end = 2 * half // 3
+    t = np.arange(max(centres[0] - end, first), min(centres[-1] + end, last) + 1, max(step // 5, 1))
+    heading, Omega = np.zeros((len(t), 3)), np.zeros((len(t), 3))
+    covariance, total, contrast = np.zeros((len(t), 6, 6)), np.zeros(len(t)), np.zeros(len(t))
+    reach = min(end, step)
+    for centre, fit in zip(centres, fits, strict=True):
+        near = np.abs(t - centre) <= end
+        if fit is None or not near.any():
+            continue
+        far = np.minimum(np.abs(t[near] - centre) / max(reach, 1), 1)
+        weight = np.maximum(np.cos(np.pi / 2 * far) ** 2, 1e-3)
+        T, turn = fit.path.twist((t[near] - centre) * 1e-6)
+        heading[near] += weight[:, None] * T
+        Omega[near] += weight[:, None] * turn
+        covariance[near] += weight[:, None, None] * fit.covariance
+        contrast[near] += weight * fit.agreement
+        total[near] += weight
+    lost = total < 1e-6
+    safe = np.where(lost, 1, total)
+    size = np.linalg.norm(heading, axis=1, keepdims=True)
+    heading = np.where(size > 0, heading / np.where(size > 0, size, 1), np.array([0.0, 0, 1]))
+    mean = np.concatenate([heading, Omega / safe[:, None]], 1)
+    return Motion.of("general", t, mean, covariance / safe[:, None, None], lost, contrast / safe)

@@ -1,0 +1,87 @@
+"""Every estimator by name, loaded when it is first asked for.
+
+To add one: a line here, or from outside "package.module:object" wherever a name is asked for.
+"""
+
+import functools
+from collections.abc import Iterator, Mapping
+
+from jaxevent.errors import InputError
+from jaxevent.estimator import Estimator, imported
+from jaxevent.parameters import nearest
+
+HOMES = {
+    "reconstruction": {
+        "akf": "jaxevent.reconstruction.kalman:akf",
+        "aks": "jaxevent.reconstruction.smoother:aks",
+        "cf": "jaxevent.reconstruction.complementary:cf",
+        "cf-augmented": "jaxevent.reconstruction.complementary:cf_augmented",
+        "high-pass": "jaxevent.reconstruction.complementary:high_pass",
+        "edi": "jaxevent.reconstruction.direct:edi",
+        "augmented": "jaxevent.reconstruction.direct:augmented",
+        "blend": "jaxevent.reconstruction.direct:blend",
+        "last-frame": "jaxevent.reconstruction.direct:last_frame",
+    },
+    "blob": {
+        "moment": "jaxevent.blob:moment",
+        "chi2": "jaxevent.blob:chi2",
+        "chi2_split": "jaxevent.blob:chi2_split",
+        "constant_velocity": "jaxevent.blob:constant_velocity",
+        "moving_moments": "jaxevent.blob:moving_moments",
+    },
+    "egomotion": {
+        "voting": "jaxevent.egomotion.particle_filter:voting",
+        "batch": "jaxevent.egomotion.batch_fit.windows:batch",
+        "contrast": "jaxevent.egomotion.baselines.contrast_maximisation:contrast",
+        "planes": "jaxevent.egomotion.baselines.local_planes:planes",
+        "frames": "jaxevent.egomotion.baselines.tracked_points:frames",
+    },
+}
+
+
+@functools.cache
+def _load(path: str) -> Estimator:
+    return imported(path, Estimator, "method")
+
+
+def names(family: str | None = None) -> list[str]:
+    """The names of the estimators of a family, or of all."""
+    return [name for key, homes in HOMES.items() if family in (None, key) for name in homes]
+
+
+def find(name: str, family: str | None = None) -> Estimator:
+    """The estimator of that name, or of "package.module:object".
+
+    Raises `InputError` for an unknown name, naming the nearest, and for another family's.
+    """
+    if ":" in name:
+        found = _load(name)
+    else:
+        known = {one: path for homes in HOMES.values() for one, path in homes.items()}
+        if name not in known:
+            raise InputError(f"there is no method {name!r}; {nearest(name, names(family))}")
+        found = _load(known[name])
+    if family is not None and found.family != family:
+        raise InputError(
+            f"the method {name!r} is of {found.family}, not of {family}; "
+            f"{nearest(name, names(family))}"
+        )
+    return found
+
+
+class _Methods(Mapping[str, Estimator]):
+    """All estimators by name, each loaded when it is first asked for."""
+
+    def __getitem__(self, name: str) -> Estimator:
+        if name not in names():
+            raise KeyError(name)
+        return find(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(names())
+
+    def __len__(self) -> int:
+        return len(names())
+
+
+METHODS: Mapping[str, Estimator] = _Methods()

@@ -1,0 +1,24 @@
+"""Progress bars: shown by default where somebody looks on, in a terminal or a notebook."""
+
+import sys
+from collections.abc import Iterable
+from typing import Any
+
+from tqdm.auto import tqdm
+
+
+def watched() -> bool:
+    """Whether somebody looks on: stderr is a terminal, or the code runs in a notebook."""
+    kernel = sys.modules.get("ipykernel")
+    return sys.stderr.isatty() or kernel is not None
+
+
+def bar(
+    items: Iterable[Any] | None = None, *, unit: str, progress: bool | None = None, **more: Any
+) -> tqdm:
+    """A bar on stderr that appears after 2 s and goes when done; see `tqdm` for further options.
+
+    `progress` shows or hides it; None: shown where somebody looks on (`watched`).
+    """
+    shown = watched() if progress is None else progress
+    return tqdm(items, unit=unit, delay=2, leave=False, disable=not shown, **more)

@@ -1,0 +1,1246 @@
+"""Parameters fitted to recordings: one loop for every estimator.
+
+    fitted = jaxevent.runs.fit.optimise(loss, params, ["c_on", "c_off"], batches)
+
+`loss(params, batch)` is a scalar, the mean over what a batch holds. `fit` and the command `jaxevent
+fit CONFIG.toml` run the loop as a file describes it:
+
+    recordings = ["slider_depth.zip"]   # paths or globs, relative to this file; $NAME is expanded
+    validation = []                     # recordings for early stopping,
+    test = []                           # and those that are only scored; if neither is given,
+    split = [2, 1, 1]                   # of every 4 images in turn 2 are fitted, 1, 1 are those
+    size = [240, 180]                   # only for recordings that do not tell it
+    window = 1.0                        # s, of mini-batches; omitted: whole recordings
+    batch = 4                           # windows per step; omitted: all
+    iterations = 300                    # and the other fields of `Settings`
+    loss = "held-out"                   # or "reference" (protocols of `jaxevent.runs.evaluate`), or
+                                        # "likelihood" of the frames that the protocol gives
+    protocol = "held-out"               # with the likelihood: what is given, and scored
+    error = "linear"                    # or "log", "nll"; see `objectives.Objective`
+    dark_offset = 0.003                 # of the error "log"
+    weights = { dark = 1, bright = 1 }  # of pixels of HDR references outside what frames record
+    warm_up = 0.2                       # s that are prepared around a window
+
+    [[method]]
+    name = "akf"                        # a key of jaxevent.METHODS
+    label = "akf, mine"                 # in the results; omitted: the name
+    params = { c_on = 0.08 }            # to start from, or a TOML file; omitted: defaults
+    fit = ["c_on", "c_off"]             # by gradient
+    search = { clock_offset = [-0.02, 0.02, 9] }  # from, to, number of points
+
+A method may have its own loss, error, learning_rate, iterations and starts. Parameters that are
+fixed when a recording is prepared have no gradient to follow; each candidate of a search is
+prepared anew. Values omitted are those above, except where comments say otherwise.
+
+The settings from `loss` on are those of reconstruction. `jaxevent.runs.blob` tells those of
+the tracker, the method "blob", and `jaxevent.runs.egomotion` those of egomotion, the method
+"voting". What the loop and the files need of a system is in `System`. All local devices are used,
+and several processes fit together: `jaxevent.devices`.
+"""
+
+import contextlib
+import csv
+import dataclasses
+import functools
+import hashlib
+import io
+import json
+import math
+import re
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import scipy.optimize
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
+from tqdm import tqdm
+
+from jaxevent import devices
+from jaxevent.errors import InputError, require
+from jaxevent.io import load
+from jaxevent.io.output import complete
+from jaxevent.parameters import Parameters, nearest, read_toml
+from jaxevent.reconstruction import METHODS
+from jaxevent.reconstruction.augment import PREPARED, FrameParams
+from jaxevent.reconstruction.filtering import Estimator
+from jaxevent.recording import Recording
+from jaxevent.runs.evaluate import (
+    PROTOCOLS,
+    find_recordings,
+    read_params,
+    results,
+    score,
+    subset,
+    write_rows,
+)
+from jaxevent.runs.reconstruction import (
+    ERRORS,
+    REGIONS,
+    Objective,
+    Problem,
+    parts,
+)
+from jaxevent.show.report import markdown_table
+from jaxevent.splits import SPLITS, interleave
+
+P = TypeVar("P", bound=Parameters)
+
+# Derivatives of so many numbers are computed forwards, of more in reverse. Loss and gradient of
+# the AKF on slider_depth (1.08 M events, 22 images, 2 cores): the loss alone 67 ms; forwards 135 ms
+# for 1 number, 181 ms for 2; in reverse 213 ms for any. Forwards over reverse, both in turn: 0.60
+# for 1 number, 0.80 for 2, 1.12 for 3, 1.15 for 4, 1.9 for 8, and 3.9 for 8 with 4 starts.
+FORWARD = 2
+
+# s between checkpoints
+PERIOD = 2.0
+
+Loss = Callable[[Any, Any], Array]
+Batches = tuple[Sequence[Any], Sequence[Any]]
+Interval = tuple[float | int, float | int, int]
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How `optimise` goes about it.
+
+    A round is a search of all searched parameters followed by `iterations` steps of Adam, whose
+    rate falls from `learning_rate`, halved with every round, to a tenth along a cosine. Every
+    `every` iterations the validation loss is looked at; a start that has not improved for
+    `patience` iterations stops, and the best of what was looked at counts. `starts` starting points
+    are followed at once: the given one, and others drawn around it with a standard deviation of
+    `spread` in the unconstrained numbers. `batch` batches make a step, drawn without replacement;
+    None: all. `forward` chooses the derivatives' mode; None: the faster.
+    """
+
+    iterations: int = 300
+    learning_rate: float | int = 0.05
+    patience: int = 50
+    every: int = 5
+    starts: int = 1
+    spread: float | int = 0.3
+    rounds: int = 2
+    batch: int | None = None
+    seed: int = 0
+    forward: bool | None = None
+
+
+class Position(eqx.Module):
+    """Where all starting points are; leaves of `raw`, `best`, `optimiser` begin with [starts]."""
+
+    raw: dict[str, Array]  # the fitted parameters, unconstrained
+    optimiser: Any
+    best: dict[str, Array]  # of this round
+    best_loss: Float[Array, " starts"]
+    best_at: Int[Array, " starts"]  # iteration
+    searched: dict[str, Array]  # common to all starts, unconstrained
+
+
+@dataclasses.dataclass
+class Run:
+    """All that changes while a fit runs: written to checkpoints.
+
+    Stage 2 r is the search of round r, 2 r + 1 its descent; one last search follows. `tried` are
+    the losses of this search's candidates in order: the search is a function of them, so it is
+    taken up again by replaying it. `history` has start, round, iteration, fit loss and validation
+    loss (None where it was not looked at).
+    """
+
+    position: Position
+    stage: int = 0
+    iteration: int = 0
+    tried: list[float] = dataclasses.field(default_factory=list)
+    history: list[list[Any]] = dataclasses.field(default_factory=list)
+
+
+@dataclasses.dataclass(frozen=True)
+class Fitted(Generic[P]):
+    """The parameters found, their validation loss (without validation: fit loss), the history."""
+
+    params: P
+    loss: float
+    history: list[list[Any]]
+
+
+def begin(
+    params: Parameters,
+    names: Sequence[str],
+    settings: Settings = Settings(),
+    search: Mapping[str, Interval] | None = None,
+) -> Run:
+    """The state of a fit before its first step; see `optimise`."""
+    search = search or {}
+    for name in [*names, *search]:
+        if name not in params.raw:
+            raise InputError(f"there is no parameter {name!r}; {nearest(name, params.raw)}")
+    for name in names:
+        if name in search:
+            raise InputError(f"{name} is both to be fitted and searched; choose one")
+        if not np.isfinite(params.raw[name]).all():
+            raise InputError(
+                f"the parameter {name} starts at 0, where its logarithm has no gradient; start at "
+                "a positive value or do not fit it"
+            )
+    for name, (low, high, count) in search.items():
+        if params.raw[name].ndim or not low < high or count < 3:
+            raise InputError(
+                f"the search of {name} is {[low, high, count]}; give [from, to, number of points], "
+                "3 or more, of a parameter that is one number"
+            )
+        params.numbers[name].check(float(low))
+    normal = np.random.default_rng(settings.seed).standard_normal
+    raw = {}
+    for name in names:
+        leaf = np.asarray(params.raw[name])
+        drawn = settings.spread * normal((settings.starts - 1, *leaf.shape))
+        raw[name] = jnp.asarray(np.concatenate([leaf[None], leaf + drawn]), leaf.dtype)
+    dtype = jnp.result_type(float)
+    position = Position(
+        raw,
+        jax.vmap(ADAM.init)(raw) if raw else None,
+        raw,
+        jnp.full(settings.starts, jnp.inf, dtype),
+        jnp.zeros(settings.starts, int),
+        {name: params.raw[name] for name in search},
+    )
+    return Run(position)
+
+
+def optimise(
+    loss: Loss,
+    params: P,
+    names: Sequence[str],
+    batches: Sequence[Any] | Callable[[P], Batches],
+    validation: Sequence[Any] = (),
+    settings: Settings = Settings(),
+    search: Mapping[str, Interval] | None = None,
+    *,
+    run: Run | None = None,
+    save: Callable[[Run, bool], None] | None = None,
+    progress: bool = False,
+    title: str = "fit",
+) -> Fitted[P]:
+    """Fit some parameters of an estimator: minimise the mean loss over batches.
+
+    Args:
+        loss: `loss(params, batch)`, the mean over a batch's measurements; pure.
+        params: Where to start; what is not named stays as it is.
+        names: Parameters to follow the gradient of.
+        batches: Pytrees, one compilation for each shape. A batch with an attribute `weight` counts
+            that much in means over batches. Or a function `prepare(params)` that gives batches to
+            fit to and batches to validate on, for parameters that act when batches are made. Of
+            several processes (`devices.join`) all give the same list and each computes its share;
+            a function gives `devices.ELSEWHERE` in place of what other processes compute.
+        validation: Batches for early stopping, if `batches` is a list; without any, the fit's.
+        settings: See `Settings`.
+        search: By name, (from, to, number of points): parameters searched without gradients, one
+            after another, by the fit loss of the best start. Every round looks at all points and
+            around the best, ever closer.
+        run: Where an interrupted fit is to go on; by default at `begin(...)`.
+        save: Called with the run and whether to save it for sure, after every step.
+        progress: Show a bar on stderr.
+        title: What the bar calls the fit.
+
+    Raises:
+        InputError: A name does not exist, or the loss is not finite at the start.
+    """
+    if callable(batches):
+        prepare = batches
+    else:
+        shares = devices.shared_out(batches), devices.shared_out(validation)
+        prepare = lambda _: shares  # noqa: E731
+    fresh = run is None
+    run = begin(params, names, settings, search) if run is None else run
+    loop = _Loop(loss, params, prepare, settings, search or {}, run, save or (lambda *_: None))
+    with tqdm(
+        total=settings.rounds * settings.iterations * bool(names),
+        desc=title,
+        unit="step",
+        delay=2,
+        disable=not progress,
+        leave=False,
+    ) as loop.bar:
+        if fresh:
+            loop.check()
+            loop.save(run, True)
+        while run.stage <= 2 * settings.rounds:
+            stage = loop.descend if run.stage % 2 else loop.search
+            stage()
+            run.stage, run.iteration, run.tried = run.stage + 1, 0, []
+            loop.save(run, True)
+        fitted = loop.leader()
+        return Fitted(fitted, loop.loss(fitted, loop.watched(fitted)), run.history)
+
+
+# A step whose gradient is not finite is left out, however many there are.
+ADAM = optax.apply_if_finite(optax.scale_by_adam(), max_consecutive_errors=2**31 - 1)
+
+
+def with_raw(params: P, raw: Mapping[str, Array]) -> P:
+    """The parameters with some of their unconstrained numbers replaced."""
+    return eqx.tree_at(lambda p: p.raw, params, {**params.raw, **raw})
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _value(loss: Loss, params: Parameters, batch: Any) -> Array:
+    return loss(params, batch)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _values(loss: Loss, params: Parameters, raw: dict[str, Array], batch: Any) -> Array:
+    """The loss of each start, (starts,)."""
+    return jax.vmap(lambda one: loss(with_raw(params, one), batch))(raw)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _slopes(
+    loss: Loss, forward: bool, params: Parameters, raw: dict[str, Array], batch: Any
+) -> tuple[Array, dict[str, Array]]:
+    """The loss of each start, (starts,), and its derivatives in the shape of `raw`."""
+
+    def value(one: dict[str, Array]) -> Array:
+        return loss(with_raw(params, one), batch)
+
+    def forwards(one: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
+        flat, restore = ravel_pytree(one)
+
+        def along(direction: Array) -> tuple[Array, Array]:
+            return jax.jvp(lambda at: value(restore(at)), (flat,), (direction,))
+
+        directions = jnp.eye(flat.size, dtype=flat.dtype)
+        here, slope = jax.vmap(along, out_axes=(None, 0))(directions)
+        return here, restore(slope)
+
+    return jax.vmap(forwards if forward else jax.value_and_grad(value))(raw)
+
+
+@jax.jit
+def _step(position: Position, slope: dict[str, Array], rate: float | Array) -> Position:
+    update: Any = jax.vmap(ADAM.update)
+    direction, memory = update(slope, position.optimiser)
+    raw = {name: leaf - rate * direction[name] for name, leaf in position.raw.items()}
+    return dataclasses.replace(position, raw=raw, optimiser=memory)
+
+
+@jax.jit
+def _judge(
+    position: Position, seen: Array, i: int | Array, patience: int | Array
+) -> tuple[Position, Array]:
+    """Keep the best of each start at iteration i; and whether any has not stopped yet.
+
+    A start that has stopped keeps its best, however long the others make it go on.
+    """
+    first = i == 0
+    going = first | (i - position.best_at < patience)
+    better = first | (going & (seen < position.best_loss))
+
+    def choose(new: Array, old: Array) -> Array:
+        return jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+    best_at = choose(jnp.full_like(position.best_at, i), position.best_at)
+    seen = jnp.where(jnp.isnan(seen), jnp.inf, seen)
+    position = dataclasses.replace(
+        position,
+        best=jax.tree.map(choose, position.raw, position.best),
+        best_loss=choose(seen, position.best_loss),
+        best_at=best_at,
+    )
+    return position, (i - best_at < patience).any()
+
+
+def _mean(function: Callable[[Any], Any], batches: Sequence[Any]) -> Any:
+    """The mean of a function of batches (a pytree), weighted by the batches' `weight`.
+
+    On several devices or in several processes the results are added in the same order as on one.
+    """
+    if devices.alone():
+        weights = [_weight(batch) for batch in batches]
+        parts = map(function, batches)
+    else:
+        own = ((k, batch) for k, batch in enumerate(batches) if batch is not devices.ELSEWHERE)
+        mine = {k: (batch, function(batch)) for k, batch in own}  # before any is waited for
+        said = {k: (_weight(batch), jax.device_get(part)) for k, (batch, part) in mine.items()}
+        told = {k: v for some in devices.gathered(said) for k, v in some.items()}
+        weights = [told[k][0] for k in range(len(batches))]
+        parts = (jax.tree.map(jnp.asarray, told[k][1]) for k in range(len(batches)))
+    if len(batches) == 1:
+        return next(iter(parts))
+    total = None
+    for part, weight in zip(parts, weights, strict=True):
+        share = weight / sum(weights)
+        part = jax.tree.map(lambda leaf, share=share: share * leaf, part)
+        total = part if total is None else jax.tree.map(jnp.add, total, part)
+    return total
+
+
+def _weight(batch: Any) -> float:
+    return float(getattr(batch, "weight", 1.0))
+
+
+class _Loop:
+    """The stages of `optimise`, which change its `Run`."""
+
+    bar: tqdm
+
+    def __init__(
+        self,
+        loss: Loss,
+        params: Parameters,
+        prepare: Callable[[Any], Batches],
+        settings: Settings,
+        intervals: Mapping[str, Interval],
+        run: Run,
+        save: Callable[[Run, bool], None],
+    ):
+        self.function, self.params, self.settings = loss, params, settings
+        self._prepare = prepare
+        self._places = devices.Places(settings.batch), devices.Places(None)
+        self.intervals, self.run, self.save = intervals, run, save
+        numbers = sum(leaf[0].size for leaf in run.position.raw.values())
+        self.forward = numbers <= FORWARD if settings.forward is None else settings.forward
+
+    def prepare(self, params: Any) -> Batches:
+        """The batches to fit to and to validate on, on the devices that compute with them."""
+        if devices.alone():
+            return self._prepare(params)
+        with devices.on_host():
+            fit, validation = devices.in_step(lambda: self._prepare(params))
+        return self._places[0](fit), self._places[1](validation)
+
+    def leader(self) -> Any:
+        """The parameters of the best start."""
+        position = self.run.position
+        best = int(jnp.argmin(position.best_loss))
+        raw = {name: leaf[best] for name, leaf in position.raw.items()}
+        return with_raw(self.params, {**raw, **position.searched})
+
+    def watched(self, params: Any) -> Sequence[Any]:
+        fit, validation = self.prepare(params)
+        return validation or fit
+
+    def loss(self, params: Any, batches: Sequence[Any]) -> float:
+        return float(_mean(lambda batch: _value(self.function, params, batch), batches))
+
+    def check(self) -> None:
+        """Raise `InputError` unless the losses of the given parameters are finite."""
+        fit, validation = self.prepare(self.params)
+        if not fit:
+            raise InputError("there is nothing to fit to; give recordings with images or positions")
+        for batches in (fit, validation or fit):
+            if not math.isfinite(self.loss(self.params, batches)):
+                raise InputError(
+                    "the loss is not finite where the fit starts; start from other parameters, or "
+                    "remove hot pixels"
+                )
+
+    def search(self) -> None:
+        """All searched parameters in turn, the others as the best start has them."""
+        replay, leader = iter(list(self.run.tried)), self.leader()
+
+        def look(name: str, value: float) -> float:
+            """The fit loss of a candidate; infinite if it is not a number."""
+            loss = next(replay, None)
+            if loss is None:
+                candidate = self._searched(leader, name, value)
+                loss = self.loss(candidate, self.prepare(candidate)[0])
+                loss = loss if math.isfinite(loss) else math.inf
+                self.run.tried.append(loss)
+                self.bar.set_postfix({name: f"{value:.4g}", "loss": f"{loss:.4g}"})
+                self.save(self.run, False)
+            return loss
+
+        for name, interval in self.intervals.items():
+            here = float(getattr(leader, name))
+            found = _minimise(functools.partial(look, name), interval, here, self.run.stage // 2)
+            leader = self._searched(leader, name, found)
+        searched = {name: leader.raw[name] for name in self.intervals}
+        self.run.position = dataclasses.replace(self.run.position, searched=searched)
+
+    def _searched(self, params: Any, name: str, value: float) -> Any:
+        raw = params.numbers[name].unconstrained(jnp.asarray(value, params.raw[name].dtype))
+        return with_raw(params, {name: raw})
+
+    def descend(self) -> None:
+        """The gradient steps of a round, from where all starts are to the best they come by."""
+        run, settings = self.run, self.settings
+        position, turn = run.position, run.stage // 2
+        if not position.raw:
+            return
+        params = with_raw(self.params, position.searched)
+        fit, watched = self.prepare(params)[0], self.watched(params)
+        if run.iteration == 0:
+            worst = jnp.full_like(position.best_loss, jnp.inf)
+            memory = jax.vmap(ADAM.init)(position.raw)
+            position = dataclasses.replace(position, optimiser=memory, best_loss=worst)
+        while True:
+            i, seen = run.iteration, None
+            if i % settings.every == 0 or i == settings.iterations:
+                look = functools.partial(_values, self.function, params, position.raw)
+                seen = _mean(look, watched)
+                position, going = _judge(position, seen, i, settings.patience)
+                if i == settings.iterations or not bool(going):
+                    self._record(turn, i, None, seen)
+                    break
+            slopes = functools.partial(_slopes, self.function, self.forward, params, position.raw)
+            losses, slope = _mean(slopes, [fit[k] for k in self._drawn(len(fit))])
+            fall = 0.55 + 0.45 * math.cos(math.pi * i / settings.iterations)
+            position = _step(position, slope, settings.learning_rate / 2**turn * fall)
+            self._record(turn, i, losses, seen)
+            run.position, run.iteration = position, i + 1
+            self.bar.n = turn * settings.iterations + i + 1
+            self.bar.set_postfix(loss=f"{float(jnp.min(losses)):.5g}")
+            self.save(run, False)
+        run.position = dataclasses.replace(position, raw=position.best)
+
+    def _drawn(self, count: int) -> Sequence[int]:
+        """The batches of this iteration: the next ones of one random order after another."""
+        size = self.settings.batch
+        if size is None or size >= count:
+            return range(count)
+        first = (self.run.stage // 2 * self.settings.iterations + self.run.iteration) * size
+        chosen = []
+        for k in range(first, first + size):
+            order = np.random.default_rng([self.settings.seed, k // count]).permutation(count)
+            chosen.append(int(order[k % count]))
+        return chosen
+
+    def _record(self, turn: int, i: int, losses: Array | None, seen: Array | None) -> None:
+        for start in range(self.settings.starts):
+            pair = [None if v is None else float(v[start]) for v in (losses, seen)]
+            self.run.history.append([start, turn, i, *pair])
+
+
+def _minimise(look: Callable[[float], float], interval: Interval, value: float, turn: int) -> float:
+    """Where a search of one number ends: the least of what it saw, `value` among it.
+
+    Every turn looks at all points of the interval, as the best one may be another once the other
+    parameters have moved. The first goes on to the vertex of the parabola through the best point
+    and its neighbours, later ones close in on the minimum around the best, by Brent's method.
+    """
+    low, high, count = interval
+    step = (high - low) / (count - 1)
+    grid = [float(x) for x in np.linspace(low, high, count)]
+    losses = [look(x) for x in grid]
+    k = int(np.argmin(losses))
+    best = min((losses[k], grid[k]), (look(value), value))
+    if turn:
+        reach, middle = step / 2 ** (turn - 1), min(max(best[1], low), high)
+        found = scipy.optimize.minimize_scalar(
+            look,
+            bounds=(max(low, middle - reach), min(high, middle + reach)),
+            method="bounded",
+            options={"xatol": step / 100, "maxiter": 20},
+        )
+        return min((float(found.fun), float(found.x)), best)[1]
+    if 0 < k < count - 1:
+        a, b, c = losses[k - 1 : k + 2]
+        if math.isfinite(a + c) and a - 2 * b + c > 0:
+            vertex = grid[k] + step * (a - c) / (a - 2 * b + c) / 2
+            best = min((look(vertex), vertex), best)
+    return best[1]
+
+
+def fit(
+    config: str | Path,
+    out: str | Path,
+    recordings: Sequence[str | Path] | None = None,
+    resume: bool = False,
+    progress: bool = False,
+) -> list[dict[str, Any]]:
+    """Run a fit that a TOML file describes; its layout is in the text of this module.
+
+    Writes the folder `out`, made if missing: params.toml (a table of physical values for each
+    method), results.json ({"rows": [...]}), results.md (the table of the test images), loss.csv,
+    loss.png and config.toml. While it runs, `out` holds a checkpoint at most a few seconds old, by
+    which an interrupted run goes on and ends with the same parameters, to the bit. Of several
+    processes (`devices.join`) all read the recordings and return the rows, and the first reads and
+    writes `out`.
+
+    Args:
+        config: The TOML file.
+        out: The folder; earlier results in it are replaced at the end.
+        recordings: To be fitted to instead of those in the file, relative to the working directory.
+        resume: Go on from the checkpoint in `out`. Where the run had not got to the first one, it
+            starts; where it had ended, its rows are returned.
+        progress: Show bars on stderr.
+
+    Returns:
+        Rows as `evaluate.score` gives them, of the recordings and images of each split: `split` is
+        "fit", "validation" or "test", `method` the label, with ", before" for the start values.
+        Those of the tracker are described in `jaxevent.runs.blob`.
+
+    Raises:
+        InputError: The file, a recording or a parameter cannot be used, `out` cannot be written or
+            holds another run's checkpoint, or matplotlib is missing (extra "plot").
+    """
+    devices.in_step(lambda: require("matplotlib", "plot"))
+    out = Path(out)
+    plan = devices.in_step(lambda: read_plan(Path(config), recordings))
+    checkpoint, writes = out / "checkpoint", devices.first()
+    progress = progress and writes
+
+    def finished() -> list[dict[str, Any]] | None:
+        """The rows of a run that had ended."""
+        if checkpoint.exists() and not resume:
+            raise InputError(
+                f"{out}: holds the checkpoint of an interrupted fit; go on with --resume, or "
+                "choose another folder"
+            )
+        if resume and not checkpoint.exists() and (out / "results.json").exists():
+            return _finished(out, plan)
+        return None
+
+    rows = devices.by_first(finished)
+    if rows is not None:
+        return rows
+    sources, digest = devices.in_step(lambda: (_sources(plan, progress), plan.digest()))
+    if len(set(devices.gathered(digest))) > 1:
+        raise InputError(
+            f"{config}: the processes see different configurations or recordings; give all the same"
+        )
+    done: list[Fitted] = []
+    with contextlib.ExitStack() as new:
+
+        def begun() -> bytes | None:
+            """The checkpoint in the folder, which is made if missing."""
+            nonlocal write
+            # `results` removes a folder that it made if the block raises. At the first checkpoint
+            # the block ends: from then on the folder stays.
+            write = new.enter_context(results(out))
+            content = checkpoint.read_bytes() if checkpoint.exists() else None
+            for remains in out.glob(".*.part"):  # of a write during which the run was killed
+                remains.unlink(missing_ok=True)
+            return content
+
+        write: Any = None
+        content, run, saved = devices.by_first(begun), None, -math.inf
+        if content is not None:
+            done, run = _restore(content, checkpoint, digest, plan)
+
+        def save(run: Run | None, certain: bool) -> None:
+            nonlocal saved
+            if writes and (certain or time.monotonic() - saved > PERIOD):
+                _save(checkpoint, digest, done, run)
+                saved = time.monotonic()
+            new.close()
+
+        for task in plan.tasks[len(done) :]:
+            try:
+                one = optimise(
+                    task.goal.loss, task.params, task.names,
+                    task.goal.problem(sources, plan.split, plan.window), (),
+                    task.settings, task.search,
+                    run=run, save=save, progress=progress, title=task.label,
+                )  # fmt: skip
+            except InputError as error:
+                raise InputError(f"{config}: {task.label}: {error}") from None
+            run = None
+            done.append(one)
+            save(None, True)
+        new.close()
+    scored = [
+        (task, label, params)
+        for task, one in zip(plan.tasks, done, strict=True)
+        for label, params in ((f"{task.label}, before", task.params), (task.label, one.params))
+    ]
+    mine = range(jax.process_index(), len(scored), jax.process_count())
+    found = devices.in_step(
+        lambda: {k: list(_rows(*scored[k], sources, plan, progress)) for k in mine}
+    )
+    told = {k: some for each in devices.gathered(found) for k, some in each.items()}
+    rows = [row for k in range(len(scored)) for row in told[k]]
+    if not writes:
+        return rows
+    write("config.toml", plan.text)
+    write("loss.csv", _losses(plan.tasks, done).encode())
+    write("loss.png", _curves(plan.tasks, done))
+    write_rows(rows, write, lambda rows: _results(plan.tasks, unseen(rows)))
+    write("params.toml", _tables(plan.tasks, done).encode())
+    checkpoint.unlink()
+    return rows
+
+
+def _rows(
+    task: "Task", label: str, params: Any, sources: "Sources", plan: "Plan", progress: bool
+) -> Iterator[dict[str, Any]]:
+    for row in task.goal.score(sources, plan.split, plan.window, params, progress):
+        yield {**row, "method": label}
+
+
+def _results(tasks: Sequence["Task"], rows: Sequence[dict[str, Any]]) -> str:
+    """results.md: one table for the methods of each system."""
+    goals = {name: task.goal for task in tasks for name in (task.label, f"{task.label}, before")}
+    kinds = dict.fromkeys(type(goal) for goal in goals.values())
+    parts = []
+    for kind in kinds:
+        mine = [row for row in rows if type(goals[row["method"]]) is kind]
+        parts.append(goals[mine[0]["method"]].table(mine) if mine else "")
+    return "\n".join(filter(None, parts))
+
+
+def unseen(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows of the test images; where there are none, of the validation or the fit."""
+    for split in reversed(SPLITS):
+        chosen = [row for row in rows if row["split"] == split]
+        if chosen:
+            return chosen
+    return []
+
+
+Sources = Mapping[str, Sequence[tuple[str, Recording]]]  # (as given, recording) by split
+Shares = tuple[int, ...] | None  # of fit, validation, test; None: they have their own recordings
+Check = tuple[Callable[[Any], bool], str]  # of a setting: what is accepted, and how to say so
+
+
+@runtime_checkable
+class Goal(Protocol):
+    """What one method of a configuration is fitted to, and how what comes of it is scored."""
+
+    @property
+    def loss(self) -> Loss:
+        """That of `optimise`; equal goals have losses that are equal and hash alike."""
+        ...
+
+    @property
+    def prepared(self) -> Collection[str]:
+        """Parameters without gradient: they act when batches are made, or by decisions."""
+        ...
+
+    @property
+    def forward(self) -> bool | None:
+        """Which mode of derivatives is the faster; None: that depends on how many, see FORWARD."""
+        ...
+
+    def files(self, recording: Path) -> list[Path]:
+        """What is read besides the recording."""
+        ...
+
+    def problem(
+        self, sources: Sources, split: Shares, window: float | int | None
+    ) -> Callable[[Any], Batches]:
+        """The batches to fit to and to validate on, as functions of parameters."""
+        ...
+
+    def score(
+        self,
+        sources: Sources,
+        split: Shares,
+        window: float | int | None,
+        params: Any,
+        progress: bool,
+    ) -> Iterator[dict[str, Any]]:
+        """Rows of every recording and split: they have the keys recording and split."""
+        ...
+
+    def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
+        """Rows, which now have the key method too, as a Markdown table."""
+        ...
+
+
+@runtime_checkable
+class System(Protocol):
+    """A family of methods, as configurations name them: reconstruction, or the tracker."""
+
+    @property
+    def settings(self) -> Mapping[str, Check]:
+        """What a configuration may hold for it."""
+        ...
+
+    @property
+    def own(self) -> Collection[str]:
+        """Those settings that a method may have for itself."""
+        ...
+
+    def start(self, name: str, given: Any, folder: Path) -> Parameters:
+        """Parameters of a method as a configuration gives them."""
+        ...
+
+    def goal(self, name: str, params: Any, given: Mapping[str, Any]) -> Goal:
+        """From checked settings, the method's own before those of the file."""
+        ...
+
+
+def systems() -> dict[str, System]:
+    """By the name of every method that can be fitted."""
+    from jaxevent.runs.blob import BLOB
+    from jaxevent.runs.egomotion import VOTING
+
+    return {**dict.fromkeys(METHODS, RECONSTRUCTION), "blob": BLOB, "voting": VOTING}
+
+
+@dataclasses.dataclass(frozen=True)
+class Reconstruction:
+    """The goal of a reconstruction method."""
+
+    method: Estimator
+    loss: Objective
+    protocol: str
+    warm_up: float | int
+    weights: Mapping[str, float | int] | None
+    prepared = PREPARED
+    forward = None
+
+    def files(self, recording: Path) -> list[Path]:
+        return []
+
+    def problem(self, sources: Sources, split: Shares, window: float | int | None) -> Problem:
+        cut = functools.partial(
+            parts,
+            protocol=self.protocol,
+            split=split or (1, 0, 0),
+            window=window,
+            warm_up=self.warm_up,
+        )
+        found: dict[str, list] = {}
+        for name in ("fit", "validation"):
+            found[name] = []
+            for _, recording in sources[name]:
+                self.method.check(recording)
+                found[name] += cut(recording)
+        return Problem(self.loss, found["fit"], found["validation"], self.weights)
+
+    def score(
+        self,
+        sources: Sources,
+        split: Shares,
+        window: float | int | None,
+        params: FrameParams,
+        progress: bool,
+    ) -> Iterator[dict[str, Any]]:
+        for whole in SPLITS:
+            for given, recording in sources[whole]:
+                row = score(recording, self.method, params, self.protocol, progress=progress)
+                row["recording"] = given
+                if split is None:
+                    yield {**row, "split": whole}
+                    continue
+                shared = interleave(split, row["frames"])
+                if self.loss.error is None:  # no image was looked at
+                    shared[:] = SPLITS.index("test")
+                for place, name in enumerate(SPLITS):
+                    if (shared == place).any():
+                        yield {**subset(row, np.flatnonzero(shared == place)), "split": name}
+
+    def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
+        return markdown_table(rows)
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """One method of a configuration, checked."""
+
+    label: str
+    params: Parameters
+    names: tuple[str, ...]
+    search: Mapping[str, Interval]
+    goal: Goal
+    settings: Settings
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """A checked configuration; recordings are (as given, path) by split."""
+
+    text: bytes
+    recordings: Mapping[str, list[tuple[str, Path]]]
+    tasks: list[Task]
+    size: tuple[int, int] | None
+    split: Shares
+    window: float | int | None
+
+    def digest(self) -> str:
+        """A number that changes with the configuration, the recordings and the precision."""
+        digest = hashlib.sha256(self.text)
+        digest.update(repr([task.params.values() for task in self.tasks]).encode())
+        digest.update(str(jnp.result_type(float)).encode())
+        for split in SPLITS:
+            for given, path in self.recordings[split]:
+                digest.update(f"{split} {given}".encode())
+                files = [path] if path.is_file() else sorted(path.rglob("*"))
+                for task in self.tasks:
+                    files += task.goal.files(path)
+                for file in filter(Path.is_file, files):
+                    _fingerprint(file, digest.update)
+        return digest.hexdigest()
+
+
+def _fingerprint(path: Path, update: Callable[[bytes], None]) -> None:
+    """The file's name, size and content; of a large file 64 pieces of 1 MiB."""
+    size, piece = path.stat().st_size, 1 << 20
+    update(f"{path.name} {size}".encode())
+    step = max(piece, size // 64)
+    with path.open("rb") as file:
+        for first in range(0, size, step):
+            file.seek(first)
+            update(file.read(piece))
+
+
+def _text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _texts(value: Any) -> bool:
+    return isinstance(value, list) and all(map(_text, value))
+
+
+def _number(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
+
+
+def _natural(value: Any) -> bool:
+    return type(value) is int and value > 0
+
+
+_POSITIVE = (lambda value: _number(value) and value > 0, "a positive number")
+_NOT_NEGATIVE = (lambda value: _number(value) and value >= 0, "a number, 0 or more")
+_NATURAL = (_natural, "a whole number, 1 or more")
+_NAME = (_text, "text")
+_PATHS = (_texts, 'a list of paths, as ["file.zip"]')
+_SETTINGS: dict[str, Check] = {
+    "iterations": _NATURAL,
+    "learning_rate": _POSITIVE,
+    "patience": _NATURAL,
+    "every": _NATURAL,
+    "starts": _NATURAL,
+    "spread": _NOT_NEGATIVE,
+    "rounds": _NATURAL,
+    "batch": _NATURAL,
+    "seed": (lambda value: type(value) is int and value >= 0, "a whole number, 0 or more"),
+}
+_COMMON: dict[str, Check] = {
+    **_SETTINGS,
+    "recordings": _PATHS,
+    "validation": _PATHS,
+    "test": _PATHS,
+    "split": (
+        lambda value: (
+            isinstance(value, list)
+            and len(value) == 3
+            and all(type(n) is int and n >= 0 for n in value)
+            and value[0] > 0
+        ),
+        "[fit, validation, test] in whole numbers, the first not 0",
+    ),
+    "size": (
+        lambda value: isinstance(value, list) and len(value) == 2 and all(map(_natural, value)),
+        "[width, height] in pixels",
+    ),
+    "window": _POSITIVE,
+    "method": (
+        lambda value: isinstance(value, list) and all(isinstance(n, dict) for n in value),
+        '[[method]] with name = "akf"',
+    ),
+}
+_METHOD: dict[str, Check] = {
+    **{name: _SETTINGS[name] for name in ("learning_rate", "iterations", "starts")},
+    "name": _NAME,
+    "label": _NAME,
+    "params": (lambda value: isinstance(value, str | dict), "a table or the path of a TOML file"),
+    "fit": (_texts, 'a list of names, as ["c_on", "c_off"]'),
+    "search": (
+        lambda value: (
+            isinstance(value, dict)
+            and all(
+                isinstance(v, list) and len(v) == 3 and all(map(_number, v)) and type(v[2]) is int
+                for v in value.values()
+            )
+        ),
+        "a table of name = [from, to, number of points]",
+    ),
+}
+
+
+def _check(table: Mapping[str, Any], known: Mapping[str, Check]) -> None:
+    for name, value in table.items():
+        if name not in known:
+            raise InputError(f"there is no setting {name!r}; {nearest(name, known)}")
+        accepts, text = known[name]
+        if not accepts(value):
+            raise InputError(f"{name} is {str(value)[:60]!r}; give {text}")
+
+
+def one_of(value: str, what: str, known: Sequence[str]) -> str:
+    if value not in known:
+        raise InputError(f"there is no {what} {value!r}; {nearest(value, known)}")
+    return value
+
+
+def read_plan(config: Path, recordings: Sequence[str | Path] | None = None) -> Plan:
+    """Read and check a configuration; raises `InputError` naming the file and the setting.
+
+    `recordings` take the place of those that it names, relative to the working directory.
+    """
+    table = read_toml(config)
+    try:
+        known = systems()
+        further = {k: v for one in known.values() for k, v in one.settings.items()}
+        _check(table, {**_COMMON, **further})
+        text = config.read_bytes()
+        folders = dict.fromkeys(SPLITS, config.parent)
+        if recordings:
+            table = {**table, "recordings": [str(Path(one).absolute()) for one in recordings]}
+            text = _dump(table).encode()
+        found = {
+            split: find_recordings(table[key], folders[split]) if table.get(key) else []
+            for split, key in zip(SPLITS, ("recordings", "validation", "test"), strict=True)
+        }
+        if not found["fit"]:
+            raise InputError('no recording is given; add recordings = ["file.zip"]')
+        places = [path.resolve() for split in SPLITS for _, path in found[split]]
+        twice = [path for path in places if places.count(path) > 1]
+        if twice:
+            raise InputError(f"{twice[0]} is in two of recordings, validation and test; choose one")
+        apart = bool(found["validation"] or found["test"])
+        if apart and "split" in table:
+            raise InputError("split is for configurations without validation and test; omit it")
+        if not table.get("method"):
+            raise InputError('no method is given; add [[method]] with name = "akf"')
+        tasks: list[Task] = []
+        for number, entry in enumerate(table["method"], 1):
+            try:
+                tasks.append(_task(entry, table, config.parent, known))
+            except InputError as error:
+                raise InputError(f"method {number}: {error}") from None
+        labels = [task.label for task in tasks]
+        for label in labels:
+            if labels.count(label) > 1:
+                raise InputError(f"two methods are called {label!r}; give them different labels")
+        used = {k for entry in table["method"] for k in known[entry["name"]].settings}
+        for name in table:
+            if name in further and name not in used:
+                raise InputError(f"{name} is a setting of none of these methods; omit it")
+        size = table.get("size")
+        return Plan(
+            text,
+            found,
+            tasks,
+            None if size is None else (size[0], size[1]),
+            None if apart else tuple(table.get("split", (2, 1, 1))),
+            table.get("window"),
+        )
+    except InputError as error:
+        raise InputError(f"{config}: {error}") from None
+
+
+def _task(
+    entry: Mapping[str, Any], table: Mapping[str, Any], folder: Path, known: Mapping[str, System]
+) -> Task:
+    name = entry.get("name")
+    system = known.get(name) if isinstance(name, str) else None
+    own = (one for one in known.values() if system in (one, None))
+    _check(entry, {**_METHOD, **{k: one.settings[k] for one in own for k in one.own}})
+    if name is None:
+        raise InputError('a method has no name; give name = "akf"')
+    if system is None:
+        raise InputError(f"there is no method {name!r}; {nearest(name, known)}")
+    params = system.start(name, entry.get("params", {}), folder)
+    both = {**table, **entry}
+    goal = system.goal(name, params, both)
+    names, search = tuple(entry.get("fit", ())), entry.get("search", {})
+    for one in names:
+        if one in goal.prepared:
+            raise InputError(
+                f"{one} is fixed when a recording is prepared and has no gradient to follow; "
+                f"put search = {{ {one} = [from, to, number of points] }}"
+            )
+    if not names and not search:
+        raise InputError('nothing is to be fitted; give names, as fit = ["c_on", "c_off"]')
+    given = {name: both[name] for name in _SETTINGS if name in both}
+    settings = Settings(**given, forward=goal.forward)
+    intervals = {name: (low, high, count) for name, (low, high, count) in search.items()}
+    begin(params, names, settings, intervals)  # checks the names
+    return Task(entry.get("label", name), params, names, intervals, goal, settings)
+
+
+class _Reconstructions:
+    """The system of the methods of `jaxevent.METHODS`."""
+
+    settings: dict[str, Check] = {
+        "loss": _NAME,
+        "protocol": _NAME,
+        "error": _NAME,
+        "dark_offset": _POSITIVE,
+        "weights": (
+            lambda value: (
+                isinstance(value, dict)
+                and set(value) <= set(REGIONS)
+                and all(_number(n) and n >= 0 for n in value.values())
+            ),
+            "a table of numbers named dark, well, bright",
+        ),
+        "warm_up": _NOT_NEGATIVE,
+    }
+    own = ("loss", "error")
+
+    def start(self, name: str, given: Any, folder: Path) -> FrameParams:
+        return read_params(METHODS[name].Params, name, given, folder)
+
+    def goal(self, name: str, params: Any, given: Mapping[str, Any]) -> Reconstruction:
+        method = METHODS[name]
+        loss = one_of(given.get("loss", "held-out"), "loss", [*PROTOCOLS, "likelihood"])
+        protocol = loss
+        if loss == "likelihood":
+            protocol = one_of(given.get("protocol", "held-out"), "protocol", list(PROTOCOLS))
+        elif given.get("protocol", loss) != loss:
+            raise InputError(f"the loss {loss!r} has the protocol of that name; omit protocol")
+        error = one_of(given.get("error", "linear"), "error", ERRORS)
+        weights = given.get("weights")
+        if weights is not None and protocol != "reference":
+            raise InputError("weights are for HDR references, the loss 'reference'; omit them")
+        objective = Objective(
+            method,
+            None if loss == "likelihood" else error,
+            protocol == "held-out",
+            given.get("dark_offset", 0.003),
+        )
+        return Reconstruction(method, objective, protocol, given.get("warm_up", 0.2), weights)
+
+
+RECONSTRUCTION = _Reconstructions()
+
+
+def _sources(plan: Plan, progress: bool) -> Sources:
+    return {
+        split: [(given, _load(path, plan, progress)) for given, path in plan.recordings[split]]
+        for split in SPLITS
+    }
+
+
+def _load(path: Path, plan: Plan, progress: bool) -> Recording:
+    recording = load(path, plan.size, in_memory=False, progress=progress)
+    return dataclasses.replace(recording, name=str(path))  # for messages
+
+
+def _save(path: Path, digest: str, done: Sequence[Fitted], run: Run | None) -> None:
+    """Write a checkpoint: a line of JSON, then the arrays as equinox stores them."""
+    header = {
+        "digest": digest,
+        "done": [[one.loss, one.history] for one in done],
+        "run": None if run is None else [run.stage, run.iteration, run.tried, run.history],
+    }
+    arrays = [one.params.raw for one in done], None if run is None else run.position
+    with complete(path) as partial, partial.open("wb") as file:
+        file.write(json.dumps(header).encode() + b"\n")
+        eqx.tree_serialise_leaves(file, arrays)
+
+
+def _restore(
+    content: bytes, path: Path, digest: str, plan: Plan
+) -> tuple[list[Fitted], Run | None]:
+    """The methods done and the one under way, if any, of a checkpoint."""
+    with io.BytesIO(content) as file:
+        try:
+            header = json.loads(file.readline())
+            if header["digest"] != digest:
+                raise InputError(
+                    f"{path}: is of another configuration, other recordings or another precision; "
+                    "go on with the same ones, or choose another folder"
+                )
+            ended, under_way = header["done"], header["run"]
+            tasks = plan.tasks[: len(ended)]
+            run = None
+            if under_way is not None:
+                task = plan.tasks[len(ended)]
+                run = begin(task.params, task.names, task.settings, task.search)
+            like = [task.params.raw for task in tasks], None if run is None else run.position
+            raws, position = eqx.tree_deserialise_leaves(file, like)
+        except (ValueError, KeyError, TypeError, RuntimeError, EOFError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{path}: is not a checkpoint; remove it to start anew") from error
+    done = [
+        Fitted(with_raw(task.params, raw), *rest)
+        for task, raw, rest in zip(tasks, raws, ended, strict=True)
+    ]
+    return done, None if under_way is None else Run(position, *under_way)
+
+
+def _finished(out: Path, plan: Plan) -> list[dict[str, Any]]:
+    """The rows of a run that had ended; raises `InputError` if it was another one."""
+    try:
+        same = (out / "config.toml").read_bytes() == plan.text
+        rows = json.loads((out / "results.json").read_bytes())["rows"] if same else []
+    except (OSError, ValueError, KeyError):
+        same, rows = False, []
+    given = {name for split in SPLITS for name, _ in plan.recordings[split]}
+    if not same or {row["recording"] for row in rows} != given:
+        raise InputError(
+            f"{out}: holds results of another run and no checkpoint; leave out --resume to replace "
+            "them, or choose another folder"
+        )
+    return rows
+
+
+def _losses(tasks: Sequence[Task], done: Sequence[Fitted]) -> str:
+    """loss.csv; empty where a loss was not computed."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["method", "start", "round", "iteration", "fit", "validation"])
+    for task, one in zip(tasks, done, strict=True):
+        table.writerows([task.label, *line] for line in one.history)
+    return text.getvalue()
+
+
+def _curves(tasks: Sequence[Task], done: Sequence[Fitted]) -> bytes:
+    """loss.png: the losses of every method over iterations, a line for each start."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 3 * len(tasks)), layout="constrained")
+    for task, one, axis in zip(
+        tasks, done, figure.subplots(len(tasks), squeeze=False)[:, 0], strict=True
+    ):
+        for start in range(task.settings.starts):
+            lines = [line for line in one.history if line[0] == start]
+            for column, colour, name in ((3, "C0", "fit"), (4, "C1", "validation")):
+                seen = [line for line in lines if line[column] is not None]
+                at = [line[1] * task.settings.iterations + line[2] for line in seen]
+                losses = [line[column] for line in seen]
+                axis.plot(at, losses, colour, lw=1, label=name if start == 0 else None)
+        axis.set(title=task.label, xlabel="iteration", ylabel="loss")
+        axis.legend(frameon=False)
+    image = io.BytesIO()
+    figure.savefig(image, format="png", dpi=120)
+    return image.getvalue()
+
+
+def _tables(tasks: Sequence[Task], done: Sequence[Fitted]) -> str:
+    """params.toml: physical values with all their digits, a table for each method."""
+    lines = []
+    for task, one in zip(tasks, done, strict=True):
+        lines.append(f"[{_key(task.label)}]")
+        for name, value in one.params.values().items():
+            if name in one.params.numbers:
+                digits = np.asarray(getattr(one.params, name))
+                value = np.array([float(str(n)) for n in digits.ravel()]).reshape(digits.shape)
+                value = value.tolist()
+            lines.append(f"{name} = {_value_of(value)}")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _dump(table: Mapping[str, Any]) -> str:
+    """A configuration as TOML."""
+    lines = [f"{_key(k)} = {_value_of(v)}" for k, v in table.items() if k != "method"]
+    for entry in table.get("method", []):
+        lines += ["", "[[method]]", *(f"{_key(k)} = {_value_of(v)}" for k, v in entry.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
+
+
+def _value_of(value: Any) -> str:
+    """A value as TOML writes it."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{_key(k)} = {_value_of(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_value_of, value)) + "]"
+    # JSON's text and numbers are TOML's, but for NaN and infinity.
+    return repr(value) if isinstance(value, float) else json.dumps(value)

@@ -1,0 +1,294 @@
+"""What reconstructions are fitted to: images not given to the method, or the frames' likelihood.
+
+A recording is cut into time windows (or taken whole), each prepared once: a `Part`. `Problem` turns
+the parts of a method into the batches of `jaxevent.runs.fit.optimise`, `Objective` is its loss.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from jaxevent.devices import ELSEWHERE
+from jaxevent.errors import InputError
+from jaxevent.reconstruction.augment import PREPARED, FrameParams
+from jaxevent.reconstruction.filtering import Estimator, Filter
+from jaxevent.reconstruction.pixels import Numeric, over_pixels, pixel_mesh
+from jaxevent.recording import Frames, Recording
+from jaxevent.runs.evaluate import PROTOCOLS, Reference, frame_times
+from jaxevent.splits import interleave
+
+ERRORS = ("linear", "log", "nll")
+REGIONS = ("dark", "well", "bright")
+
+
+class Images(eqx.Module):
+    """A batch: what `run` and `read` need, the true images, and how much each value counts."""
+
+    features: Any
+    out: Any
+    truth: Float[Numeric, "times pixels"]
+    weights: Float[Numeric, "times #pixels"]
+    white: Float[Numeric, ""]  # the brightest intensity that the truth can show
+    weight: Float[Numeric, ""]  # of this batch's mean among those of other batches
+
+    def over(self, devices: Sequence[Any]) -> "Images":
+        """The batch on several devices, pixels shared out."""
+        mesh = pixel_mesh(devices)
+        if mesh is None:
+            return self
+        rest = (self.truth, self.weights, self.white, self.weight)
+        placed = over_pixels(rest, mesh, self.truth.shape[1])
+        return Images(self.features.over(devices), self.out.over(devices), *placed)
+
+
+class Window(eqx.Module):
+    """A batch for the likelihood: features, and the number of measured frame pixels."""
+
+    features: Any
+    weight: Float[Numeric, ""]
+
+    def over(self, devices: Sequence[Any]) -> "Window":
+        """The batch on several devices, pixels shared out."""
+        return Window(self.features.over(devices), self.weight)
+
+
+@dataclasses.dataclass(frozen=True)
+class Objective:
+    """The loss of a reconstruction method, a mean over pixels: `objective(params, batch)`.
+
+    `error` compares images with the truth I: "linear" is the squared difference, "log" that of
+    ln(I + dark_offset), "nll" the negative log likelihood of I if ln(I + I0) is Gaussian with the
+    method's mean L and variance P. With `error` None the loss is minus the method's own log
+    likelihood of the frames it was given, per frame and pixel. `clipped` says that the truth shows
+    all beyond [0, 1] as 0 or 1.
+    """
+
+    method: Estimator
+    error: str | None = "linear"
+    clipped: bool = True
+    dark_offset: float | int = 0.003
+
+    def __post_init__(self):
+        if self.error is None:
+            if getattr(self.method, "log_likelihood", None) is None:
+                raise InputError(
+                    f"the method {self.method.name!r} has no likelihood; choose another loss or "
+                    "the method 'aks'"
+                )
+        elif self.error == "nll" and not self._has_variance():
+            raise InputError(
+                f"the method {self.method.name!r} estimates no variance, which the error 'nll' "
+                "needs; choose 'linear' or 'log'"
+            )
+
+    def _has_variance(self) -> bool:
+        if not isinstance(self.method, Filter):
+            return True
+        start = self.method.initial(self.method.Params(), jnp.zeros(()))
+        return bool(jnp.isfinite(start.P))
+
+    def __call__(self, params: FrameParams, batch: Any) -> Float[Array, ""]:
+        if self.error is None:
+            return -self.method.log_likelihood(params, batch.features) / batch.weight  # type: ignore[reportAttributeAccessIssue]
+        trajectory, _ = self.method.run(params, batch.features)
+        image, variance = self.method.read(params, trajectory, batch.out)
+        if self.error == "nll":
+            errors = self._surprise(params, image, variance, batch.truth)
+        else:
+            errors = self._difference(image, batch) ** 2
+        counted = jnp.where(batch.weights > 0, batch.weights * errors, 0)
+        each = batch.truth.shape[1] // batch.weights.shape[1]  # pixels that share a weight
+        return counted.sum() / (batch.weights.sum() * each)
+
+    def _difference(self, image: Array, batch: Images) -> Array:
+        """Image minus truth, linear or logarithmic.
+
+        Evaluation clips images to what the truth can show. Clipped, a pixel beyond white has no
+        gradient, and as it is, a hot pixel's exp(L) outweighs all others. So intensity beyond white
+        grows with its logarithm from there on, with the same slope at white; and where the truth
+        itself is clipped, what lies beyond is no error. The result is never smaller than the
+        evaluated error, equals it for images in [0, white], and has a slope wherever it is not 0.
+        """
+        white, truth = batch.white, batch.truth
+        over = image > white
+        image = jnp.where(over, white * (1 + jnp.log(jnp.where(over, image, white) / white)), image)
+        if self.error == "log":
+            difference = self._log(image) - self._log(truth)
+        else:
+            difference = image - truth
+        if self.clipped:
+            difference = jnp.where(truth >= 1, jnp.minimum(difference, 0), difference)
+            difference = jnp.where(truth <= 0, jnp.maximum(difference, 0), difference)
+        return difference
+
+    def _log(self, image: Array) -> Array:
+        """ln(I + dark_offset) - ln(dark_offset), continued below black as an odd function.
+
+        exp(L) - I0 may be negative; the slope stays continuous and no value is -inf.
+        """
+        return jnp.sign(image) * jnp.log1p(jnp.abs(image) / self.dark_offset)
+
+    def _surprise(self, params: FrameParams, image: Array, variance: Array, truth: Array) -> Array:
+        """-ln p(I), p(I) = N(ln(I + I0); L, P) / (I + I0).
+
+        The Jacobian 1 / (I + I0) makes values of different I0 comparable: without it, the best I0
+        is infinite. A clipped truth counts with the probability of all that lies beyond it.
+        """
+        L, seen = jnp.log(image + params.I0), jnp.log(truth + params.I0)
+        z = (seen - L) / jnp.sqrt(variance)
+        surprise = 0.5 * (z**2 + jnp.log(2 * math.pi * variance)) + seen
+        if self.clipped:
+            surprise = jnp.where(truth >= 1, -jax.scipy.stats.norm.logcdf(-z), surprise)
+            surprise = jnp.where(truth <= 0, -jax.scipy.stats.norm.logcdf(z), surprise)
+        return surprise
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """A window of a recording: what the method is given, and the true images in it."""
+
+    recording: Recording
+    truth: Frames  # of the whole recording
+    rows: NDArray[np.int64]  # (images,), those of the truth in the window
+    split: NDArray[np.int64]  # (images,), the place in SPLITS of each; -1: not used
+
+
+def parts(
+    recording: Recording,
+    protocol: str,
+    split: Sequence[int] = (1, 0, 0),
+    window: float | int | None = None,
+    warm_up: float | int = 0.2,
+) -> list[Part]:
+    """Cut a recording into windows of `window` seconds (None: one part, the whole).
+
+    The true images are those that the protocol hides (`jaxevent.runs.evaluate.PROTOCOLS`), shared
+    out by `interleave`. A window's images are those stamped in it; it is prepared from `warm_up`
+    seconds more on either side: a filter needs them before to forget its initial state, and the
+    augmented frame and the smoother use frames after. Windows without events or frames are left
+    out. Raises `InputError` for recordings that the protocol cannot use.
+    """
+    given, truth = PROTOCOLS[protocol](recording)
+    use = interleave(split, len(truth))
+    if window is None:
+        return [Part(given, truth, np.arange(len(truth)), use)]
+    length, margin = round(window * 1e6), round(warm_up * 1e6)
+    found = []
+    for t0 in range(recording.start, recording.stop + 1, length):
+        rows = np.arange(*np.searchsorted(truth.t, [t0, t0 + length]))
+        span = slice(t0 - margin, t0 + length + margin)
+        if given.events.index(span.start) == given.events.index(span.stop):
+            continue
+        part = given[span]
+        if part.frames is None and given.frames is not None:
+            continue
+        found.append(Part(part, truth, rows, use[rows]))
+    return found
+
+
+class Problem:
+    """The batches of a method's fit and of its validation: `problem(params)`.
+
+    Of several processes each prepares its own parts; in place of the others' batches are
+    `devices.ELSEWHERE`.
+
+    They are prepared when first asked for and again for params that differ in what preparation
+    fixes (`augment.PREPARED`). `weights` are those of dark, well exposed and bright pixels of HDR
+    references, told apart by their `clip`; omitted, 1.
+    """
+
+    def __init__(
+        self,
+        objective: Objective,
+        fit: Iterable[Part],
+        validation: Iterable[Part] = (),
+        weights: Mapping[str, float | int] | None = None,
+    ):
+        self.objective, self.weights = objective, weights
+        # Parts of the fitted recordings also hold the images set apart for validation.
+        self._jobs = [(part, (0, 1)) for part in fit] + [
+            (dataclasses.replace(part, split=np.where(part.split == 0, 1, -1)), (1,))
+            for part in validation
+        ]
+        # One number of images for all windows of a split, so that one shape is compiled.
+        self._rooms = [
+            max([int((part.split == s).sum()) for part, _ in self._jobs], default=0) for s in (0, 1)
+        ]
+        self._prepared: tuple[tuple[float, ...], tuple[list[Any], list[Any]]] | None = None
+
+    def __call__(self, params: FrameParams) -> tuple[list[Any], list[Any]]:
+        """Batches to fit to, and batches to validate on."""
+        fixed = tuple(float(getattr(params, n)) for n in PREPARED if n in params.numbers)
+        if self._prepared is None or self._prepared[0] != fixed:
+            self._prepared = None  # so that two are never held at once
+            batches: tuple[list[Any], list[Any]] = ([], [])
+            for number, (part, splits) in enumerate(self._jobs):
+                used = self._used(part, splits)
+                mine = number % jax.process_count() == jax.process_index()
+                made = self._batches(part, used, params) if mine and used else []
+                for s, batch in made if mine else [(s, ELSEWHERE) for s in used]:
+                    batches[s].append(batch)
+            self._prepared = fixed, batches
+        return self._prepared[1]
+
+    def _used(self, part: Part, splits: Sequence[int]) -> Sequence[int]:
+        """Those of the splits that the part has a batch of."""
+        if self.objective.error is None:
+            # Only the frames given are measured, whatever the hidden ones are for.
+            return splits[: 1 if part.recording.frames else 0]
+        return [s for s in splits if (part.split == s).any()]
+
+    def _batches(
+        self, part: Part, splits: Sequence[int], params: FrameParams
+    ) -> list[tuple[int, Any]]:
+        method, dtype = self.objective.method, np.dtype(jnp.result_type(float))
+        if self.objective.error is None:
+            features, _ = method.prepare(part.recording, np.empty(0, np.int64), params)
+            assert part.recording.frames is not None
+            frames = len(part.recording.frames)
+            count = np.asarray(frames * part.recording.width * part.recording.height, dtype)
+            return [(splits[0], Window(features, count))]
+        times = frame_times(part.truth, params)[part.rows]
+        features, out = method.prepare(part.recording, times, params)
+        found = []
+        for s in splits:
+            places = np.flatnonzero(part.split == s)
+            padded = np.resize(places, self._rooms[s])  # repeated images count nothing
+            truth = _intensity(part.truth, part.rows[places]).astype(dtype)
+            weights = self._weigh(part, truth)
+            white = max(1.0, float(np.nanmax(truth, initial=0)))
+            spare = [(0, len(padded) - len(places)), (0, 0)]
+            batch = Images(
+                features,
+                out.images(padded),
+                np.pad(np.nan_to_num(truth), spare),
+                np.pad(weights, spare),
+                np.asarray(white, dtype),
+                np.asarray(weights.sum(dtype=float) * truth.shape[1] / weights.shape[1], dtype),
+            )
+            found.append((s, jax.device_put(batch)))
+        return found
+
+    def _weigh(self, part: Part, truth: NDArray) -> NDArray:
+        """1 for each image, or a weight for each pixel; 0 where there is no truth."""
+        if not isinstance(part.truth, Reference):
+            return np.ones((len(truth), 1), truth.dtype)
+        low, high = part.truth.clip
+        region = (truth >= low).astype(int) + (truth > high)
+        weights = [1 if self.weights is None else self.weights.get(name, 1) for name in REGIONS]
+        return np.where(np.isnan(truth), 0, np.array(weights, truth.dtype)[region])
+
+
+def _intensity(truth: Frames, rows: NDArray[np.int64]) -> NDArray:
+    """Some of the images, (images, pixels), NaN where there is no truth."""
+    if isinstance(truth, Reference):
+        return np.stack([truth.truth(int(row)).ravel() for row in rows])
+    return truth[rows].intensity.reshape(len(rows), -1)

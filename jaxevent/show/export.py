@@ -1,0 +1,148 @@
+"""A reconstruction written to files: HDF5 of exact values, a video, or a folder of images."""
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from jaxevent.errors import InputError
+from jaxevent.io.output import complete, complete_hdf5
+from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
+from jaxevent.reconstruction.video import BATCH, Video
+from jaxevent.recording import Recording
+from jaxevent.runs.evaluate import values_of
+from jaxevent.show.report import display_limits, tone_map, video_writer, write_png
+
+
+def evenly(recording: Recording, rate: float | int) -> NDArray[np.int64]:
+    """Times (us) at a rate (1/s) from the recording's start to its stop."""
+    if not 0 < rate <= 1e6:
+        raise InputError(
+            f"{recording.name}: cannot be read at --rate {rate:g}; give a number of images per "
+            "second above 0, up to 1e6"
+        )
+    count = math.floor((recording.stop - recording.start) * rate / 1e6 + 1e-9) + 1
+    return recording.start + np.rint(np.arange(count) * (1e6 / rate)).astype(np.int64)
+
+
+Colours = Callable[[NDArray], NDArray] | None  # what `colour_video` returns; None: grey
+Writer = Callable[[Video, NDArray, Path, str, str, Colours], str]
+
+
+def writer(out: Path) -> Writer:
+    """How to write a file: `writer(out)(video, times, out, tone, recording_name, colours)`.
+
+    `times` are sorted, us; `colours` is `colour_video(video, recording)`, or None for grey images.
+    HDF5 holds t, image and variance, exact, or t and image (T, H, W, 3) in colour; videos and PNG
+    images are toned for the display. It returns the end of a sentence about what was written.
+    Raises `InputError` for a suffix other than .h5, .hdf5, .mp4 or none.
+    """
+    if not out.name:
+        raise InputError(f"{out}: is a folder in use; give the name of a new file or folder")
+    kinds = {".h5": write_hdf5, ".hdf5": write_hdf5, ".mp4": _write_video, "": _write_images}
+    if out.suffix.lower() not in kinds:
+        raise InputError(
+            f"{out}: images cannot be stored as {out.suffix}; end the name in .h5 or .mp4, or "
+            "leave out the suffix for a folder of PNG images"
+        )
+    return kinds[out.suffix.lower()]
+
+
+def write_hdf5(
+    video: Video, times: NDArray, out: Path, tone: str, name: str, colours: Colours
+) -> str:
+    shape = (len(times), video.recording.height, video.recording.width)
+    what = "linear intensity" if colours is None else "linear Rec. 709 red, green, blue"
+    units = {"image": f"{what}: 0 is the frames' black, 1 their white"}
+    if colours is None:
+        units["variance"] = "(ln I)^2, of ln(intensity + I0); NaN: not estimated"
+    else:
+        shape = (*shape, 3)
+    with complete_hdf5(out) as (file, check):
+        file.attrs["method"] = video.estimator.name
+        file.attrs["params"] = json.dumps(values_of(video.params), allow_nan=False)
+        file.attrs["recording"] = name
+        file["t"] = times.astype("i8")
+        file["t"].attrs["unit"] = "us on the recording's clock"
+        fields = {
+            field: file.create_dataset(field, shape, "f4", chunks=(1, *shape[1:]))
+            for field in units
+        }
+        for field, unit in units.items():
+            fields[field].attrs["unit"] = unit
+        row = 0
+        for batch, values in _batches(video, times, colours):
+            for field, images in values.items():
+                fields[field][row : row + len(batch)] = images
+            check()
+            row += len(batch)
+    return ""
+
+
+def _write_video(
+    video: Video, times: NDArray, out: Path, tone: str, name: str, colours: Colours
+) -> str:
+    rate = (len(times) - 1) / ((times[-1] - times[0]) / 1e6) if len(times) > 1 else 25.0
+    fps = min(rate, 60.0)
+    with video_writer(out, fps) as write:
+        for _, image in shown(video, times, tone, colours):
+            write(image)
+    return f", played at {fps:.4g} per s, {fps / rate:.3g} of real time"
+
+
+def _write_images(
+    video: Video, times: NDArray, out: Path, tone: str, name: str, colours: Colours
+) -> str:
+    with complete(out, directory=True) as partial:
+        lines = []
+        for number, (at, image) in enumerate(shown(video, times, tone, colours)):
+            file = f"frame_{number:08d}.png"
+            write_png(partial / file, image)
+            lines.append(f"{at / 1e6:.6f} {file}\n")
+        (partial / "images.txt").write_text("".join(lines))
+    return ""
+
+
+def shown(
+    video: Video, times: NDArray, tone: str, colours: Colours = None
+) -> Iterator[tuple[int, NDArray]]:
+    """Each time (us) and its image for the display, of limits common to all.
+
+    A colour image is its toned luminance with the chrominance it had.
+    """
+    sample = times[np.unique(np.linspace(0, len(times) - 1, 16).round().astype(int))]
+    if tone == "linear":  # the limits are those of any image
+        sample = sample[:1]
+    limits = display_limits(video(sample)[0], tone)
+    for batch, values in _batches(video, times, colours):
+        images = values["image"]
+        if colours is None:
+            shown = tone_map(images, tone, limits)
+        else:
+            # Infinite intensity (`tone_map`) times a chrominance of 0 is NaN.
+            images = np.nan_to_num(images, nan=1e30, posinf=1e30)
+            toned = tone_map(luminance(images), tone, limits).astype(np.float32)
+            shown = apply_chrominance(toned, chrominance(images, white=np.inf))
+            shown = np.rint(shown.clip(0, 255)).astype(np.uint8)
+        for at, image in zip(batch, shown, strict=True):
+            yield int(at), image
+
+
+def _batches(
+    video: Video, times: NDArray, colours: Colours
+) -> Iterator[tuple[NDArray, dict[str, NDArray]]]:
+    """A few images after another: their times, and what HDF5 holds of them by name."""
+    if colours is None:
+        for batch, image, variance in video.batches(times):
+            yield batch, {"image": image, "variance": variance}
+        return
+    rows = range(0, len(times), BATCH)
+    for row in tqdm(rows, unit="batch", delay=2, disable=not video.progress, leave=False):
+        batch = times[row : row + BATCH]
+        with np.errstate(invalid="ignore"):  # infinity times 0
+            image = colours(batch)
+        yield batch, {"image": image}

@@ -1,0 +1,109 @@
+"""Blob tracking on real recordings, short slices, against references made without the tracker."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxevent
+from jaxevent.blob import Params
+from jaxevent.blob.tracker import Tracks, _begin, _run, _windows
+from jaxevent.recording import Events, Recording
+
+SCRIPT = Path(__file__).parents[2] / "experiments" / "blob_real.py"
+
+
+@pytest.fixture(scope="module")
+def real():
+    """The experiment; its references are what these tests compare with."""
+    spec = importlib.util.spec_from_file_location("blob_real", SCRIPT)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["blob_real"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def dot(data):
+    return jaxevent.load(data / "spinning_dot.npz")
+
+
+def follow(recording, params, steps, chunks):
+    """`track` with chunks of a size that suits short slices."""
+    shape = {"steps": steps, "chunks": chunks}
+    return Tracks(_windows(recording, params, None, None, None, None, **shape), params)
+
+
+def test_reference_finds_a_known_path(real):
+    # Events of a known ellipse, turned by 0.1 rad against its travel, on a known circle.
+    rng = np.random.default_rng(0)
+    t = np.sort(rng.uniform(0, 0.05, 100_000))
+    angle = 2 * np.pi * 19.3 * t + 1
+    u = rng.normal(size=(2, len(t))) * [[12.0], [7.0]]
+    heading = angle + np.pi / 2 + 0.1
+    x = 314 + 107 * np.cos(angle) + np.cos(heading) * u[0] - np.sin(heading) * u[1]
+    y = 202 + 107 * np.sin(angle) + np.sin(heading) * u[0] + np.cos(heading) * u[1]
+    xi = np.rint([x, y]).astype(np.uint16)
+    events = Events(np.rint(t * 1e6).astype(np.int64), xi[0], xi[1], t > 0)
+    path = real.fit_circling(Recording("circle", 640, 480, events))
+    assert path.omega == pytest.approx(2 * np.pi * 19.3, rel=1e-3)
+    np.testing.assert_allclose(path.terms[0], [314, 202], atol=0.2)
+    # A circle of 3 lambda1 leaves out 1 % of the variance along the longer axis or more.
+    np.testing.assert_allclose(path.size, [12, 7], rtol=0.03)
+    assert path.turned == pytest.approx(0.1, abs=0.02)
+
+
+def test_spinning_dot_is_found_and_followed(real, dot, float32):
+    path = real.fit_circling(dot)
+    cut = dot[0:10_000]
+    tracks = follow(cut, Params.of({"preset": "fast", **real.DOT_FOUND}), 64, 128)
+    assert len(tracks) == 1  # not its tail, no hot pixel
+    row = real.score_dot(tracks, path, (0.004, 0.01))
+    assert row["tracked"] == 1
+    assert row["rmse"] < 1
+    assert abs(row["velocity"]) < 0.03
+    assert abs(row["velocity_circle"]) < 0.03
+    assert abs(row["direction"]) < 4
+    assert abs(row["lambda1"]) < 0.03
+    assert abs(row["lambda2"]) < 0.03
+    assert row["theta"] < 2
+
+
+def test_tail_of_the_dot_begins_no_track(real, dot, float32):
+    cut = dot[0:20_000]
+    begun = {}
+    for surround in (1.0, 2.0):
+        params = Params.of({"preset": "fast", **real.DOT_FOUND, "surround": surround})
+        shape = {"steps": 64, "chunks": 128}
+        features = _windows(cut, params, None, None, None, None, **shape).whole()
+        carry, _ = _run(params, _begin(params, features), features)
+        begun[surround] = int(carry.next_id)
+    assert begun[2.0] == 1 < begun[1.0]
+
+
+def test_cars_are_found_and_followed(real, data, float32):
+    recording = jaxevent.load(data / "davis346_street.npz")
+    cars = real.find_cars(np.asarray(recording.frames.images))
+    assert len(cars) == 3
+    cut = recording.with_frames(slice(0))[0:500_000]
+    tracks = follow(cut, Params.of(real.STREET), 64, 128)
+    row = real.score_cars(tracks, cars, recording.frames.t, (0.1, 0.5))
+    assert row["tracks"] == 2
+    assert row["coverage"] == 1
+    assert row["median"] < 4
+    assert row["switches"] == row["strays"] == 0
+
+
+def test_dat_events(real, tmp_path):
+    events = np.array([[5, 1279 | 719 << 14 | 1 << 28], [7, 3 | 2 << 14]], "<u4")
+    path = tmp_path / "two.dat"
+    path.write_bytes(b"% Height 720\n% Width 1280\n" + bytes([12, 8]) + events.tobytes())
+    recording = real.read_dat(path)
+    assert (recording.width, recording.height) == (1280, 720)
+    assert recording.events.t.tolist() == [5, 7]
+    assert recording.events.x.tolist() == [1279, 3]
+    assert recording.events.y.tolist() == [719, 2]
+    assert recording.events.p.tolist() == [True, False]

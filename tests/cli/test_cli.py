@@ -1,0 +1,637 @@
+"""The command line: what it writes, and that bad input is said in one line and leaves nothing."""
+
+import contextlib
+import json
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from commands import decoded, fails
+from noise import HEIGHT, ONE, STAMPS, WIDTH, small, write_config
+from PIL import Image
+
+import jaxevent
+from jaxevent import cli
+from jaxevent.recording import Events, Frames, Recording
+from jaxevent.show import describe, export
+from jaxevent.show.report import tone_map
+from jaxevent.simulate import SCENES, SENSORS, Pan, from_video, scene, simulate
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    jaxevent.save(small(), tmp_path / "small.h5")
+    return tmp_path
+
+
+def arrays(**changed) -> dict:
+    """The arrays of an .npz like `small`; None leaves one out."""
+    recording = small()
+    assert recording.frames is not None and isinstance(recording.events, Events)
+    fields = {name: getattr(recording.events, name) for name in "txyp"}
+    fields.update(width=WIDTH, height=HEIGHT)
+    fields.update(frames=recording.frames.images, frame_t=recording.frames.t)
+    return {name: value for name, value in {**fields, **changed}.items() if value is not None}
+
+
+def missing(path: Path) -> None:
+    pass
+
+
+def wrong_format(path: Path) -> None:
+    path.write_text("t,x,y,p\n1,2,3,1\n")
+
+
+def unsorted(path: Path) -> None:
+    np.savez(path, **arrays(t=arrays()["t"][::-1]))
+
+
+def unsorted_in_hdf5(path: Path) -> None:
+    jaxevent.save(small(), path.with_name("good.h5"))
+    path.with_name("good.h5").rename(path)
+    with h5py.File(path, "r+") as file:
+        events = file["events/t"]
+        assert isinstance(events, h5py.Dataset)
+        events[200] = 0
+
+
+def outside(path: Path) -> None:
+    np.savez(path, **arrays(width=12, frames=None, frame_t=None))
+
+
+def nan_frames(path: Path) -> None:
+    images = np.full((6, HEIGHT, WIDTH), 0.5)
+    images[3, 2, 1] = np.nan
+    np.savez(path, **arrays(frames=images))
+
+
+def empty(path: Path) -> None:
+    np.savez(path, **arrays(**{name: np.empty(0, int) for name in "txyp"}, frames=None))
+
+
+def disagreeing_sizes(path: Path) -> None:
+    np.savez(path, **arrays(frames=np.zeros((6, 10, 10), np.uint8)))
+
+
+def damaged(path: Path) -> None:
+    np.savez(path, **arrays())
+    path.write_bytes(path.read_bytes()[:3000])
+
+
+BAD = [
+    missing,
+    wrong_format,
+    unsorted,
+    unsorted_in_hdf5,
+    outside,
+    nan_frames,
+    empty,
+    disagreeing_sizes,
+    damaged,
+]
+
+
+@pytest.mark.parametrize("make", BAD)
+def test_bad_recordings(make, tmp_path, capsys):
+    path = tmp_path / "bad.npz"
+    make(path)
+    out, video, table = tmp_path / "out.h5", tmp_path / "images", tmp_path / "results"
+    config = write_config(tmp_path, ONE.replace("small.h5", "bad.npz"))
+    for argv in (
+        ["info", path],
+        ["convert", path, out],
+        ["reconstruct", path, "--method", "blend", "--rate", 200, "--out", out],
+        ["reconstruct", path, "--method", "blend", "--out", video],
+        ["evaluate", config, "--out", table],
+    ):
+        fails(capsys, argv, path)
+    assert {file.name for file in tmp_path.iterdir()} <= {"bad.npz", "run.toml"}
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ('recordingz = ["small.h5"]\n', "recordings"),
+        (ONE + "params = { c_one = 0.1 }\n", "c_on"),
+        (ONE.replace("blend", "blends"), "'blend'"),
+        (ONE + "params = { c_on = \n", "line 4"),
+        (ONE.replace("small", "none-*"), "none-*.h5"),
+    ],
+)
+def test_bad_configurations(text, named, folder, capsys):
+    config = write_config(folder, text)
+    fails(capsys, ["evaluate", config, "--out", folder / "results"], config, named)
+    assert not (folder / "results").exists()
+
+
+def test_unwritable_outputs(folder, capsys, monkeypatch):
+    monkeypatch.setattr("jaxevent.simulate.scene", None)  # it is told before anything is simulated
+    source = folder / "small.h5"
+    config = write_config(folder, ONE)
+    before = sorted(folder.rglob("*"))
+    for parent in (folder / "missing", source):
+        fails(capsys, ["simulate", "--scene", "lake", "--out", parent / "a.h5"], parent / "a.h5")
+        for name in ("a.h5", "a.mp4", "a"):
+            out = parent / name
+            fails(capsys, ["reconstruct", source, "--method", "blend", "--out", out], out)
+        fails(capsys, ["convert", source, parent / "a.h5"], parent / "a.h5")
+        fails(capsys, ["evaluate", config, "--out", parent / "a"], parent / "a")
+        fails(capsys, ["demo", "--out", parent / "a"], parent / "a")
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_bad_ways_to_reconstruct(folder, capsys):
+    path, bare, out = folder / "small.h5", folder / "bare.h5", folder / "out.h5"
+    jaxevent.save(small(frames=None), bare)
+    (folder / "mine.toml").write_text("alpha = 3\n")
+    (folder / "broken.toml").write_text("alpha = \n")
+    (folder / "other.toml").write_text("[akf]\nc_on = 0.2\n")
+    before = sorted(folder.rglob("*"))
+    blend = ["--method", "blend", "--out", out]
+    for rate in ("0", "-1", "nan", "inf", "1e7"):
+        fails(capsys, ["reconstruct", path, *blend, f"--rate={rate}"], path, "--rate")
+    fails(capsys, ["reconstruct", bare, *blend], bare, "no frames")
+    fails(capsys, ["reconstruct", bare, "--method", "akf", "--at", "frames", "--out", out], bare)
+    fails(capsys, ["reconstruct", path, *blend, "--tone", "log"], out, "--tone")
+    for name in ("mine.toml", "broken.toml", "other.toml", "none.toml"):
+        fails(capsys, ["reconstruct", path, *blend, "--params", folder / name], folder / name)
+    fails(capsys, ["reconstruct", path, "--method", "akff", "--out", out], "'akf'")
+    for name in ("out.h5", "out.mp4", "out"):
+        argv = ["reconstruct", path, *blend[:2], "--colour", "--out", folder / name]
+        fails(capsys, argv, path, "no colour frames")
+    for name in ("out.avi", "out.h5.gz"):
+        fails(capsys, ["reconstruct", path, *blend[:2], "--out", folder / name], folder / name)
+    fails(capsys, ["reconstruct", path, *blend[:2], "--out", "."])
+    fails(capsys, ["reconstruct", path, *blend[:2], "--out", folder], folder, "not empty")
+    assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        [],
+        ["unknown"],
+        ["info"],
+        ["info", "a", "--size", "240"],
+        ["reconstruct", "a", "--method", "akf"],
+        ["reconstruct", "a", "--method", "akf", "--out", "b", "--rate", "9", "--at", "frames"],
+        ["convert", "a", "b", "--compression", "best"],
+        ["simulate", "--out", "b"],
+        ["simulate", "a.mp4", "--scene", "lake", "--out", "b"],
+        ["simulate", "--scene", "lake"],
+    ],
+)
+def test_bad_arguments(argv, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(argv)
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.startswith("usage: jaxevent")
+
+
+def test_help_and_version(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "500")  # names are not broken at their hyphens
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"jaxevent {jaxevent.__version__}\n"
+    named = {"reconstruct": tuple(jaxevent.METHODS), "simulate": (*SCENES, *SENSORS)}
+    for command in ("demo", "info", "convert", "reconstruct", "evaluate", "fit", "simulate"):
+        with pytest.raises(SystemExit) as stop:
+            cli.main([command, "--help"])
+        assert stop.value.code == 0
+        assert re.search(rf"\nexamples?:\n  jaxevent {command}", text := capsys.readouterr().out)
+        assert set(named.get(command, ())) <= set(re.findall(r"[\w-]+", text))
+
+
+def as_process(*arguments: object, env: dict[str, str] | None = None) -> subprocess.Popen:
+    root = str(Path(jaxevent.__file__).parents[1])
+    # Jobs in the background of a shell inherit that interrupts are ignored.
+    code = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    code += "from jaxevent import cli; sys.exit(cli.main())"
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        env={**(os.environ if env is None else env), "PYTHONPATH": root},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_as_a_process(tmp_path):
+    process = as_process("convert", tmp_path / "none.npz", tmp_path / "out.h5")
+    out, error = process.communicate()
+    assert (process.returncode, out) == (2, "")
+    assert re.fullmatch(r"jaxevent: .*none\.npz: .*\n", error)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt, 130), (BrokenPipeError, 1)])
+def test_interrupted_and_broken_pipe(error, status, monkeypatch, capsys):
+    def info(path, size, stream):
+        raise error
+
+    monkeypatch.setattr(cli, "info", info)
+    assert cli.main(["info", "a"]) == status
+    assert capsys.readouterr().err == ""
+
+
+def test_interrupted_while_it_writes(folder):
+    """And what it compiles is kept, by default in the user's cache."""
+    env = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    env |= {
+        "XDG_CACHE_HOME": str(folder / "cache"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+    out = folder / "out"
+    out.mkdir()
+    words = ("--method", "akf", "--rate", 2e5, "--out", out / "images.h5")
+    process = as_process("reconstruct", folder / "small.h5", *words, env=env)
+    while not any(path.stat().st_size > 1e6 for path in out.iterdir()):
+        assert process.poll() is None
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    assert process.communicate() == ("", "")
+    assert process.returncode == 130
+    assert not list(out.iterdir())
+    if sys.platform == "linux":
+        assert list((folder / "cache").glob("jaxevent/compiled/*/*-cache"))
+
+
+@contextlib.contextmanager
+def room(size: int):
+    """Files cannot grow beyond so many bytes."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize("size", [100, 3000])
+@pytest.mark.parametrize("name", ["images.h5", "images.mp4", "images", "recording.h5"])
+def test_full_disk(name, size, folder, capsys):
+    out = folder / "out"
+    out.mkdir()
+    words = ["reconstruct", folder / "small.h5", "--method", "blend", "--rate", 3000, "--out"]
+    if name == "recording.h5":
+        words = ["convert", folder / "small.h5"]
+    elif name == "images":
+        size //= 20
+    with room(size):
+        fails(capsys, [*words, out / name], out / name)
+    assert not list(out.iterdir())
+
+
+def test_full_disk_is_no_crash_at_exit(tmp_path):
+    """HDF5's own flush at exit crashes where it fails."""
+    code = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from jaxevent.errors import InputError
+from jaxevent.io.output import complete_hdf5
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
+try:
+    with complete_hdf5(Path(sys.argv[1])) as (file, check):
+        stored = file.create_dataset("a", (100, 1000), "f4", chunks=(1, 1000))
+        for row in range(100):
+            stored[row] = 1
+            if sys.argv[2]:
+                check()
+except InputError as error:
+    sys.exit(f"said: {error}")
+"""
+    for how in ("", "early"):
+        words = [sys.executable, "-c", code, tmp_path / "a.h5", how]
+        done = subprocess.run(words, capture_output=True)
+        assert (done.returncode, done.stderr[:5]) == (1, b"said:")
+        assert not list(tmp_path.iterdir())
+
+
+def test_import_is_lazy():
+    """Nothing is loaded or computed before it is used; no device is opened by any import."""
+    code = """
+import importlib, pkgutil, sys
+import jaxevent
+assert not {"jax", "numba", "pandas", "scipy", "h5py"} & sys.modules.keys()
+for module in pkgutil.walk_packages(jaxevent.__path__, "jaxevent."):
+    importlib.import_module(module.name)
+from jax._src import xla_bridge
+assert not xla_bridge.backends_are_initialized()
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_info(tmp_path, capsys, monkeypatch):
+    """In blocks as at once, of a file whose events can be counted by hand."""
+    t = np.r_[0, 5_000, 5_001, 9_999, 10_000, 100_000]
+    x, y, p = np.r_[3, 4, 4, 4, 3, 1], np.r_[7, 2, 2, 2, 7, 0], np.r_[1, 0, 0, 1, 1, 0]
+    images = np.zeros((2, HEIGHT, WIDTH))
+    images[0, :5], images[1] = 1, 0.5
+    path = tmp_path / "known.npz"
+    np.savez(
+        path,
+        **arrays(t=t, x=x, y=y, p=p, frames=images, frame_t=None),
+        exp_start=np.r_[0, 40_000],
+        exp_end=np.r_[3_000, 44_000],
+        imu_t=np.r_[0, 1_000],
+        gyro=np.zeros((2, 3)),
+        acc=np.zeros((2, 3)),
+        calib=np.arange(9.0),
+        threshold=np.r_[0.1, 0.2],
+    )
+    assert cli.main(["convert", str(path), str(tmp_path / "known.h5")]) == 0
+    assert re.search(r"known\.h5: 6 events, 2 frames, 0\.\d MB\n", capsys.readouterr().out)
+    assert cli.main(["info", str(path)]) == 0
+    first = capsys.readouterr().out
+    monkeypatch.setattr(describe, "BLOCK", 2)
+    assert cli.main(["info", str(tmp_path / "known.h5")]) == 0
+    assert capsys.readouterr().out.splitlines()[1:] == first.splitlines()[1:]
+    lines = dict(re.split(r"  +", line, maxsplit=1) for line in first.splitlines())
+    assert lines == {
+        "file": str(path),
+        "name": "known",
+        "sensor": "24 x 20 pixels",
+        "time": "0.000000 to 0.100000 s (0.100 s)",
+        "events": "6, from 0.000000 to 0.100000 s",
+        "polarity": "50.0 % ON, 50.0 % OFF",
+        "event rate": "mean 60 per s, peak 400 per s in 10 ms",
+        "rate over time": "400, 100, 0, 0, 0, 0, 0, 0, 0, 100 per s, in tenths of 0.01 s",
+        "gaps": "longest 90.000 ms, after 0.010000 s",
+        "hot pixels": "none",
+        "hottest pixels": "(4, 2) 3 events, 30 per s; (3, 7) 2 events, 20 per s; "
+        "(1, 0) 1 events, 10 per s",
+        "frames": "2 of 24 x 20, float64, 24.7 per s",
+        "exposure": "3.000 to 4.000 ms",
+        "grey levels": "37.5 % dark (< 0.02), 12.5 % saturated (> 0.98)",
+        "calibration": "fx 0.00, fy 1.00, cx 2.00, cy 3.00; distortion 4, 5, 6, 7, 8",
+        "IMU": "2, 1000.0 per s",
+        "ground truth": "none",
+        "extra threshold": "float64 of shape (2,)",
+    }
+
+
+def test_one_event_is_enough(tmp_path, capsys):
+    path = tmp_path / "one.npz"
+    one: dict = {name: np.array([value]) for name, value in zip("txyp", (7, 3, 4, 1), strict=True)}
+    np.savez(path, **one)
+    fails(capsys, ["info", path], path, "--size")
+    size = ["--size", f"{WIDTH},{HEIGHT}"]
+    assert cli.main(["info", str(path), *size]) == 0
+    assert "1, from 0.000007 to 0.000007 s" in capsys.readouterr().out
+    assert cli.main(["convert", str(path), str(tmp_path / "one.h5"), *size]) == 0
+    out = tmp_path / "images.h5"
+    assert cli.main(["reconstruct", str(path), "--method", "akf", "--out", str(out), *size]) == 0
+    with h5py.File(out) as file:
+        assert np.asarray(file["t"]).tolist() == [7]
+        image = np.asarray(file["image"])[0]
+    expected = np.full((HEIGHT, WIDTH), 0.5)  # without frames the AKF begins with mid-grey
+    expected[4, 3] = 1.5 * np.exp(0.1) - 1
+    np.testing.assert_allclose(image, expected, rtol=1e-6)
+
+
+def test_reconstruct_to_hdf5(folder, capsys):
+    mine = "c_on = 0.2\nclock_offset = 0.0025\n"
+    (folder / "a.toml").write_text(mine)
+    (folder / "b.toml").write_text(f"[cf]\nc_on = 0.3\n[akf]\n{mine}")
+    contents = []
+    for name in ("a.h5", "b.hdf5"):
+        params = (folder / name).with_suffix(".toml")
+        argv = f"reconstruct {folder}/small.h5 --method akf --params {params} --out"
+        assert cli.main([*argv.split(), str(folder / name)]) == 0
+        said = capsys.readouterr().out
+        assert said.startswith(f"{folder / name}: 6 images") and said.count("\n") == 1
+        with h5py.File(folder / name) as file:
+            contents.append({key: np.asarray(file[key]) for key in ("t", "image", "variance")})
+            attributes = dict(file.attrs)
+    params = json.loads(str(attributes.pop("params")))
+    assert attributes == {"method": "akf", "recording": "small"}
+    assert (params["c_on"], params["c_off"], params["clock_offset"]) == (0.2, 0.1, 0.0025)
+    assert all(contents[0][key].tobytes() == contents[1][key].tobytes() for key in contents[0])
+
+    params = jaxevent.akf.Params.of({"c_on": 0.2, "clock_offset": 0.0025})
+    video = jaxevent.akf.reconstruct(small(), params)
+    image, variance = video(STAMPS + 2_500)
+    assert contents[0]["t"].dtype == np.int64 and contents[0]["image"].dtype == np.float32
+    np.testing.assert_array_equal(contents[0]["t"], STAMPS + 2_500)
+    np.testing.assert_array_equal(contents[0]["image"], image.astype(np.float32))
+    np.testing.assert_array_equal(contents[0]["variance"], variance.astype(np.float32))
+
+
+def test_reconstruct_to_images(folder):
+    stored = []
+    for name in ("a", "b"):
+        argv = f"reconstruct {folder}/small.h5 --method blend --rate 300 --out {folder}/{name}"
+        assert cli.main(argv.split()) == 0
+        stored.append({file.name: file.read_bytes() for file in (folder / name).iterdir()})
+    assert stored[0] == stored[1]
+    times = np.rint(np.arange(16) / 300 * 1e6).astype(np.int64)  # until 50 of 52 ms
+    names = [f"frame_{number:08d}.png" for number in range(len(times))]
+    assert sorted(stored[0]) == [*names, "images.txt"]
+    lines = [f"{t / 1e6:.6f} {name}\n" for t, name in zip(times, names, strict=True)]
+    assert (folder / "a" / "images.txt").read_text() == "".join(lines)
+    images, _ = jaxevent.blend.reconstruct(small())(times)
+    for name, image in zip(names, tone_map(images), strict=True):
+        with Image.open(folder / "a" / name) as stored_image:
+            np.testing.assert_array_equal(np.asarray(stored_image), image)
+
+
+@pytest.mark.parametrize(
+    ("rate", "fps", "factor"), [("500", 60, "0.12"), ("40", 40, "1")], ids=["slow", "real time"]
+)
+def test_reconstruct_to_video(rate, fps, factor, folder, capsys):
+    ramp = 60 + 2 * np.arange(WIDTH) + 3 * np.arange(6)[:, None, None]  # 60 to 121 of 255
+    images = np.broadcast_to(ramp, (6, HEIGHT, WIDTH)).astype(np.uint8)
+    recording = small(frames=Frames(STAMPS, images, np.zeros_like(STAMPS)))
+    jaxevent.save(recording, folder / "small.h5")
+    path = folder / "out.mp4"
+    argv = f"reconstruct {folder}/small.h5 --method blend --rate {rate} --tone percentile"
+    assert cli.main([*argv.split(), "--out", str(path)]) == 0
+    assert f"played at {fps} per s, {factor} of real time" in capsys.readouterr().out
+    images, about = decoded(path, HEIGHT, WIDTH)
+    times = np.arange(0, 52_001, 1_000_000 // int(rate))
+    assert len(images) == len(times)
+    assert f" {WIDTH}x{HEIGHT}" in about and f" {fps} fps" in about
+    sample = times[np.unique(np.linspace(0, len(times) - 1, 16).round().astype(int))]
+    video = jaxevent.blend.reconstruct(recording)
+    limits = tuple(np.percentile(video(sample)[0], [0.5, 99.5]).tolist())
+    shown = tone_map(video(times)[0], "percentile", limits).astype(float)
+    assert np.abs(images - shown).mean() < 3
+
+
+def test_reconstruct_in_colour(folder):
+    """Two colours side by side, far from black and white, on frames of their own brightness."""
+    ramp = 60 + 2 * np.arange(WIDTH) + 3 * np.arange(6)[:, None, None]
+    images = np.broadcast_to(ramp, (6, HEIGHT, WIDTH)).astype(np.uint8)
+    rgb = np.empty((6, HEIGHT, WIDTH, 3), np.uint8)
+    rgb[:, :, :10], rgb[:, :, 10:] = (140, 90, 60), (60, 100, 120)
+    frames = Frames(STAMPS, images, np.zeros_like(STAMPS))
+    recording = small(frames=frames, extra={"rgb": rgb})
+    jaxevent.save(recording, folder / "small.h5")
+    outs = {"a.h5": [], "b": ["--tone", "percentile"], "c.mp4": []}
+    for name, tone in outs.items():
+        argv = f"reconstruct {folder}/small.h5 --method blend --rate 300 --colour --out"
+        assert cli.main([*argv.split(), str(folder / name), *tone]) == 0
+
+    times = np.rint(np.arange(16) / 300 * 1e6).astype(np.int64)
+    grey = jaxevent.blend.reconstruct(recording)(times)[0]
+    colour = rgb[0].astype(float)
+    ratio = colour / (colour @ [0.2126, 0.7152, 0.0722])[..., None]
+    with h5py.File(folder / "a.h5") as file:
+        assert set(file) == {"t", "image"}
+        np.testing.assert_array_equal(np.asarray(file["t"]), times)
+        np.testing.assert_allclose(np.asarray(file["image"]), grey[..., None] * ratio, rtol=1e-5)
+
+    low, high = np.percentile(grey, [0.5, 99.5])  # there are no more than 16 images to sample
+    toned = np.rint(255 * ((grey - low) / (high - low)).clip(0, 1))
+    expected = (toned[..., None] * ratio).clip(0, 255)
+    for number, image in enumerate(expected):
+        with Image.open(folder / "b" / f"frame_{number:08d}.png") as stored:
+            assert np.abs(np.asarray(stored) - image).max() <= 2
+    images, _ = decoded(folder / "c.mp4", HEIGHT, WIDTH, "rgb24")
+    assert np.abs(images - 255 * grey[..., None] * ratio).mean() < 5
+
+
+def test_a_pixel_without_bound_is_white_in_colour():
+    """Pure red has no green; infinity times 0 is no number."""
+    times = np.array([0])
+    red = np.full((1, HEIGHT, WIDTH, 3), np.array([0.5, 0, 0]), np.float32)
+    red[0, 3, 4] = (np.inf, np.nan, np.nan)
+    video = jaxevent.blend.reconstruct(small())
+    ((_, image),) = export.shown(video, times, "linear", lambda _: red)
+    assert image[3, 4].tolist() == [255, 255, 255]
+    assert image[0, 0].tolist() == [127, 0, 0]
+
+
+def equal(one: Recording, other: Recording) -> None:
+    assert (one.name, one.width, one.height) == (other.name, other.width, other.height)
+    assert isinstance(one.events, Events) and one.frames and other.frames
+    for part, same in ((one.events, other.events), (one.frames, other.frames)):
+        for name, values in vars(part).items():
+            np.testing.assert_array_equal(values, getattr(same, name), name)
+    assert set(one.extra) == set(other.extra)
+    for name, values in one.extra.items():
+        np.testing.assert_array_equal(values, other.extra[name], name)
+
+
+def test_simulate_a_scene(tmp_path, capsys):
+    out = tmp_path / "night.h5"
+    argv = "simulate --scene night --speed fast --sensor poor --seed 3 --duration 0.3 --size 24,20"
+    assert cli.main([*argv.split(), "--out", str(out)]) == 0
+    source = Pan(scene("night"), (24, 20), 0.3, "fast", 3)
+    recording = simulate(source, SENSORS["poor"], 3, "night-fast")
+    equal(jaxevent.load(out), recording)
+    said = capsys.readouterr().out
+    assert said.startswith(f"{out}: {len(recording.events):,} events, 15 frames, 0.")
+    assert said.count("\n") == 1 and [file.name for file in tmp_path.iterdir()] == ["night.h5"]
+
+
+def test_what_is_simulated_by_default(tmp_path, monkeypatch):
+    asked = []
+
+    def record(*settings):
+        asked.append(settings)
+        return small()
+
+    monkeypatch.setattr("jaxevent.simulate.simulate", record)
+    assert cli.main(["simulate", "--scene", "7", "--out", str(tmp_path / "a.h5")]) == 0
+    ((source, sensor, seed, name),) = asked
+    assert (source.size, source.duration, source.speed, source.seed) == ((128, 96), 1.5, "slow", 0)
+    np.testing.assert_array_equal(source.panorama, scene(7))
+    assert (sensor, seed, name) == (SENSORS["davis"], 0, "7-slow")
+
+
+@pytest.fixture
+def film(tmp_path: Path) -> Path:
+    """A folder of 12 colour images, 32x24: stripes that move 2 pixels from each to the next."""
+    film = tmp_path / "film"
+    film.mkdir()
+    x = np.arange(32)
+    for k in range(12):
+        wave = 150 + 60 * np.sin((x - 2 * k) / 3)
+        image = np.empty((24, 32, 3), np.uint8)
+        image[:] = wave[:, None] * [1, 0.9, 0.8]
+        Image.fromarray(image).save(film / f"{k}.png")
+    return film
+
+
+def test_simulate_a_video(film, capsys):
+    part = "--start 0.1 --duration 0.2 --max-size 16"
+    for out, options, settings in (
+        ("a.h5", "", {}),
+        ("b.h5", part, {"start": 0.1, "stop": 0.1 + 0.2, "max_size": 16}),
+    ):
+        argv = f"simulate {film} --sensor ideal --cut 30 --speed 0.5 --seed 2 {options} --out"
+        assert cli.main([*argv.split(), str(film.parent / out)]) == 0
+        recording = from_video(film, SENSORS["ideal"], cut=30, speed=0.5, seed=2, **settings)
+        assert recording.frames is not None
+        equal(jaxevent.load(film.parent / out), recording)
+        said = f"{out}: {len(recording.events):,} events, {len(recording.frames)} frames, "
+        assert said in capsys.readouterr().out
+    argv = f"reconstruct {film.parent}/b.h5 --method blend --rate 10 --colour --out {film}/c"
+    assert cli.main(argv.split()) == 0
+    with Image.open(film / "c" / "frame_00000000.png") as image:
+        assert (image.mode, image.size) == ("RGB", (16, 12))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ("--scene lakes", "'lakes'"),
+        ("--scene lake --speed 2", "--speed 2"),
+        ("--scene lake --sensor davi", "did you mean 'davis'"),
+        ("--scene lake --seed -1", "--seed -1"),
+        ("--scene lake --duration 0", "--duration 0"),
+        ("--scene lake --duration inf", "--duration inf"),
+        ("--scene lake --duration 0.01", "fewer than two frames"),
+        ("--scene lake --size 0,9", "--size 0,9"),
+        ("--scene lake --cut 50", "--cut is for a video"),
+        ("--scene lake --max-size 50", "--max-size is for a video"),
+        ("film --size 9,9", "--size is for a scene"),
+        ("film --speed slow", "--speed slow is for a scene"),
+        ("film --speed 0", "speed = 0"),
+        ("film --cut 200", "200"),
+        ("film --start 5", "film"),
+        ("film --max-size 3", "max_size = 3"),
+        ("none.mp4", "none.mp4: there is no such file"),
+    ],
+)
+def test_bad_ways_to_simulate(options, said, film, capsys, monkeypatch):
+    monkeypatch.chdir(film.parent)
+    fails(capsys, ["simulate", *options.split(), "--out", "out.h5"], said)
+    assert [file.name for file in film.parent.iterdir()] == ["film"]
+
+
+def test_evaluate(folder, capsys):
+    config = write_config(folder, ONE)
+    assert cli.main(["evaluate", str(config), "--out", str(folder / "results")]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith((folder / "results" / "results.md").read_text())
+    assert str(folder / "results") in said
+    assert "| small.h5  | blend" in said
+
+
+def test_demo(tmp_path, capsys, float32):
+    out = tmp_path / "demo"
+    assert cli.main(["demo", "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith((out / "results.md").read_text()) and str(out) in said
+    rows = json.loads((out / "results.json").read_text())["rows"]
+    errors = {row["method"]: row["mse"] for row in rows}
+    assert list(errors)[: len(jaxevent.METHODS)] == list(jaxevent.METHODS)
+    assert len(errors) == len(jaxevent.METHODS) + 2
+    by_hand = errors["akf, thresholds and clock set by hand"]
+    assert by_hand < errors["akf"] < errors["cf"] < errors["last-frame"]
+    with Image.open(out / "comparison.png") as figure:
+        assert figure.width > 1000
+    images, about = decoded(out / "video.mp4", 360, 480)
+    assert len(images) == 180 and " 30 fps" in about

@@ -1,0 +1,329 @@
+"""`jaxevent track`: what it writes is what `track` says, and bad input is said in one line."""
+
+import csv
+import functools
+import sys
+import tomllib
+from pathlib import Path
+
+import h5py
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from commands import decoded, fails
+from PIL import Image
+
+import jaxevent
+from jaxevent import cli
+from jaxevent.blob import Params, track
+from jaxevent.blob.quantities import inverse_ttc, size_range
+from jaxevent.recording import Events, Frames, Recording
+from jaxevent.show import tracks as pictures
+from jaxevent.show.tracks import COLUMNS
+from jaxevent.simulate import Line, Target, simulate_blobs
+
+WIDTH, HEIGHT = 120, 80
+SEEDS = [(30.0, 30.0, 6.0), (80.0, 50.0, 6.0)]
+HEADER = ["t", "id", *COLUMNS]
+# A filter that compiles fast.
+SETTINGS = 'filter = "constant_velocity"\nevents_per_step = 8\nQ_v = 1e4\nP0_v = 1e4\n'
+
+
+@functools.cache
+def two() -> Recording:
+    """Two blobs that move slowly apart, from 0 to 0.05 s."""
+    targets = [
+        Target(Line((30, 30), (-100, 0), size=(4.0, 2.0)), 4e4),
+        Target(Line((80, 50), (100, 20), size=(3.0, 3.0)), 4e4),
+    ]
+    return simulate_blobs(targets, (WIDTH, HEIGHT), 0.05, seed=1)[0]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    jaxevent.save(two(), tmp_path / "two.h5")
+    (tmp_path / "mine.toml").write_text(SETTINGS)
+    return tmp_path
+
+
+def seeded(*more: object) -> list[str]:
+    seeds = [f"--seed={x:g},{y:g},{size:g}" for x, y, size in SEEDS]
+    return [*seeds, *(str(word) for word in more)]
+
+
+def followed(**more):
+    params = Params.of(tomllib.loads(SETTINGS))
+    return track(two(), params, SEEDS, **more)
+
+
+def read_table(path: Path) -> tuple[list[str], np.ndarray]:
+    with path.open() as file:
+        lines = list(csv.reader(file))
+    return lines[0], np.array(lines[1:], float).reshape(-1, len(lines[0]))
+
+
+def test_header_is_exact():
+    assert HEADER == ["t", "id", "x", "y", "vx", "vy", "lambda1", "lambda2", "theta", "q"]
+
+
+def test_a_folder_of_everything(folder, capsys):
+    out = folder / "out"
+    argv = [
+        *("track", folder / "two.h5", "--params", folder / "mine.toml", "--rate", 500),
+        *("--pair", "0,1", "--extent", 0.3, "--focal", 200, "--size-factor", 0.25, "--out", out),
+    ]
+    assert cli.main([*map(str, argv), *seeded()]) == 0
+    said = capsys.readouterr().out
+    names = ["quantities.csv", "tracks.csv", "tracks.h5", "tracks.mp4", "tracks.png"]
+    assert sorted(path.name for path in out.iterdir()) == names
+    assert all(name in said for name in names) and f"{out}: 2 tracks" in said
+
+    tracks = followed()
+    times = tracks.start + 2000 * np.arange(25)
+    states = tracks(times)
+    assert states.alive.all()
+    header, table = read_table(out / "tracks.csv")
+    assert header == [*HEADER, *(f"std_{name}" for name in COLUMNS)]
+    assert np.array_equal(table[:, 0], np.repeat(times, 2) / 1e6)
+    assert np.array_equal(table[:, 1], np.tile([0, 1], 25))
+    np.testing.assert_allclose(table[:, 2:10], states.mean.reshape(-1, 8), rtol=1e-12)
+    variance = np.diagonal(states.covariance, axis1=2, axis2=3).reshape(-1, 8)
+    np.testing.assert_allclose(table[:, 10:] ** 2, variance, rtol=1e-12)
+    with h5py.File(out / "tracks.h5") as file:
+        assert np.array_equal(file["t"], np.repeat(times, 2))
+        assert np.array_equal(file["mean"], states.mean.reshape(-1, 8))
+        assert np.array_equal(file["covariance"], states.covariance.reshape(-1, 8, 8))
+        assert list(file["mean"].attrs["columns"]) == list(COLUMNS)
+
+    scale = 6  # 80 rows become 480
+    images, about = decoded(out / "tracks.mp4", scale * HEIGHT, scale * WIDTH, "rgb24")
+    # 300 pictures would be 6000 a second, of which the rate allows 500.
+    assert len(images) == 25 and " 60 fps" in about
+    for one, place in enumerate(states.mean[-1, :, :2]):
+        x, y = np.rint((place + 0.5) * scale).astype(int)
+        near = images[-1][max(y - 60, 0) : y + 60, max(x - 60, 0) : x + 60].astype(int)
+        wanted = pictures.track_colour(one)
+        assert (abs(near - wanted).sum(2) < 60).sum() > 50
+    with Image.open(out / "tracks.png") as figure:
+        assert figure.width > 800 and figure.height > 1000  # three plots
+
+    with (out / "quantities.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    names = ["t", "id", "other", "inverse_ttc", "std_inverse_ttc", "range", "std_range"]
+    assert list(rows[0]) == names and len(rows) == 75
+    pair = [row for row in rows if row["other"] == "1"]
+    a, b = (jnp.asarray(states.mean[:, k]) for k in (0, 1))
+    P_a, P_b = (jnp.asarray(states.covariance[:, k]) for k in (0, 1))
+    value, variance = inverse_ttc(a, P_a, b, P_b)
+    np.testing.assert_allclose([float(row["inverse_ttc"]) for row in pair], value, rtol=1e-9)
+    deviation = [float(row["std_inverse_ttc"]) for row in pair]
+    np.testing.assert_allclose(deviation, np.sqrt(variance), rtol=1e-9)
+    one = [row for row in rows if row["id"] == "1"]
+    value, variance = size_range(b, P_b, 0.3, 200, 0.25)
+    assert [row["other"] for row in one] == [""] * 25
+    np.testing.assert_allclose([float(row["range"]) for row in one], value, rtol=1e-9)
+    np.testing.assert_allclose([float(row["std_range"]) ** 2 for row in one], variance, rtol=1e-9)
+
+
+def test_a_row_for_each_event(folder, capsys, monkeypatch):
+    monkeypatch.setattr(pictures, "_STRETCH", 300)
+    argv = ["track", folder / "two.h5", "--params", folder / "mine.toml", "--at", "events"]
+    path = folder / "events.csv"
+    span = ["--start", "0.01", "--stop", "0.04"]
+    assert cli.main([*map(str, argv), *seeded(*span, "--out", path)]) == 0
+    assert f"{path}: 2 tracks" in capsys.readouterr().out
+    tracks = followed(start=0.01, stop=0.04)
+    (told,) = tracks.events()
+    held = told.id >= 0
+    states = tracks(told.t[held])
+    _, table = read_table(path)
+    assert 1000 < held.sum() == len(table)
+    # Events of one time may come in any order.
+    order = np.lexsort((table[:, 1], table[:, 0]))
+    expected = np.lexsort((told.id[held], told.t[held]))
+    assert np.array_equal(table[order, 0], told.t[held][expected] / 1e6)
+    assert np.array_equal(table[order, 1], told.id[held][expected])
+    mean = states.mean[np.arange(held.sum()), told.id[held]][expected]
+    np.testing.assert_allclose(table[order, 2:10], mean, rtol=1e-12)
+
+
+def test_one_file_of_each_kind(folder, capsys):
+    # The frames, which nobody looks at, begin before the events and end after.
+    stamps = np.array([-5_000, 90_000])
+    frames = Frames(stamps, np.zeros((2, HEIGHT, WIDTH), np.uint8), 0 * stamps)
+    path = folder / "framed.h5"
+    jaxevent.save(Recording("framed", WIDTH, HEIGHT, two().events, frames), path)
+    argv = ["track", str(path), "--params", str(folder / "mine.toml"), *seeded("--rate", 100)]
+    for name, more in (
+        ("a.csv", []),
+        ("a.hdf5", []),
+        ("a.svg", ["--pair", "0,1"]),
+        ("a.mp4", ["--background", "high-pass"]),
+    ):
+        before = set(folder.iterdir())
+        assert cli.main([*argv, *more, "--out", str(folder / name)]) == 0
+        assert set(folder.iterdir()) - before == {folder / name}
+        assert ("of real time" in capsys.readouterr().out) == (name == "a.mp4")
+    _, table = read_table(folder / "a.csv")
+    with h5py.File(folder / "a.hdf5") as file:
+        assert np.array_equal(file["t"], np.rint(1e6 * table[:, 0]).astype(int))
+        np.testing.assert_allclose(np.asarray(file["mean"]), table[:, 2:10], rtol=1e-12)
+    assert "<svg" in (folder / "a.svg").read_text()
+    images, _ = decoded(folder / "a.mp4", 6 * HEIGHT, 6 * WIDTH, "rgb24")
+    assert len(images) == 5
+    assert abs(np.median(images[0]) - 128) < 20  # grey where nothing happened
+
+
+def test_nothing_found_is_an_empty_table(tmp_path, capsys):
+    t = np.arange(0, 60_000, 3_000)
+    x, y = (37 * np.arange(20)) % WIDTH, (23 * np.arange(20)) % HEIGHT
+    events = Events(t, x.astype(np.uint16), y.astype(np.uint16), x % 2 == 0)
+    jaxevent.save(Recording("stray", WIDTH, HEIGHT, events), tmp_path / "stray.h5")
+    out = tmp_path / "out"
+    (tmp_path / "mine.toml").write_text(SETTINGS)
+    argv = ["track", tmp_path / "stray.h5", "--params", tmp_path / "mine.toml", "--out", out]
+    assert cli.main([*map(str, argv)]) == 0
+    said = capsys.readouterr().out
+    assert "no blob was found" in said and "--seed" in said and f"{out}: 0 tracks" in said
+    header, table = read_table(out / "tracks.csv")
+    assert header[:10] == HEADER and len(table) == 0
+    with h5py.File(out / "tracks.h5") as file:
+        assert {name: file[name].shape for name in file} == {
+            "t": (0,),
+            "id": (0,),
+            "mean": (0, 8),
+            "covariance": (0, 8, 8),
+        }
+    images, _ = decoded(out / "tracks.mp4", 6 * HEIGHT, 6 * WIDTH)
+    assert len(images) > 40
+    with Image.open(out / "tracks.png") as figure:
+        assert figure.width > 800
+
+
+def test_bad_ways_to_track(folder, capsys):
+    path, out = folder / "two.h5", folder / "out"
+    bare = folder / "bare.h5"
+    frames = Frames(np.array([0]), np.zeros((1, HEIGHT, WIDTH), np.uint8), np.array([0]))
+    jaxevent.save(Recording("bare", WIDTH, HEIGHT, Events.empty(), frames), bare)
+    (folder / "wrong.toml").write_text("Q_vv = 3\n")
+    (folder / "negative.toml").write_text("gate = -3\n")
+    (folder / "other.toml").write_text("[akf]\nc_on = 0.2\n")
+    (folder / "full").mkdir()
+    (folder / "full" / "a").touch()
+    before = sorted(folder.rglob("*"))
+    to = ["--out", out]
+    fails(capsys, ["track", folder / "none.h5", *to], "none.h5")
+    fails(capsys, ["track", bare, *to], bare, "no events")
+    for name, said in (
+        ("wrong.toml", "did you mean 'Q_v'"),
+        ("negative.toml", "gate"),
+        ("other.toml", "none of blob"),
+        ("none.toml", "cannot be read"),
+    ):
+        fails(capsys, ["track", path, "--params", folder / name, *to], folder / name, said)
+    for seed, said in (
+        ("200,10,5", "outside the 120x80 sensor"),
+        ("-9,10,5", "outside the 120x80 sensor"),
+        ("20,10,0", "size above 0"),
+        ("20,nan,5", "outside"),
+        ("20,10,5,7.5", "begins at 7500000 us"),
+    ):
+        fails(capsys, ["track", path, f"--seed={seed}", *to], path, "seed 0", said)
+    fails(capsys, ["track", path, "--start", 3, *to], path, "nothing to track")
+    fails(capsys, ["track", path, "--start", "nan", *to], "start")
+    for rate in ("0", "-1", "nan", "1e7"):
+        fails(capsys, ["track", path, f"--rate={rate}", *to], "--rate")
+    fails(capsys, ["track", path, "--pair", "0,0", *to], "--pair 0,0 is one track")
+    pair = ["--params", folder / "mine.toml", *seeded("--pair", "0,7")]
+    fails(capsys, ["track", path, *pair, *to], path, "--pair 0,7", "found, 0, 1")
+    fails(capsys, ["track", path, "--extent", 1, *to], "--focal")
+    fails(capsys, ["track", path, "--focal", 1, *to], "--extent")
+    fails(capsys, ["track", path, "--size-factor", 1, *to], "--extent")
+    fails(capsys, ["track", path, "--extent", 0, "--focal", 9, *to], "--extent 0")
+    for name in ("a.txt", "a.csv.gz"):
+        fails(capsys, ["track", path, "--out", folder / name], folder / name, "stored as")
+    for name in ("a.csv", "a.h5", "a.mp4"):
+        fails(capsys, ["track", path, "--pair", "0,1", "--out", folder / name], "--pair")
+    fails(capsys, ["track", path, "--background", "high-pass", "--out", folder / "a.csv"], "video")
+    for name in ("missing/a", "missing/a.csv", "two.h5/a.mp4", "full", "full/b/a.png"):
+        fails(capsys, ["track", path, "--out", folder / name], folder / name)
+    fails(capsys, ["track", path, "--out", "."])
+    assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "needs", "does_without"),
+    [
+        ("imageio_ffmpeg", "video", ("out", "a.mp4"), "a.csv"),
+        ("matplotlib", "plot", ("out", "a.png"), "a.h5"),
+    ],
+)
+def test_missing_extras_are_named(module, extra, needs, does_without, folder, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    for name in needs:
+        fails(
+            capsys,
+            ["track", folder / "two.h5", "--out", folder / name],
+            f"jaxevent[{extra}]",
+        )
+        assert not (folder / name).exists()
+    argv = ["track", folder / "two.h5", "--params", folder / "mine.toml", *seeded()]
+    assert cli.main([*map(str, argv), "--rate", "100", "--out", str(folder / does_without)]) == 0
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["track"],
+        ["track", "a"],
+        ["track", "a", "--out", "b", "--seed", "1,2"],
+        ["track", "a", "--out", "b", "--seed", "1,2,x"],
+        ["track", "a", "--out", "b", "--pair", "1"],
+        ["track", "a", "--out", "b", "--pair", "1,2.5"],
+        ["track", "a", "--out", "b", "--rate", "9", "--at", "events"],
+        ["track", "a", "--out", "b", "--at", "frames"],
+        ["track", "a", "--out", "b", "--background", "black"],
+        ["simulate", "--blobs", "disc", "--scene", "lake", "--out", "b"],
+    ],
+)
+def test_bad_arguments(argv, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(argv)
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.startswith("usage: jaxevent")
+
+
+def test_help(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["track", "--help"])
+    assert stop.value.code == 0 and "\nexamples:\n  jaxevent track" in capsys.readouterr().out
+
+
+def test_simulated_blobs_and_their_truth(tmp_path, capsys):
+    truth, out = tmp_path / "truth.csv", tmp_path / "dot.h5"
+    argv = f"simulate --blobs dropout --seed 3 --truth {truth} --out {out}"
+    assert cli.main([*argv.split(), "--duration", "0.56"]) == 0
+    recording, states = jaxevent.simulate.blob_scene("dropout", 3)
+    loaded = jaxevent.load(out)
+    assert f"{out}: {len(loaded.events):,} events" in capsys.readouterr().out
+    assert np.array_equal(loaded.events[:].t, recording[:0.56].events[:].t)
+    header, table = read_table(truth)
+    assert header == HEADER
+    times = np.arange(0, loaded.stop + 1, 1000)
+    times = times[states.visible(times)[:, 0]]
+    assert np.array_equal(table[:, 0], times / 1e6) and 0 < 560 - len(table) < 560
+    assert (table[:, 1] == 0).all()
+    np.testing.assert_allclose(table[:, 2:], states(times)[:, 0], rtol=1e-9)
+
+    before = sorted(tmp_path.iterdir())
+    for options, said in (
+        ("--blobs disk", "did you mean 'disc'"),
+        ("--blobs disc --seed -1", "--seed -1"),
+        ("--blobs disc --duration 0", "--duration 0"),
+        ("--blobs disc --sensor good", "--sensor is not for blobs"),
+        ("--blobs disc --max-size 9", "--max-size is not for blobs"),
+        ("--blobs disc --truth no/a.csv", "no/a.csv"),
+        ("--scene lake --truth a.csv", "--truth is that of --blobs"),
+    ):
+        fails(capsys, ["simulate", *options.split(), "--out", tmp_path / "b.h5"], said)
+    assert sorted(tmp_path.iterdir()) == before

@@ -1,0 +1,537 @@
+"""General motion of a window: the warp against rigid geometry, and scenes of points."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.interpolate
+import scipy.sparse.linalg
+from scipy.spatial.transform import Rotation
+
+from jaxevent.camera import PinholeCamera
+from jaxevent.egomotion import geometry
+from jaxevent.egomotion.batch_fit import photometric, starts
+from jaxevent.egomotion.batch_fit import windows as batch
+from jaxevent.egomotion.batch_fit.path import ROWS, Path, advanced, normalised, warp
+from jaxevent.egomotion.batch_fit.photometric import Report, Scene
+from jaxevent.egomotion.truth import Twists
+from jaxevent.errors import InputError
+from jaxevent.recording import Events, Recording
+
+WIDTH, HEIGHT, F = 96, 72, 80.0
+CAMERA = PinholeCamera(F, F, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+T, OMEGA = np.array([0.5, -0.3, 0.6]), np.array([0.3, -0.5, 0.4])
+SECONDS = 0.3
+
+
+# normal . P = distance
+ROOF = ((-0.5, 0.1, 1.0), 1.6), ((0.6, 0.3, 1.0), 1.5)
+
+
+@functools.cache
+def seen(planes: tuple = ROOF, finest: float = 9.0) -> Recording:
+    """Textured planes, 1 to 2 m away: events where log intensity passes levels.
+
+    The poses are exp(t (T, Omega)) by the closed form, t from the middle.
+    """
+    rng = np.random.default_rng(0)
+    wave = 2 * np.pi * rng.uniform(2, finest, (20, 1)) * rng.normal(size=(20, 2)) / 1.5
+    phase = rng.uniform(0, 2 * np.pi, 20)
+    y, x = np.mgrid[:HEIGHT, :WIDTH].reshape(2, -1)
+    rays = np.stack([(x - CAMERA.cx) / F, (y - CAMERA.cy) / F, np.ones(len(x))], 1)
+    normals, distances = (np.array(part) for part in zip(*planes, strict=True))
+
+    def seen_at(pose: np.ndarray) -> np.ndarray:
+        R, C = pose[:3, :3], pose[:3, 3]
+        depth = ((distances - normals @ C) / (rays @ R.T @ normals.T)).min(1)
+        P = C + depth[:, None] * (rays @ R.T)
+        return 0.17 * np.sin(P[:, :2] @ wave.T + phase).sum(1)
+
+    steps = np.linspace(-SECONDS / 2, SECONDS / 2, 151)
+    poses = np.asarray(geometry.twist_exp(steps[:, None] * np.r_[T, OMEGA]))
+    level, rows = None, []
+    C = 0.25
+    for t, pose in zip(steps, poses, strict=True):
+        new = seen_at(pose)
+        if level is None:
+            level, before = new + C * rng.uniform(-0.5, 0.5, len(new)), new
+            continue
+        while True:
+            sign = np.sign(new - level)
+            crossed = np.flatnonzero(np.abs(new - level) >= C)
+            if not len(crossed):
+                break
+            level[crossed] += C * sign[crossed]
+            share = (level - before)[crossed] / (new - before)[crossed]
+            when = t - (1 - share) * (steps[1] - steps[0]) + SECONDS / 2
+            rows.append(np.stack([1e6 * when, x[crossed], y[crossed], sign[crossed] > 0], 1))
+        before = new
+    table = np.concatenate(rows)
+    t, x, y, p = table[np.argsort(table[:, 0], kind="stable")].T
+    events = Events(
+        np.rint(t).astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), p.astype(bool)
+    )
+    return Recording("planes", WIDTH, HEIGHT, events, camera=CAMERA)
+
+
+GIVEN = {"events": 8192, "fewest": 500, "starts": 3, "rivals": 1, "flow_max": 120.0, "cell": 16}
+PARAMS = batch.Params.of(GIVEN)
+
+
+def test_the_warp_is_the_rigid_scene():
+    """Points seen by a moving camera go where the camera at the reference time sees them."""
+    rng = np.random.default_rng(1)
+    O = rng.normal(size=(3, 3)) * [[1.0], [4], [20]]  # noqa: E741
+    D = rng.normal(size=(3, 3))
+    path = Path(jnp.asarray(O), jnp.asarray(D), jnp.zeros(1))
+    C = np.asarray(path.coefficients()[1])
+    np.testing.assert_allclose(C[1], D[1] + np.cross(O[0], D[0]))
+    tau = rng.uniform(-0.15, 0.15, 50)
+    powers = np.stack([tau, tau**2 / 2, tau**3 / 6], 1)
+    P = np.concatenate([rng.uniform(-0.5, 0.5, (50, 2)), np.ones((50, 1))], 1)
+    P *= rng.uniform(2, 5, (50, 1))
+    R = Rotation.from_rotvec(powers @ O)
+    local = R.apply(P - powers @ C, inverse=True)
+    seen = F * local[:, :2] / local[:, 2:]
+    rho = 1 / P[:, 2]
+    x, y = warp(path, jnp.asarray(F), *(jnp.asarray(v) for v in (*seen.T, tau, rho)))
+    exact = F * P[:, :2] / P[:, 2:]
+    np.testing.assert_allclose(np.stack([x, y], 1), exact, atol=2e-4)
+
+
+def test_twists_of_a_path():
+    """Against differences of its poses; a constant twist stays one."""
+    path = Path(jnp.zeros((3, 3)).at[0].set(OMEGA), jnp.zeros((3, 3)).at[0].set(T), jnp.zeros(1))
+    heading, Omega = path.twist(np.array([-0.1, 0.0, 0.1]))
+    np.testing.assert_allclose(Omega, np.broadcast_to(OMEGA, (3, 3)))
+    np.testing.assert_allclose(heading, np.broadcast_to(T / np.linalg.norm(T), (3, 3)), atol=2e-3)
+    later = advanced(path, 0.05, 0.15)
+    np.testing.assert_allclose(later.D[0], T / np.linalg.norm(T), atol=1e-3)
+
+
+def test_a_path_goes_on_in_the_next_window():
+    """Where windows overlap twists are the same, to what a polynomial tells; beyond they stay."""
+    path = true_path(np.zeros(1))
+    path = dataclasses.replace(path, O=path.O.at[1].set(2.0).at[2].set(-10.0))
+    path = dataclasses.replace(path, D=path.D.at[1].set(jnp.asarray([1.0, -2.0, 0.5])))
+    t = np.linspace(-0.15, 0.15, 31)
+    for tau in (0.0, 0.05, -0.05):
+        T, Omega = path.twist(np.clip(t + tau, -0.15, 0.15))
+        heading, turn = advanced(path, tau, 0.15).twist(t)
+        np.testing.assert_allclose(turn, Omega, atol=0.03 if tau else 1e-3)
+        np.testing.assert_allclose(heading, T, atol=0.03 if tau else 1e-3)
+    # The fifth power of what turns by 0.02 rad/s more within the window does not go on beyond.
+    steep = dataclasses.replace(path, O=path.O.at[4].set(1e3))
+    for tau in (0.1, -0.1):
+        change = advanced(steep, tau, 0.15).twist(t)[1] - advanced(path, tau, 0.15).twist(t)[1]
+        assert np.abs(change).max() < 0.03
+    # Depths are in units of the speed at the reference time.
+    fast = dataclasses.replace(path, D=path.D.at[1].set(2 * path.D[0]))
+    ratio = np.exp(float(advanced(fast, 0.1, 0.15).log_rho[0] - path.log_rho[0]))
+    assert ratio == pytest.approx(1.2, abs=0.03)
+
+
+@functools.cache
+def fitted() -> tuple[batch.Windows, batch.Fit]:
+    windows = batch.Windows(seen(), PARAMS, CAMERA)
+    fit = windows.fit(150_000)
+    assert fit is not None
+    return windows, fit
+
+
+def test_the_motion_of_a_window_is_found():
+    """As far as 96 x 72 pixels tell it: a heading beside a turn, and a turn beside a heading."""
+    _, fit = fitted()
+    heading, Omega = (part[0] for part in fit.path.twist(0.0))
+    assert np.degrees(np.arccos(heading @ T / np.linalg.norm(T))) < 15
+    assert np.linalg.norm(Omega - OMEGA) < 0.35 * np.linalg.norm(OMEGA)
+    assert fit.agreement > 0.5 and np.isfinite(fit.covariance).all()
+    assert (np.linalg.eigvalsh(fit.covariance) > -1e-12).all()
+
+
+def test_the_motion_before_a_wall_is_found():
+    """The homography has two, the true one costs less with a plane's depths."""
+    more = batch.Params.of({**GIVEN, "events": 20_000})
+    windows = batch.Windows(seen(ROOF[:1], 5.0), more, CAMERA)
+    normal = np.array(ROOF[0][0]) / ROOF[0][1]
+    exact = np.cross(np.eye(3), OMEGA) + np.outer(T, normal)
+    exact -= np.trace(exact) / 3 * np.eye(3)
+    M = starts.homography(windows.cut(150_000, 0.05, 20_000), windows.rotation(150_000))
+    assert np.linalg.norm(M - exact) < 0.5 * np.linalg.norm(exact)
+
+    near = exact + 0.05 * np.linalg.norm(exact) * np.diag([0.5, -0.7, 0.5])
+    made = starts.before_a_plane(near)
+    found = windows.before_a_plane(150_000, made)
+    assert len(found) == 2 and float(found[0][1].cost) < float(found[1][1].cost)
+    heading, turn = found[0][0].path.twist(0.0)
+    assert np.degrees(np.arccos(heading[0] @ T / np.linalg.norm(T))) < 1
+    assert np.linalg.norm(turn[0] - OMEGA) < 0.02 * np.linalg.norm(OMEGA)
+    # Depths are the plane's; smaller than LEAST some were not.
+    (x, y), rho = windows.tracks(150_000, 0.15, 20_000).places, np.exp(found[0][0].path.log_rho)
+    rays = np.stack([x / F, y / F, np.ones(len(x))], 1)
+    ahead = rays @ normal > 0.3
+    n = np.linalg.lstsq(rays[ahead], rho[ahead])[0]
+    np.testing.assert_allclose(rays[ahead] @ n, rho[ahead], rtol=1e-3)
+    np.testing.assert_allclose(n, normal * np.linalg.norm(T), atol=0.01)
+    roof = batch.Windows(seen(), PARAMS, CAMERA)
+    assert roof.before_a_plane(150_000, made) == []
+
+
+def scene_of(fit: batch.Fit) -> photometric.Scene:
+    return photometric.Scene(fit.path, jnp.asarray(fit.map), jnp.zeros(()))
+
+
+def test_tracks_are_the_events_of_pixels():
+    windows, _ = fitted()
+    tracks = windows.tracks(150_000, 0.15, 3000)
+    events, n = seen().events, int(tracks.on.sum())
+    assert 2000 < n <= 3000
+    pixel, level, number = (np.asarray(a)[:n] for a in (tracks.pixel, tracks.level, tracks.number))
+    where = events.y.astype(int) * WIDTH + events.x
+    for one in np.unique(pixel)[::20]:
+        at = np.flatnonzero(where == one)
+        np.testing.assert_array_equal(level[pixel == one], np.cumsum(2.0 * events.p[at] - 1))
+        np.testing.assert_array_equal(number[pixel == one], np.arange(len(at)) + 1)
+        np.testing.assert_allclose(
+            np.asarray(tracks.tau)[:n][pixel == one], (events.t[at] - 150_000) * 1e-6, atol=1e-12
+        )
+
+
+def true_path(log_rho: np.ndarray) -> Path:
+    O, D = np.zeros((ROWS, 3)), np.zeros((ROWS, 3))  # noqa: E741
+    O[0], D[0] = OMEGA, T / np.linalg.norm(T)
+    return Path(*(jnp.asarray(part) for part in (O, D, log_rho)))
+
+
+def test_events_are_placed_on_the_nearest_surface():
+    """Against the largest of the inverse depths that a fine search finds on each ray."""
+    windows, _ = fitted()
+    tracks = windows.tracks(150_000, 0.15, 3000)
+    rows, columns = tracks.nodes
+    # A near square before a far wall.
+    depths = np.full((rows, columns), np.log(0.3))
+    depths[rows // 3 : 2 * rows // 3, columns // 3 : 2 * columns // 3] = np.log(1.8)
+    path = true_path(depths.ravel())
+    placed = np.stack(jax.jit(photometric.placed)(path, tracks), 1)
+    lattice = [
+        tracks.corner[axis] + tracks.node * np.arange(n) for axis, n in ((1, rows), (0, columns))
+    ]
+    there = scipy.interpolate.RegularGridInterpolator(lattice, depths, bounds_error=False)
+    tried = np.linspace(np.log(1.9), np.log(0.28), 1000)
+    far, near = (
+        np.stack(warp(path, tracks.f, tracks.x, tracks.y, tracks.tau, rho + 0 * tracks.x), 1)
+        for rho in (0.0, 1.0)
+    )
+    seen_at = far + np.exp(tried)[:, None, None] * (near - far)
+    off = tried[:, None] - there(seen_at[..., ::-1])
+    first = np.argmax(off <= 0, 0)
+    expected = seen_at[first, np.arange(len(first))]
+    n = int(tracks.on.sum())
+    right = np.linalg.norm(placed - expected, axis=1)[:n] < 0.05
+    hidden = ((off[1:] * off[:-1] < 0).sum(0) > 1)[:n]
+    # So many depths are looked at; surfaces that a ray only grazes lie between them.
+    assert right.mean() > 0.95
+    assert hidden.sum() > 20 and right[hidden].mean() > 0.7
+
+
+def test_depths_of_a_known_path():
+    """The roof's, where events tell them, from a plane at half the distance."""
+    windows, _ = fitted()
+    tracks = windows.tracks(150_000, 0.15, 8192)
+    rows, columns = tracks.nodes
+    flat = true_path(np.full(rows * columns, np.log(1.2)))
+    found = np.asarray(photometric.depths(flat, tracks)).reshape(rows, columns)
+    j, i = np.mgrid[:rows, :columns] * tracks.node
+    rays = np.stack([(i + tracks.corner[0]) / F, (j + tracks.corner[1]) / F, np.ones(i.shape)], -1)
+    normals, distances = (np.array(part) for part in zip(*ROOF, strict=True))
+    exact = np.log(np.linalg.norm(T) * (rays @ normals.T / distances).max(-1))
+    middle = (abs(rays[..., 0]) < 0.4) & (abs(rays[..., 1]) < 0.3)
+    assert np.median(abs(found - exact)[middle]) < 0.06
+
+
+def test_two_motions_before_a_plane_have_the_same_flow():
+    """Against A T rho + B Omega of the motion that made M, and of the one it was not."""
+    x, y = (part.ravel() for part in np.meshgrid(np.linspace(-40, 40, 9), np.linspace(-30, 30, 7)))
+    a, b = (np.asarray(part(x, y, F)) for part in (geometry.A, geometry.B))
+
+    def flow(one: starts.Plane) -> np.ndarray:
+        rho = np.stack([x / F, y / F, np.ones(len(x))], 1) @ one.normal
+        return (a @ one.T) * rho[:, None] + b @ one.Omega
+
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        made = starts.Plane(rng.normal(size=3), np.append(rng.normal(size=2), 1.0), OMEGA)
+        M = np.cross(np.eye(3), made.Omega) + np.outer(made.T, made.normal)
+        both = starts.before_a_plane(M - np.trace(M) / 3 * np.eye(3))
+        for one in both:
+            np.testing.assert_allclose(flow(one), flow(made), atol=1e-9)
+        off = [abs(one.Omega - made.Omega).max() for one in both]
+        assert min(off) < 1e-9 and max(off) > 1e-2
+    path = made.path(x, y, F, float)
+    at = np.abs(x) + np.abs(y) < 20
+    heading = made.T / np.linalg.norm(made.T)
+    there = (a @ heading) * np.exp(path.log_rho)[:, None] + b @ path.O[0]
+    np.testing.assert_allclose(there[at], flow(made)[at], atol=1e-9)
+    still = starts.before_a_plane(np.cross(np.eye(3), OMEGA))
+    assert all(np.isfinite(np.concatenate(one)).all() for one in still)
+
+
+def test_the_map_is_the_least_squares_one():
+    """For a path held fixed, against a sparse solver on splines' weights written out."""
+    windows, fit = fitted()
+    tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    scene = scene_of(fit)._replace(map=jnp.zeros(tracks.shape))
+    # All events' weights are 1: sigma is so large that none costs anything beside it, and 4 times
+    # as much counts where costs are small.
+    prior = prior._replace(alike=jnp.asarray(4e-6), flat=jnp.asarray(0.02))
+    for _ in range(2):
+        scene, _ = photometric.adjust(tracks, scene, prior, 1e3, 100, 8)
+    left = np.asarray(photometric.misfits(scene, tracks))
+    n = int(tracks.on.sum())
+    X, Y = (np.asarray(a)[:n] for a in photometric.placed(scene.path, tracks))
+    i, j = X - tracks.corner[0], Y - tracks.corner[1]
+    height, width = tracks.shape
+    inside = (i >= 1) & (i < width - 2) & (j >= 1) & (j < height - 2)
+    i, j, e = i[inside], j[inside], np.arange(inside.sum())
+    column, row = np.rint(i).astype(int), np.rint(j).astype(int)
+    spline = scipy.interpolate.BSpline.basis_element([-1.5, -0.5, 0.5, 1.5])
+    parts = [
+        (e, (row + v) * width + column + u, spline(i - column - u) * spline(j - row - v))
+        for u in (-1, 0, 1)
+        for v in (-1, 0, 1)
+    ]
+    rows, columns, values = (np.concatenate(part) for part in zip(*parts, strict=True))
+    pixel = np.unique(np.asarray(tracks.pixel)[:n][inside], return_inverse=True)[1]
+    offsets = scipy.sparse.csr_array((-np.ones(len(e)), (e, pixel)), (len(e), pixel.max() + 1))
+    events = scipy.sparse.csr_array((values, (rows, columns)), (len(e), height * width))
+    number = np.arange(height * width).reshape(height, width)
+    one = scipy.sparse.eye_array(height * width).tocsr()
+    apart = [one[number[1:].ravel()] - one[number[:-1].ravel()],
+             one[number[:, 1:].ravel()] - one[number[:, :-1].ravel()]]  # fmt: skip
+    prior_rows = scipy.sparse.vstack([np.sqrt(0.02) * part for part in apart])
+    none = scipy.sparse.csr_array((prior_rows.shape[0], offsets.shape[1]))
+    matrix = scipy.sparse.vstack(
+        [scipy.sparse.hstack([events, offsets]), scipy.sparse.hstack([prior_rows, none])]
+    )
+    level = np.asarray(tracks.level)[:n][inside]
+    side = np.append(level, np.zeros(prior_rows.shape[0]))
+    found = scipy.sparse.linalg.lsqr(matrix, side, iter_lim=300)
+    cost = np.linalg.norm(left) ** 2 + ((prior_rows @ np.asarray(scene.map).ravel()) ** 2).sum()
+    assert np.sqrt(cost) == pytest.approx(found[3], rel=0.01)
+    assert found[3] < 0.5 * np.linalg.norm(level)
+
+
+def test_the_photometric_fit_ends_at_the_truth():
+    """From 6 degrees beside it, and depths of a plane that faces the camera."""
+    windows, _ = fitted()
+    tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    depths = np.full(tracks.nodes[0] * tracks.nodes[1], np.log(np.linalg.norm(T) / 1.5))
+    path = true_path(depths)
+    beside = path.D.at[0].add(jnp.array([0.1, 0, 0]))
+    path = normalised(dataclasses.replace(path, D=beside))
+    scene = photometric.Scene(path, jnp.zeros(tracks.shape), jnp.zeros(()))
+    for sigma, settle, steps in ((0.3, 2, 12), (0.2, 0, 15), (0.05, 0, 15)):
+        scene, report = photometric.adjust(tracks, scene, prior, sigma, settle, steps)
+    heading, Omega = (part[0] for part in scene.path.twist(0.0))
+    assert np.degrees(np.arccos(heading @ T / np.linalg.norm(T))) < 3
+    assert np.linalg.norm(Omega - OMEGA) < 0.06 * np.linalg.norm(OMEGA)
+    assert report.noise < 0.05 and report.inliers > 0.9
+
+
+def test_the_covariance_is_that_of_repeated_fits():
+    """Of the same events at times that are off by some ms, anew each time."""
+    windows, fit = fitted()
+    tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    rng = np.random.default_rng(0)
+    rows, told = [], []
+    for _ in range(6):
+        tau = tracks.tau + 5e-3 * rng.normal(size=len(tracks.tau))
+        noisy = dataclasses.replace(tracks, tau=tau)
+        scene, report = photometric.adjust(noisy, scene_of(fit), prior, 0.2, 1, 8, True)
+        rows.append(np.concatenate([part[0] for part in scene.path.twist(0.0)]))
+        told.append(np.diag(report.covariance))
+    ratio = np.var(rows, 0, ddof=1).sum() / np.mean(told, 0).sum()
+    assert 0.5**2 < ratio < 2**2, ratio
+
+
+def test_steps_never_cost_more():
+    """Beside true depths, with a sigma rather small for how far they are."""
+    windows, _ = fitted()
+    tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    rng = np.random.default_rng(0)
+    depths = np.log(0.6) + 0.1 * rng.normal(size=tracks.nodes[0] * tracks.nodes[1])
+    scene = photometric.Scene(true_path(depths), jnp.zeros(tracks.shape), jnp.zeros(()))
+    scene, first = photometric.adjust(tracks, scene, prior, 0.1, 3, 3)
+    costs = [
+        float(photometric.adjust(tracks, scene, prior, 0.1, 0, steps)[1].cost)
+        for steps in (1, 2, 4, 8, 16, 32, 64)
+    ]
+    assert costs[-1] < 0.1 * first.cost
+    assert (np.diff(costs) <= 1e-3 * np.array(costs[:-1])).all()
+
+
+def test_the_gradient_of_misfits():
+    """Before a smooth surface: beside edges of depth misfits jump from one surface to the other."""
+    windows, fit = fitted()
+    tracks = windows.tracks(150_000, 0.15, 8192)
+    rows, columns = tracks.nodes
+    depths = np.log(0.6) + 0.2 * np.sin(np.arange(columns) / 6) + np.zeros((rows, 1))
+    given = true_path(depths.ravel())
+    scene = scene_of(fit)._replace(path=given)
+
+    @jax.jit
+    def value(O0):
+        path = dataclasses.replace(given, O=given.O.at[0].set(O0))
+        return jnp.mean(photometric.misfits(scene._replace(path=path), tracks) ** 2)
+
+    at = given.O[0] + 0.01
+    slope = jax.jit(jax.grad(value))(at)
+    h = 1e-7
+    for axis in np.eye(3):
+        difference = (value(at + h * axis) - value(at - h * axis)) / (2 * h)
+        assert slope @ axis == pytest.approx(float(difference), rel=1e-3, abs=1e-5)
+    assert value(given.O[0]) < 0.9 * value(given.O[0] + 0.2)
+
+
+def test_priors_pull():
+    windows, fit = fitted()
+    tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    strong = prior._replace(omega=jnp.asarray(1e9))
+    scene, _ = photometric.adjust(tracks, scene_of(fit), strong, 0.1, 0, 8)
+    assert np.linalg.norm(scene.path.O[0]) < 0.1 * np.linalg.norm(fit.path.O[0])
+    t = np.array([0, 300_000])
+    wrong = OMEGA + [0.0, 0.2, 0.0]
+    windows = batch.Windows(
+        seen(), batch.Params.of({**GIVEN, "gyro_std": 1e-5}), CAMERA,
+        Twists(t, np.stack([wrong, wrong]), None, 0, 300_000),
+    )  # fmt: skip
+    prior = windows.prior(150_000, 0.15)
+    scene, report = photometric.adjust(tracks, scene_of(fit), prior, 0.1, 0, 8, True)
+    np.testing.assert_allclose(scene.path.twist(0.0)[1][0], wrong, atol=1e-2)
+    assert np.sqrt(np.diag(report.covariance)[3:]).max() < 1e-4
+
+
+def test_a_recording_from_end_to_end():
+    motion = batch.estimate(seen(), PARAMS)
+    mean, covariance, lost = motion(motion.t[len(motion) // 2 :][:1])
+    assert not lost[0] and covariance.shape == (1, 6, 6)
+    assert np.linalg.norm(mean[0, :3]) == pytest.approx(1)
+    assert np.degrees(np.arccos(mean[0, :3] @ T / np.linalg.norm(T))) < 15
+    again = batch.estimate(seen(), PARAMS)
+    np.testing.assert_array_equal(again.mean, motion.mean)
+    few = batch.estimate(seen()[0.0:0.01], PARAMS)
+    assert few.lost.all() and np.isfinite(few.mean).all()
+    at_once = seen().events[:3000]
+    at_once = dataclasses.replace(at_once, t=np.full(3000, 150_000))
+    instant = batch.estimate(dataclasses.replace(seen(), events=at_once), PARAMS)
+    assert all(np.isfinite(part).all() for part in (instant.mean, instant.covariance))
+    empty = dataclasses.replace(seen(), events=seen().events[:0])
+    assert len(batch.estimate(empty, PARAMS)) == 0
+
+
+def a_fit(path, cost):
+    return batch.Fit(path, np.eye(6), 1.0, cost, np.zeros((1, 1)))
+
+
+def windows_that(monkeypatch, fit, follow):
+    """Windows whose fits are given, by centre and path; what was asked for, in order."""
+    asked = []
+
+    def anew(self, centre, warm=None):
+        asked.append(("anew", centre))
+        return a_fit(*fit(centre, warm))
+
+    def followed(self, centre, warm):
+        none = np.zeros(())
+        return Scene(warm, np.full((), centre), none), Report(none, none, none, np.eye(6))
+
+    def ended(self, centre, rivals, stages=()):
+        ((scene, _),) = rivals
+        assert scene.map == centre
+        asked.append(("followed", centre))
+        return a_fit(*follow(centre, scene.path))
+
+    for name, function in (("fit", anew), ("followed", followed), ("ended", ended)):
+        monkeypatch.setattr(batch.Windows, name, function)
+    return asked
+
+
+def test_a_path_that_is_lost_is_not_followed(monkeypatch):
+    path = true_path(np.zeros(4))
+    # The third window costs much more, what the sixth costs cannot be told.
+    costs = {2: 2 * batch.LOST * 1e-3, 5: np.nan}
+    asked = windows_that(
+        monkeypatch,
+        lambda centre, warm: (path, 1e-3),
+        lambda centre, warm: (path, costs.get((centre - first) // 20_000, 1e-3)),
+    )
+    recording = seen()
+    first = int(recording.events.t[0]) + 20_000
+    short = {"half_window": 0.02, "step": 0.02, "fresh": 100}
+    batch.estimate(recording, batch.Params.of({**GIVEN, **short}))
+    assert [(kind, (centre - first) // 20_000) for kind, centre in asked][:10] == [
+        ("anew", 0),
+        ("followed", 1),
+        ("followed", 2),
+        ("anew", 2),
+        ("followed", 3),
+        ("followed", 4),
+        ("followed", 5),
+        ("anew", 5),
+        ("followed", 6),
+        ("followed", 7),
+    ]
+
+
+def test_new_starts_that_agree_are_made_less_often(monkeypatch):
+    path = true_path(np.zeros(4))
+    other = Path(path.O, -path.D, path.log_rho)
+    found = iter([path, path, path, other, other, other])
+    asked = windows_that(
+        monkeypatch,
+        lambda centre, warm: (next(found), 1e-3),
+        lambda centre, warm: (warm, 1e-3),
+    )
+    recording = seen()
+    first = int(recording.events.t[0]) + 10_000
+    short = {"half_window": 0.01, "step": 0.01, "fewest": 1, "fresh": 2}
+    batch.estimate(recording, batch.Params.of({**GIVEN, **short}))
+    anew = [(centre - first) // 10_000 for kind, centre in asked if kind == "anew"]
+    # 2 windows after the first, 4, 8, where they do not agree, again 2.
+    assert anew == [0, 2, 6, 14, 16, 20]
+
+
+@pytest.mark.parametrize("cheaper", ["all", "none", "the last two"])
+def test_a_wrong_beginning_is_fitted_again(monkeypatch, cheaper):
+    """What new starts find is followed back, as far as that costs less."""
+    right = true_path(np.zeros(4))
+    wrong = Path(right.O, -right.D, right.log_rho)
+    recording = seen()
+    first = int(recording.events.t[0]) + 50_000
+
+    def follow(centre, warm):
+        if float(warm.D[0] @ right.D[0]) < 0:
+            return warm, 1e-3
+        less = cheaper == "all" or (cheaper == "the last two" and centre > first)
+        return warm, 5e-4 if less else 3e-3
+
+    windows_that(
+        monkeypatch,
+        lambda centre, warm: (wrong if warm is None else right, 1e-3),
+        follow,
+    )
+    params = batch.Params.of({**GIVEN, "half_window": 0.05, "step": 0.05, "fresh": 3})
+    motion = batch.estimate(recording, params)
+    at = np.searchsorted(motion.t, first + 50_000 * np.arange(4))
+    along = motion.mean[at, :3] @ right.twist(0.0)[0].ravel()
+    assert (along > 0).tolist() == [cheaper == "all", *2 * [cheaper != "none"], True]
+
+
+def test_what_cannot_be_estimated_is_refused():
+    with pytest.raises(InputError, match="calibration"):
+        batch.estimate(dataclasses.replace(seen(), camera=None), PARAMS)
+    with pytest.raises(InputError, match="general"):
+        batch.estimate(seen(), PARAMS, model="generl")

@@ -1,0 +1,45 @@
+"""Damaged files of every format: a clear error or a valid recording, as experiments/fuzz.py asks.
+
+The files are made from numbers alone, so that those that once failed stay here.
+"""
+
+import contextlib
+import importlib.util
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+SCRIPT = Path(__file__).parents[2] / "experiments" / "fuzz.py"
+NEEDS = {"evt3": "evt3", "aedat4": "aedat", "bag": "rosbags"}
+
+
+def _script():
+    spec = importlib.util.spec_from_file_location("fuzz", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+fuzz = _script()
+
+
+@pytest.mark.parametrize("name", fuzz.FORMATS)
+@given(seed=st.integers(0, 2**31 - 1))
+@settings(max_examples=100)
+@example(seed=123)  # aedat: not UTF-8 in the header, which aborts the decoder
+@example(seed=92)  # mat: an unknown type, which SciPy takes as an index
+@example(seed=14)  # m3ed: a damaged group where a name is looked for
+@example(seed=3282)  # hdf5: the size of a string in its heap, from which libhdf5 goes on for ever
+@example(seed=1300)  # hdf5: free space of size 0 in the heap of strings
+@example(seed=3637)  # hdf5: a string's heap far past the end, for which libhdf5 takes 4 GB
+@example(seed=1442)  # hdf5: an attribute of a type that is none
+@example(seed=2163)  # mat: complex, without imaginary numbers
+@example(seed=34)  # zip: a long name in the reason
+def test_damaged_files_are_refused_or_read(name, seed, tmp_path_factory):
+    pytest.importorskip(NEEDS.get(name, "numpy"))
+    path = tmp_path_factory.getbasetemp() / f"fuzz-{os.getpid()}.bin"
+    with open(os.devnull, "w") as null, contextlib.redirect_stderr(null):
+        assert fuzz.outcome(name, seed, path) in ("read", "refused")

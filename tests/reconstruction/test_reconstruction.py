@@ -1,0 +1,552 @@
+"""The reconstruction chain against a loop over events, and the laws it must keep."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxevent
+from jaxevent.reconstruction import video
+from jaxevent.reconstruction.filtering import Event, Observation, State
+from jaxevent.recording import Events, Frames, Recording
+
+PARAMS = {
+    "c_on": 0.13,
+    "c_off": 0.09,
+    "I0": 0.4,
+    "ratio_min": 0.05,
+    "kappa": 3e4,
+    "sigma_proc": 0.3,
+    "sigma_iso": 0.4,
+    "sigma_ref": 0.1,
+    "rho": 0.004,
+    "alpha": 40.0,
+}
+
+
+# Every option that the paper does not have.
+OPTIONS = {
+    **PARAMS,
+    "rho_ref": 0.0008,
+    "exposure": 0.0011,
+    "calibrate": False,
+    "weighting": "certainty",
+    "margin": 2.5,
+    "w_min": 1e-3,
+    "certainty": [0.5, 1.3, 2.0, 0.7],
+    "rho_width": 0.4,
+    "above": 0.7,
+    "below": 0.4,
+    "one_sided": True,
+    "clip_rate": 300.0,
+    "spread": 0.004,
+    "share": 0.3,
+}
+
+
+def params_of(method, **values):
+    """Params of a method with those of the values that it has."""
+    known = {**method.Params.numbers, **method.Params.choices}
+    return method.Params(**{k: v for k, v in values.items() if k in known})
+
+
+@st.composite
+def recordings(draw, fewest_frames=0, most=60):
+    """Small recordings: bursts, equal times, silent and border pixels, odd exposures."""
+    width, height = draw(st.sampled_from([(4, 3), (1, 5)]))
+    count = draw(st.integers(fewest_frames, 4))
+    n = draw(st.integers(0 if count else 1, most))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    # A small range of times forces equal ones; the frames may lie before, among or after them.
+    span = draw(st.sampled_from([20, 1000, 60_000]))
+    t = np.sort(rng.integers(0, span, n)) + draw(st.sampled_from([0, 5_000, 10**9]))
+    x, y = rng.integers(0, width, n), rng.integers(0, height, n)
+    events = Events(t, x.astype(np.uint16), y.astype(np.uint16), rng.random(n) < 0.6)
+    images = None
+    if count:
+        base = int(t[0]) if n else 0
+        mid = (
+            base
+            + draw(st.sampled_from([-4_000, 0, 2_000]))
+            + np.cumsum(rng.integers(1, max(span // 2, 3), count))
+        )
+        # Unknown, short, odd (half-microsecond edges) and overlapping exposures.
+        exposure = rng.choice([0, 3, 500, 2_001, span // 2], count)
+        grey = rng.integers(0, 256, (count, height, width)).astype(np.uint8)
+        images = Frames(mid, grey, exposure)
+    return Recording("random", width, height, events, images).check()
+
+
+def times_of(recording):
+    rng = np.random.default_rng(3)
+    span = max(recording.stop - recording.start, 10)
+    return np.sort(recording.start + rng.integers(-3, span + span // 3, 7))
+
+
+@pytest.mark.parametrize("name", jaxevent.METHODS)
+@settings(max_examples=20)
+@given(
+    recording=recordings(),
+    offset=st.sampled_from([0.0, 0.0007, -0.0021]),
+    values=st.sampled_from(
+        [PARAMS, OPTIONS, {**OPTIONS, "weighting": "linear", "one_sided": False}]
+    ),
+)
+def test_chain_equals_loop_over_events(name, recording, offset, values):
+    method = jaxevent.METHODS[name]
+    if recording.frames is None and method.needs_frames:
+        with pytest.raises(jaxevent.InputError, match="holds no frames"):
+            method.reconstruct(recording)
+        return
+    params = params_of(method, **{"weighting": "linear", **values}, clock_offset=offset)
+    times = times_of(recording)
+    image, variance = method.reconstruct(recording, params)(times)
+    expected, P = oracles.reconstruct(name, recording, params.values(), times)
+    # The oracle finds the moments of truncated Gaussians on a grid.
+    close = 3e-5 if name == "aks" and params.one_sided else 1e-10
+    np.testing.assert_allclose(image, expected, rtol=close, atol=close)
+    np.testing.assert_allclose(variance, P, rtol=close)
+
+
+@pytest.mark.parametrize("name", ["akf", "cf"])
+@given(recording=recordings())
+def test_float32_chain(name, recording):
+    method = jaxevent.METHODS[name]
+    if recording.frames is None and method.needs_frames:
+        return
+    with jax.enable_x64(False):
+        params = params_of(method, **PARAMS)
+        values = params.values()
+        times = times_of(recording)
+        image, variance = method.reconstruct(recording, params)(times)
+    assert image.dtype == np.float32
+    expected, P = oracles.reconstruct(name, recording, values, times)
+    np.testing.assert_allclose(image, expected, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(variance, P, rtol=1e-4)
+
+
+# Laws
+
+
+def random_recording(seed, n, frames, size=(4, 3), span=200_000, exposure=3_000, hot=0):
+    """One recording; `hot` of its events happen at a single pixel, a tenth of that at another."""
+    rng = np.random.default_rng(seed)
+    width, height = size
+    t = np.sort(rng.integers(0, span, n)) + 7
+    x, y = rng.integers(0, width, n), rng.integers(0, height, n)
+    chosen = rng.permutation(n)[:hot]
+    x[chosen], y[chosen] = 1, 1
+    x[chosen[: hot // 10]] = 2
+    events = Events(t, x.astype(np.uint16), y.astype(np.uint16), rng.random(n) < 0.5)
+    mid = np.linspace(10_000, span - 5_000, frames).astype(np.int64)
+    grey = rng.integers(0, 256, (frames, height, width)).astype(np.uint8)
+    images = Frames(mid, grey, np.full(frames, exposure)) if frames else None
+    return Recording("random", width, height, events, images).check()
+
+
+def whole_at(images, i):
+    return [image[i : i + 1] for image in images]
+
+
+@pytest.mark.parametrize("name", ["akf", "aks", "cf", "edi"])
+@given(recording=recordings(fewest_frames=1), events=st.sampled_from([1, 7, 23]))
+def test_windows_do_not_change_the_result(name, recording, events):
+    method = jaxevent.METHODS[name]
+    params = params_of(method, **OPTIONS)
+    times = times_of(recording)
+    whole = method.reconstruct(recording, params)(times)
+    video = method.reconstruct(recording, params, window_events=events)
+    np.testing.assert_allclose(video(times), whole, rtol=1e-12, atol=1e-12)
+    # Read again from the start: windows are opened anew from their kept states.
+    np.testing.assert_allclose(video(times[2]), whole_at(whole, 2), rtol=1e-12, atol=1e-12)
+
+
+def test_many_frames_and_uneven_pixels_in_windows():
+    """Hundreds of frames and a pixel with thousands of events use every kind of tile."""
+    recording = random_recording(1, 5_000, 150, exposure=500, hot=4_500)
+    params = params_of(jaxevent.akf, **PARAMS)
+    times = np.linspace(0, 210_000, 30).astype(np.int64)
+    whole = jaxevent.akf.reconstruct(recording, params, window_events=10**6)
+    features, out = jaxevent.prepare(recording, times)
+    assert set(np.unique(features.tiles.kind)) == {0, 1, 2, 3}
+    image, variance = jaxevent.akf.read(params, jaxevent.akf.run(params, features)[0], out)
+    expected = whole(times)
+    assert len(whole._begins) > 1  # cut by frames
+    np.testing.assert_allclose(
+        image.reshape(expected[0].shape), expected[0], rtol=1e-12, atol=1e-12
+    )
+    np.testing.assert_allclose(variance.reshape(expected[1].shape), expected[1], rtol=1e-12)
+    small = jaxevent.akf.reconstruct(recording, params, window_events=100)
+    np.testing.assert_allclose(small(times), expected, rtol=1e-12, atol=1e-12)
+    # More windows than states are kept: some images are filtered to from further back.
+    assert len(small._begins) <= video.BEGINS < 5_000 / 100
+    for i in (3, 17, 11):
+        again = [image[0] for image in small(times[i])]
+        np.testing.assert_allclose(again, [e[i] for e in expected], rtol=1e-12, atol=1e-12)
+
+
+@given(recording=recordings())
+def test_reading_more_times_changes_nothing(recording):
+    params = params_of(jaxevent.akf, **PARAMS)
+    times = times_of(recording)
+    few = jaxevent.akf.reconstruct(recording, params)(times[::3])
+    video = jaxevent.akf.reconstruct(recording, params)
+    video(times[::-1])
+    dense = video(np.sort(np.concatenate([times, times + 1, times - 5])))
+    at = np.searchsorted(np.sort(np.concatenate([times, times + 1, times - 5])), times[::3])
+    np.testing.assert_array_equal(few, np.stack(dense)[:, at])
+
+
+@given(recording=recordings())
+def test_later_clock_changes_nothing(recording):
+    shift = 10**9
+    frames = recording.frames
+    later = dataclasses.replace(
+        recording,
+        events=dataclasses.replace(recording.events, t=recording.events.t + shift),
+        frames=frames and dataclasses.replace(frames, t=frames.t + shift),
+    )
+    params = params_of(jaxevent.akf, **PARAMS)
+    times = times_of(recording)
+    np.testing.assert_array_equal(
+        jaxevent.akf.reconstruct(later, params)(times + shift),
+        jaxevent.akf.reconstruct(recording, params)(times),
+    )
+
+
+@given(recording=recordings(fewest_frames=1))
+def test_order_of_pixels_changes_nothing(recording):
+    """Mirrored in x and y, the neighbourhoods stay and every pixel gets another number."""
+    e, f = recording.events, recording.frames
+    mirrored = dataclasses.replace(
+        recording,
+        events=Events(
+            e.t,
+            (recording.width - 1 - e.x).astype(np.uint16),
+            (recording.height - 1 - e.y).astype(np.uint16),
+            e.p,
+        ),
+        frames=dataclasses.replace(f, images=f.images[:, ::-1, ::-1]),
+    )
+    params = params_of(jaxevent.akf, **PARAMS)
+    times = times_of(recording)
+    image, variance = jaxevent.akf.reconstruct(mirrored, params)(times)
+    expected = jaxevent.akf.reconstruct(recording, params)(times)
+    # Not to the last bit: compilers round whole vectors and their remainder differently.
+    np.testing.assert_allclose(image[:, ::-1, ::-1], expected[0], rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(variance[:, ::-1, ::-1], expected[1], rtol=1e-12)
+
+
+def test_without_events_the_filter_tends_to_the_augmented_frame():
+    recording = random_recording(2, 1, 6)
+    recording = dataclasses.replace(recording, events=Events.empty())
+    times = recording.frames.t[2:]
+    image, variance = jaxevent.akf.reconstruct(recording, jaxevent.akf.Params(kappa=7e7))(times)
+    expected, _ = jaxevent.augmented.reconstruct(recording)(times)
+    # What is left of the start is 1 / (1 + P0 t / R) < 1e-4: R < 1.6e-7 s, t > 0.07 s, P0 = 0.09.
+    np.testing.assert_allclose(image, expected, atol=1e-4)
+    elapsed = (times - recording.start)[:, None, None] * 1e-6
+    assert (variance < 1 / (0.09 * 7e7 * elapsed)).all()  # P < R / elapsed, I + I0 >= 1
+
+
+def test_without_belief_in_frames_the_filter_integrates_events():
+    recording = random_recording(3, 80, 3)
+    params = jaxevent.akf.Params(kappa=1e-30, c_on=0.2, c_off=0.15)
+    image, _ = jaxevent.akf.reconstruct(recording, params)(recording.stop)
+    first, _ = jaxevent.akf.reconstruct(recording, params)(recording.start - 1)
+    total = np.zeros((3, 4))
+    e = recording.events
+    np.add.at(total, (e.y, e.x), np.where(e.p, 0.2, -0.15))
+    np.testing.assert_allclose(np.log1p(image[0]) - np.log1p(first[0]), total, atol=1e-9)
+
+
+def test_deblurring_a_blur_made_from_events_returns_the_sharp_image():
+    """Known brightness: constant between events. The frame is its mean over the exposure."""
+    rng = np.random.default_rng(5)
+    recording = random_recording(5, 60, 1, span=20_000, exposure=12_000)
+    e, f = recording.events, recording.frames
+    params = jaxevent.edi.Params(c_on=0.07, c_off=0.05, I0=0.3)
+    level = rng.uniform(-1, -0.6, (3, 4))  # ln(I + I0) before the first event
+
+    def sharp(t):
+        moved = np.zeros((3, 4))
+        done = e.t <= t
+        np.add.at(moved, (e.y[done], e.x[done]), np.where(e.p[done], 0.07, -0.05))
+        return np.exp(level + moved)
+
+    left, right = f.t[0] - 6_000, f.t[0] + 6_000
+    blurred = np.mean([sharp(t) for t in range(left, right)], axis=0) - 0.3
+    frames = dataclasses.replace(f, images=blurred[None])
+    video = jaxevent.edi.reconstruct(dataclasses.replace(recording, frames=frames), params)
+    for t in (0, left, f.t[0], right - 1, 30_000):
+        np.testing.assert_allclose(video(int(t))[0][0], sharp(t) - 0.3, atol=1e-12)
+
+
+# The authors' program
+
+
+@pytest.mark.parametrize("name", ["mini_akf_deblur_hfr300", "mini_akf_nodeblur_hfr300"])
+def test_step_reproduces_the_authors_program(name, golden):
+    """Row by row: state before each event, augmented frame, certainty and noise as they recorded.
+
+    A pixel's state is its previous row, or the last image written after that row (their program
+    updates every pixel whenever it writes one).
+    """
+    z = np.load(golden / f"{name}.npz")
+    columns = [str(c) for c in z["ev_columns"]]
+    par = json.loads(str(z["par_json"]))
+    c = float(z["in_ct"])
+    # Their noise is fed as recorded: sigma_iso = 1 makes `near` a variance.
+    params = jaxevent.akf.Params(
+        c_on=c, c_off=c, sigma_proc=par["sigma_p"] ** 0.5, sigma_iso=1.0, sigma_ref=0.0
+    )
+    L = np.log(z["in_image"][:, :, 1] / 255 + 1)
+    P = np.full(L.shape, par["p_ini"])
+    writes = sorted(zip(z["snap_event"], z["snap_kind"], range(len(z["snap_ts"])), strict=True))
+    before, path = [], []
+    for values in z["ev"]:
+        row = dict(zip(columns, values, strict=True))
+        # Images of kind 1 come before the update of their event, of kind 2 after it.
+        while writes and (writes[0][0], writes[0][1]) < (row["i"], 2):
+            snapshot = writes.pop(0)[2]
+            L, P = z["snap_L"][snapshot].copy(), z["snap_P"][snapshot].copy()
+        at = int(row["y"]) - 1, int(row["x"]) - 1
+        before.append((L[at], P[at]))
+        path.append(row)
+        L[at], P[at] = row["L_after"], row["P_after"]
+    state = State(*(jnp.asarray(v) for v in zip(*before, strict=True)))
+    rows = {k: jnp.asarray([row[k] for row in path]) for k in columns}
+    event = Event(
+        rows["delta_t_s"],
+        rows["Q_i"] + rows["Q_r"],
+        rows["polarity"].astype(int),
+        Observation(rows["LA_used"], rows["Rinv_used"]),
+    )
+    after = jax.vmap(lambda s, e: jaxevent.akf.step(params, s, e))(state, event)
+    assert len(path) == 1257
+    np.testing.assert_allclose(after.L, rows["L_after"], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(after.P, rows["P_after"], rtol=1e-12)
+
+
+# Pure functions
+
+
+def chain(method, recording, times, params=None):
+    features, out = method.prepare(recording, times, params)
+
+    def images(params):
+        trajectory, _ = method.run(params, features)
+        return method.read(params, trajectory, out)
+
+    return images
+
+
+def test_run_jits_and_maps_over_parameters():
+    recording = random_recording(6, 90, 4)
+    times = recording.frames.t + 900
+    images = chain(jaxevent.akf, recording, times)
+    params = [jaxevent.akf.Params(c_on=c, kappa=k) for c, k in ((0.1, 7e5), (0.2, 1e3))]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *params)
+    mapped = jax.jit(jax.vmap(images))(stacked)
+    for i, p in enumerate(params):
+        np.testing.assert_allclose(mapped[0][i], images(p)[0], rtol=1e-12, atol=1e-13)
+        video = jaxevent.akf.reconstruct(recording, p)(times)[0]
+        np.testing.assert_allclose(mapped[0][i].reshape(video.shape), video, rtol=1e-12, atol=1e-13)
+
+
+def test_step_maps_over_pixels():
+    params = jaxevent.akf.Params()
+    rng = np.random.default_rng(0)
+    L, P, dt, near, u, rate = rng.uniform(0.1, 1, (6, 5))
+    polarity = np.array([1, -1, 1, 0, -1])
+    pixels, events = State(L, P), Event(dt, near, polarity, Observation(u, rate))
+    mapped = jax.vmap(jaxevent.akf.step, (None, 0, 0))(params, pixels, events)
+    for i in range(5):
+        state, event = jax.tree.map(lambda v: jnp.asarray(v[i]), (pixels, events))  # noqa: B023
+        one = jaxevent.akf.step(params, state, event)
+        np.testing.assert_allclose([mapped.L[i], mapped.P[i]], [one.L, one.P], rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "name, exposure, values",
+    [
+        ("akf", 3_000, PARAMS),
+        ("akf", 0, OPTIONS),
+        ("aks", 0, PARAMS),
+        ("aks", 3_000, OPTIONS),
+        ("cf-augmented", 3_000, OPTIONS),
+    ],
+)
+def test_gradients_equal_central_differences(name, exposure, values):
+    """Every leaf, through deblurring, calibration, filter and read-out."""
+    method = jaxevent.METHODS[name]
+    recording = random_recording(7, 90, 4, exposure=exposure)
+    times = recording.frames.t + 1_300
+    params = params_of(method, **values)
+    images = chain(method, recording, times, params)
+    weight = jnp.asarray(np.random.default_rng(0).normal(size=(len(times), 12)))
+
+    @jax.jit
+    def loss(params):
+        image, variance = images(params)
+        noise = 0.0 if name == "cf-augmented" else (variance * weight).sum()
+        return (image * weight).sum() + noise
+
+    slopes = [jax.jit(jax.grad(loss))(params)]
+    if values is PARAMS:  # the other direction takes as long to compile
+        slopes.append(jax.jit(jax.jacfwd(loss))(params))
+    leaves, tree = jax.tree.flatten(params)
+    names = list(jax.tree.leaves(jax.tree_util.tree_map_with_path(lambda p, _: str(p), params)))
+    for i, leaf in enumerate(leaves):
+        for entry in range(leaf.size):
+            if np.isneginf(leaf.ravel()[entry]):
+                continue  # a positive parameter at 0
+            h = 1e-5 * max(abs(float(leaf.ravel()[entry])), 1e-2)
+            up, down = (
+                loss(
+                    tree.unflatten(
+                        [
+                            *leaves[:i],
+                            leaf.ravel().at[entry].add(s).reshape(leaf.shape),
+                            *leaves[i + 1 :],
+                        ]
+                    )
+                )
+                for s in (h, -h)
+            )
+            expected = float(up - down) / (2 * h)
+            got = [float(jax.tree.leaves(g)[i].ravel()[entry]) for g in slopes]
+            np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-7, err_msg=names[i])
+
+
+@pytest.mark.parametrize("name", ["akf", "aks"])
+def test_gradients_are_finite_at_corners(name):
+    """No events, equal times, black and saturated pixels."""
+    method = jaxevent.METHODS[name]
+    for recording, values in (
+        (dataclasses.replace(random_recording(8, 1, 3), events=Events.empty()), PARAMS),
+        (random_recording(9, 50, 3, span=24_000), OPTIONS),
+    ):
+        images = np.zeros_like(recording.frames.images)
+        images[:, 1] = 255
+        recording = dataclasses.replace(
+            recording,
+            frames=dataclasses.replace(recording.frames, images=images),
+            events=dataclasses.replace(recording.events, t=recording.events.t // 4_000 * 4_000),
+        )
+        params = params_of(method, **values)
+        read = chain(method, recording, recording.frames.t + 1, params)
+        gradient = jax.jit(jax.grad(lambda p: sum(v.sum() for v in read(p))))(params)  # noqa: B023
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+
+@pytest.mark.parametrize("name", ["akf", "aks", "edi"])
+def test_derivative_by_the_dead_time_is_that_of_preparing_anew(name):
+    method = jaxevent.METHODS[name]
+    recording = random_recording(7, 90, 4)
+    times = recording.frames.t + 1_300
+    rho, h = 0.0008, 1e-7  # rounded to 10 ns
+
+    def anew(rho):
+        params = params_of(method, **{**OPTIONS, "rho_ref": rho})
+        return method.reconstruct(recording, params)(times)[0].sum()
+
+    params = params_of(method, **{**OPTIONS, "rho_ref": rho})
+    features, out = method.prepare(recording, times, params)
+
+    def total(params):
+        return method.read(params, method.run(params, features)[0], out)[0].sum()
+
+    expected = (anew(rho + h) - anew(rho - h)) / (2 * h) * rho  # by ln rho
+    np.testing.assert_allclose(jax.jit(jax.grad(total))(params).raw["rho_ref"], expected, rtol=1e-5)
+
+
+LIKELIHOOD = jax.jit(jaxevent.aks.log_likelihood)
+
+
+@settings(max_examples=15)
+@given(recording=recordings(fewest_frames=1), one_sided=st.booleans())
+def test_likelihood_equals_that_of_measurements_one_by_one(recording, one_sided):
+    params = params_of(jaxevent.aks, **{**OPTIONS, "one_sided": one_sided})
+    features, _ = jaxevent.aks.prepare(recording, [recording.start], params)
+    _, expected = oracles.reconstruct("aks", recording, params.values(), [], likelihood=True)
+    total = LIKELIHOOD(params, features)
+    np.testing.assert_allclose(total, expected, rtol=1e-5 if one_sided else 1e-9)
+
+
+def test_next_recording_of_the_sensor_compiles_nothing():
+    params = jaxevent.akf.Params()
+
+    def reconstruct(seed, n, frames):
+        recording = random_recording(seed, n, frames)
+        return jaxevent.akf.reconstruct(recording, params)(recording.frames.t)
+
+    reconstruct(1, 300, 5)
+    compiled = []
+
+    def listen(event, duration, **kwargs):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        reconstruct(2, 2_000, 40)
+        assert compiled == []
+        jax.jit(lambda x: x + 1.5)(jnp.zeros(17))
+        assert compiled  # the listener does hear
+    finally:
+        jax.monitoring.clear_event_listeners()
+
+
+def test_times_must_make_sense():
+    recording = random_recording(1, 20, 2)
+    video = jaxevent.akf.reconstruct(recording)
+    with pytest.raises(jaxevent.InputError, match="integers are microseconds, floats seconds"):
+        video(np.array([5_000.0]))
+    with pytest.raises(jaxevent.InputError, match="not finite"):
+        video(np.array([np.nan]))
+    np.testing.assert_array_equal(video(0.05)[0], video(50_000)[0])
+
+
+def test_stored_recording_gives_the_same_images(tmp_path):
+    """Events and frames read window by window from a file."""
+    recording = random_recording(12, 400, 30, exposure=900)
+    jaxevent.save(recording, tmp_path / "stored.h5")
+    stored = jaxevent.load(tmp_path / "stored.h5", in_memory=False)
+    params = params_of(jaxevent.akf, **PARAMS)
+    times = np.linspace(recording.start, recording.stop, 9).astype(np.int64)
+    expected = jaxevent.akf.reconstruct(recording, params, window_events=90)(times)
+    images = jaxevent.akf.reconstruct(stored, params, window_events=90)(times)
+    np.testing.assert_array_equal(images, expected)
+
+
+def test_frames_of_an_automatic_exposure_share_a_scale():
+    """Grey levels divided by the gain, also where only some of the frames are given."""
+    recording = random_recording(13, 40, 4)
+    gain = np.array([1.0, 2.0, 0.5, 4.0])
+    recording = dataclasses.replace(recording, extra={"gain": gain}).with_frames(slice(1, 4))
+    image, _ = jaxevent.last_frame.reconstruct(recording)(recording.frames.t)
+    expected = np.asarray(recording.frames.images) / 255 / gain[1:, None, None]
+    np.testing.assert_allclose(image, expected, rtol=1e-12, atol=1e-14)
+    wrong = dataclasses.replace(recording, extra={"gain": gain})
+    with pytest.raises(jaxevent.InputError, match="one positive number for each of the 3 frames"):
+        jaxevent.last_frame.reconstruct(wrong)
+
+
+def test_presets():
+    paper, hdr = (jaxevent.akf.Params(preset=name) for name in ("paper", "hdr"))
+    assert paper.values() == jaxevent.akf.Params().values()
+    assert hdr.weighting == "certainty" and not hdr.calibrate
+    assert float(jaxevent.akf.Params(preset="hdr", I0=0.5).I0) == 0.5
+    with pytest.raises(jaxevent.InputError, match="no preset 'hdri'; did you mean 'hdr'"):
+        jaxevent.akf.Params(preset="hdri")
+    with pytest.raises(jaxevent.InputError, match="weighting is 'none'; give 'linear' or"):
+        jaxevent.akf.Params(weighting="none")
+    with pytest.raises(jaxevent.InputError, match="certainty is 2; give a list of numbers"):
+        jaxevent.akf.Params(certainty=2)

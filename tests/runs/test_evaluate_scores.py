@@ -1,0 +1,137 @@
+"""Evaluations of motion and tracks: rows against what the estimators give, keys, bad settings."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import jaxevent
+from jaxevent import blob, egomotion
+from jaxevent.egomotion.truth import endpoint_error, read_motion
+from jaxevent.errors import InputError
+from jaxevent.runs import evaluate
+from jaxevent.runs.blob import read_positions
+from jaxevent.show.page import page
+from jaxevent.show.report import markdown_table
+from jaxevent.simulate import blob_scene, motion_scene
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A planar motion and a blob, each with its table."""
+    folder = tmp_path_factory.mktemp("known")
+    recording, source = motion_scene("planar", "constant", 3, size=(64, 48), duration=0.2)
+    jaxevent.save(recording, folder / "wall.h5")
+    t = np.arange(0, 0.2, 0.001)
+    vx, vy = source.velocity(t).T
+    pd.DataFrame({"t": t, "vx": vx, "vy": vy}).to_csv(folder / "wall.csv", index=False)
+    moving, truth = blob_scene("disc", seed=1)
+    jaxevent.save(moving[:0.1], folder / "dot.h5")
+    t = np.arange(0.005, 0.095, 0.001)
+    x, y = truth(t)[:, 0, :2].T
+    pd.DataFrame({"t": t, "x": x, "y": y}).to_csv(folder / "dot.csv", index=False)
+    return folder
+
+
+def configured(folder: Path, name: str, text: str) -> Path:
+    path = folder / f"{name}.toml"
+    path.write_text(text)
+    return path
+
+
+MOTION = """
+recordings = ["wall.h5"]
+protocol = "motion"
+truth = "*.csv"
+settle = 0.1
+[[method]]
+name = "planes"
+[[method]]
+name = "planes"
+label = "coarse"
+params = { step = 0.04 }
+"""
+TRACKS = """
+recordings = ["dot.h5"]
+protocol = "tracks"
+positions = "*.csv"
+[[method]]
+name = "blob"
+grid = { lambda0 = [4.0, 8.0] }
+"""
+
+
+def test_motion(folder, tmp_path):
+    config = configured(folder, "motion", MOTION)
+    rows = evaluate.evaluate(config, tmp_path / "out")
+    assert [row["method"] for row in rows] == ["planes", "coarse"]
+    recording = jaxevent.load(folder / "wall.h5")
+    truth = read_motion(folder / "wall.csv", "planar")
+    for row, settings in zip(rows, ({}, {"step": 0.04}), strict=True):
+        params = egomotion.planes.Params.of(settings)
+        motion = egomotion.estimate(recording, params, method="planes")
+        times = np.array(row["per_time"]["t"])
+        assert times[0] >= 100_000 and set(np.diff(times)) == {5000}
+        mean, _, lost = motion(times)
+        assert row["lost"] == 0 and not lost.any() and row["times"] == len(times)
+        np.testing.assert_allclose(row["AEE"], endpoint_error(mean, truth(times)).mean())
+        speed = np.linalg.norm(truth(times), axis=1)
+        each = 100 * np.linalg.norm(mean - truth(times), axis=1) / speed
+        np.testing.assert_allclose(row["per_time"]["error"], each, rtol=1e-5)
+        np.testing.assert_allclose(row["AEE_rel"], each.mean())
+    assert rows[0]["AEE"] != rows[1]["AEE"]
+    said = markdown_table(rows)
+    assert "AEE %" in said and "MSE" not in said
+    assert "<h2>Pictures" not in page(rows, [None, None], "motion", "", [], "a")
+
+    # Nothing is computed again but what depends on a changed truth.
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "out" / "tasks").glob("*.json")}
+    assert len(kept) == 2
+    assert json.dumps(evaluate.evaluate(config, tmp_path / "out")) == json.dumps(rows)
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    table = pd.read_csv(folder / "wall.csv")
+    other = configured(folder, "other", MOTION.replace("*.csv", "twice.csv"))
+    table.assign(vx=2 * table.vx, vy=2 * table.vy).to_csv(folder / "twice.csv", index=False)
+    far = evaluate.evaluate(other, tmp_path / "out")
+    assert 40 < far[0]["AEE_rel"] < 60
+
+
+def test_tracks(folder):
+    rows = evaluate.evaluate(configured(folder, "tracks", TRACKS))
+    recording = jaxevent.load(folder / "dot.h5")
+    known = read_positions(folder / "dot.csv")
+    for row, size in zip(rows, (4.0, 8.0), strict=True):
+        x, y = known.xi[0, 0]
+        params = blob.Params.of({"lambda0": size})
+        tracks = blob.track(recording, params, [(x, y, size, int(known.t[0]) / 1e6)])
+        told = tracks(known.t)
+        distance = np.linalg.norm(told.mean[:, 0, :2] - known.xi[:, 0], axis=1)
+        alive = np.isfinite(distance)
+        assert alive.mean() > 0.9
+        np.testing.assert_allclose(row["rmse"], np.sqrt((distance[alive] ** 2).mean()))
+        np.testing.assert_allclose(row["median"], np.median(distance[alive]))
+        assert row["covered"] == alive.mean() and row["times"] == len(known.t)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        (MOTION.replace('truth = "*.csv"', ""), "true motion is not given"),
+        (MOTION.replace('truth = "*.csv"', 'truth = "*.csv"\nmodel = "planer"'), "planar"),
+        (MOTION.replace("settle = 0.1", "settle = -1"), "settle is -1"),
+        (MOTION.replace("settle = 0.1", "metrics = ['lpips']"), "no setting 'metrics'"),
+        (MOTION.replace("planes", "akf", 1), "'akf' of motion"),
+        (MOTION.replace("*.csv", "*.txt"), "wall.txt: cannot be read"),
+        (MOTION.replace("*.csv", "poses"), "neither from poses"),
+        (MOTION.replace('label = "coarse"', "normalise = 'affine'"), "no setting 'normalise'"),
+        (MOTION.replace('"motion"', '"motions"'), "did you mean 'motion'"),
+        (TRACKS.replace('positions = "*.csv"', ""), "positions are not given"),
+        (TRACKS.replace('"blob"', '"akf"'), "'akf' of tracks"),
+        (TRACKS.replace('"*.csv"', '"none.csv"'), "none.csv: cannot be read"),
+    ],
+)
+def test_bad_settings(text, named, folder):
+    with pytest.raises(InputError, match=named.replace(".", r"\.")):
+        evaluate.evaluate(configured(folder, "bad", text))
