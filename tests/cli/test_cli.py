@@ -235,10 +235,10 @@ def test_as_a_process(tmp_path):
 
 @pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt, 130), (BrokenPipeError, 1)])
 def test_interrupted_and_broken_pipe(error, status, monkeypatch, capsys):
-    def info(path, size, stream):
+    def load(*arguments, **options):
         raise error
 
-    monkeypatch.setattr(cli, "info", info)
+    monkeypatch.setattr("jaxevent.io.load", load)
     assert cli.main(["info", "a"]) == status
     assert capsys.readouterr().err == ""
 
