@@ -36,6 +36,7 @@ from scipy import ndimage, sparse
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError, require
+from jaxevent.io.images import Scale, is_series, read_series
 from jaxevent.recording import Events, Frames, Recording
 
 Grid = NDArray[np.float64]
@@ -288,7 +289,7 @@ def read_frames(
     """Another camera's frames, as a recording that need not hold events.
 
     `path` is anything that `jaxevent.load` reads, whose frames are taken, or images as of
-    `jaxevent.runs.external`: a folder of PNG, TIFF, JPEG or .npy with timestamps.txt or images.txt
+    `jaxevent.io.images`: a folder of PNG, TIFF, JPEG or .npy with timestamps.txt or images.txt
     of lines "t name", or HDF5 of t and image. `exposure` (s) is that of the latter, which do not
     tell it. With `reference`, of a recording its HDR images are taken if it holds any
     (`extra["hdr"]` and `extra["hdr_t"]`), and `white` is the value of images that is intensity 1.
@@ -299,7 +300,7 @@ def read_frames(
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: there is no such file or folder; correct the path")
-    if _is_series(path):
+    if is_series(path):
         recording = _series(path, exposure, white, reference)
     else:
         recording = load(path, in_memory=False, progress=progress)
@@ -1332,33 +1333,14 @@ def _numbers(values: Any, where: str) -> NDArray[np.float64]:
     return numbers
 
 
-def _is_series(path: Path) -> bool:
-    """Whether these are images with times, not a recording."""
-    import h5py
-
-    from jaxevent.io import reading
-    from jaxevent.runs.external import SUFFIXES
-
-    with reading(str(path)):
-        if path.is_dir():
-            images = any(one.suffix.lower() in SUFFIXES for one in path.iterdir())
-            return images and not (path / "events.txt").is_file()
-        if not h5py.is_hdf5(path):
-            return False
-        with h5py.File(path) as file:
-            return {"t", "image"} <= set(file)
-
-
 def _series(
     path: Path, exposure: float | int | None, white: float | int | None, reference: bool
 ) -> Recording:
-    from jaxevent.runs.external import External
-
     if exposure is not None and not 0 < exposure < math.inf:
         raise InputError(f"{path}: an exposure of {exposure} s is not possible; give seconds")
     if white is not None and not 0 < white < math.inf:
         raise InputError(f"{path}: white = {white} is not possible; give a number above 0")
-    series = External(images=str(path), white=white).find(path.name)
+    series = read_series(path, Scale(white))
     images: list[NDArray[np.float32]] = []
     for row in range(len(series.t)):
         image = series.read(row).astype(np.float32)

@@ -1,0 +1,210 @@
+"""Series of images with times, stored as files that any program can write.
+
+A series is a folder of PNG, JPEG, TIFF or .npy files, taken in the order of their names; or one
+.npy file (images, height, width); or one HDF5 file of the datasets t and image, as `jaxevent
+reconstruct` writes. Integers of 8 or 16 bits and floats are linear intensities. Colours become grey
+(ITU-R 601 luma). Timestamps are lines "t", one per image, or "t name"; where all are whole numbers
+they are microseconds, otherwise seconds.
+"""
+
+import contextlib
+import dataclasses
+import math
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError
+from jaxevent.io import reading
+from jaxevent.recording import microseconds
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
+TIMES = ("timestamps.txt", "images.txt")
+LUMA = np.array([0.299, 0.587, 0.114])
+
+
+@dataclasses.dataclass(frozen=True)
+class Series:
+    """Images at sorted times (us), each read when asked for: `read(row)` is (height, width)."""
+
+    t: NDArray[np.int64]
+    read: Callable[[int], NDArray[np.float64]]
+    files: tuple[Path, ...]  # that hold all this
+
+
+@dataclasses.dataclass(frozen=True)
+class Scale:
+    """Stored values as linear intensity: (value / white) ** gamma.
+
+    `white` None: the largest value of integers of 8 or 16 bits, 1 of floats.
+    """
+
+    white: float | int | None = None
+    gamma: float | int = 1.0
+
+    def intensity(self, image: NDArray, source: str) -> NDArray[np.float64]:
+        """An image as stored, grey (height, width); raises `InputError` naming the `source`."""
+        kind = image.dtype
+        if kind not in (np.uint8, np.uint16) and kind.kind != "f" and self.white is None:
+            raise InputError(f"{source}: holds {kind}; give white, the value of intensity 1")
+        if image.ndim not in (2, 3) or kind.kind not in "iuf":
+            raise InputError(
+                f"{source}: is {kind} of shape {image.shape}; store numbers (height, width)"
+            )
+        white = self.white or (1.0 if kind.kind == "f" else float(np.iinfo(kind).max))
+        intensity = image.astype(np.float64) / white
+        if self.gamma != 1:
+            intensity = np.maximum(intensity, 0) ** self.gamma
+        if intensity.ndim == 3:
+            if intensity.shape[2] not in (1, 3, 4):
+                raise InputError(
+                    f"{source}: has {intensity.shape[2]} channels; store grey or red, green, blue"
+                )
+            grey = intensity.shape[2] == 1
+            intensity = intensity[..., 0] if grey else intensity[..., :3] @ LUMA
+        return intensity
+
+
+def is_series(path: Path) -> bool:
+    """Whether these are images with times, not a recording."""
+    import h5py
+
+    with reading(str(path)):
+        if path.is_dir():
+            images = any(one.suffix.lower() in SUFFIXES for one in path.iterdir())
+            return images and not (path / "events.txt").is_file()
+        if not h5py.is_hdf5(path):
+            return False
+        with h5py.File(path) as file:
+            return {"t", "image"} <= set(file)
+
+
+def read_series(
+    images: Path,
+    scale: Scale = Scale(),
+    timestamps: Sequence[str] = TIMES,
+    beside: Path | None = None,
+) -> Series:
+    """The images of a folder or file that exists; see the text of this module.
+
+    `timestamps` are names of the file of times, the first that there is in the folder of the images
+    or else in the folder `beside`. Raises `InputError` naming what is wrong.
+    """
+    if images.is_file() and images.suffix.lower() != ".npy":
+        return _of_hdf5(images, scale)
+    place = images if images.is_dir() else images.parent
+    times = _find_timestamps(place, beside, timestamps)
+    t, names = _times(times)
+    if images.is_file():
+        with reading(str(images)):
+            stack = np.load(images, mmap_mode="r", allow_pickle=False)
+        _check_count(images, len(stack) if stack.ndim in (3, 4) else 0, times, len(t))
+        return _series(t, lambda row: stack[row], str(images), (images, times), scale)
+    if names is None:
+        files = sorted(p for p in images.iterdir() if p.suffix.lower() in SUFFIXES)
+        _check_count(images, len(files), times, len(t))
+    else:
+        files = [images / name for name in names]
+    return _series(t, lambda row: _image(files[row]), str(images), (*files, times), scale)
+
+
+def _find_timestamps(place: Path, beside: Path | None, names: Sequence[str]) -> Path:
+    folders = [place] if beside is None else [place, beside]
+    for path in (folder / name for name in names for folder in folders):
+        if path.is_file():
+            return path
+    raise InputError(
+        f"{place}: there is no {' or '.join(names)} with the images' times; add it or give "
+        "timestamps"
+    )
+
+
+def _check_count(images: Path, found: int, times: Path, expected: int) -> None:
+    if found != expected:
+        raise InputError(
+            f"{images}: holds {found} images, {times.name} {expected} times; there must be one "
+            "time for each image"
+        )
+
+
+def _series(
+    t: NDArray[np.int64],
+    stored: Callable[[int], NDArray],
+    source: str,
+    files: tuple[Path, ...],
+    scale: Scale,
+) -> Series:
+    if not len(t):
+        raise InputError(f"{source}: holds no images; give those of the recording")
+    if (t[1:] < t[:-1]).any():
+        row = int(np.argmax(t[1:] < t[:-1])) + 1
+        raise InputError(
+            f"{source}: image {row} at {t[row]} us is earlier than the one before it; sort "
+            "images and times"
+        )
+
+    def read(row: int) -> NDArray[np.float64]:
+        with reading(f"{source}: image {row}"):
+            image = stored(row)
+        return scale.intensity(np.asarray(image), f"{source}: image {row}")
+
+    return Series(t, read, files)
+
+
+def _of_hdf5(path: Path, scale: Scale) -> Series:
+    import h5py
+
+    with reading(str(path)):
+        file = h5py.File(path)
+        stored, t = file.get("image"), file.get("t")
+    if not isinstance(stored, h5py.Dataset) or not isinstance(t, h5py.Dataset):
+        raise InputError(
+            f"{path}: has no datasets t and image; store t (images,) and image (images, "
+            "height, width)"
+        )
+    if t.ndim != 1 or stored.ndim not in (3, 4) or len(t) != len(stored):
+        raise InputError(
+            f"{path}: image has the shape {stored.shape} and t {t.shape}; store one time for "
+            "each image"
+        )
+    times = microseconds(t[()], f"{path}: t")
+    return _series(times, lambda row: stored[row], str(path), (path,), scale)
+
+
+def _image(path: Path) -> NDArray:
+    from PIL import Image
+
+    if path.suffix.lower() == ".npy":
+        return np.load(path, allow_pickle=False)
+    with Image.open(path) as image:
+        if getattr(image, "n_frames", 1) > 1:
+            raise InputError(f"{path}: holds several images; store each as a file of its own")
+        return np.asarray(image.convert("RGB") if image.mode in ("P", "CMYK") else image)
+
+
+def _times(path: Path) -> tuple[NDArray[np.int64], list[str] | None]:
+    """The times (us) of a file of lines "t" or "t name", and the names."""
+    with reading(str(path)):
+        lines = [line.split(maxsplit=1) for line in path.read_text(encoding="utf-8").splitlines()]
+    lines = [words for words in lines if words and not words[0].startswith("#")]
+    if len({len(words) for words in lines}) > 1:
+        raise InputError(f"{path}: some lines have a name and some have none; give all or none")
+    whole = all(re.fullmatch(r"[+-]?\d+", words[0]) for words in lines)
+    times: list[int] = []
+    for number, words in enumerate(lines):
+        value = math.nan
+        with contextlib.suppress(ValueError):
+            value = int(words[0]) if whole else float(words[0]) * 1e6
+        if not abs(value) < 9e18:
+            raise InputError(
+                f"{path}: line {number} of numbers starts with {words[0][:20]!r}, not a time; give "
+                "lines 't' or 't name'"
+            )
+        times.append(round(value))
+    names = [words[1].strip() for words in lines] if lines and len(lines[0]) == 2 else None
+    if names and all(re.fullmatch(r"[+-]?[\d.eE+-]+", name) for name in names):
+        raise InputError(f"{path}: has two columns of numbers; keep the times only")
+    return np.array(times, np.int64), names
