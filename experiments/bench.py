@@ -35,8 +35,8 @@ from jaxevent.io import load, save
 from jaxevent.reconstruction.filtering import Observation, Observer, State, Trajectory
 from jaxevent.reconstruction.pixels import Windows
 from jaxevent.recording import Events, Frames, Recording
-from jaxevent.runs.fit import with_raw
 from jaxevent.simulate import blob_scene
+from jaxevent.tuning import with_raw
 
 WIDTH, HEIGHT = 346, 260
 BASELINE = Path(__file__).with_name("bench_baseline.json")

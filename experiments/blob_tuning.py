@@ -3,7 +3,7 @@
     python experiments/blob_tuning.py [--iterations 30]
 
 From process noises that are wrong by factors of 10 to 100 the mean negative log-likelihood of each
-event, predicted before it is used, is minimised by `jaxevent.runs.fit.optimise` on two recordings.
+event, predicted before it is used, is minimised by `jaxevent.optimise` on two recordings.
 The position's RMSE on other recordings stands beside that of the best point of a grid, which is
 chosen by the true positions of those recordings themselves.
 """
@@ -25,8 +25,8 @@ from jaxevent.blob import (
     position_error,
     prepare_positions,
 )
-from jaxevent.runs.fit import Settings, optimise, with_raw
 from jaxevent.simulate import blob_scene
+from jaxevent.tuning import Settings, optimise, with_raw
 
 STEP = {"events_per_step": 32}
 # Process noises times these.

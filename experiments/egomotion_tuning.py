@@ -23,9 +23,9 @@ from bench import machine
 from jaxevent.egomotion import particle_filter as voting
 from jaxevent.egomotion.truth import Known
 from jaxevent.recording import Events, Recording
-from jaxevent.runs import fit
 from jaxevent.runs.egomotion import Goal, Loss
 from jaxevent.simulate import motion_scene
+from jaxevent.tuning import Settings, optimise
 
 GRID = 10.0 ** np.arange(1, 6.1, 0.5)  # px/s
 
@@ -109,10 +109,10 @@ def fitted(problem: Problem, label: str, given: dict[str, Any], names: list[str]
     """Print a line of the table."""
     params = voting.Params.of({"particles": 100, "batch": 32, **given})
     loss, mine, unseen = problem(params)
-    settings = fit.Settings(
+    settings = Settings(
         iterations=40, learning_rate=0.3, rounds=1, every=40, patience=1000, forward=True
     )
-    found = fit.optimise(loss, params, names, mine, mine, settings)
+    found = optimise(loss, params, names, mine, mine, settings)
     shown = [
         "; ".join(f"{n} {float(getattr(p, n)):.3g}" for n in names) for p in (params, found.params)
     ]

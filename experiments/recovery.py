@@ -10,9 +10,9 @@ import numpy as np
 
 import jaxevent
 from jaxevent.recording import Events, Frames, Recording
-from jaxevent.runs.fit import Settings, optimise
 from jaxevent.runs.reconstruction import Objective, Part, Problem
 from jaxevent.simulate import Pan, Sensor, scene, simulate
+from jaxevent.tuning import Settings, optimise
 
 TRUE = {
     "c_on": 0.12,

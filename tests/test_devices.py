@@ -23,8 +23,9 @@ from jaxevent.errors import InputError
 from jaxevent.reconstruction import METHODS
 from jaxevent.runs.egomotion import VOTING
 from jaxevent.runs.evaluate import evaluate
-from jaxevent.runs.fit import Settings, fit, optimise
+from jaxevent.runs.fit import fit
 from jaxevent.runs.reconstruction import Objective, Problem, parts
+from jaxevent.tuning import Settings, optimise
 
 FOUR = "--xla_force_host_platform_device_count=4"
 

@@ -570,7 +570,7 @@ def negative_log_likelihood(
     With "associated", p sums N(xi; p^-, L L^T + P_p) over the gates that hold the event, and only
     events in a gate count: right for process noise, but a smaller gate lowers it. With "all",
     p = (1 - o) mean_i N_i(xi) + o / area, o = `outliers`, for every event and without gates: right
-    for gates and for whole recordings too. A loss for `jaxevent.runs.fit.optimise`.
+    for gates and for whole recordings too. A loss for `jaxevent.optimise`.
     """
     _, told = run(params, begin(params, features), features, events)
     assert told.loss is not None and told.count is not None

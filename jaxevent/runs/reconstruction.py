@@ -1,7 +1,7 @@
 """What reconstructions are fitted to: images not given to the method, or the frames' likelihood.
 
 A recording is cut into time windows (or taken whole), each prepared once: a `Part`. `Problem` turns
-the parts of a method into the batches of `jaxevent.runs.fit.optimise`, `Objective` is its loss.
+the parts of a method into the batches of `jaxevent.optimise`, `Objective` is its loss.
 """
 
 import dataclasses

@@ -26,15 +26,17 @@ from texture import C_OFF, C_ON, HEIGHT, LATE, WIDTH, moving
 
 import jaxevent
 import jaxevent.runs.fit
+import jaxevent.tuning
 from jaxevent import cli
 from jaxevent.parameters import Number, Parameters, Positive
 from jaxevent.reconstruction import METHODS
 from jaxevent.reconstruction.filtering import Estimator, Filter
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.runs.evaluate import Reference, held_out, score
-from jaxevent.runs.fit import Settings, begin, fit, optimise
+from jaxevent.runs.fit import fit
 from jaxevent.runs.reconstruction import Images, Objective, Problem, parts
 from jaxevent.splits import interleave
+from jaxevent.tuning import Settings, begin, optimise
 
 
 @pytest.fixture
@@ -121,7 +123,7 @@ def test_starts_are_followed_as_if_alone():
     best = []
     for start in range(3):
         raw = {name: leaf[start] for name, leaf in drawn.items()}
-        params = jaxevent.runs.fit.with_raw(Toy(), raw)
+        params = jaxevent.tuning.with_raw(Toy(), raw)
         alone = optimise(
             toy, params, ["a", "b"], [ONE], settings=dataclasses.replace(settings, starts=1)
         )
@@ -261,12 +263,12 @@ def test_a_run_taken_up_anywhere_ends_the_same():
     settings = Settings(iterations=7, starts=2, every=3, patience=4, batch=1, learning_rate=0.3)
     batches = [ONE, (jnp.ones(()), jnp.asarray(1.1))]
     arguments = (toy, Toy(), ["a", "b"], batches, (), settings, {"c": (-1, 1, 3)})
-    saved: list[jaxevent.runs.fit.Run] = []
+    saved: list[jaxevent.tuning.Run] = []
     whole = optimise(*arguments, save=lambda run, _: saved.append(copy.deepcopy(run)))
     assert {run.stage for run in saved} == {0, 1, 2, 3, 4, 5} and len(saved) > 30
     assert any(run.iteration for run in saved) and any(run.tried for run in saved)
 
-    def looked(runs: list[jaxevent.runs.fit.Run], stage: int) -> int:
+    def looked(runs: list[jaxevent.tuning.Run], stage: int) -> int:
         return max([len(run.tried) for run in runs if run.stage == stage], default=0)
 
     for run in saved:
@@ -469,7 +471,7 @@ def test_thresholds_and_clock_are_recovered(fitted):
 
     def loss(offset: float) -> float:
         shifted = edi.Params(**{**params.values(), "clock_offset": offset})
-        return float(jaxevent.runs.fit._value(problem.objective, shifted, problem(shifted)[0][0]))
+        return float(jaxevent.tuning._value(problem.objective, shifted, problem(shifted)[0][0]))
 
     scan = [float(offset) for offset in np.arange(0.003, 0.008, 0.00025)]
     losses = [loss(offset) for offset in scan]
@@ -518,15 +520,13 @@ def test_gradients_of_a_reconstruction_agree():
     params = edi.Params(clock_offset=0.004)
     batch = problem(params)[0][0]
     raw = {name: params.raw[name] + jnp.array([0, 0.1]) for name in ("c_on", "I0")}
-    slopes = functools.partial(jaxevent.runs.fit._slopes, problem.objective)
+    slopes = functools.partial(jaxevent.tuning._slopes, problem.objective)
     forward, reverse = (slopes(mode, params, raw, batch) for mode in (True, False))
     np.testing.assert_allclose(forward[0], reverse[0], rtol=1e-12)
     for name in raw:
         np.testing.assert_allclose(forward[1][name], reverse[1][name], rtol=1e-9)
         ends = [
-            jaxevent.runs.fit._values(
-                problem.objective, params, {**raw, name: raw[name] + h}, batch
-            )
+            jaxevent.tuning._values(problem.objective, params, {**raw, name: raw[name] + h}, batch)
             for h in (1e-5, -1e-5)
         ]
         np.testing.assert_allclose(forward[1][name], (ends[0] - ends[1]) / 2e-5, rtol=1e-4)

@@ -18,7 +18,7 @@ from jaxevent import cli
 from jaxevent.egomotion import particle_filter as voting
 from jaxevent.errors import InputError
 from jaxevent.runs.egomotion import VOTING, Loss
-from jaxevent.runs.fit import with_raw
+from jaxevent.tuning import with_raw
 
 VELOCITIES = ((150.0, 80.0), (-90.0, 60.0), (40.0, -170.0))
 START = {"particles": 32, "batch": 16, "every": 4, "noise": 3.0, "tau_max": 0.06}
