@@ -21,8 +21,9 @@ import numpy as np
 from tqdm import tqdm
 
 import jaxevent
-from jaxevent.runs.evaluate import PROTOCOLS, Reference, frame_times, score
 from jaxevent.runs.fit import fit
+from jaxevent.runs.protocols import PROTOCOLS, Reference, frame_times
+from jaxevent.runs.scores import score
 from jaxevent.simulate import FITTING, SENSORS, TESTING, Pan, scene, simulate
 from jaxevent.simulate.scenes import Speed
 

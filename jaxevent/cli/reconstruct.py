@@ -67,7 +67,8 @@ def run(
 ) -> None:
     from jaxevent.io import load
     from jaxevent.reconstruction.colour import colour_video
-    from jaxevent.runs.evaluate import find_method, frame_times
+    from jaxevent.runs.evaluate import find_method
+    from jaxevent.runs.protocols import frame_times
     from jaxevent.show.export import evenly, write_hdf5, writer
 
     write = writer(out)

@@ -2,13 +2,17 @@
 
 import contextlib
 import io
+import math
 import shutil
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from jaxevent.errors import InputError
+from jaxevent.parameters import Parameters
 
 if TYPE_CHECKING:
     import h5py
@@ -123,3 +127,24 @@ def _refuse(path: Path, directory: bool) -> None:
         raise InputError(f"{path}: is a folder; give the name of a file to write")
     elif path.exists() and (directory or not path.is_file()):
         raise InputError(f"{path}: exists and is not what is to be written; choose another name")
+
+
+def finite(value: float | int) -> float | int | None:
+    """The value, None where JSON has no number."""
+    return value if math.isfinite(value) else None
+
+
+def values_of(params: Parameters) -> dict[str, Any]:
+    """The values as they were given: numbers to 6 digits, lists of them, text, true and false.
+
+    None where JSON has no number.
+    """
+
+    def plain(value: Any) -> Any:
+        if value is None or isinstance(value, str | bool | np.bool_):
+            return bool(value) if isinstance(value, np.bool_) else value
+        if np.ndim(value):
+            return [plain(one) for one in value]
+        return finite(float(f"{float(value):.6g}"))
+
+    return {name: plain(value) for name, value in params.values().items()}

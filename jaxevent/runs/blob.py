@@ -49,9 +49,10 @@ from jaxevent.blob.tracker import (
 )
 from jaxevent.devices import shared_out
 from jaxevent.errors import InputError
+from jaxevent.io.output import finite, values_of
 from jaxevent.parameters import nearest
 from jaxevent.recording import Recording
-from jaxevent.runs.evaluate import finite, read_params, values_of
+from jaxevent.runs.config import read_params
 from jaxevent.show.report import aligned
 from jaxevent.splits import SPLITS, windows
 

@@ -9,7 +9,9 @@ import numpy as np
 from jaxevent.io import load
 from jaxevent.reconstruction import METHODS
 from jaxevent.recording import Recording
-from jaxevent.runs.evaluate import frame_times, held_out, results, score, write_rows
+from jaxevent.runs.protocols import frame_times, held_out
+from jaxevent.runs.results import results, write_rows
+from jaxevent.runs.scores import score
 from jaxevent.show.export import evenly, shown
 from jaxevent.show.report import comparison_figure, markdown_table, video_writer
 

@@ -48,9 +48,10 @@ from jaxevent.egomotion.truth import (
     relative_error,
 )
 from jaxevent.errors import InputError
+from jaxevent.io.output import finite, values_of
 from jaxevent.recording import Recording
 from jaxevent.runs import egomotion_scores as scores
-from jaxevent.runs.evaluate import finite, read_params, values_of
+from jaxevent.runs.config import read_params
 from jaxevent.show.report import aligned
 from jaxevent.splits import SPLITS, windows
 

@@ -42,155 +42,37 @@ again.
 
 import contextlib
 import dataclasses
-import glob
 import hashlib
 import importlib
 import itertools
 import json
-import math
-import os
-import re
-import shutil
-import threading
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from tqdm import tqdm
 
 import jaxevent
-from jaxevent.devices import local
-from jaxevent.errors import InputError, require
-from jaxevent.io import load
-from jaxevent.io.output import complete
-from jaxevent.metrics import (
-    global_ssim,
-    hdr_quality,
-    log_display,
-    log_mse,
-    log_ssim,
-    lpips,
-    lpips_weights,
-    mse,
-    regions,
-    ssim,
-)
+from jaxevent.errors import InputError
+from jaxevent.io.output import values_of
 from jaxevent.parameters import Parameters, nearest, read_toml
 from jaxevent.reconstruction import METHODS
-from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.filtering import Estimator
-from jaxevent.recording import Frames, Recording, microseconds
-from jaxevent.runs.external import External, Normalise, check_normalise, fit_brightness
+from jaxevent.runs.config import find_recordings, read_params
+from jaxevent.runs.contents import Contents, Opened
+from jaxevent.runs.external import External, check_normalise
+from jaxevent.runs.protocols import PROTOCOLS
+from jaxevent.runs.results import results, write_rows
+from jaxevent.runs.scores import check_measures, score_and_sample
 from jaxevent.runs.tasks import Outcome, Place, Task, run
-from jaxevent.show.report import markdown_table, write_parquet
+from jaxevent.show.report import write_parquet
 
 # Part of the keys of stored results: raised whenever the same recording, method and parameters give
 # other results than before.
 RESULTS_VERSION = 1
 
-P = TypeVar("P", bound=Parameters)
-
-
-def held_out(recording: Recording) -> tuple[Recording, Frames]:
-    """The recording with every second frame, and the frames taken out of it.
-
-    Raises `InputError` for fewer than 3 frames and for no events.
-    """
-    frames = recording.frames
-    if frames is None or len(frames) < 3:
-        raise InputError(
-            f"{recording.name}: has {0 if frames is None else len(frames)} frames; hiding every "
-            "second one needs at least 3, so choose a recording with more"
-        )
-    _need_events(recording)
-    return recording.with_frames(slice(0, None, 2)), frames[1::2]
-
-
-def _need_events(recording: Recording) -> None:
-    if not len(recording.events):
-        raise InputError(
-            f"{recording.name}: holds no events, so there is nothing to reconstruct from; choose "
-            "another recording"
-        )
-
-
-@dataclasses.dataclass(frozen=True)
-class Reference(Frames):
-    """HDR reference images, float intensities that may exceed 1; the exposure is not known.
-
-    `timed` says that t is on the events' clock. `clip` is what the frames record from and to.
-    `white` is the value of `images` that is intensity 1; None says so of 1, and NaN of pixels
-    without reference, which are 0 otherwise.
-    """
-
-    timed: bool
-    clip: tuple[float, float]
-    white: float | None = None
-
-    def truth(self, row: int) -> NDArray[np.float64]:
-        """One image (height, width) of intensity, NaN where there is no reference."""
-        image = np.asarray(self.images[row], np.float64)
-        return image if self.white is None else np.where(image == 0, np.nan, image / self.white)
-
-
-def reference(recording: Recording) -> tuple[Recording, Reference]:
-    """The recording itself, and the HDR images in its `extra`; the text of this module has more.
-
-    Raises `InputError` for no or unusable images and for no events.
-    """
-    _need_events(recording)
-    extra, name = recording.extra, recording.name
-    size = (recording.height, recording.width)
-    clip = np.asarray(extra.get("clip", (0.01, 1.0)))
-    if clip.shape != (2,) or clip.dtype.kind not in "iuf" or not clip[0] < clip[1]:
-        raise InputError(f"{name}: clip is {clip.tolist()}; store two intensities, low below high")
-    if "hdr" in extra:
-        images, what, white = extra["hdr"], "hdr", None
-        if "hdr_t" not in extra:
-            raise InputError(f"{name}: hdr has no times; add hdr_t, in us on the events' clock")
-        t = np.atleast_1d(microseconds(extra["hdr_t"], f"{name}: hdr_t"))
-        if t.ndim != 1 or (t[1:] <= t[:-1]).any():
-            raise InputError(f"{name}: hdr_t is not sorted; sort hdr by time, each time once")
-    elif "HDR_mat" in extra:
-        images, what, frames = extra["HDR_mat"], "HDR_mat", recording.frames
-        if frames is None:
-            raise InputError(f"{name}: HDR_mat needs frames to tell its times; add frames")
-        images, t = (images[None], frames.t[-1:]) if images.ndim == 2 else (images, frames.t)
-        kind = frames.images.dtype
-        white = 1.0 if kind.kind == "f" else float(np.iinfo(kind).max)
-    else:
-        raise InputError(
-            f"{name}: holds no HDR reference; add hdr (T, H, W) and hdr_t, or choose the protocol "
-            "'held-out'"
-        )
-    if images.shape != (len(t), *size) or not len(t):
-        raise InputError(
-            f"{name}: {what} has the shape {images.shape}; its {len(t)} times and the sensor need "
-            f"({len(t)}, {size[0]}, {size[1]})"
-        )
-    if images.dtype.kind != "f" and white is None:
-        raise InputError(
-            f"{name}: {what} is {images.dtype}; store floats of which 1 is the frames' white"
-        )
-    for row in range(len(images)):
-        if (images[row] < 0).any() or np.isinf(images[row]).any():
-            raise InputError(
-                f"{name}: {what} image {row} holds negative or infinite values; store linear "
-                "intensities, NaN where there is none"
-            )
-    bounds = (float(clip[0]), float(clip[1]))
-    none = np.zeros(len(t), np.int64)
-    return recording, Reference(t, images, none, what == "hdr", bounds, white)
-
-
-Protocol = Callable[[Recording], tuple[Recording, Frames]]
-PROTOCOLS: dict[str, Protocol] = {"held-out": held_out, "reference": reference}
 
 # Protocols of other things than images: where they are described and their rows made.
 OTHERS = {"motion": "jaxevent.runs.egomotion_scores", "tracks": "jaxevent.runs.blob_scores"}
@@ -203,24 +85,7 @@ class Named(NamedTuple):
     Params: type[Parameters]
 
 
-# Further measures of an image and the truth, each a number per image. They cost more time, and the
-# first two need an extra.
-MEASURES: dict[str, Callable[..., NDArray[np.float64]]] = {
-    "lpips": lpips,
-    "hdr_quality": hdr_quality,
-    "global_ssim": global_ssim,
-}
-
-
-def _check_measures(names: Iterable[str]) -> None:
-    """Raise `InputError` for unknown measures and for those whose extra is missing."""
-    for name in names:
-        if name not in MEASURES:
-            raise InputError(f"there is no metric {name!r}; {nearest(name, MEASURES)}")
-        if name == "lpips":
-            lpips_weights()
-        if name == "hdr_quality":
-            require("pycvvdp", "hdr")
+_opened = Opened()
 
 
 def find_method(name: str) -> Estimator:
@@ -228,327 +93,6 @@ def find_method(name: str) -> Estimator:
     if name not in METHODS:
         raise InputError(f"there is no method {name!r}; {nearest(name, METHODS)}")
     return METHODS[name]
-
-
-def values_of(params: Parameters) -> dict[str, Any]:
-    """The values as they were given: numbers to 6 digits, lists of them, text, true and false.
-
-    None where JSON has no number.
-    """
-
-    def plain(value: Any) -> Any:
-        if value is None or isinstance(value, str | bool | np.bool_):
-            return bool(value) if isinstance(value, np.bool_) else value
-        if np.ndim(value):
-            return [plain(one) for one in value]
-        return finite(float(f"{float(value):.6g}"))
-
-    return {name: plain(value) for name, value in params.values().items()}
-
-
-def frame_times(frames: Frames, params: FrameParams | External) -> np.ndarray:
-    """When the frames were taken (us) on the events' clock: time stamps plus `clock_offset`.
-
-    The times of a `Reference` on that clock as they are.
-    """
-    if isinstance(frames, Reference) and frames.timed:
-        return frames.t
-    return frames.t + round(float(params.clock_offset) * 1e6)
-
-
-# The scores of one image; those of its regions are nested under "regions".
-Scores = dict[str, float | dict[str, dict[str, float | int]]]
-
-
-def _measures(image: NDArray, truth: NDArray, names: Iterable[str]) -> Scores:
-    """The scores of a hidden frame; intensities are clipped to [0, 1]."""
-    image = np.clip(image, 0, 1)
-    measures = {"mse": mse, "ssim": ssim, **{name: MEASURES[name] for name in names}}
-    if not np.isfinite(image).all():
-        return dict.fromkeys(measures, math.nan)
-    return {name: float(measure(image, truth)) for name, measure in measures.items()}
-
-
-def _hdr_measures(
-    image: NDArray,
-    variance: NDArray | None,
-    truth: NDArray[np.float64],
-    names: Iterable[str],
-    clip: tuple[float, float],
-    I0: float,
-) -> Scores:
-    """The scores of an image against an HDR reference, NaN where there is none."""
-    known = np.isfinite(truth)
-    covered = np.where(known, truth, 0)
-    masks = {name: mask & known for name, mask in regions(covered, *clip).items()}
-    # A hot pixel's events add up until exp(L) overflows; such a pixel is only very bright.
-    shown = np.where(known, np.clip(image.astype(np.float64), -1e30, 1e30), 0)
-    broken = not np.isfinite(shown).all()
-    if broken:
-        shown = np.zeros_like(shown)
-
-    scores: Scores = {
-        "mse": float(mse(shown, covered, known)),
-        "ssim": float(ssim(shown, covered)),
-        "log_mse": float(log_mse(shown, covered, where=known)),
-        "log_ssim": float(log_ssim(shown, covered)),
-    }
-    for name in names:
-        pair = (shown, covered)
-        if name == "lpips":  # it looks at what a display shows
-            pair = tuple(np.clip(part, 0, 1) for part in log_display(shown, covered))
-        scores[name] = float(MEASURES[name](*pair))
-    parts: dict[str, dict[str, float | int]] = {
-        name: {
-            "pixels": int(mask.sum()),
-            "mse": float(mse(shown, covered, mask)),
-            "log_mse": float(log_mse(shown, covered, where=mask)),
-        }
-        for name, mask in masks.items()
-    }
-    if variance is not None:
-        # L = ln(I + I0) cannot be known better than I is rounded.
-        least = max(float(np.finfo(image.dtype).eps) * I0, 1e-12)
-        L, true_L = (np.log(np.maximum(part + I0, least)) for part in (shown, covered))
-        usable = np.isfinite(variance) & (variance > 0)
-        z2 = (L - true_L) ** 2 / np.where(usable, variance, 1).astype(np.float64)
-
-        def over(mask: NDArray[np.bool_], mean: Callable[[NDArray], Any]) -> float:
-            values = z2[mask & usable]
-            return float(mean(values)) if len(values) else math.nan
-
-        scores["z2"], scores["z2_median"] = over(known, np.mean), over(known, np.median)
-        for name, mask in masks.items():
-            parts[name]["z2"] = over(mask, np.mean)
-    if broken:
-        scores = dict.fromkeys(scores, math.nan)
-        parts = {
-            name: {**dict.fromkeys(part, math.nan), "pixels": part["pixels"]}
-            for name, part in parts.items()
-        }
-    return {**scores, "regions": parts}
-
-
-def _listed(scores: list[Scores]) -> dict[str, Any]:
-    """One list per measure of the values of all images, None for what is not a number."""
-    if not scores:
-        return {}
-
-    def gather(values: list[Any]) -> Any:
-        if isinstance(values[0], dict):
-            return {name: gather([value[name] for value in values]) for name in values[0]}
-        return [finite(value) for value in values]
-
-    return gather(scores)
-
-
-def _means(per_frame: Mapping[str, Any]) -> dict[str, Any]:
-    """The means over images of what `per_frame` lists; regions' over pixels."""
-
-    def mean(values: list[float | None], weights: list[int] | None = None) -> float | None:
-        numbers = np.array([math.nan if value is None else value for value in values])
-        weight = np.ones(len(values)) if weights is None else np.array(weights)
-        counted = weight > 0
-        if not counted.any():
-            return None
-        return finite(float(np.average(numbers[counted], weights=weight[counted])))
-
-    means: dict[str, Any] = {}
-    for name, values in per_frame.items():
-        if name == "regions":
-            total = sum(sum(part["pixels"]) for part in values.values())
-            means[name] = {
-                region: {
-                    "share": sum(part["pixels"]) / total if total else None,
-                    **{k: mean(v, part["pixels"]) for k, v in part.items() if k != "pixels"},
-                }
-                for region, part in values.items()
-            }
-        elif name != "t":
-            means[name] = mean(values)
-    return means
-
-
-def subset(row: Mapping[str, Any], frames: ArrayLike) -> dict[str, Any]:
-    """The row of `score` had only some of its images been asked for; nothing is reconstructed.
-
-    `frames` is a mask over the images, bool, or their numbers. `seconds` stays that of all. Raises
-    `InputError` for numbers that there are not and for a mask of another length.
-    """
-    count = len(row["per_frame"]["t"])
-    chosen = np.asarray(frames)
-    try:
-        rows = np.arange(count)[chosen if chosen.size or chosen.dtype == bool else []].ravel()
-    except IndexError as error:
-        raise InputError(
-            f"the images of a row of {count} cannot be chosen by {chosen.dtype} of shape "
-            f"{chosen.shape} ({error}); give a mask of that length or numbers below it"
-        ) from None
-
-    def cut(part: Any) -> Any:
-        if isinstance(part, Mapping):
-            return {name: cut(value) for name, value in part.items()}
-        return [part[i] for i in rows]
-
-    per_frame = cut(row["per_frame"])
-    return {**row, **_means(per_frame), "frames": len(rows), "per_frame": per_frame}
-
-
-@dataclasses.dataclass(frozen=True)
-class Sample:
-    """One of the images asked for, at `t` (us, as stamped), and the truth, NaN where unknown."""
-
-    t: int
-    image: NDArray[np.floating]
-    truth: NDArray[np.floating]
-    hdr: bool
-
-
-def score(
-    recording: Recording,
-    method: Estimator | External,
-    params: FrameParams | None = None,
-    protocol: str = "held-out",
-    *,
-    metrics: Iterable[str] = (),
-    normalise: Normalise = "none",
-    progress: bool = False,
-) -> dict[str, Any]:
-    """Reconstruct the images that `protocol` asks for, and compare: one row of a table of results.
-
-    Memory does not grow with the recording's length. With "held-out" intensities are clipped to
-    [0, 1] before they are compared. `mse`, `ssim` and those of `metrics` (names in `MEASURES`) are
-    means over the images. `seconds` is the time of reconstructing and reading images, with
-    compilation but without scoring. What is not a number is None. `per_frame` lists t (us, as
-    stamped) and every measure of every image.
-
-    Rows of "reference" have also `log_mse` and `log_ssim`; `clip`, the bounds of the `regions`
-    "bright", "dark" and "well"; and of each of those its `share` of all pixels and, over its pixels
-    of all images, `mse` and `log_mse`. Where the method estimates a variance, `z2` is the mean of
-    (error of ln(I + I0))^2 / variance, over all pixels and in each region, 1 for honest variances,
-    and `z2_median` the mean over images of its median, then 0.45 if errors are Gaussian. "lpips" is
-    that of ln(I + 0.003), clipped to the truth's range.
-
-    With `normalise` "affine", which is then in the row, the brightness of each image is fitted to
-    the truth first (`external.fit_brightness`), and no variance is judged. Of `External` images,
-    taken for those of `recording.name`, `missing` is how many were asked for in vain, and `seconds`
-    is None.
-
-    Raises `InputError` for a recording that the protocol or the method cannot use, for unknown
-    metrics and for those whose extra is missing.
-    """
-    check_normalise(normalise)
-    return _score(recording, method, params, protocol, metrics, normalise, progress)[0]
-
-
-def _score(
-    recording: Recording,
-    method: Estimator | External,
-    params: FrameParams | None,
-    protocol: str,
-    metrics: Iterable[str],
-    normalise: str,
-    progress: bool,
-    name: str | None = None,
-) -> tuple[dict[str, Any], Sample | None]:
-    """As `score`, with the middle one of the images; `name` is by which images are found."""
-    if protocol not in PROTOCOLS:
-        raise InputError(f"there is no protocol {protocol!r}; {nearest(protocol, PROTOCOLS)}")
-    names = list(metrics)
-    _check_measures(names)
-    given, hidden = PROTOCOLS[protocol](recording)
-    hdr = hidden if isinstance(hidden, Reference) else None
-    clock = time.perf_counter()
-    seconds, estimated = 0.0, False  # whether the method estimates a variance
-    values: dict[str, Any]
-    if isinstance(method, External):
-        estimates = _external(given, hidden, method, name or recording.name)
-        values, I0 = method.values(), 0.0
-    else:
-        chosen: FrameParams = params or method.Params()
-        estimates = _estimates(given, hidden, method, chosen, progress)
-        values, I0 = values_of(chosen), float(chosen.I0)
-    scores: list[Scores] = []
-    t: list[int] = []
-    sample: Sample | None = None
-    for first, images, variances in estimates:
-        seconds += time.perf_counter() - clock
-        if hdr is None:
-            truths = hidden[first : first + len(images)].intensity
-        else:
-            truths = np.stack([hdr.truth(row) for row in range(first, first + len(images))])
-            if not scores:
-                estimated = normalise == "none" and not np.isnan(variances).all()
-        for row, (image, variance, truth) in enumerate(
-            zip(images, variances, truths, strict=True), first
-        ):
-            if normalise == "affine":
-                image = fit_brightness(image, truth)
-            if hdr is None:
-                scores.append(_measures(image, truth, names))
-            else:
-                P = variance if estimated else None
-                scores.append(_hdr_measures(image, P, truth, names, hdr.clip, I0))
-            t.append(int(hidden.t[row]))
-            if row == len(hidden) // 2:
-                sample = Sample(t[-1], image, truth, hdr is not None)
-        clock = time.perf_counter()
-    external = isinstance(method, External)
-    per_frame = {"t": t, **_listed(scores)}
-    row = {
-        "recording": recording.name,
-        "method": method.name,
-        **_means(per_frame),
-        **({} if hdr is None else {"clip": list(hdr.clip)}),
-        "frames": len(scores),
-        **({"missing": len(hidden) - len(scores)} if external else {}),
-        "events": len(recording.events),
-        "seconds": None if external else seconds,
-        **({} if normalise == "none" else {"normalise": normalise}),
-        "params": values,
-        "per_frame": per_frame,
-    }
-    return row, sample
-
-
-# The number of the first image, and some images with their variances, each (images, height, width).
-Estimates = Iterator[tuple[int, NDArray[np.floating], NDArray[np.floating]]]
-
-
-def _estimates(
-    given: Recording, hidden: Frames, method: Estimator, params: FrameParams, progress: bool
-) -> Estimates:
-    video = method.reconstruct(given, params, progress=progress, devices=local())
-    first = 0
-    for _, images, variances in video.batches(frame_times(hidden, params)):
-        yield first, images, variances
-        first += len(images)
-
-
-def _external(given: Recording, hidden: Frames, method: External, name: str) -> Estimates:
-    series = method.find(name)
-    times = frame_times(hidden, method)
-    shape = (given.height, given.width)
-    found = False
-    for row, place in method.nearest(series, times):
-        image = series.read(place)
-        if image.shape != shape:
-            raise InputError(
-                f"{method.images}: the image at {series.t[place]} us of {name} has the size "
-                f"{image.shape[1]}x{image.shape[0]}; the sensor has {shape[1]}x{shape[0]} pixels"
-            )
-        found = True
-        yield row, image[None], np.full((1, *shape), np.nan)
-    if not found:
-        after = np.searchsorted(series.t, times)
-        gap = min(
-            int(np.abs(series.t[(after - back).clip(0, len(series.t) - 1)] - times).min())
-            for back in (0, 1)
-        )
-        raise InputError(
-            f"{method.images}: no image of {name} is within {method.tolerance:g} s of those asked "
-            f"for (the nearest is {gap / 1e6:g} s away); correct the times or raise tolerance"
-        )
 
 
 def evaluate(
@@ -633,7 +177,7 @@ def _tasks(plan: "Plan", folder: Path | None, progress: bool, here: bool) -> lis
 
     Tasks that are run `here` show a bar of their own.
     """
-    contents = None if folder is None else _Contents(folder / "contents", progress)
+    contents = None if folder is None else Contents(folder / "contents", progress)
     double = jnp.result_type(float) == jnp.float64
     tasks: list[Task] = []
     for (given, path), entry in itertools.product(plan.recordings, plan.methods):
@@ -704,7 +248,7 @@ def _compute(
         source = External(**params) if method == "external" else find_method(method)
         values = None if isinstance(source, External) else source.Params.of(params)
         name = _name(Path(path))
-        row, sample = _score(
+        row, sample = score_and_sample(
             recording, source, values, protocol, metrics, normalise, progress, name
         )
     return {"row": row, "picture": None if sample is None else picture(sample)}
@@ -713,153 +257,6 @@ def _compute(
 def _name(path: Path) -> str:
     """How other programs' results call a recording: its name without suffix."""
     return path.name if path.is_dir() else path.stem
-
-
-class _Opened(threading.local):
-    """The recording last loaded: methods are run on it one after another."""
-
-    def __init__(self):
-        self.clear()
-
-    def clear(self) -> None:
-        self._last: tuple[Any, Recording | InputError | None] = (None, None)
-
-    def load(self, path: Path, size: tuple[int, int] | None, progress: bool) -> Recording:
-        size = None if size is None else (size[0], size[1])
-        what = (path, size, [_stamp(file) for file in _files(path)])
-        before, loaded = self._last
-        if loaded is None or before != what:
-            self.clear()
-            try:
-                loaded = load(path, size, in_memory=False, progress=progress)
-                loaded = dataclasses.replace(loaded, name=str(path))  # for messages
-            except InputError as error:
-                loaded = error
-            self._last = what, loaded
-        if isinstance(loaded, InputError):
-            raise InputError(str(loaded))
-        return loaded
-
-
-_opened = _Opened()
-
-
-def _files(path: Path) -> list[Path]:
-    return sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
-
-
-def _stamp(file: Path) -> tuple[str, int, int]:
-    try:
-        about = file.stat()
-    except OSError:
-        return str(file), -1, 0
-    return str(file), about.st_size, about.st_mtime_ns
-
-
-class _Contents:
-    """Hashes of what files and folders hold, kept in a file as long as size and time agree."""
-
-    # A file changed again within the clock's tick (s) after it was read would look unchanged.
-    TICK = 2
-
-    def __init__(self, cache: Path, progress: bool):
-        self.cache, self.progress = cache, progress
-        self.known: dict[str, list] = {}
-        with contextlib.suppress(OSError, ValueError):
-            self.known = dict(json.loads(cache.read_bytes()))
-        self.used: dict[str, list] = {}
-        self.now: dict[Path, str] = {}
-
-    def of(self, path: Path) -> str:
-        """The hash of a file, or of all names and files in a folder; raises OSError."""
-        if path not in self.now:
-            files = _files(path)
-            hashes = [self._of_file(file) for file in files]
-            if path.is_dir():
-                names = [str(file.relative_to(path)) for file in files]
-                text = json.dumps(list(zip(names, hashes, strict=True)))
-                self.now[path] = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
-            else:
-                self.now[path] = hashes[0]
-        return self.now[path]
-
-    def _of_file(self, file: Path) -> str:
-        name, size, changed = _stamp(file)
-        known = self.known.get(name)
-        if isinstance(known, list) and known[:2] == [size, changed]:
-            self.used[name] = known
-            return known[2]
-        digest = hashlib.blake2b(digest_size=16)
-        with (
-            file.open("rb") as opened,
-            tqdm(
-                desc=f"reading {file.name}",
-                total=size,
-                unit="B",
-                unit_scale=True,
-                delay=2,
-                disable=not self.progress,
-                leave=False,
-            ) as bar,
-        ):
-            while block := opened.read(1 << 22):
-                digest.update(block)
-                bar.update(len(block))
-        if time.time_ns() - changed > self.TICK * 10**9:
-            self.used[name] = [size, changed, digest.hexdigest()]
-        return digest.hexdigest()
-
-    def save(self) -> None:
-        known = {**self.known, **self.used}
-        if known != self.known:
-            self.cache.parent.mkdir(exist_ok=True)
-            with complete(self.cache) as partial:
-                partial.write_text(json.dumps(known))
-
-
-Write = Callable[[str, bytes], None]
-
-
-def write_rows(
-    rows: Iterable[dict[str, Any]],
-    write: Write,
-    table: Callable[[list[dict[str, Any]]], str] = markdown_table,
-) -> None:
-    """Write results.json and results.md by a function that `results` gives."""
-    rows = list(rows)
-    text = json.dumps({"rows": rows}, indent=1, allow_nan=False) + "\n"
-    write("results.json", text.encode())
-    write("results.md", table(rows).encode())
-
-
-@contextlib.contextmanager
-def results(folder: Path) -> Iterator[Write]:
-    """Open a folder for results, made if missing; gives the function `write(name, content)`.
-
-    A folder made here is removed again if the block raises, unless it holds finished tasks. Raises
-    `InputError` if the folder cannot be made.
-    """
-    made = not folder.exists()
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{folder}: the folder cannot be made ({error.strerror}); choose a place for a new "
-            "folder in an existing, writable one"
-        ) from None
-
-    def write(name: str, content: bytes) -> None:
-        with complete(folder / name) as partial:
-            partial.write_bytes(content)
-
-    try:
-        if not os.access(folder, os.W_OK):  # before hours of computing
-            raise InputError(f"{folder}: is not writable; choose another folder")
-        yield write
-    except BaseException:
-        if made and not any(folder.glob("tasks/*.json")):
-            shutil.rmtree(folder, ignore_errors=True)
-        raise
 
 
 @dataclasses.dataclass(frozen=True)
@@ -934,7 +331,7 @@ def read_plan(config: Path) -> Plan:
         metrics = table.get("metrics", [])
         if not (isinstance(metrics, list) and all(isinstance(name, str) for name in metrics)):
             raise InputError(f'metrics is {metrics!r}; give a list of names, as ["lpips"]')
-        _check_measures(metrics)
+        check_measures(metrics)
         recordings = find_recordings(table.get("recordings"), config.parent)
         return Plan(
             recordings,
@@ -946,27 +343,6 @@ def read_plan(config: Path) -> Plan:
         )
     except InputError as error:
         raise InputError(f"{config}: {error}") from None
-
-
-def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path]]:
-    if not (isinstance(given, list) and given and all(isinstance(one, str) for one in given)):
-        raise InputError('recordings is missing or not a list; give recordings = ["file.zip", ...]')
-    found: dict[Path, str] = {}
-    for text in given:
-        expanded = os.path.expanduser(os.path.expandvars(text))
-        unset = re.search(r"\$(\w+|\{[^}]*\})", expanded)
-        if unset and not (folder / expanded).exists():
-            name = unset.group(1).strip("{}")
-            raise InputError(f"the recording {text!r} needs the variable {name}, which is not set")
-        if not glob.has_magic(expanded) or (folder / expanded).exists():
-            found.setdefault(folder / expanded, text)
-            continue
-        matches = sorted(glob.glob(expanded, root_dir=folder, recursive=True))
-        if not matches:
-            raise InputError(f"no recording matches {text!r} in {folder}; correct the pattern")
-        for match in matches:
-            found.setdefault(folder / match, match)
-    return [(text, path) for path, text in found.items()]
 
 
 def _methods(
@@ -1021,34 +397,7 @@ def _entries(
         yield Entry(f"{label}{said}{fitted}", method, chosen, normalise)
 
 
-def read_params(kind: type[P], name: str, given: Any, folder: Path) -> P:
-    """Params of a method as a configuration gives them: a table, a TOML file's path, or both.
-
-    Paths are relative to `folder`. Raises `InputError` for anything else and naming a bad setting.
-    """
-
-    def load_file(path: str) -> P:
-        return kind.load(folder / os.path.expandvars(path), name)
-
-    if isinstance(given, str):
-        return load_file(given)
-    if not isinstance(given, dict):
-        raise InputError(f"params is {given!r}; give a table or the path of a TOML file")
-    values = dict(given)
-    file = values.pop("file", None)
-    if file is None:
-        return kind.of(values)
-    if not isinstance(file, str):
-        raise InputError(f"file is {file!r}; give the path of a TOML file")
-    return kind.of({**load_file(file).values(), **values})
-
-
 def _refuse_unknown(table: Mapping[str, Any], known: tuple[str, ...]) -> None:
     for name in table:
         if name not in known:
             raise InputError(f"there is no setting {name!r}; {nearest(name, known)}")
-
-
-def finite(value: float | int) -> float | int | None:
-    """The value, None where JSON has no number."""
-    return value if math.isfinite(value) else None

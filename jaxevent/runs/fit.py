@@ -44,7 +44,6 @@ import hashlib
 import io
 import json
 import math
-import re
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -64,15 +63,24 @@ from jaxevent.reconstruction import METHODS
 from jaxevent.reconstruction.augment import PREPARED, FrameParams
 from jaxevent.reconstruction.filtering import Estimator
 from jaxevent.recording import Recording
-from jaxevent.runs.evaluate import (
-    PROTOCOLS,
+from jaxevent.runs import toml
+from jaxevent.runs.config import (
+    NAME,
+    NATURAL,
+    NOT_NEGATIVE,
+    PATHS,
+    POSITIVE,
+    SIZE,
+    Check,
+    check,
     find_recordings,
+    is_number,
+    is_texts,
+    one_of,
     read_params,
-    results,
-    score,
-    subset,
-    write_rows,
 )
+from jaxevent.runs.contents import fingerprint
+from jaxevent.runs.protocols import PROTOCOLS
 from jaxevent.runs.reconstruction import (
     ERRORS,
     REGIONS,
@@ -80,6 +88,8 @@ from jaxevent.runs.reconstruction import (
     Problem,
     parts,
 )
+from jaxevent.runs.results import results, write_rows
+from jaxevent.runs.scores import score, subset
 from jaxevent.show.report import markdown_table
 from jaxevent.splits import SPLITS, interleave
 from jaxevent.tuning import (
@@ -249,7 +259,6 @@ def unseen(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 Sources = Mapping[str, Sequence[tuple[str, Recording]]]  # (as given, recording) by split
 Shares = tuple[int, ...] | None  # of fit, validation, test; None: they have their own recordings
-Check = tuple[Callable[[Any], bool], str]  # of a setting: what is accepted, and how to say so
 
 
 @runtime_checkable
@@ -420,58 +429,26 @@ class Plan:
                 for task in self.tasks:
                     files += task.goal.files(path)
                 for file in filter(Path.is_file, files):
-                    _fingerprint(file, digest.update)
+                    fingerprint(file, digest.update)
         return digest.hexdigest()
 
 
-def _fingerprint(path: Path, update: Callable[[bytes], None]) -> None:
-    """The file's name, size and content; of a large file 64 pieces of 1 MiB."""
-    size, piece = path.stat().st_size, 1 << 20
-    update(f"{path.name} {size}".encode())
-    step = max(piece, size // 64)
-    with path.open("rb") as file:
-        for first in range(0, size, step):
-            file.seek(first)
-            update(file.read(piece))
-
-
-def _text(value: Any) -> bool:
-    return isinstance(value, str)
-
-
-def _texts(value: Any) -> bool:
-    return isinstance(value, list) and all(map(_text, value))
-
-
-def _number(value: Any) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)
-
-
-def _natural(value: Any) -> bool:
-    return type(value) is int and value > 0
-
-
-_POSITIVE = (lambda value: _number(value) and value > 0, "a positive number")
-_NOT_NEGATIVE = (lambda value: _number(value) and value >= 0, "a number, 0 or more")
-_NATURAL = (_natural, "a whole number, 1 or more")
-_NAME = (_text, "text")
-_PATHS = (_texts, 'a list of paths, as ["file.zip"]')
 _SETTINGS: dict[str, Check] = {
-    "iterations": _NATURAL,
-    "learning_rate": _POSITIVE,
-    "patience": _NATURAL,
-    "every": _NATURAL,
-    "starts": _NATURAL,
-    "spread": _NOT_NEGATIVE,
-    "rounds": _NATURAL,
-    "batch": _NATURAL,
+    "iterations": NATURAL,
+    "learning_rate": POSITIVE,
+    "patience": NATURAL,
+    "every": NATURAL,
+    "starts": NATURAL,
+    "spread": NOT_NEGATIVE,
+    "rounds": NATURAL,
+    "batch": NATURAL,
     "seed": (lambda value: type(value) is int and value >= 0, "a whole number, 0 or more"),
 }
 _COMMON: dict[str, Check] = {
     **_SETTINGS,
-    "recordings": _PATHS,
-    "validation": _PATHS,
-    "test": _PATHS,
+    "recordings": PATHS,
+    "validation": PATHS,
+    "test": PATHS,
     "split": (
         lambda value: (
             isinstance(value, list)
@@ -481,11 +458,8 @@ _COMMON: dict[str, Check] = {
         ),
         "[fit, validation, test] in whole numbers, the first not 0",
     ),
-    "size": (
-        lambda value: isinstance(value, list) and len(value) == 2 and all(map(_natural, value)),
-        "[width, height] in pixels",
-    ),
-    "window": _POSITIVE,
+    "size": SIZE,
+    "window": POSITIVE,
     "method": (
         lambda value: isinstance(value, list) and all(isinstance(n, dict) for n in value),
         '[[method]] with name = "akf"',
@@ -493,36 +467,21 @@ _COMMON: dict[str, Check] = {
 }
 _METHOD: dict[str, Check] = {
     **{name: _SETTINGS[name] for name in ("learning_rate", "iterations", "starts")},
-    "name": _NAME,
-    "label": _NAME,
+    "name": NAME,
+    "label": NAME,
     "params": (lambda value: isinstance(value, str | dict), "a table or the path of a TOML file"),
-    "fit": (_texts, 'a list of names, as ["c_on", "c_off"]'),
+    "fit": (is_texts, 'a list of names, as ["c_on", "c_off"]'),
     "search": (
         lambda value: (
             isinstance(value, dict)
             and all(
-                isinstance(v, list) and len(v) == 3 and all(map(_number, v)) and type(v[2]) is int
+                isinstance(v, list) and len(v) == 3 and all(map(is_number, v)) and type(v[2]) is int
                 for v in value.values()
             )
         ),
         "a table of name = [from, to, number of points]",
     ),
 }
-
-
-def _check(table: Mapping[str, Any], known: Mapping[str, Check]) -> None:
-    for name, value in table.items():
-        if name not in known:
-            raise InputError(f"there is no setting {name!r}; {nearest(name, known)}")
-        accepts, text = known[name]
-        if not accepts(value):
-            raise InputError(f"{name} is {str(value)[:60]!r}; give {text}")
-
-
-def one_of(value: str, what: str, known: Sequence[str]) -> str:
-    if value not in known:
-        raise InputError(f"there is no {what} {value!r}; {nearest(value, known)}")
-    return value
 
 
 def read_plan(config: Path, recordings: Sequence[str | Path] | None = None) -> Plan:
@@ -534,12 +493,12 @@ def read_plan(config: Path, recordings: Sequence[str | Path] | None = None) -> P
     try:
         known = systems()
         further = {k: v for one in known.values() for k, v in one.settings.items()}
-        _check(table, {**_COMMON, **further})
+        check(table, {**_COMMON, **further})
         text = config.read_bytes()
         folders = dict.fromkeys(SPLITS, config.parent)
         if recordings:
             table = {**table, "recordings": [str(Path(one).absolute()) for one in recordings]}
-            text = _dump(table).encode()
+            text = toml.dump(table).encode()
         found = {
             split: find_recordings(table[key], folders[split]) if table.get(key) else []
             for split, key in zip(SPLITS, ("recordings", "validation", "test"), strict=True)
@@ -588,7 +547,7 @@ def _task(
     name = entry.get("name")
     system = known.get(name) if isinstance(name, str) else None
     own = (one for one in known.values() if system in (one, None))
-    _check(entry, {**_METHOD, **{k: one.settings[k] for one in own for k in one.own}})
+    check(entry, {**_METHOD, **{k: one.settings[k] for one in own for k in one.own}})
     if name is None:
         raise InputError('a method has no name; give name = "akf"')
     if system is None:
@@ -616,19 +575,19 @@ class _Reconstructions:
     """The system of the methods of `jaxevent.METHODS`."""
 
     settings: dict[str, Check] = {
-        "loss": _NAME,
-        "protocol": _NAME,
-        "error": _NAME,
-        "dark_offset": _POSITIVE,
+        "loss": NAME,
+        "protocol": NAME,
+        "error": NAME,
+        "dark_offset": POSITIVE,
         "weights": (
             lambda value: (
                 isinstance(value, dict)
                 and set(value) <= set(REGIONS)
-                and all(_number(n) and n >= 0 for n in value.values())
+                and all(is_number(n) and n >= 0 for n in value.values())
             ),
             "a table of numbers named dark, well, bright",
         ),
-        "warm_up": _NOT_NEGATIVE,
+        "warm_up": NOT_NEGATIVE,
     }
     own = ("loss", "error")
 
@@ -764,37 +723,8 @@ def _curves(tasks: Sequence[Task], done: Sequence[Fitted]) -> bytes:
 
 
 def _tables(tasks: Sequence[Task], done: Sequence[Fitted]) -> str:
-    """params.toml: physical values with all their digits, a table for each method."""
-    lines = []
-    for task, one in zip(tasks, done, strict=True):
-        lines.append(f"[{_key(task.label)}]")
-        for name, value in one.params.values().items():
-            if name in one.params.numbers:
-                digits = np.asarray(getattr(one.params, name))
-                value = np.array([float(str(n)) for n in digits.ravel()]).reshape(digits.shape)
-                value = value.tolist()
-            lines.append(f"{name} = {_value_of(value)}")
-        lines.append("")
-    return "\n".join(lines)
-
-
-def _dump(table: Mapping[str, Any]) -> str:
-    """A configuration as TOML."""
-    lines = [f"{_key(k)} = {_value_of(v)}" for k, v in table.items() if k != "method"]
-    for entry in table.get("method", []):
-        lines += ["", "[[method]]", *(f"{_key(k)} = {_value_of(v)}" for k, v in entry.items())]
-    return "\n".join(lines) + "\n"
-
-
-def _key(name: str) -> str:
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
-
-
-def _value_of(value: Any) -> str:
-    """A value as TOML writes it."""
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{_key(k)} = {_value_of(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_value_of, value)) + "]"
-    # JSON's text and numbers are TOML's, but for NaN and infinity.
-    return repr(value) if isinstance(value, float) else json.dumps(value)
+    """params.toml: a table for each method."""
+    pairs = zip(tasks, done, strict=True)
+    return "\n".join(
+        f"[{toml.key(task.label)}]\n{toml.parameters(one.params)}\n" for task, one in pairs
+    )

@@ -22,7 +22,7 @@ from jaxevent.reconstruction.augment import PREPARED, FrameParams
 from jaxevent.reconstruction.filtering import Estimator, Filter
 from jaxevent.reconstruction.pixels import Numeric, over_pixels, pixel_mesh
 from jaxevent.recording import Frames, Recording
-from jaxevent.runs.evaluate import PROTOCOLS, Reference, frame_times
+from jaxevent.runs.protocols import PROTOCOLS, Reference, frame_times
 from jaxevent.splits import interleave
 
 ERRORS = ("linear", "log", "nll")
@@ -170,7 +170,7 @@ def parts(
 ) -> list[Part]:
     """Cut a recording into windows of `window` seconds (None: one part, the whole).
 
-    The true images are those that the protocol hides (`jaxevent.runs.evaluate.PROTOCOLS`), shared
+    The true images are those that the protocol hides (`jaxevent.runs.protocols.PROTOCOLS`), shared
     out by `interleave`. A window's images are those stamped in it; it is prepared from `warm_up`
     seconds more on either side: a filter needs them before to forget its initial state, and the
     augmented frame and the smoother use frames after. Windows without events or frames are left

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from jaxevent.errors import InputError
-from jaxevent.io.output import complete, complete_hdf5
+from jaxevent.io.output import complete, complete_hdf5, values_of
 from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
 from jaxevent.reconstruction.video import BATCH, Video
 from jaxevent.recording import Recording
-from jaxevent.runs.evaluate import values_of
 from jaxevent.show.report import display_limits, tone_map, video_writer, write_png
 
 

@@ -28,7 +28,8 @@ from jaxevent import cli
 from jaxevent.reconstruction import METHODS
 from jaxevent.reconstruction.video import BATCH
 from jaxevent.recording import Frames, Recording
-from jaxevent.runs.evaluate import evaluate, score
+from jaxevent.runs.evaluate import evaluate
+from jaxevent.runs.scores import score
 
 SEVERAL = """
 recordings = ["*.h5"]
@@ -198,7 +199,7 @@ def test_errors_of_other_kinds_are_rows_too(tmp_path, monkeypatch):
         raise ZeroDivisionError("by zero")
 
     jaxevent.save(small(), tmp_path / "small.h5")
-    monkeypatch.setitem(jaxevent.runs.evaluate.MEASURES, "global_ssim", broken)
+    monkeypatch.setitem(jaxevent.runs.scores.MEASURES, "global_ssim", broken)
     config = write_config(tmp_path, 'metrics = ["global_ssim"]\n' + ONE)
     with pytest.raises(jaxevent.InputError, match="^ZeroDivisionError: by zero$"):
         evaluate(config, tmp_path / "out")

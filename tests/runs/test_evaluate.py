@@ -11,13 +11,15 @@ from noise import CLIP, HEIGHT, ONE, STAMPS, WIDTH, grey, hdr_recording, small, 
 from numpy.typing import NDArray
 
 import jaxevent
-import jaxevent.runs.evaluate
+import jaxevent.runs.scores
 from jaxevent import metrics
+from jaxevent.io.output import values_of
 from jaxevent.reconstruction import METHODS
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.filtering import State
 from jaxevent.recording import Events
-from jaxevent.runs.evaluate import evaluate, score, subset, values_of
+from jaxevent.runs.evaluate import evaluate
+from jaxevent.runs.scores import score, subset
 
 
 @pytest.fixture
@@ -63,7 +65,7 @@ def test_hidden_frames_are_never_seen(monkeypatch):
         seen[-1].append(image)
         return metrics.mse(image, truth)
 
-    monkeypatch.setattr(jaxevent.runs.evaluate, "mse", record)
+    monkeypatch.setattr(jaxevent.runs.scores, "mse", record)
     rows = []
     for recording in (small(), other):
         seen.append([])
@@ -411,8 +413,8 @@ def test_further_metrics_are_those_of_each_image(folder, monkeypatch):
         seen.append((image, truth))
         return metrics.mse(image, truth)
 
-    monkeypatch.setitem(jaxevent.runs.evaluate.MEASURES, "lpips", fake)
-    monkeypatch.setattr(jaxevent.runs.evaluate, "lpips_weights", lambda: None)
+    monkeypatch.setitem(jaxevent.runs.scores.MEASURES, "lpips", fake)
+    monkeypatch.setattr(jaxevent.runs.scores, "lpips_weights", lambda: None)
     row = score(small(), METHODS["blend"], metrics=["global_ssim", "lpips"])
     truth, between = blended_by_hand()
     np.testing.assert_allclose(

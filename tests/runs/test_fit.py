@@ -32,9 +32,10 @@ from jaxevent.parameters import Number, Parameters, Positive
 from jaxevent.reconstruction import METHODS
 from jaxevent.reconstruction.filtering import Estimator, Filter
 from jaxevent.recording import Events, Frames, Recording
-from jaxevent.runs.evaluate import Reference, held_out, score
 from jaxevent.runs.fit import fit
+from jaxevent.runs.protocols import Reference, held_out
 from jaxevent.runs.reconstruction import Images, Objective, Problem, parts
+from jaxevent.runs.scores import score
 from jaxevent.splits import interleave
 from jaxevent.tuning import Settings, begin, optimise
 

@@ -1,0 +1,125 @@
+"""What recordings hold: hashes of files, kept, and the recording that was last loaded."""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from jaxevent.errors import InputError
+from jaxevent.io import load
+from jaxevent.io.output import complete
+from jaxevent.progress import bar
+from jaxevent.recording import Recording
+
+
+class Opened(threading.local):
+    """The recording last loaded: methods are run on it one after another."""
+
+    def __init__(self):
+        self.clear()
+
+    def clear(self) -> None:
+        self._last: tuple[Any, Recording | InputError | None] = (None, None)
+
+    def load(self, path: Path, size: tuple[int, int] | None, progress: bool) -> Recording:
+        size = None if size is None else (size[0], size[1])
+        what = (path, size, [_stamp(file) for file in _files(path)])
+        before, loaded = self._last
+        if loaded is None or before != what:
+            self.clear()
+            try:
+                loaded = load(path, size, in_memory=False, progress=progress)
+                loaded = dataclasses.replace(loaded, name=str(path))  # for messages
+            except InputError as error:
+                loaded = error
+            self._last = what, loaded
+        if isinstance(loaded, InputError):
+            raise InputError(str(loaded))
+        return loaded
+
+
+def _files(path: Path) -> list[Path]:
+    return sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+
+
+def _stamp(file: Path) -> tuple[str, int, int]:
+    try:
+        about = file.stat()
+    except OSError:
+        return str(file), -1, 0
+    return str(file), about.st_size, about.st_mtime_ns
+
+
+class Contents:
+    """Hashes of what files and folders hold, kept in a file as long as size and time agree."""
+
+    # A file changed again within the clock's tick (s) after it was read would look unchanged.
+    TICK = 2
+
+    def __init__(self, cache: Path, progress: bool | None):
+        self.cache, self.progress = cache, progress
+        self.known: dict[str, list] = {}
+        with contextlib.suppress(OSError, ValueError):
+            self.known = dict(json.loads(cache.read_bytes()))
+        self.used: dict[str, list] = {}
+        self.now: dict[Path, str] = {}
+
+    def of(self, path: Path) -> str:
+        """The hash of a file, or of all names and files in a folder; raises OSError."""
+        if path not in self.now:
+            files = _files(path)
+            hashes = [self._of_file(file) for file in files]
+            if path.is_dir():
+                names = [str(file.relative_to(path)) for file in files]
+                text = json.dumps(list(zip(names, hashes, strict=True)))
+                self.now[path] = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+            else:
+                self.now[path] = hashes[0]
+        return self.now[path]
+
+    def _of_file(self, file: Path) -> str:
+        name, size, changed = _stamp(file)
+        known = self.known.get(name)
+        if isinstance(known, list) and known[:2] == [size, changed]:
+            self.used[name] = known
+            return known[2]
+        digest = hashlib.blake2b(digest_size=16)
+        with (
+            file.open("rb") as opened,
+            bar(
+                desc=f"reading {file.name}",
+                total=size,
+                unit="B",
+                unit_scale=True,
+                progress=self.progress,
+            ) as shown,
+        ):
+            while block := opened.read(1 << 22):
+                digest.update(block)
+                shown.update(len(block))
+        if time.time_ns() - changed > self.TICK * 10**9:
+            self.used[name] = [size, changed, digest.hexdigest()]
+        return digest.hexdigest()
+
+    def save(self) -> None:
+        known = {**self.known, **self.used}
+        if known != self.known:
+            self.cache.parent.mkdir(exist_ok=True)
+            with complete(self.cache) as partial:
+                partial.write_text(json.dumps(known))
+
+
+def fingerprint(path: Path, update: Callable[[bytes], None]) -> None:
+    """Feed a hash the file's name, size and content; of a large file 64 pieces of 1 MiB."""
+    size, piece = path.stat().st_size, 1 << 20
+    update(f"{path.name} {size}".encode())
+    step = max(piece, size // 64)
+    with path.open("rb") as file:
+        for first in range(0, size, step):
+            file.seek(first)
+            update(file.read(piece))

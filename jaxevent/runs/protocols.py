@@ -1,0 +1,134 @@
+"""What of a recording a method of reconstruction is given, and which images it is asked for.
+
+"held-out" gives frames 0, 2, 4, ... and asks for images where frames 1, 3, 5, ... are, at their
+time stamps plus the method's `clock_offset`. Images are clipped to [0, 1], the range of the truth,
+before they are scored.
+
+"reference" gives the whole recording and asks for the HDR images that it keeps in
+`Recording.extra`, float linear intensities of which 1 is the frames' white, without clipping:
+
+    hdr      (T, H, W)  with hdr_t (T,), sorted times (us) on the events' clock
+    HDR_mat  (K, H, W)  of the AKF authors' .mat files, used where there is no hdr: at the time of
+                        each of the K frames plus `clock_offset`; a single (H, W) image: of the last
+    clip     (2,)       what the frames record from and to; absent: 0.01, 1
+
+Pixels that are NaN in hdr have no reference. HDR_mat counts in the frames' grey levels (255 is
+white where they are uint8) and is 0 where it has no reference, as the authors' programs have it. In
+the measures of whole images such pixels count as right; regions and mean errors leave them out.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError
+from jaxevent.recording import Frames, Recording, microseconds
+
+
+def held_out(recording: Recording) -> tuple[Recording, Frames]:
+    """The recording with every second frame, and the frames taken out of it.
+
+    Raises `InputError` for fewer than 3 frames and for no events.
+    """
+    frames = recording.frames
+    if frames is None or len(frames) < 3:
+        raise InputError(
+            f"{recording.name}: has {0 if frames is None else len(frames)} frames; hiding every "
+            "second one needs at least 3, so choose a recording with more"
+        )
+    _need_events(recording)
+    return recording.with_frames(slice(0, None, 2)), frames[1::2]
+
+
+def _need_events(recording: Recording) -> None:
+    if not len(recording.events):
+        raise InputError(
+            f"{recording.name}: holds no events, so there is nothing to reconstruct from; choose "
+            "another recording"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Reference(Frames):
+    """HDR reference images, float intensities that may exceed 1; the exposure is not known.
+
+    `timed` says that t is on the events' clock. `clip` is what the frames record from and to.
+    `white` is the value of `images` that is intensity 1; None says so of 1, and NaN of pixels
+    without reference, which are 0 otherwise.
+    """
+
+    timed: bool
+    clip: tuple[float, float]
+    white: float | None = None
+
+    def truth(self, row: int) -> NDArray[np.float64]:
+        """One image (height, width) of intensity, NaN where there is no reference."""
+        image = np.asarray(self.images[row], np.float64)
+        return image if self.white is None else np.where(image == 0, np.nan, image / self.white)
+
+
+def reference(recording: Recording) -> tuple[Recording, Reference]:
+    """The recording itself, and the HDR images in its `extra`; the text of this module has more.
+
+    Raises `InputError` for no or unusable images and for no events.
+    """
+    _need_events(recording)
+    extra, name = recording.extra, recording.name
+    size = (recording.height, recording.width)
+    clip = np.asarray(extra.get("clip", (0.01, 1.0)))
+    if clip.shape != (2,) or clip.dtype.kind not in "iuf" or not clip[0] < clip[1]:
+        raise InputError(f"{name}: clip is {clip.tolist()}; store two intensities, low below high")
+    if "hdr" in extra:
+        images, what, white = extra["hdr"], "hdr", None
+        if "hdr_t" not in extra:
+            raise InputError(f"{name}: hdr has no times; add hdr_t, in us on the events' clock")
+        t = np.atleast_1d(microseconds(extra["hdr_t"], f"{name}: hdr_t"))
+        if t.ndim != 1 or (t[1:] <= t[:-1]).any():
+            raise InputError(f"{name}: hdr_t is not sorted; sort hdr by time, each time once")
+    elif "HDR_mat" in extra:
+        images, what, frames = extra["HDR_mat"], "HDR_mat", recording.frames
+        if frames is None:
+            raise InputError(f"{name}: HDR_mat needs frames to tell its times; add frames")
+        images, t = (images[None], frames.t[-1:]) if images.ndim == 2 else (images, frames.t)
+        kind = frames.images.dtype
+        white = 1.0 if kind.kind == "f" else float(np.iinfo(kind).max)
+    else:
+        raise InputError(
+            f"{name}: holds no HDR reference; add hdr (T, H, W) and hdr_t, or choose the protocol "
+            "'held-out'"
+        )
+    if images.shape != (len(t), *size) or not len(t):
+        raise InputError(
+            f"{name}: {what} has the shape {images.shape}; its {len(t)} times and the sensor need "
+            f"({len(t)}, {size[0]}, {size[1]})"
+        )
+    if images.dtype.kind != "f" and white is None:
+        raise InputError(
+            f"{name}: {what} is {images.dtype}; store floats of which 1 is the frames' white"
+        )
+    for row in range(len(images)):
+        if (images[row] < 0).any() or np.isinf(images[row]).any():
+            raise InputError(
+                f"{name}: {what} image {row} holds negative or infinite values; store linear "
+                "intensities, NaN where there is none"
+            )
+    bounds = (float(clip[0]), float(clip[1]))
+    none = np.zeros(len(t), np.int64)
+    return recording, Reference(t, images, none, what == "hdr", bounds, white)
+
+
+Protocol = Callable[[Recording], tuple[Recording, Frames]]
+PROTOCOLS: dict[str, Protocol] = {"held-out": held_out, "reference": reference}
+
+
+def frame_times(frames: Frames, clock: Any) -> np.ndarray:
+    """When the frames were taken (us) on the events' clock: plus `clock.clock_offset` (s).
+
+    The times of a `Reference` on that clock as they are.
+    """
+    if isinstance(frames, Reference) and frames.timed:
+        return frames.t
+    return frames.t + round(float(clock.clock_offset) * 1e6)

@@ -1,0 +1,57 @@
+"""A folder of results: made or left as it was, files complete or not at all."""
+
+import contextlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from jaxevent.errors import InputError
+from jaxevent.io.output import complete
+from jaxevent.show.report import markdown_table
+
+Write = Callable[[str, bytes], None]
+
+
+def write_rows(
+    rows: Iterable[dict[str, Any]],
+    write: Write,
+    table: Callable[[list[dict[str, Any]]], str] = markdown_table,
+) -> None:
+    """Write results.json and results.md by a function that `results` gives."""
+    rows = list(rows)
+    text = json.dumps({"rows": rows}, indent=1, allow_nan=False) + "\n"
+    write("results.json", text.encode())
+    write("results.md", table(rows).encode())
+
+
+@contextlib.contextmanager
+def results(folder: Path) -> Iterator[Write]:
+    """Open a folder for results, made if missing; gives the function `write(name, content)`.
+
+    A folder made here is removed again if the block raises, unless it holds finished tasks. Raises
+    `InputError` if the folder cannot be made.
+    """
+    made = not folder.exists()
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: the folder cannot be made ({error.strerror}); choose a place for a new "
+            "folder in an existing, writable one"
+        ) from None
+
+    def write(name: str, content: bytes) -> None:
+        with complete(folder / name) as partial:
+            partial.write_bytes(content)
+
+    try:
+        if not os.access(folder, os.W_OK):  # before hours of computing
+            raise InputError(f"{folder}: is not writable; choose another folder")
+        yield write
+    except BaseException:
+        if made and not any(folder.glob("tasks/*.json")):
+            shutil.rmtree(folder, ignore_errors=True)
+        raise

@@ -1,0 +1,346 @@
+"""Images compared with the truth: `score` makes one row of a table of results."""
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxevent.devices import local
+from jaxevent.errors import InputError, require
+from jaxevent.io.output import finite, values_of
+from jaxevent.metrics import (
+    global_ssim,
+    hdr_quality,
+    log_display,
+    log_mse,
+    log_ssim,
+    lpips,
+    lpips_weights,
+    mse,
+    regions,
+    ssim,
+)
+from jaxevent.parameters import nearest
+from jaxevent.reconstruction.augment import FrameParams
+from jaxevent.reconstruction.filtering import Estimator
+from jaxevent.recording import Frames, Recording
+from jaxevent.runs.external import External, Normalise, check_normalise, fit_brightness
+from jaxevent.runs.protocols import PROTOCOLS, Reference, frame_times
+
+# Further measures of an image and the truth, each a number per image. They cost more time, and the
+# first two need an extra.
+MEASURES: dict[str, Callable[..., NDArray[np.float64]]] = {
+    "lpips": lpips,
+    "hdr_quality": hdr_quality,
+    "global_ssim": global_ssim,
+}
+
+
+def check_measures(names: Iterable[str]) -> None:
+    """Raise `InputError` for unknown measures and for those whose extra is missing."""
+    for name in names:
+        if name not in MEASURES:
+            raise InputError(f"there is no metric {name!r}; {nearest(name, MEASURES)}")
+        if name == "lpips":
+            lpips_weights()
+        if name == "hdr_quality":
+            require("pycvvdp", "hdr")
+
+
+# The scores of one image; those of its regions are nested under "regions".
+Scores = dict[str, float | dict[str, dict[str, float | int]]]
+
+
+def _measures(image: NDArray, truth: NDArray, names: Iterable[str]) -> Scores:
+    """The scores of a hidden frame; intensities are clipped to [0, 1]."""
+    image = np.clip(image, 0, 1)
+    measures = {"mse": mse, "ssim": ssim, **{name: MEASURES[name] for name in names}}
+    if not np.isfinite(image).all():
+        return dict.fromkeys(measures, math.nan)
+    return {name: float(measure(image, truth)) for name, measure in measures.items()}
+
+
+def _hdr_measures(
+    image: NDArray,
+    variance: NDArray | None,
+    truth: NDArray[np.float64],
+    names: Iterable[str],
+    clip: tuple[float, float],
+    I0: float,
+) -> Scores:
+    """The scores of an image against an HDR reference, NaN where there is none."""
+    known = np.isfinite(truth)
+    covered = np.where(known, truth, 0)
+    masks = {name: mask & known for name, mask in regions(covered, *clip).items()}
+    # A hot pixel's events add up until exp(L) overflows; such a pixel is only very bright.
+    shown = np.where(known, np.clip(image.astype(np.float64), -1e30, 1e30), 0)
+    broken = not np.isfinite(shown).all()
+    if broken:
+        shown = np.zeros_like(shown)
+
+    scores: Scores = {
+        "mse": float(mse(shown, covered, known)),
+        "ssim": float(ssim(shown, covered)),
+        "log_mse": float(log_mse(shown, covered, where=known)),
+        "log_ssim": float(log_ssim(shown, covered)),
+    }
+    for name in names:
+        pair = (shown, covered)
+        if name == "lpips":  # it looks at what a display shows
+            pair = tuple(np.clip(part, 0, 1) for part in log_display(shown, covered))
+        scores[name] = float(MEASURES[name](*pair))
+    parts: dict[str, dict[str, float | int]] = {
+        name: {
+            "pixels": int(mask.sum()),
+            "mse": float(mse(shown, covered, mask)),
+            "log_mse": float(log_mse(shown, covered, where=mask)),
+        }
+        for name, mask in masks.items()
+    }
+    if variance is not None:
+        # L = ln(I + I0) cannot be known better than I is rounded.
+        least = max(float(np.finfo(image.dtype).eps) * I0, 1e-12)
+        L, true_L = (np.log(np.maximum(part + I0, least)) for part in (shown, covered))
+        usable = np.isfinite(variance) & (variance > 0)
+        z2 = (L - true_L) ** 2 / np.where(usable, variance, 1).astype(np.float64)
+
+        def over(mask: NDArray[np.bool_], mean: Callable[[NDArray], Any]) -> float:
+            values = z2[mask & usable]
+            return float(mean(values)) if len(values) else math.nan
+
+        scores["z2"], scores["z2_median"] = over(known, np.mean), over(known, np.median)
+        for name, mask in masks.items():
+            parts[name]["z2"] = over(mask, np.mean)
+    if broken:
+        scores = dict.fromkeys(scores, math.nan)
+        parts = {
+            name: {**dict.fromkeys(part, math.nan), "pixels": part["pixels"]}
+            for name, part in parts.items()
+        }
+    return {**scores, "regions": parts}
+
+
+def _listed(scores: list[Scores]) -> dict[str, Any]:
+    """One list per measure of the values of all images, None for what is not a number."""
+    if not scores:
+        return {}
+
+    def gather(values: list[Any]) -> Any:
+        if isinstance(values[0], dict):
+            return {name: gather([value[name] for value in values]) for name in values[0]}
+        return [finite(value) for value in values]
+
+    return gather(scores)
+
+
+def _means(per_frame: Mapping[str, Any]) -> dict[str, Any]:
+    """The means over images of what `per_frame` lists; regions' over pixels."""
+
+    def mean(values: list[float | None], weights: list[int] | None = None) -> float | None:
+        numbers = np.array([math.nan if value is None else value for value in values])
+        weight = np.ones(len(values)) if weights is None else np.array(weights)
+        counted = weight > 0
+        if not counted.any():
+            return None
+        return finite(float(np.average(numbers[counted], weights=weight[counted])))
+
+    means: dict[str, Any] = {}
+    for name, values in per_frame.items():
+        if name == "regions":
+            total = sum(sum(part["pixels"]) for part in values.values())
+            means[name] = {
+                region: {
+                    "share": sum(part["pixels"]) / total if total else None,
+                    **{k: mean(v, part["pixels"]) for k, v in part.items() if k != "pixels"},
+                }
+                for region, part in values.items()
+            }
+        elif name != "t":
+            means[name] = mean(values)
+    return means
+
+
+def subset(row: Mapping[str, Any], frames: ArrayLike) -> dict[str, Any]:
+    """The row of `score` had only some of its images been asked for; nothing is reconstructed.
+
+    `frames` is a mask over the images, bool, or their numbers. `seconds` stays that of all. Raises
+    `InputError` for numbers that there are not and for a mask of another length.
+    """
+    count = len(row["per_frame"]["t"])
+    chosen = np.asarray(frames)
+    try:
+        rows = np.arange(count)[chosen if chosen.size or chosen.dtype == bool else []].ravel()
+    except IndexError as error:
+        raise InputError(
+            f"the images of a row of {count} cannot be chosen by {chosen.dtype} of shape "
+            f"{chosen.shape} ({error}); give a mask of that length or numbers below it"
+        ) from None
+
+    def cut(part: Any) -> Any:
+        if isinstance(part, Mapping):
+            return {name: cut(value) for name, value in part.items()}
+        return [part[i] for i in rows]
+
+    per_frame = cut(row["per_frame"])
+    return {**row, **_means(per_frame), "frames": len(rows), "per_frame": per_frame}
+
+
+@dataclasses.dataclass(frozen=True)
+class Sample:
+    """One of the images asked for, at `t` (us, as stamped), and the truth, NaN where unknown."""
+
+    t: int
+    image: NDArray[np.floating]
+    truth: NDArray[np.floating]
+    hdr: bool
+
+
+def score(
+    recording: Recording,
+    method: Estimator | External,
+    params: FrameParams | None = None,
+    protocol: str = "held-out",
+    *,
+    metrics: Iterable[str] = (),
+    normalise: Normalise = "none",
+    progress: bool = False,
+) -> dict[str, Any]:
+    """Reconstruct the images that `protocol` asks for, and compare: one row of a table of results.
+
+    Memory does not grow with the recording's length. With "held-out" intensities are clipped to
+    [0, 1] before they are compared. `mse`, `ssim` and those of `metrics` (names in `MEASURES`) are
+    means over the images. `seconds` is the time of reconstructing and reading images, with
+    compilation but without scoring. What is not a number is None. `per_frame` lists t (us, as
+    stamped) and every measure of every image.
+
+    Rows of "reference" have also `log_mse` and `log_ssim`; `clip`, the bounds of the `regions`
+    "bright", "dark" and "well"; and of each of those its `share` of all pixels and, over its pixels
+    of all images, `mse` and `log_mse`. Where the method estimates a variance, `z2` is the mean of
+    (error of ln(I + I0))^2 / variance, over all pixels and in each region, 1 for honest variances,
+    and `z2_median` the mean over images of its median, then 0.45 if errors are Gaussian. "lpips" is
+    that of ln(I + 0.003), clipped to the truth's range.
+
+    With `normalise` "affine", which is then in the row, the brightness of each image is fitted to
+    the truth first (`external.fit_brightness`), and no variance is judged. Of `External` images,
+    taken for those of `recording.name`, `missing` is how many were asked for in vain, and `seconds`
+    is None.
+
+    Raises `InputError` for a recording that the protocol or the method cannot use, for unknown
+    metrics and for those whose extra is missing.
+    """
+    check_normalise(normalise)
+    return score_and_sample(recording, method, params, protocol, metrics, normalise, progress)[0]
+
+
+def score_and_sample(
+    recording: Recording,
+    method: Estimator | External,
+    params: FrameParams | None,
+    protocol: str,
+    metrics: Iterable[str],
+    normalise: str,
+    progress: bool,
+    name: str | None = None,
+) -> tuple[dict[str, Any], Sample | None]:
+    """As `score`, with the middle one of the images; `name` is by which images are found."""
+    if protocol not in PROTOCOLS:
+        raise InputError(f"there is no protocol {protocol!r}; {nearest(protocol, PROTOCOLS)}")
+    names = list(metrics)
+    check_measures(names)
+    given, hidden = PROTOCOLS[protocol](recording)
+    hdr = hidden if isinstance(hidden, Reference) else None
+    clock = time.perf_counter()
+    seconds, estimated = 0.0, False  # whether the method estimates a variance
+    values: dict[str, Any]
+    if isinstance(method, External):
+        estimates = _external(given, hidden, method, name or recording.name)
+        values, I0 = method.values(), 0.0
+    else:
+        chosen: FrameParams = params or method.Params()
+        estimates = _estimates(given, hidden, method, chosen, progress)
+        values, I0 = values_of(chosen), float(chosen.I0)
+    scores: list[Scores] = []
+    t: list[int] = []
+    sample: Sample | None = None
+    for first, images, variances in estimates:
+        seconds += time.perf_counter() - clock
+        if hdr is None:
+            truths = hidden[first : first + len(images)].intensity
+        else:
+            truths = np.stack([hdr.truth(row) for row in range(first, first + len(images))])
+            if not scores:
+                estimated = normalise == "none" and not np.isnan(variances).all()
+        for row, (image, variance, truth) in enumerate(
+            zip(images, variances, truths, strict=True), first
+        ):
+            if normalise == "affine":
+                image = fit_brightness(image, truth)
+            if hdr is None:
+                scores.append(_measures(image, truth, names))
+            else:
+                P = variance if estimated else None
+                scores.append(_hdr_measures(image, P, truth, names, hdr.clip, I0))
+            t.append(int(hidden.t[row]))
+            if row == len(hidden) // 2:
+                sample = Sample(t[-1], image, truth, hdr is not None)
+        clock = time.perf_counter()
+    external = isinstance(method, External)
+    per_frame = {"t": t, **_listed(scores)}
+    row = {
+        "recording": recording.name,
+        "method": method.name,
+        **_means(per_frame),
+        **({} if hdr is None else {"clip": list(hdr.clip)}),
+        "frames": len(scores),
+        **({"missing": len(hidden) - len(scores)} if external else {}),
+        "events": len(recording.events),
+        "seconds": None if external else seconds,
+        **({} if normalise == "none" else {"normalise": normalise}),
+        "params": values,
+        "per_frame": per_frame,
+    }
+    return row, sample
+
+
+# The number of the first image, and some images with their variances, each (images, height, width).
+Estimates = Iterator[tuple[int, NDArray[np.floating], NDArray[np.floating]]]
+
+
+def _estimates(
+    given: Recording, hidden: Frames, method: Estimator, params: FrameParams, progress: bool
+) -> Estimates:
+    video = method.reconstruct(given, params, progress=progress, devices=local())
+    first = 0
+    for _, images, variances in video.batches(frame_times(hidden, params)):
+        yield first, images, variances
+        first += len(images)
+
+
+def _external(given: Recording, hidden: Frames, method: External, name: str) -> Estimates:
+    series = method.find(name)
+    times = frame_times(hidden, method)
+    shape = (given.height, given.width)
+    found = False
+    for row, place in method.nearest(series, times):
+        image = series.read(place)
+        if image.shape != shape:
+            raise InputError(
+                f"{method.images}: the image at {series.t[place]} us of {name} has the size "
+                f"{image.shape[1]}x{image.shape[0]}; the sensor has {shape[1]}x{shape[0]} pixels"
+            )
+        found = True
+        yield row, image[None], np.full((1, *shape), np.nan)
+    if not found:
+        after = np.searchsorted(series.t, times)
+        gap = min(
+            int(np.abs(series.t[(after - back).clip(0, len(series.t) - 1)] - times).min())
+            for back in (0, 1)
+        )
+        raise InputError(
+            f"{method.images}: no image of {name} is within {method.tolerance:g} s of those asked "
+            f"for (the nearest is {gap / 1e6:g} s away); correct the times or raise tolerance"
+        )
