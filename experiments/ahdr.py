@@ -54,7 +54,7 @@ def quality(recording: jaxevent.Recording, method, params) -> float | None:
     given, reference = PROTOCOLS["reference"](recording)
     assert isinstance(reference, Reference)
     rows = np.arange(0, len(reference), 6)
-    images, _ = method.reconstruct(given, params)(frame_times(reference, params)[rows])
+    images, _, _ = method.estimate(given, params)(frame_times(reference, params)[rows])
     truth = np.stack([reference.truth(int(row)) for row in rows])
     return float(np.mean(jaxevent.metrics.hdr_quality(images, truth)))
 

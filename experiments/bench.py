@@ -182,7 +182,7 @@ def program_seconds(recording: Recording) -> float:
     numbers = (0.1, 5e-4, 0.03, 0.01, 0.01, 7e5, 0.09)
     L, P = program(e.t, e.x, e.y, e.p, grey, f.t, *numbers)
     # The same filter: at the last event of a pixel both must agree.
-    features, out = jaxevent.prepare(recording, [recording.stop + 1_000_000])
+    features, out = jaxevent.akf.prepare(recording, [recording.stop])
     trajectory, end = jax.jit(jaxevent.akf.run)(jaxevent.akf.Params(), features)
     assert np.abs(end.L.reshape(L.shape) - L).max() < 1e-3, "the program is another filter"
     return best(lambda: program(e.t, e.x, e.y, e.p, grey, f.t, *numbers))
@@ -257,7 +257,7 @@ def gradient_seconds(recording: Recording) -> tuple[float, float]:
     # Everything but the parameters is given as an argument, lest it be compiled as constants.
     def loss(raw, features, out, truth):
         params = with_raw(start, raw)
-        image, _ = jaxevent.akf.read(params, jaxevent.akf.run(params, features)[0], out)
+        image, _, _ = jaxevent.akf.read(params, jaxevent.akf.run(params, features)[0], out)
         return ((image - truth) ** 2).mean()
 
     raw = {name: start.raw[name] for name in names}
@@ -290,7 +290,7 @@ def complete_seconds(path: Path) -> tuple[float, float]:
     def run():
         recording = load(path)
         times = np.arange(recording.start, recording.stop, 10_000)
-        for _ in jaxevent.akf.reconstruct(recording, params).batches(times):
+        for _ in jaxevent.akf.estimate(recording, params).batches(times):
             pass
 
     return best(run, 3), reading
@@ -330,7 +330,7 @@ def compilations() -> int:
     def run(seed: int, events: int) -> None:
         recording = stream(events, 1.0 + seed, seed)
         times = np.arange(0, 10**6, 50_000)
-        jaxevent.akf.reconstruct(recording, jaxevent.akf.Params())(times)
+        jaxevent.akf.estimate(recording, jaxevent.akf.Params())(times)
 
     run(0, 300_000)
     jax.monitoring.register_event_duration_secs_listener(listen)
@@ -372,7 +372,7 @@ def reconstruct_long(path: str) -> None:
     recording = load(path, in_memory=False)
     start = time.perf_counter()
     times = np.arange(0, recording.stop, 200_000)
-    for _ in jaxevent.akf.reconstruct(recording, jaxevent.akf.Params()).batches(times):
+    for _ in jaxevent.akf.estimate(recording, jaxevent.akf.Params()).batches(times):
         pass
     seconds = time.perf_counter() - start
     # Not ru_maxrss, which begins at what the process that started this one used.

@@ -28,7 +28,7 @@ def rows(kinds: Iterable[type[Parameters]]) -> list[str]:
 
 
 def page() -> str:
-    methods = (method.Params for method in jaxevent.METHODS.values())
+    methods = (jaxevent.METHODS[name].Params for name in jaxevent.methods.names("reconstruction"))
     blob = jaxevent.blob.Params
     presets = ", ".join(f"`{name}`" for name in blob.presets)
     parts = [

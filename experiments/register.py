@@ -180,7 +180,7 @@ def grid_error(found: NDArray, true: NDArray) -> float:
 def reconstruction_error(recording: Recording, covered: NDArray[np.bool_]) -> float:
     """Mean squared error of ln(I + 0.003) of the AKF, at the times of `extra["hdr_t"]`."""
     params = jaxevent.akf.Params(preset="hdr", c_on=0.2, c_off=0.18)
-    image, _ = jaxevent.akf.reconstruct(recording, params)(recording.extra["hdr_t"])
+    image, _, _ = jaxevent.akf.estimate(recording, params)(recording.extra["hdr_t"])
     truth = np.asarray(recording.extra["hdr"], np.float64)
     error = jaxevent.metrics.log_mse(image.astype(np.float64), truth, where=covered)
     return float(np.mean(error))

@@ -1,8 +1,8 @@
 """Differentiable estimators for event cameras: reconstruction of HDR video from events and frames.
 
 recording = jaxevent.load("slider_depth.zip")
-video = jaxevent.akf.reconstruct(recording, jaxevent.akf.Params(c_on=0.08))
-image, variance = video(recording.frames.t)
+video = jaxevent.akf.estimate(recording, jaxevent.akf.Params(c_on=0.08))
+image, variance, valid = video(recording.frames.t)
 """
 
 import importlib
@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from jaxevent import blob, camera, egomotion, metrics, register, simulate
     from jaxevent.errors import InputError
+    from jaxevent.estimator import Estimate, Estimator
     from jaxevent.io import load, save
+    from jaxevent.methods import METHODS
     from jaxevent.reconstruction import (
-        METHODS,
         akf,
         aks,
         augmented,
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
         high_pass,
         last_frame,
     )
-    from jaxevent.reconstruction.pixels import prepare
     from jaxevent.recording import Events, Frames, Recording
     from jaxevent.runs import fit
 
@@ -36,9 +36,9 @@ _HOME = {
     "jaxevent.errors": ("InputError",),
     "jaxevent.io": ("load", "save"),
     "jaxevent.recording": ("Events", "Frames", "Recording"),
-    "jaxevent.reconstruction.pixels": ("prepare",),
+    "jaxevent.estimator": ("Estimate", "Estimator"),
+    "jaxevent.methods": ("METHODS",),
     "jaxevent.reconstruction": (
-        "METHODS",
         "akf",
         "aks",
         "augmented",
@@ -59,6 +59,8 @@ _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
     "METHODS",
+    "Estimate",
+    "Estimator",
     "Events",
     "Frames",
     "InputError",
@@ -79,7 +81,6 @@ __all__ = [
     "last_frame",
     "load",
     "metrics",
-    "prepare",
     "register",
     "save",
     "simulate",

@@ -123,7 +123,8 @@ class Estimator(abc.ABC, Generic[P]):
             if name not in self.options:
                 known = ", ".join(sorted(self.options)) or "none"
                 raise InputError(
-                    f"the method {self.name!r} has no option {name!r}; leave it out, it knows {known}"
+                    f"the method {self.name!r} has no option {name!r}; leave it out (known: "
+                    f"{known})"
                 )
 
 

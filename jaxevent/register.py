@@ -1003,8 +1003,8 @@ def _alike(
     if not len(rows):
         return
     for alpha in _ALPHAS:
-        video = high_pass.reconstruct(part, high_pass.Params(alpha=alpha), progress=progress)
-        images, _ = video(t[rows])
+        video = high_pass.estimate(part, high_pass.Params(alpha=alpha), progress=progress)
+        images = video(t[rows], extrapolate=True).mean
         for image, row in zip(images, rows, strict=True):
             level = np.log(np.maximum(image + 1, 1e-3))
             yield ndimage.gaussian_filter(level, 0.7), _log_image(other, int(row))[0]

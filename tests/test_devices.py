@@ -20,7 +20,7 @@ import jaxevent
 from jaxevent import devices
 from jaxevent.egomotion.particle_filter import Params
 from jaxevent.errors import InputError
-from jaxevent.reconstruction import METHODS
+from jaxevent.methods import METHODS
 from jaxevent.runs.egomotion import VOTING
 from jaxevent.runs.evaluate import evaluate
 from jaxevent.runs.fit import fit
@@ -89,7 +89,7 @@ def reconstructions(folder: Path) -> dict[str, Any]:
 
     def loss(params):
         trajectory, _ = method.run(params, batch.features)
-        return objective(params, batch), method.read(params, trajectory, batch.out)[0]
+        return objective(params, batch), method.read(params, trajectory, batch.out).mean
 
     (value, images), slope = jax.jit(jax.value_and_grad(loss, has_aux=True))(params)
     found["cf"] = images
@@ -116,7 +116,7 @@ def reconstructions(folder: Path) -> dict[str, Any]:
 def video(folder: Path) -> dict[str, Any]:
     """Images of windows one after another."""
     recording = jaxevent.load(folder / "moving.h5")
-    akf = METHODS["akf"].reconstruct(recording, window_events=4000, devices=devices.local())
+    akf = METHODS["akf"].estimate(recording, window_events=4000, devices=devices.local())
     return {"akf": akf(np.linspace(0.05, 0.45, 5))}
 
 

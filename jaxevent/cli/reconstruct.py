@@ -86,7 +86,7 @@ def run(
     else:
         times = evenly(recording, 100.0 if rate is None else rate)
     clock = time.perf_counter()
-    video = estimator.reconstruct(recording, values, progress=show_progress())
+    video = estimator.estimate(recording, values, progress=show_progress())
     colours = colour_video(video, recording) if colour else None
     how = write(video, times, out, tone or "linear", name, colours)
     seconds = time.perf_counter() - clock

@@ -5,13 +5,7 @@ from jaxevent.reconstruction.direct import augmented, blend, edi, last_frame
 from jaxevent.reconstruction.kalman import akf
 from jaxevent.reconstruction.smoother import aks
 
-METHODS = {
-    method.name: method
-    for method in (akf, aks, cf, cf_augmented, high_pass, edi, augmented, blend, last_frame)
-}
-
 __all__ = [
-    "METHODS",
     "akf",
     "aks",
     "augmented",

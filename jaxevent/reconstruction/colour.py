@@ -6,8 +6,8 @@ reconstruction gets the frames' chrominance (AKF paper, appendix 3), and a camer
 pattern over events and frames, each colour of which is reconstructed on its own:
 
     parts = split_channels(recording)
-    videos = {name: akf.reconstruct(part, params) for name, part in parts.items()}
-    image = join_channels({name: video(times)[0] for name, video in videos.items()})
+    videos = {name: akf.estimate(part, params) for name, part in parts.items()}
+    image = join_channels({name: video(times).mean for name, video in videos.items()})
 """
 
 import dataclasses
@@ -85,9 +85,7 @@ def _colours(rgb: ArrayLike) -> NDArray[np.floating]:
     return colours
 
 
-def colour_video(
-    video: Video[Any], recording: Recording
-) -> Callable[[Times], NDArray[np.floating]]:
+def colour_video(video: Video[Any], recording: Recording) -> Callable[..., NDArray[np.floating]]:
     """A reconstruction in the colours of `recording.extra["rgb"]`: `colour_video(...)(times)`.
 
     `extra["rgb"]`, (frames, H, W, 3) uint8, holds the colours of every one of `recording.frames`,
@@ -121,8 +119,8 @@ def colour_video(
     def chroma(frame: int) -> NDArray[np.floating]:
         return chrominance(table[np.asarray(rgb[frame])], black=black, white=white)
 
-    def colours(times: Times) -> NDArray[np.floating]:
-        image, _ = video(times)
+    def colours(times: Times, extrapolate: bool = False) -> NDArray[np.floating]:
+        image = video(times, extrapolate).mean
         t = np.atleast_1d(microseconds(times))
         place = np.interp(t, frame_t, np.arange(len(frame_t)))
         out = np.empty((*image.shape, 3), image.dtype)

@@ -75,9 +75,11 @@ def _filter(name: str, model: type[Level], params: type[FrameParams], **more: An
     def observe(values: Any, frames: FrameFeatures) -> Pull:
         return Pull(model(values, frames), values.alpha)
 
-    return Filter(name, params, observe, without_variance, advance, jump, **more)
+    return Filter(
+        name, params, observe, without_variance, advance, jump, has_covariance=False, **more
+    )
 
 
-cf = _filter("cf", Held, Params)
-cf_augmented = _filter("cf-augmented", Augmented, AugmentedParams)
-high_pass = _filter("high-pass", Nothing, Params, needs_frames=False)
+cf = _filter("cf", Held, Params, needs_frames=True)
+cf_augmented = _filter("cf-augmented", Augmented, AugmentedParams, needs_frames=True)
+high_pass = _filter("high-pass", Nothing, Params)

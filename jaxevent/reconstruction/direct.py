@@ -41,7 +41,10 @@ def _direct(name: str, model: type[Level]) -> Filter:
     def observe(values: Any, frames: FrameFeatures) -> Direct:
         return Direct(model(values, frames))
 
-    return Filter(name, model.Params, observe, without_variance, advance)
+    return Filter(
+        name, model.Params, observe, without_variance, advance,
+        needs_frames=True, has_covariance=False,
+    )  # fmt: skip
 
 
 edi = _direct("edi", EventIntegral)

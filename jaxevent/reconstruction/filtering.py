@@ -1,22 +1,24 @@
-"""The one driver of all reconstruction methods: filter events tile by tile, read at any time.
+"""The one driver of all per-pixel methods: filter events tile by tile, read at any time.
 
-An `Estimator` is a handful of pure functions over single pixels; this module supplies what they
-share: `run` scans the tiles of a window and vmaps over their lanes, `read` evaluates images.
+A `Filter` is a handful of pure functions of one pixel, written in scalars beside the paper's
+equations; this module supplies what all share: `run` scans the ranks of a window's tiles and maps
+the step over their lanes, `read` evaluates images.
 """
 
 import abc
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxevent.errors import InputError
+from jaxevent.estimator import Estimate, Estimator
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.pixels import (
     SHAPES,
@@ -28,6 +30,7 @@ from jaxevent.reconstruction.pixels import (
     ReadOut,
     Tiles,
     Timing,
+    check_times,
     prepare,
 )
 from jaxevent.recording import Recording, Times
@@ -39,7 +42,10 @@ P = TypeVar("P", bound=FrameParams)
 
 
 class State(eqx.Module):
-    """Estimate of pixels: log intensity L = ln(I + I0), its variance P (NaN if not estimated)."""
+    """Log intensity L = ln(I + I0) of a pixel and its variance P (NaN if not estimated).
+
+    The usual state of a `Filter`, whose own may be any pytree of numbers per pixel.
+    """
 
     L: Float[Numeric, "*pixels"]
     P: Float[Numeric, "*pixels"]
@@ -91,10 +97,10 @@ class Trajectory(eqx.Module):
     """A filtered window: enough to read an image at any time inside it."""
 
     observer: Observer
-    start: State  # (pixels,), after each pixel's last event before the window
-    path: State | None  # (slots,), after every event, in the order of the features' slots
+    start: Any  # state (pixels,), after each pixel's last event before the window
+    path: Any  # state (slots,), after every event, in the order of the features' slots; or None
 
-    def at(self, slot: Int[Array, "*images pixels"]) -> State:
+    def at(self, slot: Int[Array, "*images pixels"]) -> Any:
         """The states after each pixel's event in a slot, or at the window's start for slot -1."""
         if self.path is None:
             return self.start
@@ -106,12 +112,19 @@ class Trajectory(eqx.Module):
 
 
 @dataclasses.dataclass(frozen=True)
-class Estimator(Generic[P]):
-    """A reconstruction method: a name, its `Params`, and the ways to use it."""
+class ImageEstimator(Estimator[P]):
+    """A reconstruction method.
 
-    name: str
-    Params: type[P]
-    needs_frames: bool = dataclasses.field(default=True, kw_only=True)
+    Images are `Estimate`s: `mean` is intensity, 0 the frames' black and 1 their white, and goes
+    beyond; `covariance` is the variance of log intensity ln(I + I0), NaN of methods that estimate
+    none; `valid` is false where the intensity is not a finite number.
+    """
+
+    family: ClassVar[str] = "reconstruction"
+    has_likelihood: ClassVar[bool] = False  # whether it has `log_likelihood` of the frames given
+    options: frozenset[str] = dataclasses.field(
+        default=frozenset({"window_events", "devices"}), kw_only=True
+    )
 
     @property
     @abc.abstractmethod
@@ -139,34 +152,31 @@ class Estimator(Generic[P]):
         """
 
     @abc.abstractmethod
-    def read(
-        self, params: P, trajectory: Any, out: ReadOut
-    ) -> tuple[Float[Array, "times pixels"], Float[Array, "times pixels"]]:
-        """Intensity and variance of log intensity of each image in `out`; pure, as `run`."""
-
-    def check(self, recording: Recording) -> None:
-        """Raise `InputError` if the recording lacks what the method needs."""
-        if self.needs_frames and recording.frames is None:
-            raise InputError(
-                f"{recording.name}: holds no frames, which the method {self.name!r} needs; "
-                "use 'akf' or 'high-pass'"
-            )
+    def read(self, params: P, trajectory: Any, out: ReadOut) -> Estimate:
+        """The images prepared in `out`, each array (times, pixels); pure, as `run`."""
 
     def prepare(
-        self, recording: Recording, times: Times, params: P | None = None
+        self,
+        recording: Recording,
+        times: Times,
+        params: P | None = None,
+        *,
+        extrapolate: bool = False,
     ) -> tuple[Features, ReadOut]:
-        """A whole recording for `run`, and points of images at `times` for `read`.
+        """A whole recording for `run`, and points of images at sorted `times` for `read`.
 
         See `pixels.prepare`; prepared for those of the `params` that act through comparisons with
-        event times.
+        event times. Raises `InputError` if the recording lacks what the method needs, and for times
+        that are not sorted or, unless told to `extrapolate`, outside the recording.
         """
+        self.check(recording)
         params = self.Params() if params is None else params
+        if not extrapolate:
+            check_times(recording, times, params.clock_offset)
         return prepare(recording, times, *Timing.of(params), filtering=self.filters)
 
-    def reconstruct(
-        self, recording: Recording, params: P | None = None, **options: Any
-    ) -> "Video[P]":
-        """Video of a recording: `image, variance = reconstruct(recording, params)(times)`.
+    def estimate(self, recording: Recording, params: P | None = None, **options: Any) -> "Video[P]":
+        """Video of a recording: `image, variance, valid = estimate(recording, params)(times)`.
 
         `options` are those of `Video`. Raises `InputError` if the recording lacks what the method
         needs.
@@ -176,69 +186,85 @@ class Estimator(Generic[P]):
         return Video(self, recording, self.Params() if params is None else params, **options)
 
 
-@dataclasses.dataclass(frozen=True)
-class Filter(Estimator[P]):
-    """A causal method, made of pure functions over single pixels.
+def log_intensity(params: FrameParams, state: Any) -> tuple[Array, Array]:
+    """Log intensity and its variance of a pixel whose state is a `State`."""
+    return state.L, state.P
 
-    `observe(params, frames)` makes the window's `Observer`. `initial(params,
-    level)` is the state at the recording's start, where the frames say `level`. `advance(params,
+
+@dataclasses.dataclass(frozen=True)
+class Filter(ImageEstimator[P]):
+    """A causal method, made of pure functions of one pixel.
+
+    `observe(params, frames)` makes the window's `Observer`. `initial(params, level)` is the state
+    at the recording's start, where the frames say `level`: any pytree of numbers. `advance(params,
     state, dt, observation)` brings a state dt seconds on without events, `jump(params, state,
-    event)` adds an event to it. A method with `jump=None` keeps no state: its image is the
-    observation.
+    event)` adds an event to it. `tell(params, state)` is the log intensity and its variance. A
+    method with `jump=None` keeps no state: its image is the observation.
     """
 
     observe: Callable[[P, FrameFeatures], "Observer"]
-    initial: Callable[[P, Array], State]
-    advance: Callable[[P, State, Array, Observation], State]
-    jump: Callable[[P, State, Event], State] | None = None
+    initial: Callable[[P, Array], Any]
+    advance: Callable[[P, Any, Array, Observation], Any]
+    jump: Callable[[P, Any, Event], Any] | None = None
+    tell: Callable[[P, Any], tuple[Array, Array]] = log_intensity
 
     @property
     def filters(self) -> bool:
         return self.jump is not None
 
-    def step(self, params: P, state: State, event: Event) -> State:
-        """The state after an event: advance to it, then jump. Scalars; vmap for more pixels."""
+    def step(self, params: P, state: Any, event: Event) -> Any:
+        """The state of a pixel after an event: advance to it, then jump."""
         assert self.jump is not None
         return self.jump(params, self.advance(params, state, event.since, event.frame), event)
 
-    def start(self, params: P, features: Features) -> State:
+    def start(self, params: P, features: Features) -> Any:
         observer = self.observe(params, features.frames)
-        return self.initial(params, observer.outset(features.start)[0])
+        level = observer.outset(features.start)[0]
+        return jax.vmap(functools.partial(self.initial, params))(level)
 
     def run(
-        self, params: P, features: Features, state: State | None = None, future: None = None
-    ) -> tuple["Trajectory", State]:
-        """As `Estimator.run`; the state is (pixels,), after each pixel's last event."""
+        self, params: P, features: Features, state: Any = None, future: None = None
+    ) -> tuple[Trajectory, Any]:
+        """As `ImageEstimator.run`; the state is (pixels,), after each pixel's last event."""
         features = features.at(params.rho_ref)
         observer = self.observe(params, features.frames)
         if state is None:
-            state = self.initial(params, observer.outset(features.start)[0])
+            level = observer.outset(features.start)[0]
+            state = jax.vmap(functools.partial(self.initial, params))(level)
         if features.tiles is None:
             return Trajectory(observer, state, None), state
         path = self.scan(params, observer, features.tiles, state)
         trajectory = Trajectory(observer, state, path)
         return trajectory, trajectory.at(jnp.asarray(features.last))
 
-    def scan(self, params: P, observer: Observer, tiles: Tiles, state: State) -> State:
+    def scan(self, params: P, observer: Observer, tiles: Tiles, state: Any) -> Any:
         """The states after every event, (slots,)."""
         path = tiles.each(self._scan, params, observer, state)
-        return State(path.L.ravel(), path.P.ravel())
+        return jax.tree.map(jnp.ravel, path)
 
-    def _scan(self, tiles: Tiles, params: P, observer: Observer, state: State) -> State:
+    def _scan(self, tiles: Tiles, params: P, observer: Observer, state: Any) -> Any:
         """The states after every event, (tiles, slots)."""
-        events = (jnp.asarray(tiles.since), jnp.asarray(tiles.near), jnp.asarray(tiles.polarity))
         frame = observer(tiles.points)
+        events = Event(
+            jnp.asarray(tiles.since), jnp.asarray(tiles.near), jnp.asarray(tiles.polarity), frame
+        )
         place = Place(jnp.asarray(tiles.kind), jnp.asarray(tiles.lane))
         lanes = jax.tree.map(lambda s: s[tiles.pixel], state)
-        return _path(self, params, frame, lanes, events, place)
+        return _path(self, params, events, lanes, place)
 
-    def read(
-        self, params: P, trajectory: "Trajectory", out: ReadOut
-    ) -> tuple[Float[Array, "times pixels"], Float[Array, "times pixels"]]:
+    def read(self, params: P, trajectory: Trajectory, out: ReadOut) -> Estimate:
         out = out.at(params.rho_ref)
-        at = trajectory.at(jnp.asarray(out.slot))
-        at = self.advance(params, at, jnp.asarray(out.since), trajectory.observer(out.points))
-        return jnp.exp(at.L) - params.I0, at.P
+        before = trajectory.at(jnp.asarray(out.slot))
+        since, frame = jnp.asarray(out.since), trajectory.observer(out.points)
+
+        def one(state: Any, since: Array, frame: Observation) -> tuple[Array, Array]:
+            return self.tell(params, self.advance(params, state, since, frame))
+
+        frame = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, since.shape), frame)
+        over_images = jax.vmap(jax.vmap(one), (0 if trajectory.path is not None else None, 0, 0))
+        L, P = over_images(before, since, frame)
+        image = jnp.exp(L) - params.I0
+        return Estimate(image, P, jnp.isfinite(image))
 
 
 def _over_tiles(step: Callable, lanes: Any, place: Place, slots: Any) -> Any:
@@ -277,22 +303,22 @@ def _over_tiles(step: Callable, lanes: Any, place: Place, slots: Any) -> Any:
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _path(
-    estimator: Filter, params: Any, frame: Observation, lanes: State, events: tuple, place: Place
-) -> State:
-    """The states after every event, (tiles, slots)."""
+def _path(method: Filter, params: Any, events: Event, lanes: Any, place: Place) -> Any:
+    """The states after every event, (tiles, slots), from those of lanes, (lanes,)."""
 
-    def step(at: State, slot: tuple[tuple, Observation]) -> tuple[State, State]:
-        at = _each(estimator, params, at, *slot)
+    def step(at: Any, event: Event) -> tuple[Any, Any]:
+        at = _each(method, params, at, event)
         return at, at
 
-    return _over_tiles(step, lanes, place, (events, frame))
+    return _over_tiles(step, lanes, place, events)
 
 
-def _each(estimator: Filter, params: Any, at: State, event: tuple, frame: Observation) -> State:
-    """The filter's step for arrays of states and events (since, near, polarity)."""
-    since, near, polarity = event
-    return estimator.step(params, at, Event(since, near, polarity, frame))
+def _each(method: Filter, params: Any, at: Any, event: Event) -> Any:
+    """The filter's step, mapped over all axes of states and events."""
+    step = functools.partial(method.step, params)
+    for _ in range(event.since.ndim):
+        step = jax.vmap(step)
+    return step(at, event)
 
 
 # With s the state before an event, f the filter's step, the state's derivative obeys
@@ -302,32 +328,66 @@ def _each(estimator: Filter, params: Any, at: State, event: tuple, frame: Observ
 # scan itself keep and move what each step computed: reverse mode took 1.2 s where this takes 0.6 s
 # for 5 M events (two cores), next to 0.05 s for the states.
 @_path.defjvp
-def _path_jvp(estimator: Filter, primals: tuple, tangents: tuple) -> tuple[State, State]:
-    params, frame, lanes, events, place = primals
-    d_params, d_frame, d_lanes, _, _ = tangents
+def _path_jvp(method: Filter, primals: tuple, tangents: tuple) -> tuple[Any, Any]:
+    params, events, lanes, place = primals
+    d_params, d_events, d_lanes, _ = tangents
 
-    def step(at: State, slot: tuple[tuple, Observation]) -> tuple[State, tuple[State, State]]:
-        after = _each(estimator, params, at, *slot)
+    def step(at: Any, event: Event) -> tuple[Any, tuple[Any, Any]]:
+        after = _each(method, params, at, event)
         return after, (at, after)
 
-    before, path = _over_tiles(step, lanes, place, (events, frame))
+    before, path = _over_tiles(step, lanes, place, events)
+    # Counters and flags of a state have no derivative: only its real leaves are followed.
+    real, rest = eqx.partition(before, eqx.is_inexact_array)
+    leaves, tree = jax.tree.flatten(real)
 
-    def by_state(at: State) -> State:
-        return _each(estimator, params, at, events, frame)
+    def by_state(*leaves: Array) -> list[Array]:
+        at = eqx.combine(jax.tree.unflatten(tree, leaves), rest)
+        return _real(_each(method, params, at, events))
 
-    def by_rest(params: Any, frame: Observation) -> State:
-        return _each(estimator, params, before, events, frame)
+    def by_rest(params: Any, frame: Observation) -> list[Array]:
+        return _real(_each(method, params, before, dataclasses.replace(events, frame=frame)))
 
-    zero, one = jnp.zeros_like(before.L), jnp.ones_like(before.L)
-    _, by_L = jax.jvp(by_state, (before,), (State(one, zero),))
-    _, by_P = jax.jvp(by_state, (before,), (State(zero, one),))
-    _, pushed = jax.jvp(by_rest, (params, frame), (d_params, d_frame))
+    zero, one = (tuple(full(leaf) for leaf in leaves) for full in (jnp.zeros_like, jnp.ones_like))
+    columns = [
+        jax.jvp(by_state, leaves, [*zero[:k], one[k], *zero[k + 1 :]])[1]
+        for k in range(len(leaves))
+    ]
+    _, pushed = jax.jvp(by_rest, (params, events.frame), (d_params, d_events.frame))
 
-    def linear(at: State, slot: tuple[State, State, State]) -> tuple[State, State]:
-        by_L, by_P, pushed = slot
-        after = State(
-            by_L.L * at.L + by_P.L * at.P + pushed.L, by_L.P * at.L + by_P.P * at.P + pushed.P
-        )
+    def linear(at: list[Array], slot: Any) -> tuple[list[Array], list[Array]]:
+        columns, pushed = slot
+        after = []
+        for i, push in enumerate(pushed):
+            terms = [column[i] * d for column, d in zip(columns, at, strict=True)]
+            after.append(functools.reduce(jnp.add, [*terms, push]))
         return after, after
 
-    return path, _over_tiles(linear, d_lanes, place, (by_L, by_P, pushed))
+    d_real = _over_tiles(linear, _real_tangents(lanes, d_lanes), place, (columns, pushed))
+    return path, _as_tangent(path, d_real)
+
+
+def _real(state: Any) -> list[Array]:
+    """The leaves of a state that have derivatives."""
+    return jax.tree.leaves(eqx.filter(state, eqx.is_inexact_array))
+
+
+def _real_tangents(state: Any, tangent: Any) -> list[Array]:
+    """The tangents of those leaves."""
+    pairs = zip(jax.tree.leaves(state), jax.tree.leaves(tangent), strict=True)
+    return [d for leaf, d in pairs if eqx.is_inexact_array(leaf)]
+
+
+def _as_tangent(state: Any, real: list[Array]) -> Any:
+    """A tangent of a state from those of its real leaves; the others have none (float0)."""
+    leaves, tree = jax.tree.flatten(state)
+    following = iter(real)
+    return jax.tree.unflatten(
+        tree,
+        [
+            next(following)
+            if eqx.is_inexact_array(leaf)
+            else np.zeros(leaf.shape, jax.dtypes.float0)
+            for leaf in leaves
+        ],
+    )

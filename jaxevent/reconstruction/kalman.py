@@ -171,4 +171,4 @@ def jump(params: Params, state: State, event: Event) -> State:
     return State(L, state.P + jnp.where(event.polarity == 0, 0, noise(params, event)))
 
 
-akf = Filter("akf", Params, Augmentation, initial, advance, jump, needs_frames=False)
+akf = Filter("akf", Params, Augmentation, initial, advance, jump)

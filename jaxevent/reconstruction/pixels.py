@@ -1010,6 +1010,25 @@ def _rate(breaks: NDArray) -> NDArray:
     return np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)
 
 
+def check_times(recording: Recording, times: Times, clock_offset: Any = 0.0) -> None:
+    """Raise `InputError` for times outside the recording.
+
+    It lasts from its first event or frame to its last, frames on the events' clock as well as
+    stamped.
+    """
+    us = np.atleast_1d(microseconds(times))
+    if not len(us):
+        return
+    late = 0 if recording.frames is None else round(float(clock_offset) * 1e6)
+    start, stop = recording.start + min(late, 0), recording.stop + max(late, 0)
+    if us.min() < start or us.max() > stop:
+        raise InputError(
+            f"{recording.name}: times from {us.min()} to {us.max()} us were asked for, but it "
+            f"lasts from {start} to {stop} us; integers are microseconds, floats seconds, both on "
+            "the recording's clock"
+        )
+
+
 def prepare(
     recording: Recording,
     times: Times,

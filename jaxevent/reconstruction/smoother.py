@@ -18,7 +18,7 @@ reference: all parameters can be fitted with it.
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -27,6 +27,7 @@ from jax import lax
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float
 
+from jaxevent.estimator import Estimate
 from jaxevent.parameters import Choice, Positive
 from jaxevent.reconstruction.augment import (
     CertaintyParams,
@@ -38,8 +39,14 @@ from jaxevent.reconstruction.augment import (
     late,
     unclipped,
 )
-from jaxevent.reconstruction.filtering import Estimator
-from jaxevent.reconstruction.pixels import Features, FrameFeatures, Numeric, ReadOut
+from jaxevent.reconstruction.filtering import ImageEstimator
+from jaxevent.reconstruction.pixels import (
+    Features,
+    FrameFeatures,
+    ImagePoints,
+    Numeric,
+    ReadOut,
+)
 
 
 class Params(CertaintyParams):
@@ -251,9 +258,85 @@ def measure(params: Params, state: Gaussian, row: Rows) -> tuple[Gaussian, Messa
     return Gaussian(m, P), said, row.clear * log_gauss + log_side
 
 
+def filter_forward(params: Params, rows: Rows, state: Gaussian) -> tuple[Any, ...]:
+    """Kalman filter over frames, arrays [frames, pixels].
+
+    Returns the states before and after each frame, what each says, and its log likelihood.
+    """
+
+    def step(at: Gaussian, row: Rows) -> tuple[Gaussian, Any]:
+        after, said, log_likelihood = measure(params, at, row)
+        return Gaussian(after.m + row.S, after.P + row.q), (at, after, said, log_likelihood)
+
+    return lax.scan(step, state, rows)[1]
+
+
+def filter_backward(
+    rows: Rows, said: Message, last: Message, number: Any
+) -> tuple[Message, Message]:
+    """Information filter over frames: what is said before the first frame, and after each.
+
+    `last` is what the last of the `number` frames and all later ones say.
+    """
+
+    def step(later: Message, row: Any) -> tuple[Message, Message]:
+        i, own, S, q = row
+        here = later.earlier(S, q) + own
+        return jax.tree.map(lambda a, b: jnp.where(i == number - 1, a, b), last, here), later
+
+    zero = jnp.zeros_like(rows.z[0])
+    steps = (jnp.arange(len(rows.z)), said, rows.S, rows.q)
+    return lax.scan(step, Message(zero, zero), steps, reverse=True)
+
+
+def compose_links(rows: Rows, said: Message, anchor: Any, number: Any) -> Link:
+    """The link from the last of the `number` frames to the frame `anchor`."""
+
+    def step(link: Link, row: Any) -> tuple[Link, None]:
+        i, own, S, q = row
+        longer = link.then(Link(one, S, q, own.h, own.J))
+        inside = (i >= anchor) & (i < number - 1)
+        return jax.tree.map(lambda a, b: jnp.where(inside, a, b), longer, link), None
+
+    zero, one = jnp.zeros_like(rows.z[0]), jnp.ones_like(rows.z[0])
+    steps = (jnp.arange(len(rows.z)), said, rows.S, rows.q)
+    return lax.scan(step, Link(one, zero, zero, zero, zero), steps)[0]
+
+
+def counts_around(
+    params: Params, passage: "Passage", points: ImagePoints
+) -> tuple[Array, Array, Array, Array]:
+    """ON and OFF events [2, times, pixels] since the frame before and until the frame after.
+
+    Known are those since the left edge of the piece's exposure, or, before the first one, since
+    the window's start. Also the seconds (times, 1) of both stretches.
+    """
+    frames, f = passage.frames, jnp.asarray(points.level)
+    rate = jnp.asarray(frames.level_rate)[f][:, None]
+    elapsed = jnp.asarray(points.elapsed)[:, None] - late(params, frames)
+    behind = jnp.asarray(points.elapsed)[:, None] < 0  # before the first frame
+    since = jnp.stack([points.on, points.off])
+    between = jnp.take(passage.events, f, axis=1)
+    before = jnp.asarray(frames.before)[:, None]
+    if frames.head is None or frames.tail is None:
+        until = jnp.where(behind, before - since, between - since)
+    else:
+        own = jnp.maximum((jnp.asarray(points.piece) - 1) // 2, 0)
+        head = jnp.take(jnp.asarray(frames.head), own, axis=1)
+        outside = (jnp.asarray(points.piece) == 0)[:, None]
+        first = jnp.where(outside, before - frames.tail[:, :1], head) - since
+        since = since - head + jnp.where((own > f)[:, None], between, 0)
+        until = jnp.where(behind, first, between - since)
+    gap = jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), 0)
+    seconds = jnp.where(behind, -elapsed, jnp.where(rate > 0, gap - elapsed, 0))
+    return shared(params, frames, since), shared(params, frames, until), elapsed, seconds
+
+
 @dataclasses.dataclass(frozen=True)
-class Smoother(Estimator[Params]):
+class Smoother(ImageEstimator[Params]):
     """The estimator of this module."""
+
+    has_likelihood: ClassVar[bool] = True
 
     @property
     def filters(self) -> bool:
@@ -275,67 +358,23 @@ class Smoother(Estimator[Params]):
         state: Gaussian | None = None,
         future: Message | None = None,
     ) -> tuple[Passage, Gaussian]:
-        """As `Estimator.run`; the state is (pixels,), before the next window's first frame."""
+        """As `ImageEstimator.run`; the state is (pixels,), before the next window's first frame."""
         frames = features.at(params.rho_ref).frames
         rows, counts = rows_of(params, frames)
         state = self.start(params, features) if state is None else state
-
-        def forth(at: Gaussian, row: Rows) -> tuple[Gaussian, Any]:
-            after, said, log_likelihood = measure(params, at, row)
-            return Gaussian(after.m + row.S, after.P + row.q), (at, after, said, log_likelihood)
-
-        _, (ahead, past, said, likelihood) = lax.scan(forth, state, rows)
         number, anchor, onward = frames.rows
-        place = jnp.arange(len(rows.z))
+        ahead, past, said, likelihood = filter_forward(params, rows, state)
         last = jax.tree.map(lambda v: v[number - 1], said) if future is None else future
-
-        def back(later: Message, row: Any) -> tuple[Message, Message]:
-            i, own, S, q = row
-            here = later.earlier(S, q) + own
-            return jax.tree.map(lambda a, b: jnp.where(i == number - 1, a, b), last, here), later
-
-        steps = (place, said, rows.S, rows.q)
-        zero, one = jnp.zeros_like(state.m), jnp.ones_like(state.m)
-        first, later = lax.scan(back, Message(zero, zero), steps, reverse=True)
-
-        def compose(link: Link, row: Any) -> tuple[Link, None]:
-            i, own, S, q = row
-            longer = link.then(Link(one, S, q, own.h, own.J))
-            inside = (i >= anchor) & (i < number - 1)
-            return jax.tree.map(lambda a, b: jnp.where(inside, a, b), longer, link), None
-
-        link, _ = lax.scan(compose, Link(one, zero, zero, zero, zero), steps)
+        first, later = filter_backward(rows, said, last, number)
+        link = compose_links(rows, said, anchor, number)
         first = first + Message(state.m / state.P, 1 / state.P)
         passage = Passage(past, later, first, counts, frames, link, last, likelihood.sum(1))
         return passage, jax.tree.map(lambda v: v.at[onward].get(mode="clip"), ahead)
 
-    def read(
-        self, params: Params, trajectory: Passage, out: ReadOut
-    ) -> tuple[Float[Array, "times pixels"], Float[Array, "times pixels"]]:
-        points, frames = out.at(params.rho_ref).points, trajectory.frames
-        f = jnp.asarray(points.level)
-        rate = jnp.asarray(frames.level_rate)[f][:, None]
-        elapsed = jnp.asarray(points.elapsed)[:, None] - late(params, frames)
-        behind = jnp.asarray(points.elapsed)[:, None] < 0  # before the first frame
-
-        # ON and OFF events from the frame before to the point, and from the point to the frame
-        # after; known are those since the left edge of the piece's exposure, or, before the first
-        # one, since the window's start.
-        since = jnp.stack([points.on, points.off])
-        between = jnp.take(trajectory.events, f, axis=1)
-        before = jnp.asarray(frames.before)[:, None]
-        if frames.head is None or frames.tail is None:
-            until = jnp.where(behind, before - since, between - since)
-        else:
-            own = jnp.maximum((jnp.asarray(points.piece) - 1) // 2, 0)
-            head = jnp.take(jnp.asarray(frames.head), own, axis=1)
-            outside = (jnp.asarray(points.piece) == 0)[:, None]
-            first = jnp.where(outside, before - frames.tail[:, :1], head) - since
-            since = since - head + jnp.where((own > f)[:, None], between, 0)
-            until = jnp.where(behind, first, between - since)
-        gap = jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), 0)
-        seconds = jnp.where(behind, -elapsed, jnp.where(rate > 0, gap - elapsed, 0))
-        until, since = shared(params, frames, until), shared(params, frames, since)
+    def read(self, params: Params, trajectory: Passage, out: ReadOut) -> Estimate:
+        points = out.at(params.rho_ref).points
+        f, behind = jnp.asarray(points.level), jnp.asarray(points.elapsed)[:, None] < 0
+        since, until, elapsed, seconds = counts_around(params, trajectory, points)
 
         later = jax.tree.map(lambda v: v[f], trajectory.future)
         later = jax.tree.map(lambda a, b: jnp.where(behind, a, b), trajectory.first, later)
@@ -346,11 +385,12 @@ class Smoother(Estimator[Params]):
         P = trajectory.past.P[f] + added(params, since[0], since[1], elapsed)
         P = 1 / (jnp.where(behind, 0, 1 / jnp.where(behind, 1, P)) + later.J)
         m = m + P * (later.h - later.J * m)
-        return jnp.exp(m) - params.I0, P
+        image = jnp.exp(m) - params.I0
+        return Estimate(image, P, jnp.isfinite(image))
 
     def log_likelihood(self, params: Params, features: Features) -> Float[Array, ""]:
         """Of all frames of a prepared recording, given its events: a sum over frames and pixels."""
         return self.run(params, features)[0].log_likelihood.sum()
 
 
-aks = Smoother("aks", Params)
+aks = Smoother("aks", Params, needs_frames=True)

@@ -9,10 +9,11 @@ from typing import Any, Generic, NamedTuple
 import jax
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from jaxevent.errors import InputError
-from jaxevent.reconstruction.filtering import Estimator, P
+from jaxevent.estimator import Estimate
+from jaxevent.progress import bar
+from jaxevent.reconstruction.filtering import ImageEstimator, P
 from jaxevent.reconstruction.pixels import (
     WINDOW_EVENTS,
     Carry,
@@ -21,6 +22,7 @@ from jaxevent.reconstruction.pixels import (
     ReadOut,
     Timing,
     Windows,
+    check_times,
     over_pixels,
     pixel_mesh,
 )
@@ -32,17 +34,17 @@ BATCH = 8  # images read per call; 8 x 90,000 pixels stay in the second-level ca
 
 # jax.jit returns before the result is there; eqx.filter_jit waits for it.
 @functools.partial(jax.jit, static_argnums=0)
-def _start(estimator: Estimator, params, features: Features):
+def _start(estimator: ImageEstimator, params, features: Features):
     return estimator.start(params, features)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _run(estimator: Estimator, params, features: Features, state, future):
+def _run(estimator: ImageEstimator, params, features: Features, state, future):
     return estimator.run(params, features, state, future)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _read(estimator: Estimator, params, trajectory, out: ReadOut):
+def _read(estimator: ImageEstimator, params, trajectory, out: ReadOut):
     return estimator.read(params, trajectory, out)
 
 
@@ -59,7 +61,7 @@ class Begin(NamedTuple):
 
 
 class Video(Generic[P]):
-    """Images of a reconstruction: `image, variance = video(times)`.
+    """Images of a reconstruction: `image, variance, valid = video(times)`.
 
     The recording is filtered in time windows of at most `window_events` events when images in them
     are asked for; windows before them are filtered first. One window is kept, and the state at
@@ -70,12 +72,12 @@ class Video(Generic[P]):
 
     def __init__(
         self,
-        estimator: Estimator[P],
+        estimator: ImageEstimator[P],
         recording: Recording,
         params: P,
         *,
         window_events: int = WINDOW_EVENTS,
-        progress: bool = False,
+        progress: bool | None = None,
         devices: Sequence[Any] = (),
     ):
         estimator.check(recording)
@@ -93,45 +95,58 @@ class Video(Generic[P]):
         self._open: tuple[Reader, Any] | None = None
         self._future: dict[int | None, Any] | None = None  # by the start of the window
 
-    def __call__(self, times: Times) -> tuple[NDArray, NDArray]:
-        """Intensity and variance of log intensity at `times`, each of shape (T, H, W).
+    def __repr__(self) -> str:
+        r = self.recording
+        span = f"{r.start * 1e-6:g} to {r.stop * 1e-6:g} s"
+        return f"Video({self.estimator.name} of {r.name}, {r.width}x{r.height}, {span})"
 
-        Times are integers (us) or floats (s) on the recording's clock, in any order. Intensity 0 is
-        black and 1 the frames' white; reconstructed values go beyond. Before the recording's start
-        images show the initial state. The variance is NaN for methods that estimate none. Raises
-        `InputError` for times that are not finite or nowhere near the recording.
+    def __call__(self, times: Times, extrapolate: bool = False) -> Estimate:
+        """Images at `times`, integers (us) or floats (s) on the recording's clock, in any order.
+
+        Each array has the shape (T, H, W): `mean` is intensity, 0 black and 1 the frames' white,
+        and goes beyond; `covariance` is the variance of log intensity ln(I + I0), NaN of methods
+        that estimate none; `valid` is false outside the recording and where the intensity is not a
+        finite number. Raises `InputError` for times that are not finite, and for those outside the
+        recording unless told to `extrapolate`: before its start images show the initial state.
         """
         times = np.atleast_1d(microseconds(times))
         order = np.argsort(times, kind="stable")
         shape = (len(times), self.recording.height, self.recording.width)
         image, variance = np.empty((2, *shape), self._windows.dtype)
+        whole = Estimate(image, variance, np.empty(shape, bool))
         done = 0
-        for batch, images, variances in self.batches(times[order]):
+        for batch, part in self.batches(times[order], extrapolate):
             rows = order[done : done + len(batch)]
-            image[rows], variance[rows] = images, variances
+            for array, values in zip(whole, part, strict=True):
+                array[rows] = values
             done += len(batch)
-        return image, variance
+        return whole
 
     def batches(
-        self, times: Times
-    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.floating], NDArray[np.floating]]]:
-        """The same, a few images after another for sorted times: `times, image, variance`."""
+        self, times: Times, extrapolate: bool = False
+    ) -> Iterator[tuple[NDArray[np.int64], Estimate]]:
+        """The same, a few images after another for sorted times: `times, estimate`."""
         times = np.atleast_1d(microseconds(times))
         if (times[1:] < times[:-1]).any():
             raise InputError("times must be sorted to be read in batches; sort them")
-        self._check(times)
-        with tqdm(
-            total=len(times), unit="image", delay=2, disable=not self.progress, leave=False
-        ) as bar:
+        if not extrapolate:
+            check_times(self.recording, times, self.params.clock_offset)
+        start, stop = self.recording.start, self.recording.stop
+        with bar(total=len(times), unit="image", progress=self.progress) as shown:
             # One batch is computed while the next one is looked up in the events.
             ahead = None
             for following in itertools.chain(self._read(times), [None]):
                 if ahead is not None:
                     batch, images = ahead
                     shape = (len(batch), self.recording.height, self.recording.width)
-                    image, variance = (np.asarray(v)[: len(batch)].reshape(shape) for v in images)
-                    yield batch, image, variance
-                    bar.update(len(batch))
+                    image, variance, valid = (
+                        np.asarray(v)[: len(batch)].reshape(shape) for v in images
+                    )
+                    inside = (start <= batch) & (batch <= stop)
+                    if not inside.all():
+                        valid = valid & inside[:, None, None]
+                    yield batch, Estimate(image, variance, valid)
+                    shown.update(len(batch))
                 ahead = following
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
@@ -155,16 +170,6 @@ class Video(Generic[P]):
         """A state or message on the devices; else every change of how it lies would be compiled."""
         return state if self._mesh is None else over_pixels(state, self._mesh, self._windows.pixels)
 
-    def _check(self, times: NDArray[np.int64]) -> None:
-        start, stop = self.recording.start, self.recording.stop
-        reach = stop - start + 1_000_000
-        if len(times) and (times.min() < start - reach or times.max() > stop + reach):
-            raise InputError(
-                f"{self.recording.name}: times from {times.min()} to {times.max()} us were asked "
-                f"for, but it lasts from {start} to {stop} us; integers are microseconds, floats "
-                "seconds, both on the recording's clock"
-            )
-
     def _window_of(self, time: int) -> tuple[Reader, Any]:
         """The filtered window that contains `time`; windows on the way are filtered in order."""
         if self.estimator.looks_ahead and self._future is None:
@@ -185,15 +190,13 @@ class Video(Generic[P]):
     def _look_ahead(self) -> None:
         """Pass over all windows once, to know at each what later ones say."""
         begin, starts, links = self._begins[0], [], []
-        with tqdm(
-            total=len(self.recording.events), unit="event", unit_scale=True, delay=2,
-            disable=not self.progress, leave=False,
-        ) as bar:  # fmt: skip
+        total = len(self.recording.events)
+        with bar(total=total, unit="event", unit_scale=True, progress=self.progress) as shown:
             while True:
                 starts.append(begin.start)
                 (reader, trajectory), begin = self._filter(begin)
                 links.append((trajectory.link, trajectory.last))
-                bar.update(len(reader.window._events))
+                shown.update(len(reader.window._events))
                 if reader.window.stop is None:
                     break
         message, future = links[-1][1], {starts[-1]: None}

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxevent.io import load
-from jaxevent.reconstruction import METHODS
+from jaxevent.methods import find, names
 from jaxevent.recording import Recording
 from jaxevent.runs.protocols import frame_times, held_out
 from jaxevent.runs.results import results, write_rows
@@ -26,11 +26,15 @@ def demo(out: Path, progress: bool = False) -> None:
     """
     with resources.as_file(resources.files("jaxevent") / "data/slider_depth_crop.h5") as path:
         recording = load(path)
-    by_hand = {name: METHODS[name].Params.of(BY_HAND) for name in ("akf", "augmented", "cf")}
+    by_hand = {name: find(name).Params.of(BY_HAND) for name in ("akf", "augmented", "cf")}
     runs: list[tuple[str, Any, Any]] = [
-        *((name, method, method.Params()) for name, method in METHODS.items()),
         *(
-            (f"{name}, thresholds and clock set by hand", METHODS[name], by_hand[name])
+            (name, method, method.Params())
+            for name in names("reconstruction")
+            for method in [find(name)]
+        ),
+        *(
+            (f"{name}, thresholds and clock set by hand", find(name), by_hand[name])
             for name in ("akf", "augmented")
         ),
     ]
@@ -54,8 +58,8 @@ def _figure(recording: Recording, params: dict[str, Any], path: Path) -> None:
     """The AKF and a baseline, of equal thresholds, at one hidden frame in the middle."""
     given, hidden = held_out(recording)
     middle = hidden[len(hidden) // 2 :][:1]
-    (image, variance), (baseline, _) = (
-        METHODS[name].reconstruct(given, params[name])(frame_times(middle, params[name]))
+    (image, variance, _), (baseline, _, _) = (
+        find(name).estimate(given, params[name])(frame_times(middle, params[name]))
         for name in ("akf", "cf")
     )
     assert given.frames is not None
@@ -79,7 +83,7 @@ def _figure(recording: Recording, params: dict[str, Any], path: Path) -> None:
 def _video(recording: Recording, params: Any, path: Path, progress: bool) -> float:
     """200 images per second of the recording's time, shown at 30; returns the slow-down."""
     rate, fps, longest = 200.0, 30.0, 180
-    video = METHODS["akf"].reconstruct(recording, params, progress=progress)
+    video = find("akf").estimate(recording, params, progress=progress)
     zoom = 2 if recording.width < 480 else 1
     with video_writer(path, fps) as write:
         for _, image in shown(video, evenly(recording, rate)[:longest], "linear"):

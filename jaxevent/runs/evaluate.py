@@ -57,9 +57,9 @@ import jax.numpy as jnp
 import jaxevent
 from jaxevent.errors import InputError
 from jaxevent.io.output import values_of
+from jaxevent.methods import find
 from jaxevent.parameters import Parameters, nearest, read_toml
-from jaxevent.reconstruction import METHODS
-from jaxevent.reconstruction.filtering import Estimator
+from jaxevent.reconstruction.filtering import ImageEstimator
 from jaxevent.runs.config import find_recordings, read_params
 from jaxevent.runs.contents import Contents, Opened
 from jaxevent.runs.external import External, check_normalise
@@ -88,11 +88,11 @@ class Named(NamedTuple):
 _opened = Opened()
 
 
-def find_method(name: str) -> Estimator:
+def find_method(name: str) -> ImageEstimator:
     """The method of that name; raises `InputError` naming the nearest."""
-    if name not in METHODS:
-        raise InputError(f"there is no method {name!r}; {nearest(name, METHODS)}")
-    return METHODS[name]
+    method = find(name, "reconstruction")
+    assert isinstance(method, ImageEstimator)
+    return method
 
 
 def evaluate(
@@ -286,7 +286,7 @@ class Entry:
     """A method of a configuration with one set of parameters; `External` has none."""
 
     label: str
-    method: Estimator | External | Named
+    method: ImageEstimator | External | Named
     params: Parameters | None
     normalise: str
 

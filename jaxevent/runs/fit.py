@@ -58,10 +58,10 @@ from jaxevent import devices
 from jaxevent.errors import InputError, require
 from jaxevent.io import load
 from jaxevent.io.output import complete
+from jaxevent.methods import find, names
 from jaxevent.parameters import Parameters, nearest, read_toml
-from jaxevent.reconstruction import METHODS
 from jaxevent.reconstruction.augment import PREPARED, FrameParams
-from jaxevent.reconstruction.filtering import Estimator
+from jaxevent.reconstruction.filtering import ImageEstimator
 from jaxevent.recording import Recording
 from jaxevent.runs import toml
 from jaxevent.runs.config import (
@@ -334,14 +334,18 @@ def systems() -> dict[str, System]:
     from jaxevent.runs.blob import BLOB
     from jaxevent.runs.egomotion import VOTING
 
-    return {**dict.fromkeys(METHODS, RECONSTRUCTION), "blob": BLOB, "voting": VOTING}
+    return {
+        **dict.fromkeys(names("reconstruction"), RECONSTRUCTION),
+        "blob": BLOB,
+        "voting": VOTING,
+    }
 
 
 @dataclasses.dataclass(frozen=True)
 class Reconstruction:
     """The goal of a reconstruction method."""
 
-    method: Estimator
+    method: ImageEstimator
     loss: Objective
     protocol: str
     warm_up: float | int
@@ -592,10 +596,11 @@ class _Reconstructions:
     own = ("loss", "error")
 
     def start(self, name: str, given: Any, folder: Path) -> FrameParams:
-        return read_params(METHODS[name].Params, name, given, folder)
+        return read_params(find(name).Params, name, given, folder)
 
     def goal(self, name: str, params: Any, given: Mapping[str, Any]) -> Reconstruction:
-        method = METHODS[name]
+        method = find(name, "reconstruction")
+        assert isinstance(method, ImageEstimator)
         loss = one_of(given.get("loss", "held-out"), "loss", [*PROTOCOLS, "likelihood"])
         protocol = loss
         if loss == "likelihood":

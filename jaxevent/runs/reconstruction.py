@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from jaxevent.devices import ELSEWHERE
 from jaxevent.errors import InputError
 from jaxevent.reconstruction.augment import PREPARED, FrameParams
-from jaxevent.reconstruction.filtering import Estimator, Filter
+from jaxevent.reconstruction.filtering import ImageEstimator
 from jaxevent.reconstruction.pixels import Numeric, over_pixels, pixel_mesh
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.protocols import PROTOCOLS, Reference, frame_times
@@ -71,35 +71,29 @@ class Objective:
     all beyond [0, 1] as 0 or 1.
     """
 
-    method: Estimator
+    method: ImageEstimator
     error: str | None = "linear"
     clipped: bool = True
     dark_offset: float | int = 0.003
 
     def __post_init__(self):
         if self.error is None:
-            if getattr(self.method, "log_likelihood", None) is None:
+            if not self.method.has_likelihood:
                 raise InputError(
                     f"the method {self.method.name!r} has no likelihood; choose another loss or "
                     "the method 'aks'"
                 )
-        elif self.error == "nll" and not self._has_variance():
+        elif self.error == "nll" and not self.method.has_covariance:
             raise InputError(
                 f"the method {self.method.name!r} estimates no variance, which the error 'nll' "
                 "needs; choose 'linear' or 'log'"
             )
 
-    def _has_variance(self) -> bool:
-        if not isinstance(self.method, Filter):
-            return True
-        start = self.method.initial(self.method.Params(), jnp.zeros(()))
-        return bool(jnp.isfinite(start.P))
-
     def __call__(self, params: FrameParams, batch: Any) -> Float[Array, ""]:
         if self.error is None:
             return -self.method.log_likelihood(params, batch.features) / batch.weight  # type: ignore[reportAttributeAccessIssue]
         trajectory, _ = self.method.run(params, batch.features)
-        image, variance = self.method.read(params, trajectory, batch.out)
+        image, variance, _ = self.method.read(params, trajectory, batch.out)
         if self.error == "nll":
             errors = self._surprise(params, image, variance, batch.truth)
         else:
@@ -257,7 +251,7 @@ class Problem:
             count = np.asarray(frames * part.recording.width * part.recording.height, dtype)
             return [(splits[0], Window(features, count))]
         times = frame_times(part.truth, params)[part.rows]
-        features, out = method.prepare(part.recording, times, params)
+        features, out = method.prepare(part.recording, times, params, extrapolate=True)
         found = []
         for s in splits:
             places = np.flatnonzero(part.split == s)

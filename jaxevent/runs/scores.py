@@ -26,7 +26,7 @@ from jaxevent.metrics import (
 )
 from jaxevent.parameters import nearest
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.filtering import Estimator
+from jaxevent.reconstruction.filtering import ImageEstimator
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.external import External, Normalise, check_normalise, fit_brightness
 from jaxevent.runs.protocols import PROTOCOLS, Reference, frame_times
@@ -201,7 +201,7 @@ class Sample:
 
 def score(
     recording: Recording,
-    method: Estimator | External,
+    method: ImageEstimator | External,
     params: FrameParams | None = None,
     protocol: str = "held-out",
     *,
@@ -238,7 +238,7 @@ def score(
 
 def score_and_sample(
     recording: Recording,
-    method: Estimator | External,
+    method: ImageEstimator | External,
     params: FrameParams | None,
     protocol: str,
     metrics: Iterable[str],
@@ -311,13 +311,13 @@ Estimates = Iterator[tuple[int, NDArray[np.floating], NDArray[np.floating]]]
 
 
 def _estimates(
-    given: Recording, hidden: Frames, method: Estimator, params: FrameParams, progress: bool
+    given: Recording, hidden: Frames, method: ImageEstimator, params: FrameParams, progress: bool
 ) -> Estimates:
-    video = method.reconstruct(given, params, progress=progress, devices=local())
+    video = method.estimate(given, params, progress=progress, devices=local())
     first = 0
-    for _, images, variances in video.batches(frame_times(hidden, params)):
-        yield first, images, variances
-        first += len(images)
+    for times, told in video.batches(frame_times(hidden, params), extrapolate=True):
+        yield first, told.mean, told.covariance
+        first += len(times)
 
 
 def _external(given: Recording, hidden: Frames, method: External, name: str) -> Estimates:

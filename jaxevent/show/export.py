@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from jaxevent.errors import InputError
 from jaxevent.io.output import complete, complete_hdf5, values_of
+from jaxevent.progress import bar
 from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
 from jaxevent.reconstruction.video import BATCH, Video
 from jaxevent.recording import Recording
@@ -116,7 +116,7 @@ def shown(
     sample = times[np.unique(np.linspace(0, len(times) - 1, 16).round().astype(int))]
     if tone == "linear":  # the limits are those of any image
         sample = sample[:1]
-    limits = display_limits(video(sample)[0], tone)
+    limits = display_limits(video(sample).mean, tone)
     for batch, values in _batches(video, times, colours):
         images = values["image"]
         if colours is None:
@@ -136,11 +136,11 @@ def _batches(
 ) -> Iterator[tuple[NDArray, dict[str, NDArray]]]:
     """A few images after another: their times, and what HDF5 holds of them by name."""
     if colours is None:
-        for batch, image, variance in video.batches(times):
-            yield batch, {"image": image, "variance": variance}
+        for batch, told in video.batches(times):
+            yield batch, {"image": told.mean, "variance": told.covariance}
         return
     rows = range(0, len(times), BATCH)
-    for row in tqdm(rows, unit="batch", delay=2, disable=not video.progress, leave=False):
+    for row in bar(rows, unit="batch", progress=video.progress):
         batch = times[row : row + BATCH]
         with np.errstate(invalid="ignore"):  # infinity times 0
             image = colours(batch)

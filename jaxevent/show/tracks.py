@@ -627,7 +627,7 @@ def _high_pass(recording: Recording, times: NDArray[np.int64]) -> Iterator[NDArr
     from jaxevent.reconstruction import high_pass
     from jaxevent.show.export import shown
 
-    video = high_pass.reconstruct(recording)
+    video = high_pass.estimate(recording)
     return (image for _, image in shown(video, times, "percentile"))
 
 

@@ -20,6 +20,7 @@ from PIL import Image
 
 import jaxevent
 from jaxevent import cli
+from jaxevent.methods import names
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.show import describe, export
 from jaxevent.show.report import tone_map
@@ -202,7 +203,7 @@ def test_help_and_version(capsys, monkeypatch):
         cli.main(["--version"])
     assert stop.value.code == 0
     assert capsys.readouterr().out == f"jaxevent {jaxevent.__version__}\n"
-    named = {"reconstruct": tuple(jaxevent.METHODS), "simulate": (*SCENES, *SENSORS)}
+    named = {"reconstruct": tuple(names("reconstruction")), "simulate": (*SCENES, *SENSORS)}
     for command in ("demo", "info", "convert", "reconstruct", "evaluate", "fit", "simulate"):
         with pytest.raises(SystemExit) as stop:
             cli.main([command, "--help"])
@@ -419,8 +420,8 @@ def test_reconstruct_to_hdf5(folder, capsys):
     assert all(contents[0][key].tobytes() == contents[1][key].tobytes() for key in contents[0])
 
     params = jaxevent.akf.Params.of({"c_on": 0.2, "clock_offset": 0.0025})
-    video = jaxevent.akf.reconstruct(small(), params)
-    image, variance = video(STAMPS + 2_500)
+    video = jaxevent.akf.estimate(small(), params)
+    image, variance, _ = video(STAMPS + 2_500)
     assert contents[0]["t"].dtype == np.int64 and contents[0]["image"].dtype == np.float32
     np.testing.assert_array_equal(contents[0]["t"], STAMPS + 2_500)
     np.testing.assert_array_equal(contents[0]["image"], image.astype(np.float32))
@@ -439,7 +440,7 @@ def test_reconstruct_to_images(folder):
     assert sorted(stored[0]) == [*names, "images.txt"]
     lines = [f"{t / 1e6:.6f} {name}\n" for t, name in zip(times, names, strict=True)]
     assert (folder / "a" / "images.txt").read_text() == "".join(lines)
-    images, _ = jaxevent.blend.reconstruct(small())(times)
+    images, _, _ = jaxevent.blend.estimate(small())(times)
     for name, image in zip(names, tone_map(images), strict=True):
         with Image.open(folder / "a" / name) as stored_image:
             np.testing.assert_array_equal(np.asarray(stored_image), image)
@@ -462,9 +463,9 @@ def test_reconstruct_to_video(rate, fps, factor, folder, capsys):
     assert len(images) == len(times)
     assert f" {WIDTH}x{HEIGHT}" in about and f" {fps} fps" in about
     sample = times[np.unique(np.linspace(0, len(times) - 1, 16).round().astype(int))]
-    video = jaxevent.blend.reconstruct(recording)
-    limits = tuple(np.percentile(video(sample)[0], [0.5, 99.5]).tolist())
-    shown = tone_map(video(times)[0], "percentile", limits).astype(float)
+    video = jaxevent.blend.estimate(recording)
+    limits = tuple(np.percentile(video(sample).mean, [0.5, 99.5]).tolist())
+    shown = tone_map(video(times).mean, "percentile", limits).astype(float)
     assert np.abs(images - shown).mean() < 3
 
 
@@ -483,7 +484,7 @@ def test_reconstruct_in_colour(folder):
         assert cli.main([*argv.split(), str(folder / name), *tone]) == 0
 
     times = np.rint(np.arange(16) / 300 * 1e6).astype(np.int64)
-    grey = jaxevent.blend.reconstruct(recording)(times)[0]
+    grey = jaxevent.blend.estimate(recording)(times).mean
     colour = rgb[0].astype(float)
     ratio = colour / (colour @ [0.2126, 0.7152, 0.0722])[..., None]
     with h5py.File(folder / "a.h5") as file:
@@ -506,7 +507,7 @@ def test_a_pixel_without_bound_is_white_in_colour():
     times = np.array([0])
     red = np.full((1, HEIGHT, WIDTH, 3), np.array([0.5, 0, 0]), np.float32)
     red[0, 3, 4] = (np.inf, np.nan, np.nan)
-    video = jaxevent.blend.reconstruct(small())
+    video = jaxevent.blend.estimate(small())
     ((_, image),) = export.shown(video, times, "linear", lambda _: red)
     assert image[3, 4].tolist() == [255, 255, 255]
     assert image[0, 0].tolist() == [127, 0, 0]
@@ -627,8 +628,9 @@ def test_demo(tmp_path, capsys, float32):
     assert said.startswith((out / "results.md").read_text()) and str(out) in said
     rows = json.loads((out / "results.json").read_text())["rows"]
     errors = {row["method"]: row["mse"] for row in rows}
-    assert list(errors)[: len(jaxevent.METHODS)] == list(jaxevent.METHODS)
-    assert len(errors) == len(jaxevent.METHODS) + 2
+    known = names("reconstruction")
+    assert list(errors)[: len(known)] == known
+    assert len(errors) == len(known) + 2
     by_hand = errors["akf, thresholds and clock set by hand"]
     assert by_hand < errors["akf"] < errors["cf"] < errors["last-frame"]
     with Image.open(out / "comparison.png") as figure:

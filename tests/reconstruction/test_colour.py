@@ -90,29 +90,30 @@ def random_frames(count=4, shape=(6, 8)):
 def test_colour_video_of_the_frames_is_the_frames():
     rgb = random_frames()
     recording = scene(rgb)
-    video = blend.reconstruct(recording, blend.Params())
+    video = blend.estimate(recording, blend.Params())
     got = colour_video(video, recording)(recording.frames.t[[2, 0, 3, 1]])
-    assert got.shape == (4, 6, 8, 3) and got.dtype == video(0.1)[0].dtype
+    assert got.shape == (4, 6, 8, 3) and got.dtype == video(0.1).mean.dtype
     np.testing.assert_allclose(got, rgb[[2, 0, 3, 1]] / 255, rtol=2e-5)
 
 
 def test_chrominance_is_linear_between_frames_and_constant_outside():
     rgb = random_frames()
     recording = scene(rgb)
-    video = blend.reconstruct(recording, blend.Params())
+    video = blend.estimate(recording, blend.Params())
     chroma = chrominance(rgb / 255)
     times = np.array([0.05, 0.125, 0.375, 0.45])
     expected = [chroma[0], 0.75 * chroma[0] + 0.25 * chroma[1], 0.25 * chroma[2] + 0.75 * chroma[3]]
-    expected = video(times)[0][..., None] * np.stack([*expected, chroma[3]])
-    got = colour_video(video, recording)(times)
+    image = video(times, extrapolate=True).mean
+    expected = image[..., None] * np.stack([*expected, chroma[3]])
+    got = colour_video(video, recording)(times, extrapolate=True)
     np.testing.assert_allclose(got, expected, rtol=2e-5)
-    np.testing.assert_allclose(luminance(got), video(times)[0], rtol=1e-6)
+    np.testing.assert_allclose(luminance(got), image, rtol=1e-6)
 
 
 def test_colours_follow_the_clock_of_the_frames():
     rgb = random_frames()
     recording = scene(rgb)
-    video = blend.reconstruct(recording, blend.Params(clock_offset=0.03))
+    video = blend.estimate(recording, blend.Params(clock_offset=0.03))
     got = colour_video(video, recording)(recording.frames.t + 30_000)
     np.testing.assert_allclose(got / luminance(got)[..., None], chrominance(rgb / 255), rtol=2e-5)
 
@@ -123,7 +124,7 @@ def test_clipped_pixels_are_grey_and_the_response_is_undone():
     rgb[:, 0, 0] = [255, 90, 130]
     rgb[:, 0, 1] = [0, 2, 0]
     recording = scene(rgb, {"response": np.asarray(camera.table())})
-    got = colour_video(blend.reconstruct(recording, blend.Params()), recording)(0.2)[0]
+    got = colour_video(blend.estimate(recording, blend.Params()), recording)(0.2)[0]
     np.testing.assert_array_equal(got[0, 0], got[0, 0, 0])
     # Two of the three levels in which black fades: part of a pure green.
     black = float(camera.intensity(2 / 255) / camera.intensity(3 / 255))
@@ -144,7 +145,7 @@ def test_clipped_pixels_are_grey_and_the_response_is_undone():
 )
 def test_colour_frames_that_do_not_fit_are_refused(rgb, message):
     recording = scene(random_frames())
-    video = blend.reconstruct(recording, blend.Params())
+    video = blend.estimate(recording, blend.Params())
     extra = {} if rgb is None else {"rgb": rgb}
     with pytest.raises(InputError, match=f"garden: .*{message}"):
         colour_video(video, dataclasses.replace(recording, extra=extra))

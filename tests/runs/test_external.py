@@ -14,7 +14,7 @@ from PIL import Image
 
 import jaxevent
 from jaxevent import cli
-from jaxevent.reconstruction import METHODS
+from jaxevent.methods import METHODS
 from jaxevent.runs.evaluate import evaluate
 from jaxevent.runs.external import External, fit_brightness
 from jaxevent.runs.scores import score, subset

@@ -28,9 +28,10 @@ import jaxevent
 import jaxevent.runs.fit
 import jaxevent.tuning
 from jaxevent import cli
+from jaxevent.estimator import Estimate
+from jaxevent.methods import HOMES, METHODS
 from jaxevent.parameters import Number, Parameters, Positive
-from jaxevent.reconstruction import METHODS
-from jaxevent.reconstruction.filtering import Estimator, Filter
+from jaxevent.reconstruction.filtering import Filter, ImageEstimator
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.runs.fit import fit
 from jaxevent.runs.protocols import Reference, held_out
@@ -299,14 +300,19 @@ def test_images_are_shared_out_in_a_fixed_pattern():
 
 
 @dataclasses.dataclass(frozen=True)
-class Shown(Estimator):
+class Shown(ImageEstimator):
     """A method whose images are what it is given to read, with the variance 0.3."""
+
+    filters = False
+
+    def start(self, params, features):
+        return None
 
     def run(self, params, features, state=None, future=None):
         return None, None
 
     def read(self, params, trajectory, out):
-        return out, jnp.full(out.shape, 0.3)
+        return Estimate(out, jnp.full(out.shape, 0.3), jnp.isfinite(out))
 
 
 def by_hand(error: str, image: float, truth: float, clipped: bool, white: float) -> float:
@@ -693,20 +699,24 @@ def test_recordings_for_each_split_and_in_place_of_those_named(folder, capsys, m
 class Likely(Filter):
     """A method whose likelihood tells the threshold and which frames it was given."""
 
+    has_likelihood = True
+
     def log_likelihood(self, params, features):
         return -((params.c_on - 0.2) ** 2) * features.frames.grey.size + 0 * params.I0
 
 
+BLEND = METHODS["blend"]
+LIKELY = Likely(**{f.name: getattr(BLEND, f.name) for f in dataclasses.fields(BLEND)})
+
+
 def test_the_likelihood_sees_given_frames_only(folder, monkeypatch):
-    blend = METHODS["blend"]
-    fields = {f.name: getattr(blend, f.name) for f in dataclasses.fields(blend)}
-    monkeypatch.setitem(METHODS, "likely", Likely(**{**fields, "name": "likely"}))
+    monkeypatch.setitem(HOMES["reconstruction"], "likely", "test_fit:LIKELY")
     seen = []
     prepare = Likely.prepare
 
-    def record(self, recording, times, params):
+    def record(self, recording, times, params, **options):
         seen.append((recording.frames.t.tolist(), len(times)))
-        return prepare(self, recording, times, params)
+        return prepare(self, recording, times, params, **options)
 
     monkeypatch.setattr(Likely, "prepare", record)
     head = 'recordings = ["moving.h5"]\nloss = "likelihood"\nrounds = 1\n'
@@ -823,12 +833,12 @@ def test_relaxed_refractory_bound_finds_the_optimum_of_a_scan():
             rho_width=0.3,
         )  # fmt: skip
 
-    batch = jaxevent.akf.prepare(recording, np.array([stop]), params(bound))
+    batch = jaxevent.akf.prepare(recording, np.array([stop]), params(bound), extrapolate=True)
 
     @jax.jit
     def loss(params, batch):
         features, out = batch
-        image, P = jaxevent.akf.read(params, jaxevent.akf.run(params, features)[0], out)
+        image, P, _ = jaxevent.akf.read(params, jaxevent.akf.run(params, features)[0], out)
         error = jnp.log(image + params.I0) - truth
         return (error**2 / P + jnp.log(P)).mean() / 2
 

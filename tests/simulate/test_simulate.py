@@ -231,7 +231,7 @@ def test_perfect_events_reconstruct_what_the_frames_resolve():
 
     def error(method, where, **more):
         params = method.Params(**common, **more)
-        image = method.reconstruct(recording, params)(extra["hdr_t"])[0]
+        image = method.estimate(recording, params)(extra["hdr_t"]).mean
         return np.sqrt(np.mean((np.log(np.maximum(image, 0) + DARK) - truth)[where] ** 2))
 
     frames = recording.frames
