@@ -36,7 +36,6 @@ from jaxevent.reconstruction.filtering import Observation, Observer, State, Traj
 from jaxevent.reconstruction.pixels import Windows
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate import blob_scene
-from jaxevent.tuning import with_raw
 
 WIDTH, HEIGHT = 346, 260
 BASELINE = Path(__file__).with_name("bench_baseline.json")
@@ -256,7 +255,7 @@ def gradient_seconds(recording: Recording) -> tuple[float, float]:
 
     # Everything but the parameters is given as an argument, lest it be compiled as constants.
     def loss(raw, features, out, truth):
-        params = with_raw(start, raw)
+        params = start.with_raw(raw)
         image, _, _ = jaxevent.akf.read(params, jaxevent.akf.run(params, features)[0], out)
         return ((image - truth) ** 2).mean()
 

@@ -26,7 +26,7 @@ from jaxevent.blob import (
     prepare_positions,
 )
 from jaxevent.simulate import blob_scene
-from jaxevent.tuning import Settings, optimise, with_raw
+from jaxevent.tuning import Settings, optimise
 
 STEP = {"events_per_step": 32}
 # Process noises times these.
@@ -59,7 +59,7 @@ def recordings(scene: str, seeds: Sequence[int], params: Params, seconds: float,
 
 def rmse(params: Params, raw: Mapping[str, jax.Array], batches: Sequence[Any]) -> np.ndarray:
     """Of the position, px, for every set of unconstrained numbers (sets,) in `raw`."""
-    one = jax.vmap(lambda r, b: position_error(with_raw(params, r), b, SCALE), (0, None))
+    one = jax.vmap(lambda r, b: position_error(params.with_raw(r), b, SCALE), (0, None))
     squares = [jax.jit(one)(raw, batch) for batch in batches]
     return np.sqrt(np.mean(squares, axis=0))
 

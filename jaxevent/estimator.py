@@ -14,6 +14,7 @@ Evaluation, fitting, the command line and pictures know estimators through this 
 import abc
 import dataclasses
 import importlib
+import inspect
 from collections.abc import Iterator
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
@@ -59,7 +60,7 @@ class Result(Protocol):
         ...
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Estimator(abc.ABC, Generic[P]):
     """One estimator: a name, its `Params`, and the steps from a recording to a result.
 
@@ -73,6 +74,7 @@ class Estimator(abc.ABC, Generic[P]):
         has_covariance: Whether it tells how certain it is.
         models: Of egomotion: the names of the motion models that it knows; empty: all.
         options: Names of what `estimate` takes beyond `progress`.
+        about: What it is, in a sentence or more; `help` shows it.
     """
 
     name: str
@@ -83,6 +85,21 @@ class Estimator(abc.ABC, Generic[P]):
     has_covariance: bool = dataclasses.field(default=True, kw_only=True)
     models: tuple[str, ...] = dataclasses.field(default=(), kw_only=True)
     options: frozenset[str] = dataclasses.field(default=frozenset(), kw_only=True)
+    about: str = dataclasses.field(default="", kw_only=True)
+
+    def __post_init__(self):
+        # `help(akf)` shows an object's own text, if it has one, before its class.
+        parameters = inspect.cleandoc(self.Params.__doc__ or "")
+        estimate = inspect.cleandoc(type(self).estimate.__doc__ or "")
+        text = [
+            self.about or inspect.cleandoc(type(self).__doc__ or ""),
+            f"`estimate(recording, params, ...)`: {estimate}",
+            f"`Params`: {parameters}",
+        ]
+        object.__setattr__(self, "__doc__", "\n\n".join(text))
+
+    def __repr__(self) -> str:
+        return f"<{self.family} method {self.name!r}: {self.about.partition('. ')[0] or 'no text'}>"
 
     def check(self, recording: Recording) -> None:
         """Raise `InputError` if the recording lacks what the estimator needs."""

@@ -1,12 +1,14 @@
 """Parameters of estimators: numbers that are read in physical units and tuned without bounds."""
 
 import difflib
+import inspect
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, overload
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -14,28 +16,73 @@ from jaxtyping import Array
 from jaxevent.errors import InputError
 
 T = TypeVar("T", bound="Parameters")
+S = TypeVar("S", bound="Setting")
+
+NO_GRADIENT = "acts when data are prepared or by comparisons, and has no gradient to follow"
 
 
-class Number:
-    """A parameter of a `Parameters` class: its default, unit and meaning.
+class Setting:
+    """What `Parameters` classes are made of: a name, a default, a unit and a meaning.
 
-    Reading it from an instance gives the physical value; the instance stores `raw`, on which an
-    optimiser may step anywhere. A default of several numbers makes it an array, given as a list.
+    Reading it from the class gives this description, reading it from an instance its value.
     """
 
-    def __init__(self, default: float | tuple[float, ...], unit: str, meaning: str):
+    name: str
+    default: Any
+
+    def __init__(self, default: Any, unit: str, meaning: str):
         self.default, self.unit, self.meaning = default, unit, meaning
 
     def __set_name__(self, owner: type, name: str):
         self.name = name
 
-    def __get__(self, instance: "Parameters", owner: type) -> Array:
-        return self.physical(instance.raw[self.name])
+    def __repr__(self) -> str:
+        unit = f" {self.unit}" if self.unit not in ("", "1") else ""
+        return f"{self.name} = {shown(self.default)}{unit}: {self.meaning}"
+
+    def check(self, value: Any) -> None:
+        """Raise `InputError` for a value outside the domain."""
+        raise NotImplementedError
+
+
+class Number(Setting):
+    """A number: the instance stores `raw`, on which an optimiser may step anywhere.
+
+    A default of several numbers makes it an array, given as a list. With `gradient=False` it acts
+    when data are prepared, or by comparisons: no derivative goes through it, so that no step can
+    lead it away from what was prepared, and `optimise` takes it for searches only.
+    """
+
+    def __init__(
+        self,
+        default: float | tuple[float, ...],
+        unit: str,
+        meaning: str,
+        *,
+        gradient: bool = True,
+    ):
+        super().__init__(default, unit, meaning)
+        self.gradient = gradient
+
+    @overload
+    def __get__(self: S, instance: None, owner: type) -> S: ...
+
+    @overload
+    def __get__(self, instance: "Parameters", owner: type) -> Array: ...
+
+    def __get__(self, instance: "Parameters | None", owner: type) -> Any:
+        if instance is None:
+            return self
+        raw = instance.raw[self.name]
+        follows = self.gradient or self.name in instance.followed
+        return self.physical(raw if follows else jax.lax.stop_gradient(raw))
 
     def physical(self, raw: Array) -> Array:
+        """The value of what is stored."""
         return raw
 
     def unconstrained(self, value: Array) -> Array:
+        """What is stored of a value."""
         return value
 
     def check(self, value: Any) -> None:
@@ -51,6 +98,7 @@ class Number:
             self.check_one(one)
 
     def check_one(self, value: Any) -> None:
+        """Raise `InputError` for one of the numbers outside the domain."""
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not number or not abs(value) < 1e38:  # the range of float32
             raise InputError(
@@ -73,18 +121,41 @@ class Positive(Number):
             raise InputError(f"the parameter {self.name} is {value}; it must not be negative")
 
 
-class Choice:
-    """A setting of a `Parameters` class: one of a few values, not differentiated."""
+class Share(Number):
+    """A share in [0, 1), stored as ln(p / (1 - p)), so 0 is stored as -inf and stays 0."""
+
+    def physical(self, raw: Array) -> Array:
+        return jax.nn.sigmoid(raw)
+
+    def unconstrained(self, value: Array) -> Array:
+        return jnp.log(value) - jnp.log1p(-value)
+
+    def check_one(self, value: Any) -> None:
+        super().check_one(value)
+        if not 0 <= value < 1:
+            raise InputError(
+                f"the parameter {self.name} is {value}; it is a share, from 0 to below 1"
+            )
+
+
+class Choice(Setting):
+    """One of a few values, the first by default; not differentiated."""
 
     def __init__(self, options: tuple[str | bool, ...], meaning: str):
-        self.options, self.meaning = options, meaning
-        self.default = options[0]
+        super().__init__(options[0], "", meaning)
+        self.options = options
 
-    def __set_name__(self, owner: type, name: str):
-        self.name = name
+    @overload
+    def __get__(self: S, instance: None, owner: type) -> S: ...
 
-    def __get__(self, instance: "Parameters", owner: type) -> Any:
-        return dict(instance.chosen)[self.name]
+    @overload
+    def __get__(self, instance: "Parameters", owner: type) -> Any: ...
+
+    def __get__(self, instance: "Parameters | None", owner: type) -> Any:
+        return self if instance is None else dict(instance.chosen)[self.name]
+
+    def __repr__(self) -> str:
+        return f"{super().__repr__()} (one of {', '.join(map(shown, self.options))})"
 
     def check(self, value: Any) -> None:
         if not any(value is option or value == option for option in self.options) or (
@@ -96,17 +167,17 @@ class Choice:
             raise InputError(f"the parameter {self.name} is {str(value)[:40]!r}; give {options}")
 
 
-class Count:
-    """A setting of a `Parameters` class: a whole number, at least 1, that sizes arrays."""
+class Count(Setting):
+    """A whole number, at least 1, that sizes arrays; not differentiated."""
 
-    def __init__(self, default: int, unit: str, meaning: str):
-        self.default, self.unit, self.meaning = default, unit, meaning
+    @overload
+    def __get__(self: S, instance: None, owner: type) -> S: ...
 
-    def __set_name__(self, owner: type, name: str):
-        self.name = name
+    @overload
+    def __get__(self, instance: "Parameters", owner: type) -> int: ...
 
-    def __get__(self, instance: "Parameters", owner: type) -> int:
-        return dict(instance.chosen)[self.name]  # type: ignore[return-value]
+    def __get__(self, instance: "Parameters | None", owner: type) -> Any:
+        return self if instance is None else dict(instance.chosen)[self.name]
 
     def check(self, value: Any) -> None:
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
@@ -125,6 +196,7 @@ class Parameters(eqx.Module):
 
     raw: dict[str, Array]
     chosen: tuple[tuple[str, str | bool | int], ...] = eqx.field(static=True)
+    followed: frozenset[str] = eqx.field(static=True)  # see `with_derivatives`
 
     numbers: ClassVar[Mapping[str, Number]] = {}
     choices: ClassVar[Mapping[str, Choice | Count]] = {}
@@ -135,30 +207,107 @@ class Parameters(eqx.Module):
         own = vars(cls).items()
         cls.numbers = {**cls.numbers, **{k: v for k, v in own if isinstance(v, Number)}}
         cls.choices = {**cls.choices, **{k: v for k, v in own if isinstance(v, Choice | Count)}}
+        # Of its own, so that `help`, completion and `inspect` show what this class takes.
+        base = next(kind for kind in cls.__mro__[1:] if "__init__" in vars(kind))
+        init = vars(cls).get("__init__")
+        if init is None:
+
+            def init(self, *, preset: str | None = None, **values: Any):
+                base.__init__(self, preset=preset, **values)
+
+            init.__name__, init.__qualname__ = "__init__", f"{cls.__qualname__}.__init__"
+            cls.__init__ = init
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        init.__signature__ = inspect.Signature(
+            [
+                inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY),
+                inspect.Parameter("preset", keyword, default=None, annotation=str | None),
+                *(
+                    inspect.Parameter(name, keyword, default=setting.default)
+                    for name, setting in cls.settings().items()
+                ),
+            ]
+        )
+        about = (cls.__doc__ or "").partition("\n\nArguments:\n")[0]
+        cls.__doc__ = "\n".join([about, "", "Arguments:", *_described(cls)])
 
     def __init__(self, *, preset: str | None = None, **values: Any):
-        known = {**self.numbers, **self.choices}
-        _refuse_unknown(values, {**known, "preset": None})
+        _refuse_unknown(values, {**self.numbers, **self.choices, "preset": None})
         if preset is not None:
             if preset not in self.presets:
                 raise InputError(f"there is no preset {preset!r}; {nearest(preset, self.presets)}")
             values = {**self.presets[preset], **values}
-        self.raw = {}
-        for name, number in self.numbers.items():
-            value = values.get(name, number.default)
-            if not isinstance(value, Array):
-                number.check(value)
-            value = jnp.asarray(value, jnp.result_type(float))
-            self.raw[name] = number.unconstrained(value)
+        self.raw = {
+            name: _stored(number, values.get(name, number.default))
+            for name, number in self.numbers.items()
+        }
         chosen = {name: values.get(name, choice.default) for name, choice in self.choices.items()}
         for name, value in chosen.items():
             self.choices[name].check(value)
         self.chosen = tuple(chosen.items())
+        self.followed = frozenset()
+
+    @classmethod
+    def settings(cls) -> dict[str, Setting]:
+        """All that it is made of, by name."""
+        return {**cls.numbers, **cls.choices}
+
+    def __repr__(self) -> str:
+        defaults = type(self)()
+        changed, same = [], []
+        for name in self.settings():
+            text = _value_shown(self, name)
+            where = same if text == _value_shown(defaults, name) else changed
+            where.append(f"{name}={text}")
+        rest = f"defaults: {', '.join(same)}" if same else ""
+        return f"{type(self).__qualname__}({'; '.join(filter(None, [', '.join(changed), rest]))})"
 
     def values(self) -> dict[str, Any]:
         """The physical values and the choices by name, as `Params(**values)` takes them."""
         numbers = {name: np.asarray(getattr(self, name)).tolist() for name in self.numbers}
         return {**numbers, **dict(self.chosen)}
+
+    def replace(self: T, **values: Any) -> T:
+        """The same with some other values; raises `InputError` as the class does."""
+        _refuse_unknown(values, self.settings())
+        raw = {
+            name: _stored(self.numbers[name], value, self.raw[name].dtype)
+            for name, value in values.items()
+            if name in self.numbers
+        }
+        chosen = dict(self.chosen)
+        for name in values.keys() - raw.keys():
+            self.choices[name].check(values[name])
+            chosen[name] = values[name]
+        return self._with({**self.raw, **raw}, tuple(chosen.items()), self.followed)
+
+    def with_raw(self: T, raw: Mapping[str, Array]) -> T:
+        """The same with some of the unconstrained numbers replaced."""
+        return self._with({**self.raw, **raw}, self.chosen, self.followed)
+
+    def with_derivatives(self: T, *names: str) -> T:
+        """The same with derivatives by numbers that act when data are prepared.
+
+        They hold next to the prepared value only, so they are for looking at, not for stepping
+        along.
+        """
+        _refuse_unknown(dict.fromkeys(names), self.numbers)
+        return self._with(self.raw, self.chosen, self.followed | set(names))
+
+    def _with(
+        self: T,
+        raw: dict[str, Array],
+        chosen: tuple[tuple[str, str | bool | int], ...],
+        followed: frozenset[str],
+    ) -> T:
+        new = object.__new__(type(self))
+        for name, value in (("raw", raw), ("chosen", chosen), ("followed", followed)):
+            object.__setattr__(new, name, value)
+        return new
+
+    def without_gradient(self) -> dict[str, str]:
+        """The numbers that have no gradient as the others stand, and why."""
+        return {name: NO_GRADIENT for name, number in self.numbers.items() if not number.gradient}
 
     @classmethod
     def of(cls: type[T], table: Mapping[str, Any]) -> T:
@@ -187,6 +336,52 @@ class Parameters(eqx.Module):
             return cls.of(table)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
+
+
+def _stored(number: Number, value: Any, dtype: Any = None) -> Array:
+    """What is stored of a value, which is checked unless it is an array."""
+    if not isinstance(value, Array):
+        number.check(value)
+    value = jnp.asarray(value, jnp.result_type(float) if dtype is None else dtype)
+    return number.unconstrained(value)
+
+
+def _value_shown(params: Parameters, name: str) -> str:
+    """One value, of a traced or mapped one the type and shape."""
+    value = getattr(params, name)
+    if isinstance(value, jax.core.Tracer):
+        return value.aval.str_short()
+    if not isinstance(value, Array):
+        return shown(value)
+    ndim = isinstance(params.numbers[name].default, tuple)
+    return shown(np.asarray(value).tolist()) if value.ndim <= ndim else f"array{value.shape}"
+
+
+def shown(value: Any) -> str:
+    """A value as descriptions show it: numbers to four digits."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(map(shown, value))}]"
+    return repr(value)
+
+
+def _described(kind: type[Parameters]) -> list[str]:
+    """Lines about every setting, for the docstring."""
+    lines = []
+    for name, setting in kind.settings().items():
+        unit = f" {setting.unit}" if setting.unit not in ("", "1") else ""
+        more = ""
+        if isinstance(setting, Choice):
+            more = f" One of {', '.join(map(shown, setting.options))}."
+        if isinstance(setting, Number) and not setting.gradient:
+            more = " No gradient."
+        lines.append(
+            f"    {name}: default {shown(setting.default)}{unit}; {setting.meaning}.{more}"
+        )
+    if kind.presets:
+        lines.append(f"    preset: a named set of values: {', '.join(kind.presets)}.")
+    return lines
 
 
 def _refuse_unknown(values: Mapping[str, Any], known: Mapping[str, Any]) -> None:

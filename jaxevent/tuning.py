@@ -120,9 +120,15 @@ def begin(
     for name in [*names, *search]:
         if name not in params.raw:
             raise InputError(f"there is no parameter {name!r}; {nearest(name, params.raw)}")
+    stuck = params.without_gradient()
     for name in names:
         if name in search:
             raise InputError(f"{name} is both to be fitted and searched; choose one")
+        if name in stuck:
+            raise InputError(
+                f"{name} {stuck[name]}; or search it: search = {{ {name} = [from, to, number of "
+                "points] }"
+            )
         if not np.isfinite(params.raw[name]).all():
             raise InputError(
                 f"the parameter {name} starts at 0, where its logarithm has no gradient; start at "
@@ -217,11 +223,6 @@ def optimise(
 ADAM = optax.apply_if_finite(optax.scale_by_adam(), max_consecutive_errors=2**31 - 1)
 
 
-def with_raw(params: P, raw: Mapping[str, Array]) -> P:
-    """The parameters with some of their unconstrained numbers replaced."""
-    return eqx.tree_at(lambda p: p.raw, params, {**params.raw, **raw})
-
-
 @functools.partial(jax.jit, static_argnums=0)
 def _value(loss: Loss, params: Parameters, batch: Any) -> Array:
     return loss(params, batch)
@@ -230,7 +231,7 @@ def _value(loss: Loss, params: Parameters, batch: Any) -> Array:
 @functools.partial(jax.jit, static_argnums=0)
 def _values(loss: Loss, params: Parameters, raw: dict[str, Array], batch: Any) -> Array:
     """The loss of each start, (starts,)."""
-    return jax.vmap(lambda one: loss(with_raw(params, one), batch))(raw)
+    return jax.vmap(lambda one: loss(params.with_raw(one), batch))(raw)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -240,7 +241,7 @@ def _slopes(
     """The loss of each start, (starts,), and its derivatives in the shape of `raw`."""
 
     def value(one: dict[str, Array]) -> Array:
-        return loss(with_raw(params, one), batch)
+        return loss(params.with_raw(one), batch)
 
     def forwards(one: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
         flat, restore = ravel_pytree(one)
@@ -353,7 +354,7 @@ class _Loop:
         position = self.run.position
         best = int(jnp.argmin(position.best_loss))
         raw = {name: leaf[best] for name, leaf in position.raw.items()}
-        return with_raw(self.params, {**raw, **position.searched})
+        return self.params.with_raw({**raw, **position.searched})
 
     def watched(self, params: Any) -> Sequence[Any]:
         fit, validation = self.prepare(params)
@@ -399,7 +400,7 @@ class _Loop:
 
     def _searched(self, params: Any, name: str, value: float) -> Any:
         raw = params.numbers[name].unconstrained(jnp.asarray(value, params.raw[name].dtype))
-        return with_raw(params, {name: raw})
+        return params.with_raw({name: raw})
 
     def descend(self) -> None:
         """The gradient steps of a round, from where all starts are to the best they come by."""
@@ -407,7 +408,7 @@ class _Loop:
         position, turn = run.position, run.stage // 2
         if not position.raw:
             return
-        params = with_raw(self.params, position.searched)
+        params = self.params.with_raw(position.searched)
         fit, watched = self.prepare(params)[0], self.watched(params)
         if run.iteration == 0:
             worst = jnp.full_like(position.best_loss, jnp.inf)

@@ -26,7 +26,8 @@ def add(commands: Any) -> None:
         "--method",
         metavar="NAME",
         required=True,
-        help="akf, aks, cf, cf-augmented, high-pass, edi, augmented, blend or last-frame",
+        help="akf, aks, cf, cf-augmented, high-pass, edi, augmented, blend, last-frame, or "
+        "package.module:object of your own",
     )
     when = one.add_mutually_exclusive_group()
     when.add_argument("--rate", metavar="HZ", type=float, help="images per second, evenly spaced")
@@ -66,15 +67,15 @@ def run(
     out: Path,
 ) -> None:
     from jaxevent.io import load
+    from jaxevent.methods import find
     from jaxevent.reconstruction.colour import colour_video
-    from jaxevent.runs.evaluate import find_method
     from jaxevent.runs.protocols import frame_times
     from jaxevent.show.export import evenly, write_hdf5, writer
 
     write = writer(out)
     if tone is not None and write is write_hdf5:
         raise InputError(f"{out}: --tone is for images to look at; HDF5 holds linear intensity")
-    estimator = find_method(method)
+    estimator = find(method, "reconstruction")
     values = estimator.Params() if params is None else estimator.Params.load(params, method)
     recording = load(path, size, in_memory=False, progress=show_progress())
     name = recording.name

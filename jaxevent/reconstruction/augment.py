@@ -7,7 +7,7 @@ among the frames, `pixels.Points`) it looks them up.
 """
 
 import functools
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -17,10 +17,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.parameters import Choice, Number, Parameters, Positive
-from jaxevent.reconstruction.pixels import FrameFeatures, Points, Timing
-
-# Parameters that act through comparisons with event times: fixed when a recording is prepared.
-PREPARED = Timing._fields
+from jaxevent.reconstruction.pixels import FrameFeatures, Points
 
 
 class FrameParams(Parameters):
@@ -29,13 +26,12 @@ class FrameParams(Parameters):
     c_on = Positive(0.1, "ln I", "contrast threshold of ON events")
     c_off = Positive(0.1, "ln I", "contrast threshold of OFF events")
     I0 = Positive(1.0, "intensity", "offset inside the logarithm, L = ln(I + I0)")
-    clock_offset = Number(0.0, "s", "added to the frames' time stamps")
+    clock_offset = Number(0.0, "s", "added to the frames' time stamps", gradient=False)
     deblur = Choice((True, False), "whether events within an exposure sharpen its frame")
-    exposure = Positive(0.0, "s", "exposure of frames whose own is not known")
-    rho_ref = Positive(0.0, "s", "dead time of a pixel after an event, its change made good")
-
-    def __init__(self, **values: Any):
-        super().__init__(**values)
+    exposure = Positive(0.0, "s", "exposure of frames whose own is not known", gradient=False)
+    rho_ref = Positive(
+        0.0, "s", "dead time of a pixel after an event, its change made good", gradient=False
+    )
 
 
 class CertaintyParams(FrameParams):
@@ -47,22 +43,20 @@ class CertaintyParams(FrameParams):
         (1.0,), "1", "factors on the certainty w at evenly spaced greys, a spline in ln w"
     )
 
-    def __init__(self, **values: Any):
-        super().__init__(**values)
-
 
 class AugmentParams(CertaintyParams):
     """... and of the augmented frame: calibration of contrasts (10), weights of two frames."""
 
     calibrate = Choice((True, False), "whether each pixel's threshold is fitted between frames")
-    ratio_min = Positive(0.01, "1", "smallest calibrated over nominal threshold that is believed")
-    ratio_max = Positive(1 / 0.6, "1", "largest calibrated over nominal threshold believed")
+    ratio_min = Positive(
+        0.01, "1", "smallest calibrated over nominal threshold that is believed", gradient=False
+    )
+    ratio_max = Positive(
+        1 / 0.6, "1", "largest calibrated over nominal threshold believed", gradient=False
+    )
     weighting = Choice(
         ("linear", "certainty"), "of two frames between them: by time alone, or by certainty too"
     )
-
-    def __init__(self, **values: Any):
-        super().__init__(**values)
 
 
 def brightness(params: FrameParams, on: Array, off: Array) -> Array:

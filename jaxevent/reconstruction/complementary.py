@@ -36,17 +36,11 @@ class Params(FrameParams):
 
     alpha = Positive(15.0, "rad/s", "cut-off frequency")
 
-    def __init__(self, **values: Any):
-        super().__init__(**values)
-
 
 class AugmentedParams(AugmentParams):
     """Parameters of the complementary filter with augmentation."""
 
     alpha = Positive(15.0, "rad/s", "cut-off frequency")
-
-    def __init__(self, **values: Any):
-        super().__init__(**values)
 
 
 class Pull(Observer):

@@ -4,8 +4,6 @@ Per pixel: the state is the log intensity L with variance P. Events move L by th
 add noise Q; between events the augmented frame L^A, believed with variance density R, pulls L.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -63,8 +61,11 @@ class Params(AugmentParams):
         },
     }
 
-    def __init__(self, **values: Any):
-        super().__init__(**values)
+    def without_gradient(self) -> dict[str, str]:
+        found = super().without_gradient()
+        if not float(self.rho_width) > 0:
+            found["rho"] = "is compared with while rho_width is 0; start with rho_width above 0"
+        return found
 
 
 class Augmentation(Observer):

@@ -72,11 +72,10 @@ class Params(CertaintyParams):
     }
 
     share = Positive(0.5, "1", "part of an event's change that belongs to its 8 neighbours")
-    spread = Positive(0.0, "s", "longest time between events over which a change is spread")
+    spread = Positive(
+        0.0, "s", "longest time between events over which a change is spread", gradient=False
+    )
     one_sided = Choice((True, False), "whether clipped frames tell that L lies beyond the clip")
-
-    def __init__(self, **values: Any):
-        super().__init__(**values)
 
 
 class Gaussian(eqx.Module):

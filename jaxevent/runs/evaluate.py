@@ -6,15 +6,17 @@
     metrics = ["lpips"]                             # of images; further ones, named in MEASURES
 
     [[method]]
-    name = "akf"                                    # a key of jaxevent.METHODS, or of egomotion's
+    name = "akf"                                    # a key of jaxevent.METHODS, or of your own:
+                                                    # "package.module:object"
     params = { c_on = 0.08, clock_offset = 0.0075 } # or the path of a TOML file; omitted: defaults
                                                     # { file = "PATH", c_on = 0.08 }: both
     label = "akf, by hand"                          # in the table; omitted: the name
     grid = { c_on = [0.05, 0.1], kappa = [1, 2] }   # each combination, added to params and label
     normalise = "affine"                            # fit each image's brightness to the truth
 
-The protocols "motion" and "tracks", with settings of their own beside it, are described in
-`jaxevent.runs.egomotion_scores` and `jaxevent.runs.blob_scores`; the others ask for images.
+Each family of estimators has protocols of its own, with settings of their own beside it: images
+are asked for by "held-out" and "reference", described below, the others are described in
+`jaxevent.runs.egomotion_scores` ("motion") and `jaxevent.runs.blob_scores` ("tracks").
 
 A method of the name "external" scores images of another program: `jaxevent.runs.external`. Paths
 are relative to the folder of this file. The protocol "held-out" gives the methods frames 0, 2, 4,
@@ -43,62 +45,40 @@ again.
 import contextlib
 import dataclasses
 import hashlib
-import importlib
 import itertools
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 import jaxevent
 from jaxevent.errors import InputError
+from jaxevent.estimator import Estimator
 from jaxevent.io.output import values_of
 from jaxevent.methods import find
-from jaxevent.parameters import Parameters, nearest, read_toml
-from jaxevent.reconstruction.filtering import ImageEstimator
-from jaxevent.runs.config import find_recordings, read_params
+from jaxevent.parameters import Parameters, read_toml
+from jaxevent.runs.config import NAME, SIZE, Check, check, find_recordings, read_params
 from jaxevent.runs.contents import Contents, Opened
-from jaxevent.runs.external import External, check_normalise
-from jaxevent.runs.protocols import PROTOCOLS
+from jaxevent.runs.families import find_protocol
+from jaxevent.runs.family import Protocol, Source
 from jaxevent.runs.results import results, write_rows
-from jaxevent.runs.scores import check_measures, score_and_sample
 from jaxevent.runs.tasks import Outcome, Place, Task, run
 from jaxevent.show.report import write_parquet
 
 # Part of the keys of stored results: raised whenever the same recording, method and parameters give
 # other results than before.
-RESULTS_VERSION = 1
-
-
-# Protocols of other things than images: where they are described and their rows made.
-OTHERS = {"motion": "jaxevent.runs.egomotion_scores", "tracks": "jaxevent.runs.blob_scores"}
-
-
-class Named(NamedTuple):
-    """A method of another protocol."""
-
-    name: str
-    Params: type[Parameters]
-
+RESULTS_VERSION = 2
 
 _opened = Opened()
-
-
-def find_method(name: str) -> ImageEstimator:
-    """The method of that name; raises `InputError` naming the nearest."""
-    method = find(name, "reconstruction")
-    assert isinstance(method, ImageEstimator)
-    return method
 
 
 def evaluate(
     config: str | Path,
     out: str | Path | None = None,
-    progress: bool = False,
+    progress: bool | None = None,
     *,
     workers: int | None = None,
     cluster: str | None = None,
@@ -119,7 +99,7 @@ def evaluate(
             "parquet" is installed), config.toml (the file as it was run) and tasks (finished rows,
             which are not computed again); made if missing. Existing results are replaced at the
             end.
-        progress: Show bars on stderr.
+        progress: Whether bars are shown; None: where somebody looks on.
         workers: Compute in so many processes instead of this one.
         cluster: Compute on the Dask cluster whose scheduler has this address. Its workers need the
             same version of jaxevent, and to find recordings by the same paths; those with one
@@ -149,7 +129,7 @@ def evaluate(
             write_rows(rows, write)
             pictures = [(o.result or {}).get("picture") for o in outcomes]
             hosts = sorted({o.host for o in outcomes if o.host})
-            html = page(rows, pictures, plan.protocol, text.decode(), hosts, Path(config).name)
+            html = page(rows, pictures, plan.name, text.decode(), hosts, Path(config).name)
             write("report.html", html.encode())
             write_parquet(Path(out) / "results.parquet", rows)
     return rows
@@ -172,7 +152,7 @@ def _rows(plan: "Plan", outcomes: list[Outcome]) -> list[dict[str, Any]]:
     return rows
 
 
-def _tasks(plan: "Plan", folder: Path | None, progress: bool, here: bool) -> list[Task]:
+def _tasks(plan: "Plan", folder: Path | None, progress: bool | None, here: bool) -> list[Task]:
     """A task for each recording and method; with a folder, keyed by all that its row depends on.
 
     Tasks that are run `here` show a bar of their own.
@@ -183,32 +163,27 @@ def _tasks(plan: "Plan", folder: Path | None, progress: bool, here: bool) -> lis
     for (given, path), entry in itertools.product(plan.recordings, plan.methods):
         path = path.absolute()
         about = {
-            "method": entry.method.name,
+            "method": entry.name,
             "params": entry.settings(),
-            "protocol": plan.protocol,
-            "metrics": list(plan.metrics),
-            "normalise": entry.normalise,
+            "protocol": plan.name,
+            "options": {**plan.options, **entry.own},
             "size": plan.size,
             "double": double,
             "version": f"{jaxevent.__version__}, results {RESULTS_VERSION}",
-            **({} if plan.other is None else {"options": plan.options}),
         }
         key = None
         if contents is not None:
             # What cannot be read has no key; computing it says why.
             with contextlib.suppress(OSError, InputError):
-                read = contents.of(path)
-                whole = {**about, "content": read}
-                if isinstance(entry.method, External):
-                    files = entry.method.find(_name(path)).files
-                    whole["images"] = [contents.of(file) for file in files]
+                whole = {**about, "content": contents.of(path)}
+                files = plan.protocol.files(path, plan.options)
+                if isinstance(entry.method, Source):
+                    files = [*files, *entry.method.files(_name(path))]
                     whole["params"] = entry.method.values()
-                elif plan.other is not None:
-                    truths = plan.other.files(path, plan.options)
-                    whole["truths"] = [contents.of(file) for file in truths]
+                whole["files"] = [contents.of(file) for file in files]
                 text = json.dumps(whole, sort_keys=True)
                 key = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
-        arguments = {"path": str(path), **about, "progress": progress and here}
+        arguments = {"path": str(path), **about, "progress": progress if here else False}
         tasks.append(Task(f"{given}, {entry.label}", arguments, key))
     if contents is not None:
         contents.save()
@@ -220,13 +195,11 @@ def _compute(
     method: str,
     params: dict[str, Any],
     protocol: str,
-    metrics: list[str],
-    normalise: str,
+    options: dict[str, Any],
     size: tuple[int, int] | None,
     double: bool,
     version: str,
-    progress: bool,
-    options: dict[str, Any] | None = None,
+    progress: bool | None,
 ) -> dict[str, Any]:
     """The task: {"row", "picture"} of a recording and a method, on whichever machine."""
     from jaxevent.show.page import picture
@@ -236,21 +209,19 @@ def _compute(
         raise InputError(
             f"{path}: this worker has jaxevent {mine}, not {version}; install the same everywhere"
         )
+    kind, family = find_protocol(protocol)
     with jax.enable_x64(double):
         recording = _opened.load(Path(path), size, progress)
-        if options is not None:
-            kind = other(protocol)
-            assert kind is not None
-            chosen = kind.find(method, options).of(params)
-            scores = kind.score(recording, method, chosen, options, progress)
-            about = {"recording": recording.name, "method": method}
-            return {"row": {**about, **scores, "params": values_of(chosen)}, "picture": None}
-        source = External(**params) if method == "external" else find_method(method)
-        values = None if isinstance(source, External) else source.Params.of(params)
-        name = _name(Path(path))
-        row, sample = score_and_sample(
-            recording, source, values, protocol, metrics, normalise, progress, name
-        )
+        if method in kind.sources:
+            source, values = kind.sources[method](**params), None
+            told = source.values()
+        else:
+            source = find(method, family)
+            values = source.Params.of(params)
+            told = values_of(values)
+        row = kind.score(recording, source, values, options, progress)
+        sample = row.pop("sample", None)
+    row = {"recording": recording.name, "method": method, **row, "params": told}
     return {"row": row, "picture": None if sample is None else picture(sample)}
 
 
@@ -261,45 +232,33 @@ def _name(path: Path) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """A checked configuration: recordings (as given, path) and methods."""
+    """A checked configuration: recordings (as given, path), methods and how they are scored."""
 
     recordings: list[tuple[str, Path]]
     methods: list["Entry"]
-    protocol: str
+    name: str
+    protocol: Protocol
+    options: dict[str, Any]
     size: tuple[int, int] | None
-    metrics: tuple[str, ...] = ()
-    options: dict[str, Any] = dataclasses.field(default_factory=dict)  # of another protocol
-
-    @property
-    def other(self) -> ModuleType | None:
-        """Of a protocol of other things than images."""
-        return other(self.protocol)
-
-
-def other(protocol: str) -> ModuleType | None:
-    """The module of a protocol of other things than images."""
-    return importlib.import_module(OTHERS[protocol]) if protocol in OTHERS else None
 
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """A method of a configuration with one set of parameters; `External` has none."""
+    """A method of a configuration with one set of parameters; a `Source` has none."""
 
     label: str
-    method: ImageEstimator | External | Named
+    name: str  # as the registry, or the protocol's sources, find it
+    method: Estimator | Source
     params: Parameters | None
-    normalise: str
+    own: dict[str, Any]  # settings of the protocol that this method has for itself
 
     def settings(self) -> dict[str, Any]:
         """What `_compute` makes it from again."""
-        if isinstance(self.method, External):
-            return dict(vars(self.method))
-        assert self.params is not None
-        return self.params.values()
+        return dict(vars(self.method)) if self.params is None else self.params.values()
 
     def shown(self) -> dict[str, Any]:
         """The parameters as a row shows them."""
-        if isinstance(self.method, External):
+        if isinstance(self.method, Source):
             return self.method.values()
         assert self.params is not None
         return values_of(self.params)
@@ -309,51 +268,32 @@ def read_plan(config: Path) -> Plan:
     """Read and check a configuration; raises `InputError` naming the file and the setting."""
     table = read_toml(config)
     try:
-        protocol = table.get("protocol", "held-out")
-        if protocol not in (every := [*PROTOCOLS, *OTHERS]):
-            near = nearest(str(protocol), every)
-            raise InputError(f"there is no protocol {protocol!r}; {near}")
-        kind = other(protocol)
-        own = ("metrics",) if kind is None else tuple(kind.SETTINGS)
-        _refuse_unknown(table, ("recordings", "protocol", "size", "method", *own))
-        options = {name: table[name] for name in own if name in table and kind is not None}
-        if kind is not None:
-            for name, value in options.items():
-                fits, what = kind.SETTINGS[name]
-                if not fits(value):
-                    raise InputError(f"{name} is {value!r}; give {what}")
-            kind.check(options)
+        name = table.get("protocol", "held-out")
+        protocol, family = find_protocol(str(name))
+        tables: Check = (lambda value: isinstance(value, list), "[[method]] tables")
+        anything: Check = (lambda value: True, "")
+        known = {"recordings": anything, "protocol": NAME, "size": SIZE, "method": tables}
+        check(table, {**known, **protocol.settings})
+        options = {key: table[key] for key in protocol.settings if key in table}
+        protocol.check(options)
         size = table.get("size")
-        if size is not None and not (
-            isinstance(size, list) and len(size) == 2 and all(type(n) is int for n in size)
-        ):
-            raise InputError(f"size is {size!r}; give [width, height] in pixels")
-        metrics = table.get("metrics", [])
-        if not (isinstance(metrics, list) and all(isinstance(name, str) for name in metrics)):
-            raise InputError(f'metrics is {metrics!r}; give a list of names, as ["lpips"]')
-        check_measures(metrics)
         recordings = find_recordings(table.get("recordings"), config.parent)
-        return Plan(
-            recordings,
-            _methods(table.get("method"), config.parent, kind, options),
-            protocol,
-            None if size is None else (size[0], size[1]),
-            tuple(metrics),
-            options,
-        )
+        methods = _methods(table.get("method"), config.parent, protocol, family, options)
+        size = None if size is None else (size[0], size[1])
+        return Plan(recordings, methods, name, protocol, options, size)
     except InputError as error:
         raise InputError(f"{config}: {error}") from None
 
 
 def _methods(
-    given: Any, folder: Path, kind: ModuleType | None, options: Mapping[str, Any]
+    given: Any, folder: Path, protocol: Protocol, family: str, options: Mapping[str, Any]
 ) -> list[Entry]:
     if not (isinstance(given, list) and given and all(isinstance(one, dict) for one in given)):
         raise InputError('no method is given; add [[method]] with name = "akf"')
     entries: list[Entry] = []
     for number, table in enumerate(given, 1):
         try:
-            for entry in _entries(table, folder, kind, options):
+            for entry in _entries(table, folder, protocol, family, options):
                 if any(entry.label == other.label for other in entries):
                     raise InputError(f"another one is labelled {entry.label!r} too; add a label")
                 entries.append(entry)
@@ -363,24 +303,31 @@ def _methods(
 
 
 def _entries(
-    table: Mapping[str, Any], folder: Path, kind: ModuleType | None, options: Mapping[str, Any]
+    table: Mapping[str, Any],
+    folder: Path,
+    protocol: Protocol,
+    family: str,
+    options: Mapping[str, Any],
 ) -> Iterator[Entry]:
     """The method of one table, once for each combination of its grid."""
-    own = dict(table)
-    name = own.pop("name", None)
-    normalise = own.pop("normalise", "none") if kind is None else "none"
-    label = own.pop("label", name)
+    rest = dict(table)
+    name = rest.pop("name", None)
+    label = rest.pop("label", name)
     if not isinstance(name, str) or not isinstance(label, str):
         raise InputError('name and label must be text; give name = "akf"')
-    check_normalise(normalise)
-    fitted = "" if normalise == "none" else ", brightness fitted"
-    if name == External.name and kind is None:
-        yield Entry(label + fitted, External.of(own, folder.absolute()), None, normalise)
+    own = {key: rest.pop(key) for key in protocol.own if key in rest}
+    check(own, protocol.own)
+    ending = protocol.label(own)
+    if name in protocol.sources:
+        source = protocol.sources[name].of(rest, folder.absolute())
+        yield Entry(label + ending, name, source, None, own)
         return
-    _refuse_unknown(own, ("name", "params", "label", "grid", *(["normalise"] * (kind is None))))
-    method = find_method(name) if kind is None else Named(name, kind.find(name, options))
-    params = read_params(method.Params, method.name, own.get("params", {}), folder)
-    grid = own.get("grid", {})
+    anything: Check = (lambda value: True, "")
+    check(rest, {**dict.fromkeys(("name", "params", "label", "grid"), anything), **protocol.own})
+    method = find(name, family)
+    protocol.check_method(method, options)
+    params = read_params(method.Params, method.name, rest.get("params", {}), folder)
+    grid = rest.get("grid", {})
     if not isinstance(grid, dict) or not all(isinstance(v, list) and v for v in grid.values()):
         raise InputError(f"grid is {grid!r}; give a table of lists, as {{ c_on = [0.05, 0.1] }}")
     if "preset" in grid:
@@ -394,10 +341,4 @@ def _entries(
             for key, value in point.items()
         )
         chosen = method.Params.of({**params.values(), **point}) if point else params
-        yield Entry(f"{label}{said}{fitted}", method, chosen, normalise)
-
-
-def _refuse_unknown(table: Mapping[str, Any], known: tuple[str, ...]) -> None:
-    for name in table:
-        if name not in known:
-            raise InputError(f"there is no setting {name!r}; {nearest(name, known)}")
+        yield Entry(f"{label}{said}{ending}", name, method, chosen, own)

@@ -24,7 +24,7 @@ every method may have, each image is replaced by a * image + b, a >= 0, that fit
 import dataclasses
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from jaxevent.errors import InputError
 from jaxevent.io.images import TIMES, Scale, Series, read_series
 from jaxevent.parameters import nearest
+from jaxevent.runs.family import Source
 
 Normalise = Literal["none", "affine"]
 
@@ -43,7 +44,7 @@ SAMPLE = 1 << 13  # pixels that the brightness is fitted to, at most
 
 
 @dataclasses.dataclass(frozen=True)
-class External:
+class External(Source):
     """Where the images are and how they are stored; the text of this module has more."""
 
     images: str
@@ -80,6 +81,9 @@ class External:
     def values(self) -> dict[str, Any]:
         """The settings."""
         return {name: value for name, value in vars(self).items() if name != "folder"}
+
+    def files(self, recording: str) -> Sequence[Path]:
+        return self.find(recording).files
 
     def find(self, recording: str) -> Series:
         """The images of the recording of that name; raises `InputError` naming what is wrong."""

@@ -20,7 +20,7 @@ describes it:
     warm_up = 0.2                       # s that are prepared around a window
 
     [[method]]
-    name = "akf"                        # a key of jaxevent.METHODS
+    name = "akf"                        # a key of jaxevent.METHODS, or "package.module:object"
     label = "akf, mine"                 # in the results; omitted: the name
     params = { c_on = 0.08 }            # to start from, or a TOML file; omitted: defaults
     fit = ["c_on", "c_off"]             # by gradient
@@ -30,38 +30,34 @@ A method may have its own loss, error, learning_rate, iterations and starts. Par
 fixed when a recording is prepared have no gradient to follow; each candidate of a search is
 prepared anew. Values omitted are those above, except where comments say otherwise.
 
-The settings from `loss` on are those of reconstruction. `jaxevent.runs.blob` tells those of
-the tracker, the method "blob", and `jaxevent.runs.egomotion` those of egomotion, the method
-"voting". What the loop and the files need of a system is in `System`. All local devices are used,
-and several processes fit together: `jaxevent.devices`.
+The settings from `loss` on are those of reconstruction; `jaxevent.runs.blob` and
+`jaxevent.runs.egomotion` tell those of the other families. All local devices are used, and several
+processes fit together: `jaxevent.devices`.
 """
 
 import contextlib
 import csv
 import dataclasses
-import functools
 import hashlib
 import io
 import json
 import math
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxevent import devices
 from jaxevent.errors import InputError, require
+from jaxevent.estimator import Estimator
 from jaxevent.io import load
 from jaxevent.io.output import complete
-from jaxevent.methods import find, names
-from jaxevent.parameters import Parameters, nearest, read_toml
-from jaxevent.reconstruction.augment import PREPARED, FrameParams
-from jaxevent.reconstruction.filtering import ImageEstimator
+from jaxevent.methods import find
+from jaxevent.parameters import Parameters, read_toml
 from jaxevent.recording import Recording
 from jaxevent.runs import toml
 from jaxevent.runs.config import (
@@ -76,35 +72,14 @@ from jaxevent.runs.config import (
     find_recordings,
     is_number,
     is_texts,
-    one_of,
     read_params,
 )
 from jaxevent.runs.contents import fingerprint
-from jaxevent.runs.protocols import PROTOCOLS
-from jaxevent.runs.reconstruction import (
-    ERRORS,
-    REGIONS,
-    Objective,
-    Problem,
-    parts,
-)
+from jaxevent.runs.families import HOMES, family_of, find_family
+from jaxevent.runs.family import Goal, Shares, Sources
 from jaxevent.runs.results import results, write_rows
-from jaxevent.runs.scores import score, subset
-from jaxevent.show.report import markdown_table
-from jaxevent.splits import SPLITS, interleave
-from jaxevent.tuning import (
-    Batches,
-    Fitted,
-    Interval,
-    Loss,
-    Run,
-    Settings,
-    begin,
-    optimise,
-    with_raw,
-)
-
-P = TypeVar("P", bound=Parameters)
+from jaxevent.splits import SPLITS
+from jaxevent.tuning import Fitted, Interval, Run, Settings, begin, optimise
 
 # s between checkpoints
 PERIOD = 2.0
@@ -231,7 +206,7 @@ def fit(
 
 
 def _rows(
-    task: "Task", label: str, params: Any, sources: "Sources", plan: "Plan", progress: bool
+    task: "Task", label: str, params: Any, sources: Sources, plan: "Plan", progress: bool
 ) -> Iterator[dict[str, Any]]:
     for row in task.goal.score(sources, plan.split, plan.window, params, progress):
         yield {**row, "method": label}
@@ -257,152 +232,12 @@ def unseen(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return []
 
 
-Sources = Mapping[str, Sequence[tuple[str, Recording]]]  # (as given, recording) by split
-Shares = tuple[int, ...] | None  # of fit, validation, test; None: they have their own recordings
-
-
-@runtime_checkable
-class Goal(Protocol):
-    """What one method of a configuration is fitted to, and how what comes of it is scored."""
-
-    @property
-    def loss(self) -> Loss:
-        """That of `optimise`; equal goals have losses that are equal and hash alike."""
-        ...
-
-    @property
-    def prepared(self) -> Collection[str]:
-        """Parameters without gradient: they act when batches are made, or by decisions."""
-        ...
-
-    @property
-    def forward(self) -> bool | None:
-        """Which mode of derivatives is the faster; None: that depends on how many, see FORWARD."""
-        ...
-
-    def files(self, recording: Path) -> list[Path]:
-        """What is read besides the recording."""
-        ...
-
-    def problem(
-        self, sources: Sources, split: Shares, window: float | int | None
-    ) -> Callable[[Any], Batches]:
-        """The batches to fit to and to validate on, as functions of parameters."""
-        ...
-
-    def score(
-        self,
-        sources: Sources,
-        split: Shares,
-        window: float | int | None,
-        params: Any,
-        progress: bool,
-    ) -> Iterator[dict[str, Any]]:
-        """Rows of every recording and split: they have the keys recording and split."""
-        ...
-
-    def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
-        """Rows, which now have the key method too, as a Markdown table."""
-        ...
-
-
-@runtime_checkable
-class System(Protocol):
-    """A family of methods, as configurations name them: reconstruction, or the tracker."""
-
-    @property
-    def settings(self) -> Mapping[str, Check]:
-        """What a configuration may hold for it."""
-        ...
-
-    @property
-    def own(self) -> Collection[str]:
-        """Those settings that a method may have for itself."""
-        ...
-
-    def start(self, name: str, given: Any, folder: Path) -> Parameters:
-        """Parameters of a method as a configuration gives them."""
-        ...
-
-    def goal(self, name: str, params: Any, given: Mapping[str, Any]) -> Goal:
-        """From checked settings, the method's own before those of the file."""
-        ...
-
-
-def systems() -> dict[str, System]:
-    """By the name of every method that can be fitted."""
-    from jaxevent.runs.blob import BLOB
-    from jaxevent.runs.egomotion import VOTING
-
-    return {
-        **dict.fromkeys(names("reconstruction"), RECONSTRUCTION),
-        "blob": BLOB,
-        "voting": VOTING,
-    }
-
-
-@dataclasses.dataclass(frozen=True)
-class Reconstruction:
-    """The goal of a reconstruction method."""
-
-    method: ImageEstimator
-    loss: Objective
-    protocol: str
-    warm_up: float | int
-    weights: Mapping[str, float | int] | None
-    prepared = PREPARED
-    forward = None
-
-    def files(self, recording: Path) -> list[Path]:
-        return []
-
-    def problem(self, sources: Sources, split: Shares, window: float | int | None) -> Problem:
-        cut = functools.partial(
-            parts,
-            protocol=self.protocol,
-            split=split or (1, 0, 0),
-            window=window,
-            warm_up=self.warm_up,
-        )
-        found: dict[str, list] = {}
-        for name in ("fit", "validation"):
-            found[name] = []
-            for _, recording in sources[name]:
-                self.method.check(recording)
-                found[name] += cut(recording)
-        return Problem(self.loss, found["fit"], found["validation"], self.weights)
-
-    def score(
-        self,
-        sources: Sources,
-        split: Shares,
-        window: float | int | None,
-        params: FrameParams,
-        progress: bool,
-    ) -> Iterator[dict[str, Any]]:
-        for whole in SPLITS:
-            for given, recording in sources[whole]:
-                row = score(recording, self.method, params, self.protocol, progress=progress)
-                row["recording"] = given
-                if split is None:
-                    yield {**row, "split": whole}
-                    continue
-                shared = interleave(split, row["frames"])
-                if self.loss.error is None:  # no image was looked at
-                    shared[:] = SPLITS.index("test")
-                for place, name in enumerate(SPLITS):
-                    if (shared == place).any():
-                        yield {**subset(row, np.flatnonzero(shared == place)), "split": name}
-
-    def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
-        return markdown_table(rows)
-
-
 @dataclasses.dataclass(frozen=True)
 class Task:
     """One method of a configuration, checked."""
 
     label: str
+    method: Estimator
     params: Parameters
     names: tuple[str, ...]
     search: Mapping[str, Interval]
@@ -495,8 +330,8 @@ def read_plan(config: Path, recordings: Sequence[str | Path] | None = None) -> P
     """
     table = read_toml(config)
     try:
-        known = systems()
-        further = {k: v for one in known.values() for k, v in one.settings.items()}
+        families = {name: find_family(name) for name in HOMES}
+        further = {k: v for one in families.values() for k, v in one.fit_settings.items()}
         check(table, {**_COMMON, **further})
         text = config.read_bytes()
         folders = dict.fromkeys(SPLITS, config.parent)
@@ -521,14 +356,14 @@ def read_plan(config: Path, recordings: Sequence[str | Path] | None = None) -> P
         tasks: list[Task] = []
         for number, entry in enumerate(table["method"], 1):
             try:
-                tasks.append(_task(entry, table, config.parent, known))
+                tasks.append(_task(entry, table, config.parent))
             except InputError as error:
                 raise InputError(f"method {number}: {error}") from None
         labels = [task.label for task in tasks]
         for label in labels:
             if labels.count(label) > 1:
                 raise InputError(f"two methods are called {label!r}; give them different labels")
-        used = {k for entry in table["method"] for k in known[entry["name"]].settings}
+        used = {k for task in tasks for k in family_of(task.method).fit_settings}
         for name in table:
             if name in further and name not in used:
                 raise InputError(f"{name} is a setting of none of these methods; omit it")
@@ -545,82 +380,24 @@ def read_plan(config: Path, recordings: Sequence[str | Path] | None = None) -> P
         raise InputError(f"{config}: {error}") from None
 
 
-def _task(
-    entry: Mapping[str, Any], table: Mapping[str, Any], folder: Path, known: Mapping[str, System]
-) -> Task:
+def _task(entry: Mapping[str, Any], table: Mapping[str, Any], folder: Path) -> Task:
     name = entry.get("name")
-    system = known.get(name) if isinstance(name, str) else None
-    own = (one for one in known.values() if system in (one, None))
-    check(entry, {**_METHOD, **{k: one.settings[k] for one in own for k in one.own}})
-    if name is None:
+    if not isinstance(name, str):
         raise InputError('a method has no name; give name = "akf"')
-    if system is None:
-        raise InputError(f"there is no method {name!r}; {nearest(name, known)}")
-    params = system.start(name, entry.get("params", {}), folder)
+    method = find(name)
+    family = family_of(method)
+    check(entry, {**_METHOD, **{k: family.fit_settings[k] for k in family.own}})
+    params = read_params(method.Params, name, entry.get("params", {}), folder)
     both = {**table, **entry}
-    goal = system.goal(name, params, both)
+    goal = family.goal(method, params, both)
     names, search = tuple(entry.get("fit", ())), entry.get("search", {})
-    for one in names:
-        if one in goal.prepared:
-            raise InputError(
-                f"{one} is fixed when a recording is prepared and has no gradient to follow; "
-                f"put search = {{ {one} = [from, to, number of points] }}"
-            )
     if not names and not search:
         raise InputError('nothing is to be fitted; give names, as fit = ["c_on", "c_off"]')
     given = {name: both[name] for name in _SETTINGS if name in both}
     settings = Settings(**given, forward=goal.forward)
     intervals = {name: (low, high, count) for name, (low, high, count) in search.items()}
     begin(params, names, settings, intervals)  # checks the names
-    return Task(entry.get("label", name), params, names, intervals, goal, settings)
-
-
-class _Reconstructions:
-    """The system of the methods of `jaxevent.METHODS`."""
-
-    settings: dict[str, Check] = {
-        "loss": NAME,
-        "protocol": NAME,
-        "error": NAME,
-        "dark_offset": POSITIVE,
-        "weights": (
-            lambda value: (
-                isinstance(value, dict)
-                and set(value) <= set(REGIONS)
-                and all(is_number(n) and n >= 0 for n in value.values())
-            ),
-            "a table of numbers named dark, well, bright",
-        ),
-        "warm_up": NOT_NEGATIVE,
-    }
-    own = ("loss", "error")
-
-    def start(self, name: str, given: Any, folder: Path) -> FrameParams:
-        return read_params(find(name).Params, name, given, folder)
-
-    def goal(self, name: str, params: Any, given: Mapping[str, Any]) -> Reconstruction:
-        method = find(name, "reconstruction")
-        assert isinstance(method, ImageEstimator)
-        loss = one_of(given.get("loss", "held-out"), "loss", [*PROTOCOLS, "likelihood"])
-        protocol = loss
-        if loss == "likelihood":
-            protocol = one_of(given.get("protocol", "held-out"), "protocol", list(PROTOCOLS))
-        elif given.get("protocol", loss) != loss:
-            raise InputError(f"the loss {loss!r} has the protocol of that name; omit protocol")
-        error = one_of(given.get("error", "linear"), "error", ERRORS)
-        weights = given.get("weights")
-        if weights is not None and protocol != "reference":
-            raise InputError("weights are for HDR references, the loss 'reference'; omit them")
-        objective = Objective(
-            method,
-            None if loss == "likelihood" else error,
-            protocol == "held-out",
-            given.get("dark_offset", 0.003),
-        )
-        return Reconstruction(method, objective, protocol, given.get("warm_up", 0.2), weights)
-
-
-RECONSTRUCTION = _Reconstructions()
+    return Task(entry.get("label", name), method, params, names, intervals, goal, settings)
 
 
 def _sources(plan: Plan, progress: bool) -> Sources:
@@ -673,7 +450,7 @@ def _restore(
                 raise
             raise InputError(f"{path}: is not a checkpoint; remove it to start anew") from error
     done = [
-        Fitted(with_raw(task.params, raw), *rest)
+        Fitted(task.params.with_raw(raw), *rest)
         for task, raw, rest in zip(tasks, raws, ended, strict=True)
     ]
     return done, None if under_way is None else Run(position, *under_way)

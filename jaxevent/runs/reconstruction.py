@@ -1,12 +1,15 @@
-"""What reconstructions are fitted to: images not given to the method, or the frames' likelihood.
+"""How methods of reconstruction are scored and fitted.
+
+They are fitted to images not given to the method, or to the likelihood of the frames that are.
 
 A recording is cut into time windows (or taken whole), each prepared once: a `Part`. `Problem` turns
 the parts of a method into the batches of `jaxevent.optimise`, `Objective` is its loss.
 """
 
 import dataclasses
+import functools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -18,12 +21,17 @@ from numpy.typing import NDArray
 
 from jaxevent.devices import ELSEWHERE
 from jaxevent.errors import InputError
-from jaxevent.reconstruction.augment import PREPARED, FrameParams
+from jaxevent.parameters import Parameters
+from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.filtering import ImageEstimator
-from jaxevent.reconstruction.pixels import Numeric, over_pixels, pixel_mesh
+from jaxevent.reconstruction.pixels import Numeric, Timing, over_pixels, pixel_mesh
 from jaxevent.recording import Frames, Recording
+from jaxevent.runs.config import NAME, NOT_NEGATIVE, POSITIVE, is_number, one_of
+from jaxevent.runs.family import Family, Goal, Shares, Sources
 from jaxevent.runs.protocols import PROTOCOLS, Reference, frame_times
-from jaxevent.splits import interleave
+from jaxevent.runs.scores import ImageProtocol, score, subset
+from jaxevent.show.report import markdown_table
+from jaxevent.splits import SPLITS, interleave
 
 ERRORS = ("linear", "log", "nll")
 REGIONS = ("dark", "well", "bright")
@@ -195,7 +203,7 @@ class Problem:
     `devices.ELSEWHERE`.
 
     They are prepared when first asked for and again for params that differ in what preparation
-    fixes (`augment.PREPARED`). `weights` are those of dark, well exposed and bright pixels of HDR
+    fixes (`pixels.Timing`). `weights` are those of dark, well exposed and bright pixels of HDR
     references, told apart by their `clip`; omitted, 1.
     """
 
@@ -220,7 +228,7 @@ class Problem:
 
     def __call__(self, params: FrameParams) -> tuple[list[Any], list[Any]]:
         """Batches to fit to, and batches to validate on."""
-        fixed = tuple(float(getattr(params, n)) for n in PREPARED if n in params.numbers)
+        fixed = Timing.of(params)
         if self._prepared is None or self._prepared[0] != fixed:
             self._prepared = None  # so that two are never held at once
             batches: tuple[list[Any], list[Any]] = ([], [])
@@ -286,3 +294,102 @@ def _intensity(truth: Frames, rows: NDArray[np.int64]) -> NDArray:
     if isinstance(truth, Reference):
         return np.stack([truth.truth(int(row)).ravel() for row in rows])
     return truth[rows].intensity.reshape(len(rows), -1)
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageGoal(Goal):
+    """The goal of a method of reconstruction."""
+
+    method: ImageEstimator
+    loss: Objective
+    protocol: str
+    warm_up: float | int
+    weights: Mapping[str, float | int] | None
+
+    def problem(self, sources: Sources, split: Shares, window: float | int | None) -> Problem:
+        cut = functools.partial(
+            parts,
+            protocol=self.protocol,
+            split=split or (1, 0, 0),
+            window=window,
+            warm_up=self.warm_up,
+        )
+        found: dict[str, list] = {}
+        for name in ("fit", "validation"):
+            found[name] = []
+            for _, recording in sources[name]:
+                self.method.check(recording)
+                found[name] += cut(recording)
+        return Problem(self.loss, found["fit"], found["validation"], self.weights)
+
+    def score(
+        self,
+        sources: Sources,
+        split: Shares,
+        window: float | int | None,
+        params: FrameParams,
+        progress: bool,
+    ) -> Iterator[dict[str, Any]]:
+        for whole in SPLITS:
+            for given, recording in sources[whole]:
+                row = score(recording, self.method, params, self.protocol, progress=progress)
+                row["recording"] = given
+                if split is None:
+                    yield {**row, "split": whole}
+                    continue
+                shared = interleave(split, row["frames"])
+                if self.loss.error is None:  # no image was looked at
+                    shared[:] = SPLITS.index("test")
+                for place, name in enumerate(SPLITS):
+                    if (shared == place).any():
+                        yield {**subset(row, np.flatnonzero(shared == place)), "split": name}
+
+    def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
+        return markdown_table(rows)
+
+
+class Reconstruction(Family):
+    """The methods that make images."""
+
+    protocols = {name: ImageProtocol(name) for name in PROTOCOLS}
+
+    fit_settings = {
+        "loss": NAME,
+        "protocol": NAME,
+        "error": NAME,
+        "dark_offset": POSITIVE,
+        "weights": (
+            lambda value: (
+                isinstance(value, dict)
+                and set(value) <= set(REGIONS)
+                and all(is_number(n) and n >= 0 for n in value.values())
+            ),
+            "a table of numbers named dark, well, bright",
+        ),
+        "warm_up": NOT_NEGATIVE,
+    }
+    own = ("loss", "error")
+
+    def goal(
+        self, method: ImageEstimator, params: Parameters, settings: Mapping[str, Any]
+    ) -> ImageGoal:
+        loss = one_of(settings.get("loss", "held-out"), "loss", [*PROTOCOLS, "likelihood"])
+        protocol = loss
+        if loss == "likelihood":
+            protocol = one_of(settings.get("protocol", "held-out"), "protocol", list(PROTOCOLS))
+        elif settings.get("protocol", loss) != loss:
+            raise InputError(f"the loss {loss!r} has the protocol of that name; omit protocol")
+        error = one_of(settings.get("error", "linear"), "error", ERRORS)
+        weights = settings.get("weights")
+        if weights is not None and protocol != "reference":
+            raise InputError("weights are for HDR references, the loss 'reference'; omit them")
+        objective = Objective(
+            method,
+            None if loss == "likelihood" else error,
+            protocol == "held-out",
+            settings.get("dark_offset", 0.003),
+        )
+        return ImageGoal(method, objective, protocol, settings.get("warm_up", 0.2), weights)
+
+
+FAMILY = Reconstruction()

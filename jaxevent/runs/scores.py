@@ -4,7 +4,8 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,7 +29,9 @@ from jaxevent.parameters import nearest
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.filtering import ImageEstimator
 from jaxevent.recording import Frames, Recording
+from jaxevent.runs.config import is_texts
 from jaxevent.runs.external import External, Normalise, check_normalise, fit_brightness
+from jaxevent.runs.family import Protocol
 from jaxevent.runs.protocols import PROTOCOLS, Reference, frame_times
 
 # Further measures of an image and the truth, each a number per image. They cost more time, and the
@@ -207,7 +210,7 @@ def score(
     *,
     metrics: Iterable[str] = (),
     normalise: Normalise = "none",
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> dict[str, Any]:
     """Reconstruct the images that `protocol` asks for, and compare: one row of a table of results.
 
@@ -236,6 +239,50 @@ def score(
     return score_and_sample(recording, method, params, protocol, metrics, normalise, progress)[0]
 
 
+class ImageProtocol(Protocol):
+    """A protocol that asks for images; its name is a key of `protocols.PROTOCOLS`."""
+
+    settings = {
+        "metrics": (is_texts, 'a list of names, as ["lpips"]'),
+    }
+    own = {"normalise": (lambda value: value in get_args(Normalise), "'none' or 'affine'")}
+    sources = {External.name: External}
+
+    def __init__(self, name: str):
+        self.name = name
+
+    def check(self, options: Mapping[str, Any]) -> None:
+        check_measures(options.get("metrics", ()))
+
+    def label(self, own: Mapping[str, Any]) -> str:
+        return "" if own.get("normalise", "none") == "none" else ", brightness fitted"
+
+    def score(
+        self,
+        recording: Recording,
+        method: ImageEstimator | External,
+        params: FrameParams | None,
+        options: Mapping[str, Any],
+        progress: bool | None = None,
+    ) -> dict[str, Any]:
+        row, sample = score_and_sample(
+            recording,
+            method,
+            params,
+            self.name,
+            options.get("metrics", ()),
+            options.get("normalise", "none"),
+            progress,
+            _known_as(Path(recording.name)),
+        )
+        return {**row, "sample": sample}
+
+
+def _known_as(path: Path) -> str:
+    """How other programs' results call a recording: its name without suffix."""
+    return path.name if path.is_dir() else path.stem
+
+
 def score_and_sample(
     recording: Recording,
     method: ImageEstimator | External,
@@ -243,7 +290,7 @@ def score_and_sample(
     protocol: str,
     metrics: Iterable[str],
     normalise: str,
-    progress: bool,
+    progress: bool | None,
     name: str | None = None,
 ) -> tuple[dict[str, Any], Sample | None]:
     """As `score`, with the middle one of the images; `name` is by which images are found."""
@@ -311,7 +358,11 @@ Estimates = Iterator[tuple[int, NDArray[np.floating], NDArray[np.floating]]]
 
 
 def _estimates(
-    given: Recording, hidden: Frames, method: ImageEstimator, params: FrameParams, progress: bool
+    given: Recording,
+    hidden: Frames,
+    method: ImageEstimator,
+    params: FrameParams,
+    progress: bool | None,
 ) -> Estimates:
     video = method.estimate(given, params, progress=progress, devices=local())
     first = 0

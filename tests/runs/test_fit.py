@@ -125,7 +125,7 @@ def test_starts_are_followed_as_if_alone():
     best = []
     for start in range(3):
         raw = {name: leaf[start] for name, leaf in drawn.items()}
-        params = jaxevent.tuning.with_raw(Toy(), raw)
+        params = Toy().with_raw(raw)
         alone = optimise(
             toy, params, ["a", "b"], [ONE], settings=dataclasses.replace(settings, starts=1)
         )
@@ -303,7 +303,9 @@ def test_images_are_shared_out_in_a_fixed_pattern():
 class Shown(ImageEstimator):
     """A method whose images are what it is given to read, with the variance 0.3."""
 
-    filters = False
+    @property
+    def filters(self):
+        return False
 
     def start(self, params, features):
         return None

@@ -18,7 +18,6 @@ from jaxevent import cli
 from jaxevent.egomotion import particle_filter as voting
 from jaxevent.errors import InputError
 from jaxevent.runs.egomotion import VOTING, Loss
-from jaxevent.tuning import with_raw
 
 VELOCITIES = ((150.0, 80.0), (-90.0, 60.0), (40.0, -170.0))
 START = {"particles": 32, "batch": 16, "every": 4, "noise": 3.0, "tau_max": 0.06}
@@ -103,7 +102,7 @@ def test_the_gradient_with_resampling_is_that_of_common_random_numbers():
         start = 0.8 * truth + 30.0 * jax.random.normal(jax.random.fold_in(key, 1), (48, 2))
         carry = voting.begin(params, kind, noise)
         carry = dataclasses.replace(carry, particles=start, searching=jnp.asarray(False))
-        _, told = voting.run(with_raw(params, raw), kind, made, noise, carry)
+        _, told = voting.run(params.with_raw(raw), kind, made, noise, carry)
         return jnp.mean(told.mean @ truth) / jnp.sum(truth**2)
 
     value = jax.jit(jax.vmap(loss, (None, 0)))
