@@ -1,12 +1,17 @@
-"""Differentiable estimators for event cameras: reconstruction of HDR video from events and frames.
+"""Differentiable estimators for event cameras: video, tracks and motion from events.
 
-recording = jaxevent.load("slider_depth.zip")
-video = jaxevent.akf.estimate(recording, jaxevent.akf.Params(c_on=0.08))
-image, variance, valid = video(recording.frames.t)
+    recording = jaxevent.load("slider_depth.zip")
+    video = jaxevent.akf.estimate(recording, jaxevent.akf.Params(c_on=0.08))
+    image, variance, valid = video(recording.frames.t)
+
+Every estimator of `METHODS` is used in this way; `help(jaxevent.akf)` tells what one is. Compiled
+programs are kept in the user's cache folder: `jaxevent.cache` says how to change that.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
+
+from jaxevent import cache
 
 if TYPE_CHECKING:
     from jaxevent import blob, camera, egomotion, metrics, register, simulate
@@ -14,6 +19,7 @@ if TYPE_CHECKING:
     from jaxevent.estimator import Estimate, Estimator
     from jaxevent.io import load, save
     from jaxevent.methods import METHODS
+    from jaxevent.parameters import Parameters
     from jaxevent.reconstruction import (
         akf,
         aks,
@@ -27,35 +33,33 @@ if TYPE_CHECKING:
         last_frame,
     )
     from jaxevent.recording import Events, Frames, Recording
-    from jaxevent.runs import fit
+    from jaxevent.runs.evaluate import evaluate
+    from jaxevent.runs.fit import fit
+    from jaxevent.tuning import optimise
 
 __version__ = "0.1.0"
 
 # Loaded when first used: the readers and the compiled preparation are slow to import.
-_HOME = {
+_HOMES = {
     "jaxevent.errors": ("InputError",),
-    "jaxevent.io": ("load", "save"),
-    "jaxevent.recording": ("Events", "Frames", "Recording"),
     "jaxevent.estimator": ("Estimate", "Estimator"),
+    "jaxevent.io": ("load", "save"),
     "jaxevent.methods": ("METHODS",),
+    "jaxevent.parameters": ("Parameters",),
     "jaxevent.reconstruction": (
-        "akf",
-        "aks",
-        "augmented",
-        "blend",
-        "cf",
-        "cf_augmented",
-        "edi",
-        "high_pass",
-        "last_frame",
+        *("akf", "aks", "augmented", "blend", "cf", "cf_augmented", "edi", "high_pass"),
+        *("last_frame",),
     ),
+    "jaxevent.recording": ("Events", "Frames", "Recording"),
+    "jaxevent.runs.evaluate": ("evaluate",),
+    "jaxevent.runs.fit": ("fit",),
+    "jaxevent.tuning": ("optimise",),
 }
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 _MODULES = {
     **{name: name for name in ("blob", "camera", "egomotion", "metrics", "register", "simulate")},
     "colour": "reconstruction.colour",
-    "fit": "runs.fit",
 }
-_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
     "METHODS",
@@ -64,35 +68,41 @@ __all__ = [
     "Events",
     "Frames",
     "InputError",
+    "Parameters",
     "Recording",
     "akf",
     "aks",
     "augmented",
     "blend",
     "blob",
+    "cache",
     "camera",
     "cf",
     "cf_augmented",
     "colour",
     "edi",
     "egomotion",
+    "evaluate",
     "fit",
     "high_pass",
     "last_frame",
     "load",
     "metrics",
+    "optimise",
     "register",
     "save",
     "simulate",
 ]
 
+cache.keep_compiled()
+
 
 def __getattr__(name: str) -> Any:
     if name in _MODULES:
         return importlib.import_module(f"jaxevent.{_MODULES[name]}")
-    if name not in _MODULE_OF:
+    if name not in _HOME_OF:
         raise AttributeError(f"module 'jaxevent' has no attribute {name!r}")
-    return getattr(importlib.import_module(_MODULE_OF[name]), name)
+    return getattr(importlib.import_module(_HOME_OF[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -65,15 +65,38 @@ def jump(params: FrameParams, state: State, event: Event) -> State:
     return State(state.L + event_change(params, event.polarity, event.since), state.P)
 
 
-def _filter(name: str, model: type[Level], params: type[FrameParams], **more: Any) -> Filter:
+def _filter(
+    name: str, model: type[Level], params: type[FrameParams], about: str, **more: Any
+) -> Filter:
     def observe(values: Any, frames: FrameFeatures) -> Pull:
         return Pull(model(values, frames), values.alpha)
 
     return Filter(
-        name, params, observe, without_variance, advance, jump, has_covariance=False, **more
+        name,
+        params,
+        observe,
+        without_variance,
+        advance,
+        jump,
+        has_covariance=False,
+        about=f"{about} (Scheerlinck et al., ACCV 2018): a constant gain, no variance.",
+        **more,
     )
 
 
-cf = _filter("cf", Held, Params, needs_frames=True)
-cf_augmented = _filter("cf-augmented", Augmented, AugmentedParams, needs_frames=True)
-high_pass = _filter("high-pass", Nothing, Params)
+cf = _filter(
+    "cf", Held, Params, "The complementary filter of events and the last frame", needs_frames=True
+)
+cf_augmented = _filter(
+    "cf-augmented",
+    Augmented,
+    AugmentedParams,
+    "The complementary filter of events and the augmented frame",
+    needs_frames=True,
+)
+high_pass = _filter(
+    "high-pass",
+    Nothing,
+    Params,
+    "The high-pass filter of events alone, whose images have no absolute brightness",
+)

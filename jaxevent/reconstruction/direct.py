@@ -37,17 +37,33 @@ def advance(params: FrameParams, state: State, dt: Array, frame: Observation) ->
     return State(frame.level, jnp.broadcast_to(state.P, frame.level.shape))
 
 
-def _direct(name: str, model: type[Level]) -> Filter:
+def _direct(name: str, model: type[Level], about: str) -> Filter:
     def observe(values: Any, frames: FrameFeatures) -> Direct:
         return Direct(model(values, frames))
 
     return Filter(
-        name, model.Params, observe, without_variance, advance,
-        needs_frames=True, has_covariance=False,
-    )  # fmt: skip
+        name,
+        model.Params,
+        observe,
+        without_variance,
+        advance,
+        needs_frames=True,
+        has_covariance=False,
+        about=about,
+    )
 
 
-edi = _direct("edi", EventIntegral)
-augmented = _direct("augmented", Augmented)
-blend = _direct("blend", Blended)
-last_frame = _direct("last-frame", Held)
+edi = _direct(
+    "edi",
+    EventIntegral,
+    "The event double integral (Pan et al., CVPR 2019): the nearest frame, deblurred, and the "
+    "events since.",
+)
+augmented = _direct(
+    "augmented",
+    Augmented,
+    "The augmented frame of the AKF, read directly: two deblurred frames, and the events between "
+    "them with a threshold calibrated for each pixel.",
+)
+blend = _direct("blend", Blended, "The frames before and after, blended by time; no events.")
+last_frame = _direct("last-frame", Held, "The last frame, held; no events.")

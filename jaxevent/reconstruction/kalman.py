@@ -172,4 +172,14 @@ def jump(params: Params, state: State, event: Event) -> State:
     return State(L, state.P + jnp.where(event.polarity == 0, 0, noise(params, event)))
 
 
-akf = Filter("akf", Params, Augmentation, initial, advance, jump)
+akf = Filter(
+    "akf",
+    Params,
+    Augmentation,
+    initial,
+    advance,
+    jump,
+    about="The asynchronous Kalman filter (Wang et al., ICCV 2021), equations corrected. Per pixel "
+    "it estimates the log intensity and its variance: events move it by their threshold and make "
+    "it less certain, and between events the augmented frame pulls it.",
+)

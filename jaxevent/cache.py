@@ -1,0 +1,62 @@
+"""Compiled programs are kept in the user's cache folder, for later processes.
+
+Compiling takes seconds, running often less. So `import jaxevent` tells JAX to keep programs that
+took longer than `LEAST` to compile. JAX's own settings win: jax_compilation_cache_dir,
+JAX_COMPILATION_CACHE_DIR, JAX_ENABLE_COMPILATION_CACHE. JAXEVENT_CACHE=0 leaves all as it is, and
+JAXEVENT_CACHE=FOLDER names another folder.
+"""
+
+import contextlib
+import hashlib
+import os
+import platform
+import sys
+import warnings
+from pathlib import Path
+
+LEAST = 0.3  # s; shorter compilations are not worth a file
+
+
+def keep_compiled() -> Path | None:
+    """Have JAX keep what it compiles; returns the folder, or None where nothing is changed.
+
+    The settings are variables of the environment too, because processes started later inherit them.
+    The folder is named by the processor, whose instructions compiled programs use: homes are shared
+    by machines.
+    """
+    wanted = os.environ.get("JAXEVENT_CACHE", "")
+    theirs = {"JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE"} & os.environ.keys()
+    jax = sys.modules.get("jax")  # if it was imported before, it has read its variables already
+    if wanted == "0" or theirs or (jax and jax.config.jax_compilation_cache_dir):
+        return None
+    folder = (Path(wanted) if wanted else _user_folder()) / _processor()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:  # no home, as in some containers: everything works without
+        return None
+    if not os.access(folder, os.W_OK):
+        return None
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(LEAST))
+    if jax:
+        least = float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"])
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
+    # What cannot be kept, or was damaged, is compiled again.
+    warnings.filterwarnings("ignore", "Error (read|writ)ing persistent compilation cache")
+    return folder
+
+
+def _user_folder() -> Path:
+    from platformdirs import user_cache_path
+
+    return user_cache_path("jaxevent", appauthor=False) / "compiled"
+
+
+def _processor() -> str:
+    """A name of the instructions that this processor has."""
+    about = platform.machine()
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        about += next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    return hashlib.blake2b(about.encode(), digest_size=6).hexdigest()
