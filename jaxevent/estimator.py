@@ -158,5 +158,6 @@ def imported(path: str, kind: type[T], what: str) -> T:
             "package that Python finds (PYTHONPATH)"
         ) from None
     if not isinstance(found, kind):
-        raise InputError(f"{path!r} is a {type(found).__name__}, not a {kind.__name__}")
+        wanted = f"a{'n' * (kind.__name__[0] in 'AEIOU')} {kind.__name__}"
+        raise InputError(f"{path!r} is a {type(found).__name__}, not {wanted}")
     return found

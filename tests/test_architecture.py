@@ -1,0 +1,48 @@
+"""Imports go one way, those that are written as text too."""
+
+import ast
+import re
+import tomllib
+from pathlib import Path
+
+from importlinter.cli import lint_imports as run_contracts
+
+ROOT = Path(__file__).parents[1]
+CONTRACTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
+LAYERS = [
+    {name.strip() for name in layer.split("|")}
+    for layer in next(one for one in CONTRACTS["contracts"] if one["type"] == "layers")["layers"]
+]
+RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
+# The one way up: the registry of the package's face, which nothing in the package uses.
+FACE = ROOT / "jaxevent" / "__init__.py"
+
+
+def test_contracts_are_kept(monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    assert run_contracts(no_cache=True) == 0, capsys.readouterr().out
+
+
+def named_modules(tree: ast.AST) -> list[str]:
+    """Modules of the package that are named in strings, as "jaxevent.io.text:read"."""
+    strings = [n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)]
+    found = [re.fullmatch(r"(jaxevent(?:\.\w+)+)(?::\w+)?", s) for s in strings if type(s) is str]
+    return [match[1] for match in found if match]
+
+
+def test_names_in_strings_go_the_same_way():
+    seen = 0
+    for path in (ROOT / "jaxevent").rglob("*.py"):
+        if path == FACE:
+            continue
+        here = path.relative_to(ROOT / "jaxevent").parts[0].removesuffix(".py")
+        for module in named_modules(ast.parse(path.read_text())):
+            there, seen = module.split(".")[1], seen + 1
+            assert here == there or RANK[here] < RANK[there], (path, module)
+    assert seen > 15
+
+
+def test_every_module_of_the_package_has_its_place():
+    tops = {p.name.removesuffix(".py") for p in (ROOT / "jaxevent").iterdir()}
+    tops -= {"__init__", "__pycache__", "data", "py.typed"}
+    assert tops == set(RANK)
