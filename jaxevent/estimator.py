@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import equinox as eqx
+import jax
 
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters
@@ -28,7 +29,24 @@ P = TypeVar("P", bound=Parameters)
 T = TypeVar("T")
 
 
-class Estimate(eqx.Module):
+class Described(eqx.Module):
+    """A pytree whose `repr` says in a line what it holds: names, types and shapes."""
+
+    def __repr__(self) -> str:
+        fields = [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self)]
+        parts = [f"{name} {_kind_of(value)}" for name, value in fields if value is not None]
+        text = ", ".join(parts)
+        return f"{type(self).__name__}({text if len(text) < 120 else f'{text[:116]} ...'})"
+
+
+def _kind_of(value: Any) -> str:
+    if eqx.is_array_like(value) and hasattr(value, "dtype"):
+        return f"{value.dtype}{list(value.shape)}"
+    leaves = [leaf for leaf in jax.tree.leaves(value) if hasattr(leaf, "dtype")]
+    return type(value).__name__ if leaves else str(value)[:20]
+
+
+class Estimate(Described):
     """What an estimator tells of some times: `mean, covariance, valid = result(times)`.
 
     Arrays begin with an axis of times. `valid` says where the mean rests on data: of a pixel at a

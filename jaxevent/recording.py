@@ -125,7 +125,7 @@ class ImageSource(Protocol):
         ...
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Frames:
     """Grey frames: images (frames, height, width), mid-exposure times and exposure lengths (us).
 
@@ -136,6 +136,10 @@ class Frames:
     t: NDArray[np.int64]
     images: NDArray | ImageSource
     exposure: NDArray[np.int64]
+
+    def __repr__(self) -> str:
+        height, width = self.images.shape[1:]
+        return f"<{_span('frame', len(self), self.t)}, {width}x{height} {self.images.dtype}>"
 
     def __len__(self) -> int:
         return len(self.t)

@@ -122,13 +122,13 @@ def begin(
             raise InputError(f"there is no parameter {name!r}; {nearest(name, params.raw)}")
     stuck = params.without_gradient()
     for name in names:
-        if name in search:
-            raise InputError(f"{name} is both to be fitted and searched; choose one")
         if name in stuck:
             raise InputError(
                 f"{name} {stuck[name]}; or search it: search = {{ {name} = [from, to, number of "
                 "points] }"
             )
+        if name in search:
+            raise InputError(f"{name} is both to be fitted and searched; choose one")
         if not np.isfinite(params.raw[name]).all():
             raise InputError(
                 f"the parameter {name} starts at 0, where its logarithm has no gradient; start at "

@@ -37,7 +37,7 @@ def load(
     path: str | os.PathLike[str],
     size: tuple[int, int] | None = None,
     in_memory: bool = True,
-    progress: bool = False,
+    progress: bool | None = None,
     stream: str | None = None,
 ) -> Recording:
     """Read and check a recording; its format is told by its content, not by its name.
@@ -50,7 +50,8 @@ def load(
             of HDF5 are then read and checked where they are asked for (`hdf5.StoredEvents`); other
             formats are decoded and checked once now and again then (`decoded.DecodedEvents`).
             .npz, .mat and folders and zips of text are always read whole.
-        progress: Show a bar on stderr where reading takes longer than two seconds.
+        progress: Whether a bar is shown where it takes longer than two seconds; None: where
+            somebody looks on.
         stream: Which camera, of a file that holds the events of several: a topic of a ROS bag,
             "left" or "right" of MVSEC and M3ED, the number of a stream of AEDAT 4.
 
@@ -68,7 +69,7 @@ def save(
     recording: Recording,
     path: str | os.PathLike[str],
     compression: str | None = None,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> None:
     """Write a recording as HDF5 in the layout of `jaxevent.io.hdf5`, completely or not at all.
 
@@ -78,7 +79,8 @@ def save(
         recording: What to write; it is checked first.
         path: The file to write; an existing file is replaced once the new one is complete.
         compression: None for the fastest reading, "gzip" for the smallest file.
-        progress: Show a bar on stderr where it takes longer than two seconds.
+        progress: Whether a bar is shown where it takes longer than two seconds; None: where
+            somebody looks on.
 
     Raises:
         InputError: The recording is not valid, or the file cannot be written.
@@ -89,7 +91,7 @@ def save(
 
 
 def _reader(
-    path: Path, in_memory: bool, progress: bool, stream: str | None
+    path: Path, in_memory: bool, progress: bool | None, stream: str | None
 ) -> Callable[[Path, tuple[int, int] | None], Recording]:
     with reading(str(path)):
         is_folder, exists = path.is_dir(), path.exists()
@@ -164,7 +166,9 @@ def _streamed_reader(path: Path, head: bytes) -> Callable[..., Recording]:
     raise InputError(f"{path}: the format is not recognised; {READABLE}")
 
 
-def _zip_reader(path: Path, progress: bool) -> Callable[[Path, tuple[int, int] | None], Recording]:
+def _zip_reader(
+    path: Path, progress: bool | None
+) -> Callable[[Path, tuple[int, int] | None], Recording]:
     with reading(str(path)), zipfile.ZipFile(path) as archive:
         names = archive.namelist()
     if any(name.rpartition("/")[2] == "events.txt" for name in names):

@@ -75,7 +75,7 @@ class _Pass:
 
 
 def read(
-    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool = False
+    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
 ) -> Recording:
     """Read a file; `size` is (width, height). Raises `InputError` for bad input."""
     source = str(path)

@@ -68,7 +68,7 @@ def of_records(records: NDArray, source: str) -> dict[str, NDArray]:
 
 
 def read_npy(
-    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool = False
+    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
 ) -> Recording:
     """Read a structured array; `size` is (width, height). Raises `InputError` for bad input."""
     source = str(path)
@@ -98,7 +98,7 @@ def is_text(head: bytes) -> bool:
 
 
 def read_text(
-    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool = False
+    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
 ) -> Recording:
     """Read a table of text; `size` is (width, height). Raises `InputError` for bad input."""
     source = str(path)

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from jaxevent.errors import InputError
 from jaxevent.io import checked_events, reading
+from jaxevent.progress import bar
 from jaxevent.recording import Events, EventSource
 
 BLOCK = 1 << 20  # events decoded together: 13 MB
@@ -37,7 +37,7 @@ def decoded(
     size: tuple[int, int],
     source: str,
     in_memory: bool = True,
-    progress: bool = False,
+    progress: bool | None = None,
     origin: int = 0,
 ) -> EventSource:
     """All events of a decoder, checked: `Events` in memory, else `DecodedEvents`.
@@ -50,7 +50,7 @@ def decoded(
     row = 0
     with (
         reading(source),
-        tqdm(unit=" events", unit_scale=True, delay=2, disable=not progress, leave=False) as bar,
+        bar(unit=" events", unit_scale=True, progress=progress) as shown,
     ):
         for state, (t, x, y, p) in decode(None):
             if not len(t):
@@ -68,7 +68,7 @@ def decoded(
             else:
                 kept[1] = events
             row += len(events)
-            bar.update(len(events))
+            shown.update(len(events))
     if not blocks:
         return Events.empty()
     if in_memory or len(blocks) <= 2:

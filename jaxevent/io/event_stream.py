@@ -33,7 +33,7 @@ _KINDS = {0: "generic data", 1: "DVS events", 2: "ATIS events", 4: "colour event
 
 
 def read(
-    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool = False
+    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
 ) -> Recording:
     """Read a file; `size` is (width, height). Raises `InputError` for bad input."""
     with reading(str(path)), path.open("rb") as file:

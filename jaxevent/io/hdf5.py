@@ -34,11 +34,11 @@ from typing import Any
 import h5py
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from jaxevent.errors import InputError, require
 from jaxevent.io import checked_events, pinhole, reading, times, vectors
 from jaxevent.io.output import complete_hdf5
+from jaxevent.progress import bar
 from jaxevent.recording import Events, EventSource, Frames, ImageSource, Imu, Poses, Recording
 
 VERSION = 1
@@ -348,7 +348,7 @@ def _rectify_map(path: Path) -> NDArray | None:
 
 
 def write(
-    recording: Recording, path: Path, compression: str | None = None, progress: bool = False
+    recording: Recording, path: Path, compression: str | None = None, progress: bool | None = None
 ) -> None:
     """Write a recording; `jaxevent.io.save` describes the arguments and errors."""
     if compression not in (None, "gzip"):
@@ -382,7 +382,7 @@ def _write_events(
     events: EventSource,
     compression: str | None,
     source: str,
-    progress: bool,
+    progress: bool | None,
     check: Callable[[], None],
 ) -> None:
     count = len(events)
@@ -404,7 +404,7 @@ def _write_events(
     )
     ms = 0
     blocks = range(0, count, _BLOCK)
-    for row in tqdm(blocks, unit="M events", delay=2, disable=not progress, leave=False):
+    for row in bar(blocks, unit="M events", progress=progress):
         block = events[row : row + _BLOCK]
         since = block.t - offset
         rows = slice(row, row + len(block))

@@ -57,7 +57,7 @@ def is_prophesee(head: bytes) -> bool:
 
 
 def read(
-    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool = False
+    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
 ) -> Recording:
     """Read a RAW or DAT file; `size` is (width, height). Raises `InputError` for bad input."""
     with reading(str(path)):

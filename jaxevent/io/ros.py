@@ -50,7 +50,7 @@ def read(
     path: Path,
     size: tuple[int, int] | None,
     in_memory: bool = True,
-    progress: bool = False,
+    progress: bool | None = None,
     stream: str | None = None,
 ) -> Recording:
     """Read a bag; `size` is (width, height). Raises `InputError` for bad input.

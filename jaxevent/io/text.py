@@ -26,7 +26,7 @@ from jaxevent.io import checked_events, pinhole, reading, sensor_size, times
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
 
-def read(path: Path, size: tuple[int, int] | None, progress: bool = False) -> Recording:
+def read(path: Path, size: tuple[int, int] | None, progress: bool | None = None) -> Recording:
     """Read a folder or zip; `size` is (width, height). Raises `InputError` for bad input."""
     if path.is_dir():
         return _read(path, path, size, progress)
@@ -46,7 +46,7 @@ def read(path: Path, size: tuple[int, int] | None, progress: bool = False) -> Re
 
 
 def _read(
-    path: Path, root: Path | zipfile.Path, size: tuple[int, int] | None, progress: bool
+    path: Path, root: Path | zipfile.Path, size: tuple[int, int] | None, progress: bool | None
 ) -> Recording:
     source = f"{path}: events.txt"
     frames = _frames(path, root)
@@ -83,7 +83,7 @@ def _table(
     source: str,
     layout: str,
     header: str | None = None,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> tuple[list[NDArray[np.float64]], tuple[int, int] | None]:
     """The columns of a file of numbers, finite float64, and its first line if that is a header.
 

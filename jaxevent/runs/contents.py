@@ -26,7 +26,7 @@ class Opened(threading.local):
     def clear(self) -> None:
         self._last: tuple[Any, Recording | InputError | None] = (None, None)
 
-    def load(self, path: Path, size: tuple[int, int] | None, progress: bool) -> Recording:
+    def load(self, path: Path, size: tuple[int, int] | None, progress: bool | None) -> Recording:
         size = None if size is None else (size[0], size[1])
         what = (path, size, [_stamp(file) for file in _files(path)])
         before, loaded = self._last

@@ -19,7 +19,7 @@ from jaxevent.show.report import comparison_figure, markdown_table, video_writer
 BY_HAND = {"c_on": 0.083, "c_off": 0.059, "clock_offset": 0.0075}
 
 
-def demo(out: Path, progress: bool = False) -> None:
+def demo(out: Path, progress: bool | None = None) -> None:
     """Score every method on the packaged recording; prints the table, writes all to a folder.
 
     Raises `InputError` if the folder cannot be written or an extra is missing.
@@ -80,7 +80,7 @@ def _figure(recording: Recording, params: dict[str, Any], path: Path) -> None:
     )
 
 
-def _video(recording: Recording, params: Any, path: Path, progress: bool) -> float:
+def _video(recording: Recording, params: Any, path: Path, progress: bool | None) -> float:
     """200 images per second of the recording's time, shown at 30; returns the slow-down."""
     rate, fps, longest = 200.0, 30.0, 180
     video = find("akf").estimate(recording, params, progress=progress)

@@ -1,5 +1,7 @@
 """The families of estimators, each loaded when a configuration first asks for it."""
 
+from typing import Any
+
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator, imported
 from jaxevent.parameters import nearest
@@ -26,9 +28,9 @@ def find_family(name: str) -> Family:
     return imported(HOMES[name], Family, "family")
 
 
-def find_protocol(name: str) -> tuple[Protocol, str]:
+def find_protocol(name: Any) -> tuple[Protocol, str]:
     """The protocol of that name and its family's; raises `InputError` naming the nearest."""
     known = {protocol: family for family in HOMES for protocol in find_family(family).protocols}
     if name not in known:
-        raise InputError(f"there is no protocol {name!r}; {nearest(name, known)}")
+        raise InputError(f"there is no protocol {name!r}; {nearest(str(name), known)}")
     return find_family(known[name]).protocols[name], known[name]

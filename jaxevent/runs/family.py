@@ -104,7 +104,7 @@ class Goal(abc.ABC):
         split: Shares,
         window: float | int | None,
         params: Any,
-        progress: bool,
+        progress: bool | None,
     ) -> Iterator[dict[str, Any]]:
         """Rows of every recording and split: they have the keys recording and split."""
 

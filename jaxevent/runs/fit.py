@@ -90,7 +90,7 @@ def fit(
     out: str | Path,
     recordings: Sequence[str | Path] | None = None,
     resume: bool = False,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> list[dict[str, Any]]:
     """Run a fit that a TOML file describes; its layout is in the text of this module.
 
@@ -107,7 +107,7 @@ def fit(
         recordings: To be fitted to instead of those in the file, relative to the working directory.
         resume: Go on from the checkpoint in `out`. Where the run had not got to the first one, it
             starts; where it had ended, its rows are returned.
-        progress: Show bars on stderr.
+        progress: Whether bars are shown; None: where somebody looks on.
 
     Returns:
         Rows as `evaluate.score` gives them, of the recordings and images of each split: `split` is
@@ -122,7 +122,7 @@ def fit(
     out = Path(out)
     plan = devices.in_step(lambda: read_plan(Path(config), recordings))
     checkpoint, writes = out / "checkpoint", devices.first()
-    progress = progress and writes
+    progress = progress if writes else False
 
     def finished() -> list[dict[str, Any]] | None:
         """The rows of a run that had ended."""
@@ -206,7 +206,7 @@ def fit(
 
 
 def _rows(
-    task: "Task", label: str, params: Any, sources: Sources, plan: "Plan", progress: bool
+    task: "Task", label: str, params: Any, sources: Sources, plan: "Plan", progress: bool | None
 ) -> Iterator[dict[str, Any]]:
     for row in task.goal.score(sources, plan.split, plan.window, params, progress):
         yield {**row, "method": label}
@@ -400,14 +400,14 @@ def _task(entry: Mapping[str, Any], table: Mapping[str, Any], folder: Path) -> T
     return Task(entry.get("label", name), method, params, names, intervals, goal, settings)
 
 
-def _sources(plan: Plan, progress: bool) -> Sources:
+def _sources(plan: Plan, progress: bool | None) -> Sources:
     return {
         split: [(given, _load(path, plan, progress)) for given, path in plan.recordings[split]]
         for split in SPLITS
     }
 
 
-def _load(path: Path, plan: Plan, progress: bool) -> Recording:
+def _load(path: Path, plan: Plan, progress: bool | None) -> Recording:
     recording = load(path, plan.size, in_memory=False, progress=progress)
     return dataclasses.replace(recording, name=str(path))  # for messages
 

@@ -51,7 +51,7 @@ def _need_events(recording: Recording) -> None:
         )
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Reference(Frames):
     """HDR reference images, float intensities that may exceed 1; the exposure is not known.
 

@@ -328,7 +328,7 @@ class ImageGoal(Goal):
         split: Shares,
         window: float | int | None,
         params: FrameParams,
-        progress: bool,
+        progress: bool | None,
     ) -> Iterator[dict[str, Any]]:
         for whole in SPLITS:
             for given, recording in sources[whole]:

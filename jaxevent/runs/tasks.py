@@ -27,10 +27,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from tqdm import tqdm
 
 from jaxevent.devices import local
 from jaxevent.errors import InputError, require
+from jaxevent.progress import bar
 
 CONNECT = 30  # s that a scheduler has to answer
 LEAVE = 5  # s that a process has to end
@@ -94,7 +94,7 @@ def run(
     place: Place | None = None,
     *,
     retries: int = 2,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> list[Outcome]:
     """Run `function(**task.arguments)` for every task; outcomes in the order of the tasks.
 
@@ -108,7 +108,8 @@ def run(
         folder: Keeps results of tasks that have a key; made if missing.
         place: Where; None: in this process.
         retries: Further attempts of each task.
-        progress: Show a bar on stderr with the name of the last finished task.
+        progress: Whether a bar with the name of the last finished task is shown; None: where
+            somebody looks on.
 
     Raises:
         InputError: Results cannot be stored, or the cluster does not answer.
@@ -143,7 +144,7 @@ def run(
     else:
         done = _here(function, todo, folder, retries)
     with (
-        tqdm(total=len(tasks), initial=len(found), unit="task", disable=not progress) as bar,
+        bar(total=len(tasks), initial=len(found), unit="task", progress=progress) as shown,
         contextlib.closing(done),
     ):
         for number, record in done:
@@ -152,8 +153,8 @@ def run(
                 _store(folder, task.key, record)
             numbers = same[firsts[number] if task.key is None else task.key]
             found.update(dict.fromkeys(numbers, record))
-            bar.set_postfix_str(task.name)
-            bar.update(len(numbers))
+            shown.set_postfix_str(task.name)
+            shown.update(len(numbers))
     return [
         Outcome(record.get("result"), record.get("error"), record.get("host", ""))
         for record in (found[number] for number in range(len(tasks)))

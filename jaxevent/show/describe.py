@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
+from jaxevent.progress import bar
 from jaxevent.recording import EventSource, Frames, Recording
 
 BLOCK = 1 << 20  # events looked at together: 13 MB
@@ -15,7 +15,7 @@ GAP = 100_000  # us without an event that may be a jump of the clock
 _TRUTH = ("omega", "rvec", "tvec", "HDR_mat", "hdr", "motion", "tracks")
 
 
-def describe(recording: Recording, progress: bool = False) -> list[tuple[str, str]]:
+def describe(recording: Recording, progress: bool | None = None) -> list[tuple[str, str]]:
     """What a user wants to know first of a recording, as (name, text); reads events in blocks.
 
     A hot pixel is one that fired more than five times as often as the busiest of its neighbours,
@@ -94,7 +94,7 @@ def _about_clocks(recording: Recording) -> list[str]:
 
 
 def _about_events(
-    events: EventSource, width: int, height: int, progress: bool
+    events: EventSource, width: int, height: int, progress: bool | None
 ) -> list[tuple[str, str]]:
     count = len(events)
     if not count:
@@ -106,7 +106,7 @@ def _about_events(
     in_part = np.zeros(PARTS, np.int64)
     longest, longest_after, before = 0, first, first
     blocks = range(0, count, BLOCK)
-    for row in tqdm(blocks, unit="M events", delay=2, disable=not progress, leave=False):
+    for row in bar(blocks, unit="M events", progress=progress):
         block = events[row : row + BLOCK]
         on += int(block.p.sum())
         at_pixel += np.bincount(block.y.astype(np.int64) * width + block.x, minlength=len(at_pixel))
