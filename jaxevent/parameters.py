@@ -5,12 +5,13 @@ import inspect
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 from jaxevent.errors import InputError
@@ -186,7 +187,16 @@ class Count(Setting):
             )
 
 
-class Parameters(eqx.Module):
+if TYPE_CHECKING:
+    # To type checkers and editors a plain class: subclasses take what `Parameters.__init__` takes,
+    # not the fields, as those of an `eqx.Module` would.
+    class _Module:
+        pass
+else:
+    _Module = eqx.Module
+
+
+class Parameters(_Module):
     """Base of every estimator's `Params`: `Params(sigma_iso=0.1)`, `params.sigma_iso`.
 
     `raw` holds one differentiable leaf per number, `chosen` the choices and counts. A named set of
@@ -208,13 +218,14 @@ class Parameters(eqx.Module):
         cls.numbers = {**cls.numbers, **{k: v for k, v in own if isinstance(v, Number)}}
         cls.choices = {**cls.choices, **{k: v for k, v in own if isinstance(v, Choice | Count)}}
         # Of its own, so that `help`, completion and `inspect` show what this class takes.
-        base = next(kind for kind in cls.__mro__[1:] if "__init__" in vars(kind))
-        init = vars(cls).get("__init__")
+        base: Any = next(kind for kind in cls.__mro__[1:] if "__init__" in vars(kind))
+        init: Any = vars(cls).get("__init__")
         if init is None:
 
-            def init(self, *, preset: str | None = None, **values: Any):
+            def inherited(self, *, preset: str | None = None, **values: Any):
                 base.__init__(self, preset=preset, **values)
 
+            init = inherited
             init.__name__, init.__qualname__ = "__init__", f"{cls.__qualname__}.__init__"
             cls.__init__ = init
         keyword = inspect.Parameter.KEYWORD_ONLY
@@ -349,7 +360,7 @@ def _stored(number: Number, value: Any, dtype: Any = None) -> Array:
 def _value_shown(params: Parameters, name: str) -> str:
     """One value, of a traced or mapped one the type and shape."""
     value = getattr(params, name)
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         return value.aval.str_short()
     if not isinstance(value, Array):
         return shown(value)

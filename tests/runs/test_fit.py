@@ -576,7 +576,7 @@ class Killed(BaseException):
 
 def interrupted(monkeypatch, after: int) -> None:
     """Let the next fit die between its n-th checkpoint and the one after."""
-    save, count = jaxevent.runs.fit._save, 0
+    save, count = jaxevent.runs.fit.save, 0
 
     def dying(*arguments):
         nonlocal count
@@ -585,7 +585,7 @@ def interrupted(monkeypatch, after: int) -> None:
         count += 1
         save(*arguments)
 
-    monkeypatch.setattr(jaxevent.runs.fit, "_save", dying)
+    monkeypatch.setattr(jaxevent.runs.fit, "save", dying)
 
 
 def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):

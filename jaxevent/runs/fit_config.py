@@ -1,0 +1,204 @@
+"""The configuration of a fit, read and checked; `jaxevent.runs.fit` says what it may hold."""
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+
+from jaxevent.errors import InputError
+from jaxevent.estimator import Estimator
+from jaxevent.methods import find
+from jaxevent.parameters import Parameters, read_toml
+from jaxevent.runs import toml
+from jaxevent.runs.config import (
+    NAME,
+    NATURAL,
+    NOT_NEGATIVE,
+    PATHS,
+    POSITIVE,
+    SIZE,
+    Check,
+    check,
+    find_recordings,
+    is_number,
+    is_texts,
+    read_params,
+)
+from jaxevent.runs.contents import fingerprint
+from jaxevent.runs.families import HOMES, family_of, find_family
+from jaxevent.runs.family import Goal, Shares
+from jaxevent.splits import SPLITS
+from jaxevent.tuning import Interval, Settings, begin
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """One method of a configuration, checked."""
+
+    label: str
+    method: Estimator
+    params: Parameters
+    names: tuple[str, ...]
+    search: Mapping[str, Interval]
+    goal: Goal
+    settings: Settings
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """A checked configuration; recordings are (as given, path) by split."""
+
+    config: Path
+    text: bytes
+    recordings: Mapping[str, list[tuple[str, Path]]]
+    tasks: list[Task]
+    size: tuple[int, int] | None
+    split: Shares
+    window: float | int | None
+
+    def digest(self) -> str:
+        """A number that changes with the configuration, the recordings and the precision."""
+        digest = hashlib.sha256(self.text)
+        digest.update(repr([task.params.values() for task in self.tasks]).encode())
+        digest.update(str(jnp.result_type(float)).encode())
+        for split in SPLITS:
+            for given, path in self.recordings[split]:
+                digest.update(f"{split} {given}".encode())
+                files = [path] if path.is_file() else sorted(path.rglob("*"))
+                for task in self.tasks:
+                    files += task.goal.files(path)
+                for file in filter(Path.is_file, files):
+                    fingerprint(file, digest.update)
+        return digest.hexdigest()
+
+
+_SETTINGS: dict[str, Check] = {
+    "iterations": NATURAL,
+    "learning_rate": POSITIVE,
+    "patience": NATURAL,
+    "every": NATURAL,
+    "starts": NATURAL,
+    "spread": NOT_NEGATIVE,
+    "rounds": NATURAL,
+    "batch": NATURAL,
+    "seed": (lambda value: type(value) is int and value >= 0, "a whole number, 0 or more"),
+}
+_COMMON: dict[str, Check] = {
+    **_SETTINGS,
+    "recordings": PATHS,
+    "validation": PATHS,
+    "test": PATHS,
+    "split": (
+        lambda value: (
+            isinstance(value, list)
+            and len(value) == 3
+            and all(type(n) is int and n >= 0 for n in value)
+            and value[0] > 0
+        ),
+        "[fit, validation, test] in whole numbers, the first not 0",
+    ),
+    "size": SIZE,
+    "window": POSITIVE,
+    "method": (
+        lambda value: isinstance(value, list) and all(isinstance(n, dict) for n in value),
+        '[[method]] with name = "akf"',
+    ),
+}
+_METHOD: dict[str, Check] = {
+    **{name: _SETTINGS[name] for name in ("learning_rate", "iterations", "starts")},
+    "name": NAME,
+    "label": NAME,
+    "params": (lambda value: isinstance(value, str | dict), "a table or the path of a TOML file"),
+    "fit": (is_texts, 'a list of names, as ["c_on", "c_off"]'),
+    "search": (
+        lambda value: (
+            isinstance(value, dict)
+            and all(
+                isinstance(v, list) and len(v) == 3 and all(map(is_number, v)) and type(v[2]) is int
+                for v in value.values()
+            )
+        ),
+        "a table of name = [from, to, number of points]",
+    ),
+}
+
+
+def read_plan(config: Path, recordings: Sequence[str | Path] | None = None) -> Plan:
+    """Read and check a configuration; raises `InputError` naming the file and the setting.
+
+    `recordings` take the place of those that it names, relative to the working directory.
+    """
+    table = read_toml(config)
+    try:
+        families = {name: find_family(name) for name in HOMES}
+        further = {k: v for one in families.values() for k, v in one.fit_settings.items()}
+        check(table, {**_COMMON, **further})
+        text = config.read_bytes()
+        folders = dict.fromkeys(SPLITS, config.parent)
+        if recordings:
+            table = {**table, "recordings": [str(Path(one).absolute()) for one in recordings]}
+            text = toml.dump(table).encode()
+        found = {
+            split: find_recordings(table[key], folders[split]) if table.get(key) else []
+            for split, key in zip(SPLITS, ("recordings", "validation", "test"), strict=True)
+        }
+        if not found["fit"]:
+            raise InputError('no recording is given; add recordings = ["file.zip"]')
+        places = [path.resolve() for split in SPLITS for _, path in found[split]]
+        twice = [path for path in places if places.count(path) > 1]
+        if twice:
+            raise InputError(f"{twice[0]} is in two of recordings, validation and test; choose one")
+        apart = bool(found["validation"] or found["test"])
+        if apart and "split" in table:
+            raise InputError("split is for configurations without validation and test; omit it")
+        if not table.get("method"):
+            raise InputError('no method is given; add [[method]] with name = "akf"')
+        tasks: list[Task] = []
+        for number, entry in enumerate(table["method"], 1):
+            try:
+                tasks.append(_task(entry, table, config.parent))
+            except InputError as error:
+                raise InputError(f"method {number}: {error}") from None
+        labels = [task.label for task in tasks]
+        for label in labels:
+            if labels.count(label) > 1:
+                raise InputError(f"two methods are called {label!r}; give them different labels")
+        used = {k for task in tasks for k in family_of(task.method).fit_settings}
+        for name in table:
+            if name in further and name not in used:
+                raise InputError(f"{name} is a setting of none of these methods; omit it")
+        size = table.get("size")
+        return Plan(
+            config,
+            text,
+            found,
+            tasks,
+            None if size is None else (size[0], size[1]),
+            None if apart else tuple(table.get("split", (2, 1, 1))),
+            table.get("window"),
+        )
+    except InputError as error:
+        raise InputError(f"{config}: {error}") from None
+
+
+def _task(entry: Mapping[str, Any], table: Mapping[str, Any], folder: Path) -> Task:
+    name = entry.get("name")
+    if not isinstance(name, str):
+        raise InputError('a method has no name; give name = "akf"')
+    method = find(name)
+    family = family_of(method)
+    check(entry, {**_METHOD, **{k: family.fit_settings[k] for k in family.own}})
+    params = read_params(method.Params, name, entry.get("params", {}), folder)
+    both = {**table, **entry}
+    goal = family.goal(method, params, both)
+    names, search = tuple(entry.get("fit", ())), entry.get("search", {})
+    if not names and not search:
+        raise InputError('nothing is to be fitted; give names, as fit = ["c_on", "c_off"]')
+    given = {name: both[name] for name in _SETTINGS if name in both}
+    settings = Settings(**given, forward=goal.forward)
+    intervals = {name: (low, high, count) for name, (low, high, count) in search.items()}
+    begin(params, names, settings, intervals)  # checks the names
+    return Task(entry.get("label", name), method, params, names, intervals, goal, settings)
