@@ -217,6 +217,12 @@ class Packing:
         return kept
 
 
+def packing_key(params: TrackerParams) -> tuple[Any, ...]:
+    """The numbers that act when events are packed; equal ones pack alike."""
+    names = ("events_per_step", "cycle", "cell", "prefilter", "prefilter_neighbours")
+    return *(float(getattr(params, name)) for name in names), float(params.prefilter_time)
+
+
 def _span(
     recording: Recording, start: int | float | None, stop: int | float | None
 ) -> tuple[int, int]:

@@ -370,7 +370,12 @@ def _update_split(params: WindowParams, state: State, batch: Batch, weight: Arra
     return choose(seen.m > 0, State(x, P, window, True), state)
 
 
-chi2 = Tracker("chi2", Params, Filter(start, predict, update, expected, moments))
+chi2 = Tracker(
+    "chi2",
+    Params,
+    Filter(start, predict, update, expected, moments),
+    about="The asynchronous event-blob tracker (Wang et al. 2023), equations corrected.",
+)
 chi2_split = Tracker(
     "chi2_split",
     WindowParams,
@@ -381,4 +386,5 @@ chi2_split = Tracker(
         expected,
         moments,
     ),
+    about="The asynchronous event-blob tracker with one sum of squares per axis of the blob.",
 )

@@ -50,4 +50,5 @@ constant_velocity = Tracker(
     "constant_velocity",
     Params,
     Filter(start, predict, update, expected, moments),
+    about="A Kalman filter of position and velocity of round blobs; a baseline.",
 )

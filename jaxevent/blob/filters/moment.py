@@ -157,4 +157,9 @@ def moments(params: TrackerParams, state: State) -> tuple[Array, Array]:
     )
 
 
-moment = Tracker("moment", Params, Filter(start, predict, update, expected, moments))
+moment = Tracker(
+    "moment",
+    Params,
+    Filter(start, predict, update, expected, moments),
+    about="Tracking of blobs by second moments of the events' residuals; the default.",
+)

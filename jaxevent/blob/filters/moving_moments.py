@@ -100,4 +100,5 @@ moving_moments = Tracker(
     "moving_moments",
     Params,
     Filter(start, predict, update, expected, moments),
+    about="Moving mean and covariance of the events near a blob; a baseline.",
 )
