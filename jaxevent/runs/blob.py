@@ -238,6 +238,7 @@ class TrackGoal(Goal):
     def _packed(self, found: Sequence[Part], params: TrackerParams, loss: str) -> list[Batch]:
         """Batches of one shape, so that one program serves all."""
         batches, used = [], [1, 1, 0, 0]
+        no_times = np.empty(0, np.int64)
         for part in found:
             seeds = part.seeds
             if seeds is not None:
@@ -251,7 +252,9 @@ class TrackGoal(Goal):
                 features, times = batch.features, len(batch.time)
                 weight = batch.known.sum()
             else:
-                features, _ = self.tracker.prepare(part.recording, (), params, seeds=seeds, **span)
+                features, _ = self.tracker.prepare(
+                    part.recording, no_times, params, seeds=seeds, **span
+                )
                 batch = features
                 weight, times = features.valid.sum(), 0
             if seeds is not None and part.seeds is not None:

@@ -144,7 +144,7 @@ def test_batches_are_their_windows_filled_up_to_one_shape(loss, folder):
             np.testing.assert_allclose(batch.features.xi[: len(truth)], truth, atol=1e-6)
             batch = dataclasses.replace(batch, features=batch.features.features)
         else:
-            features, _ = tracker.prepare(recording, (), params, seeds=[seed], **span)
+            features, _ = tracker.prepare(recording, np.empty(0), params, seeds=[seed], **span)
             count = features.valid.sum()
         assert float(batch.weight) == count
         # What is cut off or added of chunks and steps holds no events and ends no cycle.

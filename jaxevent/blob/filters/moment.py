@@ -70,7 +70,7 @@ class _Residuals(NamedTuple):
     m: Array
     u: Array  # (2, M), px
     share: Array  # (M,)
-    age: Array  # s, their mean
+    age: Array | float  # s, their mean
     size: Array  # (2,), px
     P: Array  # (2,), px^2: variances of the centre along the axes
     cross: Array  # its covariance
