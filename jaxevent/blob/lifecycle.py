@@ -15,8 +15,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxevent.blob.association import largest_eigenvalue
 from jaxevent.blob.filters.steps import Filter, choose
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.prepare import Features
-from jaxevent.blob.targets import Slots, begin_slots, seconds, silence_limits
+from jaxevent.blob.prepare import LONGEST, Features
+from jaxevent.blob.targets import Slots, begin_slots, seconds, shift_slots, silence_limits
 
 ENDS = ("end", "idle", "unconfirmed", "left", "size", "uncertain", "merged", "not finite")
 
@@ -58,6 +58,14 @@ def begin(filter: Filter, params: TrackerParams, features: Features) -> State:
     if features.detect:
         grid = Grid(jnp.zeros((3, *features.cells), real), jnp.zeros((), jnp.int32))
     return State(slots, grid, jnp.asarray(len(features.seed), jnp.int32))
+
+
+def shift(state: State, elapsed: Array) -> State:
+    """The same with times since a later moment; at most so far back that int32 lasts."""
+    grid = state.grid
+    if grid is not None:
+        grid = Grid(grid.sums, jnp.maximum(grid.time - elapsed, -2 * LONGEST))
+    return State(shift_slots(state.slots, elapsed), grid, state.next_id)
 
 
 def sow(

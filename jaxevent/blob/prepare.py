@@ -195,7 +195,7 @@ class Packing:
 
     def check_times(self, times: Times) -> None:
         """Raise `InputError` for times outside the recording and outside what is tracked."""
-        start, stop = self.start, self.stop
+        start, stop = self.start, self.stop - 1
         if len(self.recording.events) or self.recording.frames is not None:
             start, stop = min(start, self.recording.start), max(stop, self.recording.stop)
         check_times(times, start, stop, self.recording.name)

@@ -10,10 +10,10 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxevent.blob.filters.steps import Filter
-from jaxevent.blob.lifecycle import Grid, Log, State, begin, count_strays, end_cycle, sow
+from jaxevent.blob.lifecycle import Log, State, begin, count_strays, end_cycle, shift, sow
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.prepare import LONGEST, Features
-from jaxevent.blob.targets import Slots, place, scan_steps, shift_slots
+from jaxevent.blob.prepare import Features
+from jaxevent.blob.targets import Slots, place, scan_steps
 
 
 class Association(eqx.Module):
@@ -68,13 +68,12 @@ def _run_chunk(
     part: Any,
 ) -> tuple[State, Told]:
     number, t, xi, polarity, valid, elapsed, stop, cycle = part
-    due = features.seed == number
-    before = sow(filter, params, features, due, shift_slots(state.slots, elapsed))
+    state = shift(state, elapsed)
+    before = sow(filter, params, features, features.seed == number, state.slots)
     events = t, xi, polarity, valid
     slots, steps = scan_steps(filter, params, wanted, features.frame, before, events)
     grid = state.grid
     if grid is not None:
-        grid = Grid(grid.sums, jnp.maximum(grid.time - elapsed, -2 * LONGEST))
         stray = steps.unassociated
         grid = lax.cond(
             stray.any(),

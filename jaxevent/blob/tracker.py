@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxevent.blob.filters.steps import Filter
-from jaxevent.blob.lifecycle import State
+from jaxevent.blob.lifecycle import State, shift
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Packing, ReadOut
 from jaxevent.blob.run import run
@@ -23,7 +23,7 @@ from jaxevent.recording import Recording, Times, microseconds
 P = TypeVar("P", bound=TrackerParams)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Tracker(Estimator[P]):
     """Tracking of any number of blobs, each by a `Filter`.
 
@@ -56,6 +56,7 @@ class Tracker(Estimator[P]):
         Options and errors as those of `estimate`; also raises `InputError` for times outside the
         recording, unless told to `extrapolate`: then the estimate is not valid there.
         """
+        self.check(recording)
         params = self.Params() if params is None else params
         packing = Packing(recording, params, seeds, start, stop, detect)
         us = np.atleast_1d(microseconds(times))
@@ -68,12 +69,13 @@ class Tracker(Estimator[P]):
         """Track: all targets at every chunk's start and after each of its steps, and at the end.
 
         The trajectory's arrays begin with (chunks, steps + 1, targets). `state` is what the run
-        before returned; omitted, the recording starts here. For the memory that a loss needs, see
-        `jaxevent.blob.losses`.
+        before returned, of features that end where these start; omitted, the recording starts here.
+        For losses, which need less memory, see `jaxevent.blob.losses`.
         """
         state, told = run(self.filter, params, state, features, "states")
         assert told.slots is not None
-        return told.slots, state
+        last = jnp.max(jnp.where(features.cycle, jnp.arange(len(features.cycle)), 0))
+        return told.slots, shift(state, jnp.asarray(features.stop)[last])
 
     def read(self, params: P, trajectory: Slots, out: ReadOut) -> TrackStates:
         """The targets at the times prepared: first the seeds' in the order given.
@@ -134,6 +136,7 @@ class Tracker(Estimator[P]):
         Raises:
             InputError: A seed is outside the sensor or the time, or there is no time to track.
         """
+        self.check(recording)
         params = self.Params() if params is None else params
         packing = Packing(recording, params, seeds, start, stop, detect)
         return Tracks(self.filter, packing, params, progress)

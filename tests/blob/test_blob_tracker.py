@@ -321,7 +321,7 @@ def test_strange_streams():
     none = Recording("none", WIDTH, HEIGHT, Events.empty())
     tracks = blob.moment.estimate(none)
     assert list(tracks.events()) == []
-    assert len(tracks) == 0 and tracks([0, 1]).mean.shape == (2, 0, 8)
+    assert len(tracks) == 0 and tracks([0, 1], extrapolate=True).mean.shape == (2, 0, 8)
 
 
 def test_single_precision(pair, float32):

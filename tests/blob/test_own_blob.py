@@ -39,7 +39,7 @@ def test_it_obeys_the_contract(folder):
     assert isinstance(student, Estimator) and METHOD not in names()
     recording = jaxevent.load(folder / "a.h5")
     params = student.Params(nu=3.0, **PARAMS)
-    seeds = [(30.0, 30.0, 4.0, 0.01), (20.0, 20.0, 4.0)]
+    seeds = [(50.0, 5.0, 4.0, 0.01), (20.0, 20.0, 4.0)]  # no events near the first
     times = np.arange(recording.start, recording.stop, 1500)
     features, out = student.prepare(recording, times, params, seeds=seeds)
     trajectory, _ = jax.jit(student.run)(params, features)
@@ -52,6 +52,17 @@ def test_it_obeys_the_contract(folder):
     np.testing.assert_allclose(covariance, expected.covariance, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(states.idle, expected.idle, atol=1e-12)
     assert np.array_equal(states.id[-1], [-1 if not v else k for k, v in enumerate(valid[-1])])
+
+    # In two parts, of which the second goes on from the first one's end.
+    middle = recording.start + 10_000
+    run = jax.jit(student.run)
+    features, _ = student.prepare(recording, times, params, seeds=seeds[1:], stop=middle)
+    _, state = run(params, features)
+    features, out = student.prepare(recording, times, params, seeds=[], start=middle)
+    later = student.read(params, run(params, features, state)[0], out)
+    assert np.array_equal(later.valid[:, 0], times >= middle)
+    np.testing.assert_allclose(later.mean[times >= middle, 0], mean[times >= middle, 1], rtol=1e-9)
+
     with pytest.raises(jaxevent.InputError, match="extrapolate=True"):
         tracks(recording.stop + 1)
     assert not tracks(recording.stop + 1, extrapolate=True).valid.any()
