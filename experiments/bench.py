@@ -30,7 +30,9 @@ import numpy as np
 from bench_motion import motion_bench
 
 import jaxevent
-from jaxevent.blob.filters import Batch, _truncation, filter_of
+from jaxevent.blob import moment
+from jaxevent.blob.filters.ellipse import truncation
+from jaxevent.blob.filters.steps import Batch
 from jaxevent.io import load, save
 from jaxevent.reconstruction.filtering import Observation, Observer, State, Trajectory
 from jaxevent.reconstruction.pixels import Windows
@@ -518,7 +520,7 @@ def blob_bench() -> tuple[dict[str, float], dict[str, float]]:
         XLA makes one function of a short loop over little data, as the tracker has it: 0.5 instead
         of 0.25 M steps/s of one blob.
         """
-        blob = filter_of(params)
+        blob = moment.filter
 
         def step(state, part):
             dt, batch = part
@@ -545,7 +547,7 @@ def blob_bench() -> tuple[dict[str, float], dict[str, float]]:
     }
     speed, rmse, whole = {}, {}, {}
     for M in (1, 32):
-        params = jaxevent.blob.Params.of({"events_per_step": M})
+        params = moment.Params(events_per_step=M)
         given = jax.device_put((params, start, *blob_steps(recording, M)))
         states = np.asarray(told(*given), float)
         t = e.t[M - 1 :: M][: len(states)]
@@ -563,16 +565,16 @@ def blob_bench() -> tuple[dict[str, float], dict[str, float]]:
         lambda part: jax.numpy.broadcast_to(part[:2048], (64, *part[:2048].shape)), batch
     )
     batch = Batch(batch.xi + shift[:, None, None, None], batch.age, batch.polarity)
-    given = jax.device_put((jaxevent.blob.Params.of({}), start + shift[:, None], dt[:2048], batch))
+    given = jax.device_put((moment.Params(), start + shift[:, None], dt[:2048], batch))
     many = 64 * 2048 / 1e6 / seconds(targets[256], given, 40)
 
-    p = jaxevent.blob.Params.of({})
+    p = moment.Params()
     numbers = ("p", "v", "lambda", "theta", "q")
     Q = np.array([float(getattr(p, f"Q_{name}")) for name in numbers])
     P0 = np.array([float(getattr(p, f"P0_{name}")) for name in numbers])
     P0[2] /= float(p.lambda0) ** 2
     limits = np.array([float(v) for v in (p.lambda_min, p.lambda_max, p.P_theta_max)])
-    kappa, fourth = (float(v) for v in _truncation(p))
+    kappa, fourth = (float(v) for v in truncation(p))
     arguments = start, 20.0, Q, P0, kappa, fourth, limits
     same = blob_loop(e.t, e.x, e.y, *arguments)
     # But for rounding to single precision.
@@ -581,9 +583,9 @@ def blob_bench() -> tuple[dict[str, float], dict[str, float]]:
     loop = count * 4 / 1e6 / best(lambda: blob_loop(part.t, part.x, part.y, *arguments), 15)
 
     for M in (1, 32):
-        params = jaxevent.blob.Params.of({"events_per_step": M})
+        params = moment.Params(events_per_step=M)
         stream, _ = blob_scene("lissajous", 0, rate=1e6 if M > 1 else 1e5)
-        run = functools.partial(jaxevent.blob.track, stream, params, [(*start, 20.0)])
+        run = functools.partial(moment.estimate, stream, params, seeds=[(*start, 20.0)])
         whole[M] = len(stream.events) / 1e6 / best(run, 10)
     print(
         f"\nblob: RMSE {rmse[1]:.4f} px event by event, {rmse[32]:.4f} px in steps of 32 "

@@ -22,21 +22,21 @@ from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
 import jaxevent
-from jaxevent.blob import Params, Tracks, track
+from jaxevent.blob import Tracker, Tracks, chi2, chi2_split, constant_velocity, moment
 from jaxevent.io.output import complete
 from jaxevent.recording import Events, Recording
-from jaxevent.show.tracks import track_colour, track_frames
+from jaxevent.show.track_pictures import track_colour, track_frames
 
 DOT_HZ, DOT_RADIUS = 19.39, 107.66  # of the circle that data/README.md gives
 DOT_PARTS = {"begin": (0.005, 0.015), "reported": (0.015, 0.05)}
-DOT_ROWS: dict[str, dict[str, Any]] = {
-    "moment": {"gate_shape": "ellipse"},
-    "moment, circular gate": {"gate_shape": "circle"},
-    "moment, M = 32": {"gate_shape": "ellipse", "events_per_step": 32},
-    "chi2_split": {"filter": "chi2_split", "gate_shape": "circle"},
-    "chi2_split, M = 32": {"filter": "chi2_split", "gate_shape": "circle", "events_per_step": 32},
-    "chi2, 2n+4": {"filter": "chi2", "gate_shape": "circle"},
-    "constant_velocity": {"filter": "constant_velocity", "gate_shape": "circle"},
+DOT_ROWS: dict[str, tuple[Tracker, dict[str, Any]]] = {
+    "moment": (moment, {"gate_shape": "ellipse"}),
+    "moment, circular gate": (moment, {"gate_shape": "circle"}),
+    "moment, M = 32": (moment, {"gate_shape": "ellipse", "events_per_step": 32}),
+    "chi2_split": (chi2_split, {"gate_shape": "circle"}),
+    "chi2_split, M = 32": (chi2_split, {"gate_shape": "circle", "events_per_step": 32}),
+    "chi2, 2n+4": (chi2, {"gate_shape": "circle"}),
+    "constant_velocity": (constant_velocity, {"gate_shape": "circle"}),
 }
 DOT_FOUND = {"gate_shape": "ellipse", "events_per_step": 32, "prefilter": True}
 
@@ -118,7 +118,7 @@ def score_dot(tracks: Tracks, path: Circling, span: tuple[float, float]) -> dict
     t = np.arange(round(span[0] * 1e6), round(span[1] * 1e6), 50)
     longest = tracks.id[[np.argmax(tracks.death - tracks.birth)]]
     states = tracks(t, longest)
-    alive = states.alive[:, 0]
+    alive = states.valid[:, 0]
     row: dict[str, float] = {"tracked": float(alive.mean())}
     if not alive.any():
         return row
@@ -158,9 +158,9 @@ def spinning_dot(recording: Recording, out: Path) -> tuple[dict, str]:
         "|---|" + "---:|" * 9,
     ]  # fmt: skip
     shown = None
-    for label, values in {**DOT_ROWS, "detected, M = 32": DOT_FOUND}.items():
-        params, detected = Params.of({"preset": "fast", **values}), values is DOT_FOUND
-        tracks = track(recording, params, None if detected else seeds)
+    for label, (tracker, values) in {**DOT_ROWS, "detected, M = 32": (moment, DOT_FOUND)}.items():
+        params, detected = tracker.Params(preset="fast", **values), values is DOT_FOUND
+        tracks = tracker.estimate(recording, params, seeds=None if detected else seeds)
         row: dict[str, Any] = {n: score_dot(tracks, path, s) for n, s in DOT_PARTS.items()}
         row["tracks"] = len(tracks)
         results[label] = row
@@ -174,7 +174,7 @@ def spinning_dot(recording: Recording, out: Path) -> tuple[dict, str]:
             cells += [f"{100 * r['velocity_rms']:.1f} %"]
             shape = [f"{100 * r[name]:+.1f} %" for name in ("lambda1", "lambda2")]
             shape += [f"{r['theta']:.1f}"]
-            cells += ["-"] * 3 if params.filter == "constant_velocity" else shape
+            cells += ["-"] * 3 if tracker is constant_velocity else shape
         else:
             cells += ["-"] * 8
         lines.append(f"| {label} | " + " | ".join(cells) + " |")
@@ -187,7 +187,7 @@ def spinning_dot(recording: Recording, out: Path) -> tuple[dict, str]:
 def draw_dot(out: Path, recording: Recording, tracks: Tracks, path: Circling) -> None:
     times = np.arange(1000, 50_000, 100)
     states = tracks(times)
-    arrays = recording, times, tracks.id, states.mean, states.alive
+    arrays = recording, times, tracks.id, states.mean, states.valid
     images = list(track_frames(*arrays, trail=0.02, window=2e-4))
     figure = new_figure(15, 9)
     grid = figure.add_gridspec(2, 3)
@@ -276,7 +276,7 @@ def score_cars(
     """
     now = (times >= span[0] * 1e6) & (times < span[1] * 1e6)
     states = tracks(times)
-    centre, covers = states.mean[..., :2], np.zeros(states.alive.shape, bool)
+    centre, covers = states.mean[..., :2], np.zeros(states.valid.shape, bool)
     instants, distances, relative, switches, each = 0, [], [], 0, []
     for car in cars:
         last, own, count = None, [], 0
@@ -284,7 +284,7 @@ def score_cars(
             if not now[k]:
                 continue
             count += 1
-            distance = np.where(states.alive[k], np.hypot(*(centre[k] - place).T), np.inf)
+            distance = np.where(states.valid[k], np.hypot(*(centre[k] - place).T), np.inf)
             near = distance <= car.length / 2
             covers[k] |= near
             if not near.any():
@@ -300,7 +300,7 @@ def score_cars(
         if count:
             median = round(float(np.median(own)), 2) if own else None
             each.append({"frames": count, "covered": len(own), "median": median})
-    there = states.alive & now[:, None]
+    there = states.valid & now[:, None]
     return {
         "instants": instants,
         "coverage": len(distances) / max(instants, 1),
@@ -326,7 +326,8 @@ def street(recording: Recording, out: Path) -> tuple[dict, str]:
     rows = {"detection, from t = 0": {}, "without prefilter": {"prefilter": False}}
     shown = None
     for label, values in rows.items():
-        tracks = track(recording.with_frames(slice(0)), Params.of({**STREET, **values}))
+        params = moment.Params(**{**STREET, **values})
+        tracks = moment.estimate(recording.with_frames(slice(0)), params)
         shown = shown or tracks
         for part, span in STREET_PARTS.items():
             row = score_cars(tracks, cars, times, span)
@@ -349,7 +350,7 @@ def draw_street(out: Path, recording: Recording, tracks: Tracks, cars: list[Car]
     states = tracks(times)
     settings: dict[str, Any] = {"trail": 1.0, "scale": scale, "window": 0.02}
     frames = np.asarray(recording.frames.images)[1:]
-    arrays = recording, times, tracks.id, states.mean, states.alive
+    arrays = recording, times, tracks.id, states.mean, states.valid
     behind = {
         "events": list(track_frames(*arrays, **settings)),
         "frame": list(track_frames(*arrays, images=iter(frames), **settings)),
@@ -490,7 +491,7 @@ def score_sky(tracks: Tracks, recording: Recording) -> dict[str, Any]:
     states = tracks(times)
     places = stars_at + ((times - tracks.start) * 1e-6)[:, None, None] * drift
     far = np.linalg.norm(places[:, :, None] - states.mean[:, None, :, :2], axis=-1)
-    near = (far < 5) & states.alive[:, None]
+    near = (far < 5) & states.valid[:, None]
     follows = near.any((0, 1))
     row["found"] = {
         "stars": len(stars_at),
@@ -545,7 +546,7 @@ def sky(recording: Recording, out: Path) -> tuple[dict, str]:
         plain = {"preset": "slow", "events_per_step": 16, "max_targets": 128}
         rows = {"for stars": SKY} | ({"slow preset": plain} if part == "reported" else {})
         for label, values in rows.items():
-            tracks = track(cut, Params.of(values))
+            tracks = moment.estimate(cut, moment.Params(**values))
             row = results[f"{label}, {part}"] = score_sky(tracks, cut)
             life = ", ".join(f"{one:.1f}" for one in row["life"])
             lines.append(
@@ -569,8 +570,8 @@ def draw_sky(out: Path, recording: Recording, tracks: Tracks, row: dict) -> None
     times = np.linspace(tracks.start, tracks.stop - 1, 27).astype(np.int64)[1:]
     long = [one[0] for one in row["states"]]
     states = tracks(times, long)
-    last = np.array([int(np.flatnonzero(a)[-1]) for a in states.alive.T])
-    mean, alive = states.mean.copy(), states.alive.copy()
+    last = np.array([int(np.flatnonzero(a)[-1]) for a in states.valid.T])
+    mean, alive = states.mean.copy(), states.valid.copy()
     for i, k in enumerate(last):  # tracks that ended keep their last place in the picture
         mean[k:, i], alive[k:, i] = mean[k, i], True
     arrays = recording, times, np.array(long), mean, alive

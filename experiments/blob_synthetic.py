@@ -22,7 +22,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 from bench import machine
 
-from jaxevent.blob import Params, States, Tracks, track
+from jaxevent.blob import (
+    Tracker,
+    TrackerParams,
+    Tracks,
+    TrackStates,
+    chi2,
+    chi2_split,
+    constant_velocity,
+    moment,
+    moving_moments,
+)
 from jaxevent.blob.quantities import inverse_ttc, size_range
 from jaxevent.io.output import complete
 from jaxevent.recording import Recording
@@ -31,29 +41,34 @@ from jaxevent.simulate.blobs import Approach, Truth
 
 CIRCLE, ELLIPSE = {"gate_shape": "circle"}, {"gate_shape": "ellipse"}
 CONSTANT = "constant velocity, R = 64 px^2"
-METHODS: dict[str, dict[str, Any]] = {
-    "chi2, target 2n": {"filter": "chi2", "target": "2n", **CIRCLE},
-    "chi2, target 2n+4": {"filter": "chi2", **CIRCLE},
-    "chi2_split": {"filter": "chi2_split", **ELLIPSE},
-    "moment": ELLIPSE,
-    "moment, circular gate": CIRCLE,
-    "moment, M = 32": {"events_per_step": 32, **ELLIPSE},
-    "moving moments, 2 ms": {"filter": "moving_moments", **CIRCLE},
-    CONSTANT: {"filter": "constant_velocity", "gate_min": 30.0, **CIRCLE},
+METHODS: dict[str, tuple[Tracker, dict[str, Any]]] = {
+    "chi2, target 2n": (chi2, {"target": "2n", **CIRCLE}),
+    "chi2, target 2n+4": (chi2, CIRCLE),
+    "chi2_split": (chi2_split, ELLIPSE),
+    "moment": (moment, ELLIPSE),
+    "moment, circular gate": (moment, CIRCLE),
+    "moment, M = 32": (moment, {"events_per_step": 32, **ELLIPSE}),
+    "moving moments, 2 ms": (moving_moments, CIRCLE),
+    CONSTANT: (constant_velocity, {"gate_min": 30.0, **CIRCLE}),
 }
 SETTLE = 0.1  # s, left out of all means
 SHIFT = 5.0  # px, of seeds
 FOCAL = 1000.0  # px, of the scenes
 
 
-def params_of(method: str, **values: Any) -> Params:
-    return Params.of({**METHODS[method], **values})
+Chosen = tuple[Tracker, TrackerParams]
+
+
+def choose(method: str, **values: Any) -> Chosen:
+    """A tracker and its parameters, by its name in the table."""
+    tracker, settings = METHODS[method]
+    return tracker, tracker.Params(**{**settings, **values})
 
 
 def followed(
     recording: Recording,
     truth: Truth,
-    params: Params,
+    chosen: Chosen,
     size: float,
     seed: int,
     start: float = 0.0,
@@ -62,9 +77,11 @@ def followed(
     """Tracks of all targets, each from a rough seed."""
     rng = np.random.default_rng([seed, 7])
     at = truth(start)[0]
-    size = 8.0 if params.filter == "constant_velocity" else size
+    tracker, params = chosen
+    size = 8.0 if tracker is constant_velocity else size
     xy = at[:, :2] + SHIFT * rng.normal(size=(len(at), 2))
-    return track(recording, params, [(*p, size) for p in xy], start=start, stop=stop)
+    seeds = [(*p, size) for p in xy]
+    return tracker.estimate(recording, params, seeds=seeds, start=start, stop=stop)
 
 
 def nees(error: np.ndarray, covariance: np.ndarray) -> float:
@@ -75,10 +92,10 @@ def nees(error: np.ndarray, covariance: np.ndarray) -> float:
     return float((error * solved).sum(-1).mean() / error.shape[-1])
 
 
-def measured(states: States, true: np.ndarray, times: np.ndarray) -> dict[str, float]:
+def measured(states: TrackStates, true: np.ndarray, times: np.ndarray) -> dict[str, float]:
     """How far the only track is from the truth (times, 8) after `SETTLE`."""
     late = times >= SETTLE
-    mean, alive = states.mean[late, 0].astype(float), states.alive[late, 0]
+    mean, alive = states.mean[late, 0].astype(float), states.valid[late, 0]
     P, true = states.covariance[late, 0].astype(float), true[late]
     last = np.linalg.norm(mean[-12:, :2] - true[-12:, :2], axis=1)
     lost = float(not (alive.all() and np.median(last) < 20))
@@ -116,14 +133,14 @@ def settled(tracks: Tracks, truth: Truth) -> float:
     return np.inf
 
 
-def range_of(states: States, extent: float) -> tuple[np.ndarray, np.ndarray]:
+def range_of(states: TrackStates, extent: float) -> tuple[np.ndarray, np.ndarray]:
     """Range of the first track, m, and its variance."""
     mean, covariance = jnp.asarray(states.mean[:, 0]), jnp.asarray(states.covariance[:, 0])
     value, variance = size_range(mean, covariance, extent, FOCAL, 0.25)
     return np.asarray(value, float), np.asarray(variance, float)
 
 
-def contact_of(states: States) -> tuple[np.ndarray, np.ndarray]:
+def contact_of(states: TrackStates) -> tuple[np.ndarray, np.ndarray]:
     """1 / TTC of the first two tracks, 1/s, and its variance."""
     told = [jnp.asarray(a[:, k]) for k in (0, 1) for a in (states.mean, states.covariance)]
     value, variance = inverse_ttc(*told)
@@ -159,7 +176,7 @@ def over_seeds(
         times = np.arange(step, truth.duration - step, step)
         true = truth(times)[:, 0]
         for method in methods:
-            tracks = followed(recording, truth, params_of(method, **values), size, seed)
+            tracks = followed(recording, truth, choose(method, **values), size, seed)
             run = measured(tracks(times), true, times)
             if start_up:
                 run["settled"] = settled(tracks, truth)
@@ -195,11 +212,11 @@ def growing(seeds: Sequence[int]) -> dict[str, Any]:
         assert isinstance(motion, Approach)
         depth = motion.depth(times)
         for method in rows:
-            tracks = followed(recording, truth, params_of(method), 8.0, seed)
+            tracks = followed(recording, truth, choose(method), 8.0, seed)
             states = tracks(times)
             run = measured(states, truth(times)[:, 0], times)
             distance, variance = range_of(states, max(motion.extent))
-            good = (times >= SETTLE) & states.alive[:, 0]
+            good = (times >= SETTLE) & states.valid[:, 0]
             relative = (distance / depth - 1)[good]
             run["range bias"] = 100 * relative.mean()
             run["range rms"] = 100 * float(np.sqrt((relative**2).mean()))
@@ -219,8 +236,8 @@ def contact(seeds: Sequence[int]) -> dict[str, Any]:
         assert isinstance(motion, Approach)
         true = (motion.speed + motion.acceleration * times) / motion.depth(times)
         for method in rows:
-            params = params_of(method, preset="ttc")
-            states = followed(recording, truth, params, 10.0, seed)(times)
+            chosen = choose(method, preset="ttc")
+            states = followed(recording, truth, chosen, 10.0, seed)(times)
             value, variance = (part[late] for part in contact_of(states))
             error = value - true[late]
             rows[method].append(
@@ -228,7 +245,7 @@ def contact(seeds: Sequence[int]) -> dict[str, Any]:
                     "bias": float(np.nanmean(error)),
                     "rms": float(np.sqrt(np.nanmean(error**2))),
                     "nees": float(np.nanmean(error**2 / variance)),
-                    "lost": float(not states.alive.all()),
+                    "lost": float(not states.valid.all()),
                 }
             )
     return {method: averaged(runs) for method, runs in rows.items()}
@@ -247,8 +264,8 @@ def crossings(seeds: Sequence[int]) -> dict[str, Any]:
             true = truth(0.55)[0]
             for rule in ("nearest", "soft"):
                 for method in ("moment", "moment, M = 32") if offset == 0 else ("moment, M = 32",):
-                    params = params_of(method, association=rule)
-                    tracks = followed(recording, truth, params, 20.0, seed)
+                    chosen = choose(method, association=rule)
+                    tracks = followed(recording, truth, chosen, 20.0, seed)
                     d = np.linalg.norm(tracks(0.55).mean[0, :, :2] - true[:, :2], axis=1)
                     name = f"{method}, {rule}"
                     kept[name] = kept.get(name, 0) + int((d < 20).all())
@@ -267,8 +284,8 @@ def dropouts(seeds: Sequence[int]) -> dict[str, Any]:
             at = np.random.default_rng([seed, 3]).uniform(0.59, 0.79 - length)
             recording, truth = blob_scene("dropout", seed, length=length, at=at)
             for name in names:
-                params = params_of(name, t_coast=0.3)
-                tracks = followed(recording, truth, params, 20.0, seed, at - 0.2, at + length + 0.1)
+                chosen = choose(name, t_coast=0.3)
+                tracks = followed(recording, truth, chosen, 20.0, seed, at - 0.2, at + length + 0.1)
                 times = np.array([at + length, at + length + 0.05])
                 d = np.linalg.norm(tracks(times).mean[:, 0, :2] - truth(times)[:, 0, :2], axis=1)
                 got[name] += bool(d[1] < 5)
@@ -397,7 +414,7 @@ def picture(path: Path, seed: int, rows: dict[str, Any]) -> None:
     recording, truth = blob_scene("lissajous", seed)
     ms = np.arange(0, 20_000, 100)
     for method in shown:
-        tracks = followed(recording, truth, params_of(method), 20.0, seed, stop=0.1)
+        tracks = followed(recording, truth, choose(method), 20.0, seed, stop=0.1)
         (dots,) = axes[0, 0].plot(ms / 1e3, tracks(ms).mean[:, 0, 4], label=method)
         axes[0, 0].plot(ms / 1e3, tracks(ms).mean[:, 0, 5], color=dots.get_color())
     for value in (10, 5):
@@ -411,7 +428,7 @@ def picture(path: Path, seed: int, rows: dict[str, Any]) -> None:
     assert isinstance(motion, Approach)
     axes[0, 1].plot(times, motion.depth(times), "k", lw=0.8)
     for method in shown[:1] + shown[2:]:
-        states = followed(recording, truth, params_of(method), 8.0, seed)(times)
+        states = followed(recording, truth, choose(method), 8.0, seed)(times)
         value, _ = range_of(states, 0.24)
         axes[0, 1].plot(times, value, label=method, lw=0.8)
     axes[0, 1].set(xlabel="s", ylabel="range from size (m)", ylim=(3, 20))
@@ -421,7 +438,7 @@ def picture(path: Path, seed: int, rows: dict[str, Any]) -> None:
     times = np.arange(0.02, 3.44, 0.01)
     motion = truth.targets[0].motion
     assert isinstance(motion, Approach)
-    states = followed(recording, truth, params_of("moment", preset="ttc"), 10.0, seed)(times)
+    states = followed(recording, truth, choose("moment", preset="ttc"), 10.0, seed)(times)
     value, variance = contact_of(states)
     sigma = np.sqrt(variance)
     axes[1, 0].fill_between(times, value - 2 * sigma, value + 2 * sigma, alpha=0.3)

@@ -10,6 +10,7 @@ chosen by the true positions of those recordings themselves.
 
 import argparse
 import dataclasses
+import functools
 import itertools
 import time
 from collections.abc import Mapping, Sequence
@@ -20,7 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxevent.blob import (
-    Params,
+    TrackerParams,
+    moment,
     negative_log_likelihood,
     position_error,
     prepare_positions,
@@ -40,7 +42,9 @@ SETTINGS = Settings(iterations=30, learning_rate=0.5, rounds=2, every=10, patien
 SCALE = 30.0  # px; the error is squared well below it
 
 
-def recordings(scene: str, seeds: Sequence[int], params: Params, seconds: float, **settings: Any):
+def recordings(
+    scene: str, seeds: Sequence[int], params: TrackerParams, seconds: float, **settings: Any
+):
     """For each seed the events, and those with true positions every ms after 0.1 s."""
     batches = []
     for seed in seeds:
@@ -57,9 +61,9 @@ def recordings(scene: str, seeds: Sequence[int], params: Params, seconds: float,
     return batches
 
 
-def rmse(params: Params, raw: Mapping[str, jax.Array], batches: Sequence[Any]) -> np.ndarray:
+def rmse(params: TrackerParams, raw: Mapping[str, jax.Array], batches: Sequence[Any]) -> np.ndarray:
     """Of the position, px, for every set of unconstrained numbers (sets,) in `raw`."""
-    one = jax.vmap(lambda r, b: position_error(params.with_raw(r), b, SCALE), (0, None))
+    one = jax.vmap(lambda r, b: position_error(moment, params.with_raw(r), b, SCALE), (0, None))
     squares = [jax.jit(one)(raw, batch) for batch in batches]
     return np.sqrt(np.mean(squares, axis=0))
 
@@ -75,23 +79,22 @@ def tuned(
     **scene_settings: Any,
 ) -> list[dict[str, Any]]:
     """One row for each start, its fit, and the best point of the grid."""
-    base = Params.of(STEP)
+    base = moment.Params(**STEP)
     batches = [b.features for b in recordings(scene, seeds, base, seconds, **scene_settings)]
     test = recordings(scene, held_out, base, seconds, **scene_settings)
     names = list(next(iter(starts.values())))
-    tried: list[tuple[str, Params, float]] = []
+    tried: list[tuple[str, TrackerParams, float]] = []
     for label, factors in starts.items():
         wrong = {name: float(getattr(base, name)) * factor for name, factor in factors.items()}
-        start = Params.of({**STEP, **wrong})
+        start = moment.Params(**{**STEP, **wrong})
         begin = time.perf_counter()
-        found = optimise(
-            negative_log_likelihood, start, names, batches, settings=settings, title=label
-        )
+        loss = functools.partial(negative_log_likelihood, moment)
+        found = optimise(loss, start, names, batches, settings=settings, title=label)
         tried += [(f"{label}: start", start, 0.0)]
         tried += [("fitted", found.params, time.perf_counter() - begin)]
     for point in itertools.product(*grid.values()):
         values = dict(zip(grid, point, strict=True))
-        tried.append(("best of the grid", Params.of({**STEP, **values}), 0.0))
+        tried.append(("best of the grid", moment.Params(**{**STEP, **values}), 0.0))
     raw = {n: jnp.stack([p.raw[n] for _, p, _ in tried]) for n in {**dict.fromkeys(names), **grid}}
     errors = rmse(base, raw, test)
     first = 2 * len(starts)

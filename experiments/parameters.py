@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 
 import jaxevent
+from jaxevent.methods import names
 from jaxevent.parameters import Choice, Number, Parameters
 
 
@@ -28,9 +29,8 @@ def rows(kinds: Iterable[type[Parameters]]) -> list[str]:
 
 
 def page() -> str:
-    methods = (jaxevent.METHODS[name].Params for name in jaxevent.methods.names("reconstruction"))
-    blob = jaxevent.blob.Params
-    presets = ", ".join(f"`{name}`" for name in blob.presets)
+    methods = (jaxevent.METHODS[name].Params for name in names("reconstruction"))
+    trackers = [jaxevent.METHODS[name].Params for name in names("blob")]
     parts = [
         "# Parameters",
         "Made by `python experiments/parameters.py`. Of several options the first is the default. "
@@ -40,8 +40,9 @@ def page() -> str:
         "Presets of `akf`: `paper`, `hdr`; of `aks`: `hdr`.",
         "\n".join(rows(methods)),
         "## Blob tracking",
-        f"`jaxevent.blob.Params`. Presets: {presets}.",
-        "\n".join(rows([blob])),
+        "A tracker has those of them that it uses: `jaxevent.blob.moment.Params.numbers`, "
+        "`.choices`. Presets: `slow`, `fast`, `ttc`; of `chi2` also `authors`.",
+        "\n".join(rows(trackers)),
         "## Egomotion",
         "Each method of `jaxevent.egomotion.METHODS` has its own `Params`.",
     ]

@@ -36,6 +36,21 @@ def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
     return np.asarray(np.rint(time.astype(np.float64) * 1e6), np.int64)
 
 
+def check_times(times: Times, start: int, stop: int, name: str) -> None:
+    """Raise `InputError` for times outside start <= t <= stop (us), the span of the data.
+
+    `name` is that of the recording, for the message. The message gives both conventions, since a
+    number of the wrong one is the usual reason.
+    """
+    us = np.atleast_1d(microseconds(times))
+    if len(us) and (us.min() < start or us.max() > stop):
+        raise InputError(
+            f"{name}: times from {us.min()} to {us.max()} us were asked for, but it lasts from "
+            f"{start} to {stop} us; give times of the recording's clock inside it (integers are "
+            "microseconds, floats seconds), or extrapolate=True"
+        )
+
+
 def _span(what: str, count: int, t: Any) -> str:
     """As in "2 events from 0.1 to 0.2 s"."""
     text = f"{count:,} {what}{'s' * (count != 1)}"

@@ -1,23 +1,32 @@
-"""Tracking of blobs: bright spots and other compact sources of events."""
+"""Tracking of blobs: bright spots and other compact sources of events.
 
-from jaxevent.blob.tracker import (
-    Params,
-    States,
-    Tracks,
-    negative_log_likelihood,
-    position_error,
-    prepare,
-    prepare_positions,
-    track,
-)
+tracks = blob.moment.estimate(recording, blob.moment.Params(events_per_step=32))
+mean, covariance, valid = tracks(times)
+"""
+
+from jaxevent.blob.filters.chi2 import chi2, chi2_split
+from jaxevent.blob.filters.constant_velocity import constant_velocity
+from jaxevent.blob.filters.moment import moment
+from jaxevent.blob.filters.moving_moments import moving_moments
+from jaxevent.blob.filters.steps import Filter
+from jaxevent.blob.losses import negative_log_likelihood, position_error, prepare_positions
+from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.states import TrackStates
+from jaxevent.blob.tracker import Tracker
+from jaxevent.blob.tracks import Tracks
 
 __all__ = [
-    "Params",
-    "States",
+    "Filter",
+    "TrackStates",
+    "Tracker",
+    "TrackerParams",
     "Tracks",
+    "chi2",
+    "chi2_split",
+    "constant_velocity",
+    "moment",
+    "moving_moments",
     "negative_log_likelihood",
     "position_error",
-    "prepare",
     "prepare_positions",
-    "track",
 ]

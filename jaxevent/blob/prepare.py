@@ -2,10 +2,12 @@
 
 A chunk never reaches over a boundary of the life cycle (every `cycle` seconds from the start) nor
 over the time at which a seed begins, so births, deaths and steps do not depend on how long chunks
-and windows are. Times are int32 us since the chunk's start, hence exact however long the recording.
+and stretches are. Times are int32 us since the chunk's start, hence exact however long the
+recording.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,11 +16,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
+from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.seeds import read_seeds
+from jaxevent.errors import InputError
 from jaxevent.kernels import compiled
-from jaxevent.recording import Recording
+from jaxevent.recording import Recording, Times, check_times, microseconds
 
 STEPS = (4, 8, 16, 32, 64, 128, 256)  # per chunk
-WINDOW_STEPS = 8192
+STRETCH_STEPS = 8192
 READ_ROWS = 65536  # events read from a file at a time
 LONGEST = 2**29  # us between boundaries; two of them fit into int32
 
@@ -43,21 +48,18 @@ class Features(eqx.Module):
     cells: tuple[int, int] = eqx.field(static=True)  # rows and columns of the grid of births
 
 
-@dataclasses.dataclass(frozen=True)
-class Seeds:
-    """Tracks given by the user, sorted by time: t (n,) us, xi (n, 2) and size (n,) in px.
+class ReadOut(eqx.Module):
+    """Where times are in the chunks of `Features`."""
 
-    `given` is the place of each among those that the user gave.
-    """
-
-    t: NDArray[np.int64]
-    xi: NDArray[np.float64]
-    size: NDArray[np.float64]
-    given: NDArray[np.int64]
+    chunk: Int[Numeric, " times"]
+    step: Int[Numeric, " times"]  # steps of the chunk done by then
+    time: Int[Numeric, " times"]  # us since the chunk's start
+    inside: Bool[Numeric, " times"]  # whether it is tracked then
+    given: Int[Numeric, " seeds"]  # the place of each seed, by time, among those given
 
 
 class Mark(NamedTuple):
-    """Where a window begins: the next event's row and the start of the chunk; no state."""
+    """Where a stretch begins: the next event's row and the start of the chunk; no state."""
 
     row: int
     previous: int  # us, start of the chunk before
@@ -66,7 +68,7 @@ class Mark(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Window:
+class Stretch:
     """Consecutive chunks, where they are in time (us) and of which rows their events are."""
 
     features: Features
@@ -75,25 +77,43 @@ class Window:
     next: Mark | None
 
 
-class Windows:
-    """The chunks of a recording between two times (us), one window after another."""
+class Packing:
+    """The chunks of a recording between two times, one stretch after another.
+
+    Args:
+        recording: The events.
+        params: The numbers that act here: `events_per_step`, `cycle`, `cell`, those of the
+            prefilter.
+        seeds: One (x, y, size) or (x, y, size, t) for every target; None: none.
+        start: Integers are us, floats s; None: the first event.
+        stop: The first time that is left out; None: after the last event.
+        detect: Whether tracks are born where events belong to none; None: only without seeds.
+        steps: Of a chunk; None: as suits the recording.
+        chunks: Of a stretch; None: as suits the steps.
+
+    Raises:
+        InputError: A seed is outside the sensor or the time, or there is no time to track.
+    """
 
     def __init__(
         self,
         recording: Recording,
-        params: Any,
-        seeds: Seeds,
-        start: int,
-        stop: int,
+        params: TrackerParams,
+        seeds: Sequence[Any] | np.ndarray | None = None,
+        start: int | float | None = None,
+        stop: int | float | None = None,
+        detect: bool | None = None,
         *,
-        detect: bool,
         steps: int | None = None,
         chunks: int | None = None,
     ):
-        self.recording, self.seeds, self.start, self.stop = recording, seeds, start, stop
+        begin, end = _span(recording, start, stop)
+        detect = seeds is None if detect is None else detect
+        self.recording, self.start, self.stop = recording, begin, end
+        self.seeds = read_seeds(recording, seeds, begin, end)
         # Without births and tentative tracks less is to be decided.
         self.period = max(1, round((1 if detect else 10) * 1e6 * float(params.cycle)))
-        self.rows = recording.events.index(start), recording.events.index(stop)
+        self.rows = recording.events.index(begin), recording.events.index(end)
         self.events = params.events_per_step
         self.detect, self.prefilter = detect, params.prefilter
         self.neighbours = params.prefilter_neighbours
@@ -101,63 +121,84 @@ class Windows:
         cell = params.cell
         self.cells = -(-recording.height // cell), -(-recording.width // cell)
         if steps is None:
-            events = (self.rows[1] - self.rows[0]) * self.period / max(stop - start, 1)
+            events = (self.rows[1] - self.rows[0]) * self.period / max(end - begin, 1)
             mean = (events + events**0.5) / self.events  # steps between boundaries, and some
             steps = min(STEPS, key=lambda s: max(1, np.ceil(mean / s)) * (s + 4))
         self.steps = steps
-        self.chunks = max(1, WINDOW_STEPS // steps) if chunks is None else chunks
-        self.first = Mark(self.rows[0], start, start, 0)
+        self.chunks = max(1, STRETCH_STEPS // steps) if chunks is None else chunks
+        self.first = Mark(self.rows[0], begin, begin, 0)
 
-    def prepare(self, mark: Mark) -> Window:
-        """The window that begins there."""
+    def pack(self, mark: Mark) -> Stretch:
+        """The stretch that begins there."""
         shape = self.chunks, self.steps, self.events
         real = np.dtype(jnp.result_type(float))
-        t, row = np.zeros(shape, np.int32), np.full(shape, -1, np.int64)
-        xi, polarity = np.zeros((*shape, 2), real), np.zeros(shape, real)
-        start = np.zeros(self.chunks, np.int64)
-        elapsed, stop = np.zeros((2, self.chunks), np.int32)
-        cycle = np.zeros(self.chunks, bool)
-        seed = np.full(len(self.seeds.t), -1, np.int32)
-        state = np.array([0, 0, 0, mark.previous, mark.start, 0, mark.seed])
+        out = _Chunks(
+            np.zeros(shape, np.int32),
+            np.zeros((*shape, 2), real),
+            np.zeros(shape, real),
+            np.full(shape, -1, np.int64),
+            np.zeros(self.chunks, np.int64),
+            np.zeros(self.chunks, np.int32),
+            np.zeros(self.chunks, np.int32),
+            np.zeros(self.chunks, bool),
+            np.full(len(self.seeds.t), -1, np.int32),
+        )
+        bounds = _Bounds(self.start, self.stop, self.period, self.seeds.t)
+        place = _Place(0, 0, 0, mark.previous, mark.start, 0, mark.seed)
         at, done = mark.row, False
         while not done:
             upto = min(at + READ_ROWS, self.rows[1])
             events = self.recording.events[at:upto]
-            done, used = _pack(
-                events.t, events.x, events.y, events.p, self._kept(events, at), at,
-                upto == self.rows[1], self.start, self.stop, self.period, self.seeds.t, state,
-                t, xi, polarity, row, start, elapsed, stop, cycle, seed,
-            )  # fmt: skip
+            kept = self._kept(events, at)
+            given = _Given(events.t, events.x, events.y, events.p, kept)
+            done, used, place = _pack(given, at, upto == self.rows[1], bounds, place, out)
             at += used
-        chunks = state[0]
-        start[chunks:] = np.iinfo(np.int64).max
+        out.start[place.chunk :] = np.iinfo(np.int64).max
         features = Features(
-            t, xi, polarity, row >= 0, elapsed, stop, cycle, seed,
+            out.t, out.xi, out.polarity, out.row >= 0, out.elapsed, out.stop, out.cycle, out.seed,
             self.seeds.xi.astype(real), self.seeds.size.astype(real),
             np.array([self.recording.width, self.recording.height], real),
             self.detect, self.cells,
         )  # fmt: skip
-        ended = state[3] == state[4] == self.stop
-        following = None if ended else Mark(at, int(state[3]), int(state[4]), int(state[6]))
-        return Window(features, start, row, following)
+        ended = place.previous == place.begin == self.stop
+        following = None if ended else Mark(at, place.previous, place.begin, place.seed)
+        return Stretch(features, out.start, out.row, following)
 
     def whole(self) -> Features:
         """All chunks at once, for recordings that fit into memory."""
-        windows, mark = [], self.first
+        stretches, mark = [], self.first
         while mark is not None:
-            windows.append(self.prepare(mark))
-            mark = windows[-1].next
-        used = sum(int((w.start < np.iinfo(np.int64).max).sum()) for w in windows)
+            stretches.append(self.pack(mark))
+            mark = stretches[-1].next
+        used = sum(int((w.start < np.iinfo(np.int64).max).sum()) for w in stretches)
         used = -(-used // 32) * 32  # so that few shapes occur
         fields = {}
         for name in ("t", "xi", "polarity", "valid", "elapsed", "stop", "cycle"):
-            fields[name] = np.concatenate([getattr(w.features, name) for w in windows])[:used]
-        at = np.stack([w.features.seed for w in windows])
+            fields[name] = np.concatenate([getattr(w.features, name) for w in stretches])[:used]
+        at = np.stack([w.features.seed for w in stretches])
         place = np.argmax(at >= 0, axis=0)
         seed = np.where(
             (at >= 0).any(0), at.max(0, initial=-1) + place.astype(np.int32) * self.chunks, -1
         )
-        return dataclasses.replace(windows[0].features, seed=seed.astype(np.int32), **fields)
+        return dataclasses.replace(stretches[0].features, seed=seed.astype(np.int32), **fields)
+
+    def read_out(self, features: Features, us: NDArray[np.int64]) -> ReadOut:
+        """Where some times (us) are in all chunks, `features`."""
+        inside = (self.start <= us) & (us < self.stop)
+        us = np.where(inside, us, self.start)
+        used = int(np.flatnonzero(features.cycle)[-1]) + 1  # the others fill up
+        begins = self.start + np.cumsum(features.elapsed[:used], dtype=np.int64)
+        chunk = np.searchsorted(begins, us, "right") - 1
+        step = count_steps(features, chunk, us - begins[chunk])
+        time = (us - begins[chunk]).astype(np.int32)
+        return ReadOut(chunk, step, time, inside, self.seeds.given)
+
+    def check_times(self, times: Times) -> None:
+        """Raise `InputError` for times outside the recording and outside what is tracked."""
+        start, stop = self.start, self.stop - 1
+        if len(self.recording.events) or self.recording.frames is not None:
+            start, stop = min(start, self.recording.start), max(stop, self.recording.stop)
+        check_times(times, start, stop, self.recording.name)
 
     def _kept(self, events, row: int) -> NDArray[np.bool_]:
         """Which events the background-activity prefilter keeps.
@@ -176,6 +217,41 @@ class Windows:
         return kept
 
 
+def packing_key(params: TrackerParams) -> tuple[Any, ...]:
+    """The numbers that act when events are packed; equal ones pack alike."""
+    names = ("events_per_step", "cycle", "cell", "prefilter", "prefilter_neighbours")
+    return *(float(getattr(params, name)) for name in names), float(params.prefilter_time)
+
+
+def _span(
+    recording: Recording, start: int | float | None, stop: int | float | None
+) -> tuple[int, int]:
+    """From when to when events are used (us)."""
+    if not len(recording.events):
+        first, last = 0, 1
+        if recording.frames is not None:
+            first, last = int(recording.frames.t[0]), int(recording.frames.t[-1]) + 1
+    else:
+        first, last = int(recording.events[:1].t[0]), len(recording.events)
+        last = int(recording.events[last - 1 : last].t[0]) + 1
+    begin = first if start is None else int(microseconds(start, "the start"))
+    end = last if stop is None else int(microseconds(stop, "the stop"))
+    if end <= begin:
+        raise InputError(
+            f"{recording.name}: nothing to track from {begin} us to {end} us; the events reach "
+            f"from {first} to {last - 1} us, integers are microseconds, floats seconds"
+        )
+    return begin, end
+
+
+def count_steps(features: Features, chunk: NDArray, time: NDArray) -> NDArray[np.int32]:
+    """How many steps of a chunk were done by a time (us since its start)."""
+    done = (np.asarray(features.t)[chunk, :, -1] <= time[:, None]) & np.asarray(features.valid)[
+        chunk, :, 0
+    ]
+    return done.sum(1, dtype=np.int32)
+
+
 @compiled
 def _supported(t, x, y, last, reach, neighbours):
     """Events of which `neighbours` of the 8 pixels around fired at most `reach` us before."""
@@ -191,34 +267,75 @@ def _supported(t, x, y, last, reach, neighbours):
     return kept
 
 
-@compiled
-def _pack(
-    t_in, x, y, p, kept, row_in, final, origin, finish, period, seed_t, state,
-    t, xi, polarity, row, start, elapsed, stop, cycle, seed,
-):  # fmt: skip
-    """Fill chunks until they are full or events end: (full or ended, number of events used).
+class _Given(NamedTuple):
+    """Events to be packed, (events,) each."""
 
-    `state` is (chunk, whether it is open, events in it, start of the one before, start, end, next
-    seed). With `final`, the time `finish` closes what is open.
+    t: NDArray
+    x: NDArray
+    y: NDArray
+    p: NDArray
+    kept: NDArray  # by the prefilter
+
+
+class _Bounds(NamedTuple):
+    """What chunks do not reach over, us: the cycles from `start` on, `stop`, the seeds' times."""
+
+    start: int
+    stop: int
+    period: int
+    seed_t: NDArray
+
+
+class _Place(NamedTuple):
+    """How far the packing is."""
+
+    chunk: int
+    opened: int  # whether that chunk is begun
+    fill: int  # events in it
+    previous: int  # us, start of the chunk before
+    begin: int  # us, its start
+    end: int  # us
+    seed: int  # the next one
+
+
+class _Chunks(NamedTuple):
+    """Arrays to be filled; see `Features` and `Stretch`."""
+
+    t: NDArray
+    xi: NDArray
+    polarity: NDArray
+    row: NDArray
+    start: NDArray
+    elapsed: NDArray
+    stop: NDArray
+    cycle: NDArray
+    seed: NDArray
+
+
+@compiled
+def _pack(given, first_row, final, bounds, place, out):
+    """Fill chunks until they are full or events end: (full or ended, events used, place).
+
+    With `final`, the end of the time closes what is open.
     """
-    chunk, opened, fill, previous, begin, end, following = state
-    chunks, steps, size = t.shape
-    i, count = 0, len(t_in)
+    chunk, opened, fill, previous, begin, end, following = place
+    seed_t, finish = bounds.seed_t, bounds.stop
+    chunks, steps, size = out.t.shape
+    i, count = 0, len(given.t)
     while i < count + (1 if final else 0):
-        if i < count and not kept[i]:
+        if i < count and not given.kept[i]:
             i += 1
             continue
-        now = t_in[i] if i < count else finish
+        now = given.t[i] if i < count else finish
         if not opened:
             if chunk == chunks:
-                state[:] = (chunk, 0, 0, previous, begin, 0, following)
-                return True, i
-            start[chunk] = begin
-            elapsed[chunk] = begin - previous
+                return True, i, _Place(chunk, 0, 0, previous, begin, 0, following)
+            out.start[chunk] = begin
+            out.elapsed[chunk] = begin - previous
             while following < len(seed_t) and seed_t[following] <= begin:
-                seed[following] = chunk
+                out.seed[following] = chunk
                 following += 1
-            end = origin + ((now - origin) // period + 1) * period
+            end = bounds.start + ((now - bounds.start) // bounds.period + 1) * bounds.period
             end = min(end, begin + LONGEST)
             if following < len(seed_t):
                 end = min(end, seed_t[following])
@@ -226,21 +343,20 @@ def _pack(
         over = now >= end or (i == count)
         if over or fill == steps * size:
             close = min(end, finish) if over else now
-            stop[chunk] = close - begin
-            cycle[chunk] = over and ((close - origin) % period == 0 or close == finish)
+            out.stop[chunk] = close - begin
+            whole = (close - bounds.start) % bounds.period == 0
+            out.cycle[chunk] = over and (whole or close == finish)
             previous, begin, opened = begin, close, 0
             chunk += 1
             if i == count and close == finish:
-                state[:] = (chunk, 0, 0, finish, finish, 0, following)
-                return True, i
+                return True, i, _Place(chunk, 0, 0, finish, finish, 0, following)
             continue
-        step, place = fill // size, fill % size
-        t[chunk, step, place:] = now - begin
-        xi[chunk, step, place, 0] = x[i]
-        xi[chunk, step, place, 1] = y[i]
-        polarity[chunk, step, place] = 1 if p[i] else -1
-        row[chunk, step, place] = row_in + i
+        step, slot = fill // size, fill % size
+        out.t[chunk, step, slot:] = now - begin
+        out.xi[chunk, step, slot, 0] = given.x[i]
+        out.xi[chunk, step, slot, 1] = given.y[i]
+        out.polarity[chunk, step, slot] = 1 if given.p[i] else -1
+        out.row[chunk, step, slot] = first_row + i
         fill += 1
         i += 1
-    state[:] = (chunk, opened, fill, previous, begin, end, following)
-    return False, i
+    return False, i, _Place(chunk, opened, fill, previous, begin, end, following)

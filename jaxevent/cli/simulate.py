@@ -191,7 +191,7 @@ def _simulate_blobs(
 
     from jaxevent.io import save
     from jaxevent.io.output import complete
-    from jaxevent.show.tracks import write_states
+    from jaxevent.show.track_tables import write_states
     from jaxevent.simulate import blob_scene
 
     with contextlib.ExitStack() as stack:

@@ -23,6 +23,13 @@ def add(commands: Any) -> None:
     )
     one.add_argument("path", metavar="PATH", type=Path, help="a recording; frames are not needed")
     one.add_argument(
+        "--method",
+        metavar="NAME",
+        default="moment",
+        help="moment, chi2, chi2_split, constant_velocity, moving_moments, or one of your own, "
+        "package.module:object; default: moment",
+    )
+    one.add_argument(
         "--params",
         metavar="FILE",
         type=Path,
@@ -77,6 +84,7 @@ def add(commands: Any) -> None:
 
 def run(
     path: Path,
+    method: str,
     params: Path | None,
     seeds: list[tuple[float, ...]] | None,
     detect: bool,
@@ -92,11 +100,12 @@ def run(
     size_factor: float | int | None,
     out: Path,
 ) -> None:
-    from jaxevent.blob import Params, track
     from jaxevent.io import load
+    from jaxevent.methods import find
     from jaxevent.show.tracks import Output
 
-    values = Params.of({}) if params is None else Params.load(params, "blob")
+    tracker = find(method, "blob")
+    values = tracker.Params() if params is None else tracker.Params.load(params, method)
     each = None if at == "events" else rate
     output = Output(out, each, background, pair, extent, focal, size_factor)
     recording = load(path, size, in_memory=False, progress=show_progress())
@@ -105,8 +114,9 @@ def run(
         raise InputError(f"{path}: holds no events to track; choose another recording")
     span: dict[str, Any] = {"start": start, "stop": stop}
     clock = time.perf_counter()
-    tracks = track(
-        recording, values, seeds, **span, detect=detect or seeds is None, progress=show_progress()
+    found = detect or seeds is None
+    tracks = tracker.estimate(
+        recording, values, seeds=seeds, **span, detect=found, progress=show_progress()
     )
     seconds = time.perf_counter() - clock
     written = output.write(tracks, show_progress())

@@ -1,17 +1,15 @@
-"""What the tracker is fitted to: the likelihood of events, or positions that are known.
+"""What trackers are fitted to: the likelihood of events, or positions that are known.
 
-Settings of the method "blob" in a configuration of `jaxevent.runs.fit`:
+Settings of trackers in a configuration of `jaxevent.runs.fit`:
 
     loss = "likelihood"                 # of events, each predicted before it is used; or
                                         # "positions": distance from given ones
-    events = "all"                      # or "associated"; see `tracker.negative_log_likelihood`
+    events = "all"                      # or "associated"; see `losses.negative_log_likelihood`
     seeds = [[30.0, 40.0, 8.0]]         # x, y, size in px (and s) of each target; omitted: those
                                         # of the positions, or without any, tracks are born
     positions = "*.csv"                 # beside each recording, * being its name without suffix
 
-A method may have its own loss and events. Positions are a table with the columns t (s), x, y (px)
-and, of more than one target, id, as `jaxevent track` and `jaxevent simulate --truth` write them;
-further columns are left out. Targets by rising id are those of the seeds in their order.
+A method may have its own loss and events. Positions are as in `jaxevent.runs.blob_positions`.
 
 A recording is cut into windows of `window` seconds. If neither validation nor test is given, they
 are shared out: with `split` = [2, 1, 1], of every 4 windows in turn 2 are to fit, 1 to validate and
@@ -33,43 +31,33 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-import pandas as pd
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.blob.prepare import Features
-from jaxevent.blob.tracker import (
-    Params,
-    Positions,
+from jaxevent.blob import (
+    Tracker,
+    TrackerParams,
     negative_log_likelihood,
     position_error,
-    prepare,
     prepare_positions,
-    track,
 )
+from jaxevent.blob.losses import Positions
+from jaxevent.blob.prepare import Features, packing_key
 from jaxevent.devices import shared_out
 from jaxevent.errors import InputError
 from jaxevent.io.output import finite, values_of
-from jaxevent.parameters import nearest
+from jaxevent.parameters import Parameters, nearest
 from jaxevent.recording import Recording
-from jaxevent.runs.config import read_params
+from jaxevent.runs import blob_positions
+from jaxevent.runs.blob_positions import Known, Targets, seed_at, span_of_events
+from jaxevent.runs.blob_scores import TrackProtocol
+from jaxevent.runs.config import NAME
+from jaxevent.runs.family import Family, Goal, Shares, Sources
 from jaxevent.show.report import aligned
 from jaxevent.splits import SPLITS, windows
 
 LOSSES = ("likelihood", "positions")
 EVENTS = ("all", "associated")
-
-# Parameters that act when events are packed, and those of decisions, which have no gradient.
-PACKED = ("cycle", "prefilter_time")
-DECISIVE = (
-    "surround",
-    *("gate", "gate_decay", "gate_min", "gate_max", "gate_position"),
-    *("tau_birth", "n_birth", "n_confirm", "t_confirm", "t_tentative", "t_coast", "t_merge"),
-    *("aspect_max", "sigma_max"),
-)
-
-Sources = Mapping[str, Sequence[tuple[str, Recording]]]
-Share = tuple[int, ...] | None
 
 
 class Batch(eqx.Module):
@@ -83,21 +71,14 @@ class Batch(eqx.Module):
 class Loss:
     """A mean over events (-ln p) or positions (px^2): `loss(params, batch)`."""
 
+    tracker: Tracker
     name: str = "likelihood"
     events: str = "all"
 
-    def __call__(self, params: Params, batch: Batch) -> Float[Array, ""]:
+    def __call__(self, params: TrackerParams, batch: Batch) -> Float[Array, ""]:
         if isinstance(batch.features, Positions):
-            return position_error(params, batch.features)
-        return negative_log_likelihood(params, batch.features, self.events)
-
-
-@dataclasses.dataclass(frozen=True)
-class Known:
-    """Given positions: times (T,) us, xi (T, targets, 2) in px, NaN where not known."""
-
-    t: NDArray[np.int64]
-    xi: NDArray[np.float64]
+            return position_error(self.tracker, params, batch.features)
+        return negative_log_likelihood(self.tracker, params, batch.features, self.events)
 
 
 class Part(NamedTuple):
@@ -111,69 +92,31 @@ class Part(NamedTuple):
     split: int  # the place in SPLITS
 
 
-def read_positions(path: str | Path) -> Known:
-    """Positions from a table; see the text of this module.
-
-    Raises `InputError` for a file that cannot be read and for missing columns or numbers.
-    """
-    path = Path(path)
-    try:
-        table = pd.read_csv(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    except ValueError as error:
-        raise InputError(f"{path}: is no table ({error}); give columns t, x, y") from None
-    missing = [name for name in ("t", "x", "y") if name not in table.columns]
-    if missing:
-        raise InputError(f"{path}: has no column {missing[0]!r}; give the columns t (s), x, y (px)")
-    for name in ("t", "x", "y", *(["id"] if "id" in table.columns else [])):
-        numbers = np.asarray(pd.to_numeric(table[name], errors="coerce"), np.float64)
-        if not np.isfinite(numbers).all():
-            row = int(np.argmin(np.isfinite(numbers)))
-            raise InputError(
-                f"{path}: {name} is {str(table[name][row])[:40]!r} in line {row + 2}; give a "
-                "number, or leave the line out"
-            )
-    if not len(table):
-        raise InputError(f"{path}: holds no positions; give lines of t, x, y")
-    us = np.rint(table["t"].to_numpy(np.float64) * 1e6).astype(np.int64)
-    number = table["id"].to_numpy() if "id" in table.columns else np.zeros(len(us), np.int64)
-    t, row = np.unique(us, return_inverse=True)
-    targets, column = np.unique(number, return_inverse=True)
-    xi = np.full((len(t), len(targets), 2), np.nan)
-    xi[row, column] = table[["x", "y"]].to_numpy(np.float64)
-    return Known(t, xi)
-
-
 @dataclasses.dataclass(frozen=True)
-class Goal:
-    """How the tracker is fitted and scored; `jaxevent.runs.fit.Goal` describes the methods."""
+class TrackGoal(Goal):
+    """The goal of a tracker."""
 
-    start: Params
+    tracker: Tracker
+    start: TrackerParams
     loss: Loss
-    seeds: tuple[tuple[float, ...], ...] | None
-    positions: str | None
-    prepared = (*PACKED, *DECISIVE)
+    targets: Targets
     # Loss and gradient by 2 numbers of 4,000 events in steps of 16: forwards 37 ms, in reverse 310.
     forward = True
 
     def files(self, recording: Path) -> list[Path]:
-        if self.positions is None:
-            return []
-        name = recording.name if recording.is_dir() else recording.stem
-        return [recording.with_name(self.positions.replace("*", name))]
+        return self.targets.files(recording)
 
     def problem(
-        self, sources: Sources, split: Share, window: float | int | None
-    ) -> Callable[[Params], tuple[list[Batch], list[Batch]]]:
+        self, sources: Sources, split: Shares, window: float | int | None
+    ) -> Callable[[TrackerParams], tuple[list[Batch], list[Batch]]]:
         found = [part for part in self._parts(sources, split, window) if part.split < 2]
         if self.loss.name == "positions":
             found = [p for p in found if p.known is not None and np.isfinite(p.known.xi).any()]
         prepared: tuple[Any, Any] = (None, None)
 
-        def batches(params: Params) -> tuple[list[Batch], list[Batch]]:
+        def batches(params: TrackerParams) -> tuple[list[Batch], list[Batch]]:
             nonlocal prepared
-            fixed = tuple(float(getattr(params, name)) for name in PACKED)
+            fixed = packing_key(params)
             if prepared[0] != fixed:
                 prepared = (None, None)  # so that two are never held at once
                 packed = jax.device_put(self._packed(found, params, self.loss.name))
@@ -189,9 +132,9 @@ class Goal:
     def score(
         self,
         sources: Sources,
-        split: Share,
+        split: Shares,
         window: float | int | None,
-        params: Params,
+        params: TrackerParams,
         progress: bool,
     ) -> Iterator[dict[str, Any]]:
         found = self._parts(sources, split, window)
@@ -199,7 +142,7 @@ class Goal:
         for place, (given, recording) in (
             (place, source) for place, name in enumerate(SPLITS) for source in sources[name]
         ):
-            errors = self.errors(recording, params, progress)
+            errors = self.targets.errors(recording, self.tracker, params, progress)
             of_this = [
                 (part, batch)
                 for part, batch in zip(found, packed, strict=True)
@@ -210,7 +153,9 @@ class Goal:
                 if not mine:
                     continue
                 weights = np.array([batch.weight for _, batch in mine])
-                nll = [float(_likelihood(params, batch.features)) for _, batch in mine]
+                nll = [
+                    float(_likelihood(self.tracker, params, batch.features)) for _, batch in mine
+                ]
                 row: dict[str, Any] = {
                     "recording": given,
                     "split": name,
@@ -236,58 +181,14 @@ class Goal:
             columns[3:3] = [("covered", "covered", 1, 3)]
         return aligned(rows, columns)
 
-    def _known(self, recording: Recording) -> Known | None:
-        """The positions of a recording, those in the time of its events."""
-        for path in self.files(Path(recording.name)):
-            known = read_positions(path)
-            targets = known.xi.shape[1]
-            if self.seeds is not None and len(self.seeds) != targets:
-                raise InputError(
-                    f"{path}: holds {targets} targets, but there are {len(self.seeds)} seeds; "
-                    "give one for each, by rising id, or leave out the seeds"
-                )
-            first, stop = _reach(recording)
-            inside = (first <= known.t) & (known.t < stop)
-            if not inside.any():
-                raise InputError(
-                    f"{path}: no position is within {first * 1e-6:g} to {stop * 1e-6:g} s, the "
-                    f"events' time in {recording.name}; times are seconds on its clock"
-                )
-            return Known(known.t[inside], known.xi[inside])
-        return None
-
-    def errors(
-        self, recording: Recording, params: Params, progress: bool
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Time (us) and distance (px) of all known positions; NaN where the track is not alive."""
-        known = self._known(recording)
-        if known is None:
-            return None
-        seeds = self._first_seeds(known, params)
-        tracks = track(recording, params, seeds, progress=progress)
-        found = [states.mean[..., :2] for _, states in tracks.batches(known.t)]
-        distance = np.linalg.norm(np.concatenate(found) - known.xi, axis=2)
-        given = np.isfinite(known.xi).all(2)
-        return np.broadcast_to(known.t[:, None], given.shape)[given], distance[given]
-
-    def _first_seeds(self, known: Known | None, params: Params) -> list[Any] | None:
-        """Where tracking of a whole recording begins; None: tracks are born."""
-        if self.seeds is not None:
-            return [tuple(seed) for seed in self.seeds]
-        if known is None:
-            return None
-        size = float(params.lambda0)
-        first = int(known.t[0])
-        return [_at(known, k, first, size) for k in range(known.xi.shape[1])]
-
-    def _parts(self, sources: Sources, split: Share, window: float | int | None) -> list[Part]:
+    def _parts(self, sources: Sources, split: Shares, window: float | int | None) -> list[Part]:
         """The windows of all recordings, those without events left out."""
         found = []
         for place, (_, recording) in (
             (place, source) for place, name in enumerate(SPLITS) for source in sources[name]
         ):
-            known = self._known(recording)
-            first, stop = _reach(recording)
+            known = self.targets.known(recording)
+            first, stop = span_of_events(recording)
             spans = windows(first, stop, window, split, place)
             cuts = self._seeds(recording, known, np.array([begin for begin, _, _ in spans]))
             for (begin, end, s), seeds in zip(spans, cuts, strict=True):
@@ -300,26 +201,33 @@ class Goal:
         self, recording: Recording, known: Known | None, begins: NDArray
     ) -> Sequence[list[tuple[float, float, float, int]] | None]:
         """Of every window: for each target x, y, size (0: lambda0) and time; NaN: not there."""
-        if self.seeds is None and known is None:
+        if self.targets.seeds is None and known is None:
             return [None] * len(begins)
         first = int(begins[0])
         if known is not None:
-            sizes = [0.0] * known.xi.shape[1] if self.seeds is None else [s[2] for s in self.seeds]
+            sizes = (
+                [0.0] * known.xi.shape[1]
+                if self.targets.seeds is None
+                else [s[2] for s in self.targets.seeds]
+            )
             cuts = [
-                [_at(known, k, int(begin), size) for k, size in enumerate(sizes)]
+                [seed_at(known, k, int(begin), size) for k, size in enumerate(sizes)]
                 for begin in begins
             ]
         else:
-            assert self.seeds is not None
-            tracks = track(recording, self.start, list(self.seeds))
+            assert self.targets.seeds is not None
+            tracks = self.tracker.estimate(
+                recording, self.start, seeds=list(self.targets.seeds), progress=False
+            )
             means = tracks(begins).mean.tolist()
             cuts = [
                 [(x, y, size, int(begin)) for x, y, _, _, size, *_ in rows]
                 for begin, rows in zip(begins, means, strict=True)
             ]
-        if self.seeds is not None:
+        if self.targets.seeds is not None:
             given = [
-                (s[0], s[1], s[2], first if len(s) < 4 else round(s[3] * 1e6)) for s in self.seeds
+                (s[0], s[1], s[2], first if len(s) < 4 else round(s[3] * 1e6))
+                for s in self.targets.seeds
             ]
             cuts = [
                 [g if g[3] >= begin else s for g, s in zip(given, cut, strict=True)]
@@ -327,9 +235,10 @@ class Goal:
             ]
         return cuts
 
-    def _packed(self, found: Sequence[Part], params: Params, loss: str) -> list[Batch]:
+    def _packed(self, found: Sequence[Part], params: TrackerParams, loss: str) -> list[Batch]:
         """Batches of one shape, so that one program serves all."""
         batches, used = [], [1, 1, 0, 0]
+        no_times = np.empty(0, np.int64)
         for part in found:
             seeds = part.seeds
             if seeds is not None:
@@ -343,7 +252,10 @@ class Goal:
                 features, times = batch.features, len(batch.time)
                 weight = batch.known.sum()
             else:
-                batch = features = prepare(part.recording, params, seeds, **span)
+                features, _ = self.tracker.prepare(
+                    part.recording, no_times, params, seeds=seeds, **span
+                )
+                batch = features
                 weight, times = features.valid.sum(), 0
             if seeds is not None and part.seeds is not None:
                 # A size that is not given is lambda0, which can be fitted.
@@ -357,25 +269,6 @@ class Goal:
             used = [max(pair) for pair in zip(used, shape, strict=True)]
             batches.append((batch, features, np.asarray(weight, features.xi.dtype)))
         return [Batch(_filled(b, f, used), weight) for b, f, weight in batches]
-
-
-def _reach(recording: Recording) -> tuple[int, int]:
-    """The first event's time and that after the last, us."""
-    events, count = recording.events, len(recording.events)
-    if not count:
-        raise InputError(f"{recording.name}: holds no events; choose another recording")
-    return int(events[:1].t[0]), int(events[count - 1 : count].t[0]) + 1
-
-
-def _at(known: Known, target: int, begin: int, size: float) -> tuple[float, float, float, int]:
-    """The seed of a target from a time on: there, or where it is seen first; NaN after the last."""
-    seen = np.isfinite(known.xi[:, target]).all(1)
-    t, xi = known.t[seen], known.xi[seen, target]
-    if t[-1] < begin:
-        return np.nan, np.nan, size, begin
-    at = max(begin, int(t[0]))
-    x, y = (float(np.interp(at, t, xi[:, axis])) for axis in (0, 1))
-    return x, y, size, at
 
 
 def _part(
@@ -423,55 +316,35 @@ def _filled(batch: Features | Positions, f: Features, used: Sequence[int]) -> An
     return Positions(features, **one, **two)
 
 
-_likelihood = jax.jit(functools.partial(negative_log_likelihood, events="all"))
+_likelihood = jax.jit(
+    functools.partial(negative_log_likelihood, events="all"), static_argnames="tracker"
+)
 
 
-def _is_seed(value: Any) -> bool:
-    numbers = isinstance(value, list) and len(value) in (3, 4)
-    return numbers and all(type(n) in (int, float) and np.isfinite(n) for n in value)
+class Blobs(Family):
+    """The trackers of blobs."""
 
+    protocols = {"tracks": TrackProtocol()}
 
-class _Blobs:
-    """The system of the method "blob", for `jaxevent.runs.fit`."""
-
-    settings: dict[str, tuple[Callable[[Any], bool], str]] = {
-        "loss": (lambda value: isinstance(value, str), "text"),
+    fit_settings = {
+        "loss": NAME,
         "events": (lambda value: value in EVENTS, '"all" or "associated"'),
-        "seeds": (
-            lambda value: (
-                isinstance(value, list)
-                and len(value) > 0
-                and all(_is_seed(one) and one[2] > 0 for one in value)
-            ),
-            "a list of [x, y, size], in px, or [x, y, size, t], t in s",
-        ),
-        "positions": (
-            lambda value: isinstance(value, str) and value != "",
-            'the name of tables beside the recordings, as "*.csv"',
-        ),
+        **blob_positions.SETTINGS,
     }
     own = ("loss", "events")
 
-    def start(self, name: str, given: Any, folder: Path) -> Params:
-        return read_params(Params, name, given, folder)
-
-    def goal(self, name: str, params: Any, given: Mapping[str, Any]) -> Goal:
-        loss = given.get("loss", "likelihood")
+    def goal(self, method: Tracker, params: Parameters, settings: Mapping[str, Any]) -> TrackGoal:
+        assert isinstance(params, TrackerParams)
+        loss = settings.get("loss", "likelihood")
         if loss not in LOSSES:
             raise InputError(f"there is no loss {loss!r}; {nearest(loss, LOSSES)}")
-        positions = given.get("positions")
-        if loss == "positions" and positions is None:
+        if loss == "positions" and settings.get("positions") is None:
             raise InputError(
                 "the loss 'positions' needs tables of them; give their name beside the "
                 'recordings, as positions = "*.csv"'
             )
-        seeds = given.get("seeds")
-        return Goal(
-            params,
-            Loss(loss, given.get("events", "all")),
-            None if seeds is None else tuple(tuple(map(float, seed)) for seed in seeds),
-            positions,
-        )
+        one = Loss(method, loss, settings.get("events", "all"))
+        return TrackGoal(method, params, one, Targets.of(settings))
 
 
-BLOB = _Blobs()
+FAMILY = Blobs()

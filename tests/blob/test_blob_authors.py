@@ -7,18 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxevent.blob.filters import Batch, FilterParams, filter_of
+from jaxevent import blob
+from jaxevent.blob.filters.steps import Batch
 
 
 def step_of(params):
     """One prediction and update, compiled; also x and the variances, in one array."""
-    blob = filter_of(params)
+    chi2 = blob.chi2.filter
 
     @jax.jit
     def step(state, dt, xi, sign):
-        state = blob.predict(params, state, dt)
+        state = chi2.predict(params, state, dt)
         batch = Batch(xi[None], jnp.zeros(1), sign[None])
-        state = blob.update(params, state, batch, jnp.ones(1))
+        state = chi2.update(params, state, batch, jnp.ones(1))
         return state, jnp.concatenate([state.x, jnp.diagonal(state.P)])
 
     return step
@@ -28,7 +29,7 @@ class Target:
     """A target as the program keeps it: its filter, its gate, and what was last seen of it."""
 
     def __init__(self, params, position, size, radius):
-        self.state = filter_of(params).start(params, jnp.asarray(position), jnp.asarray(size))
+        self.state = blob.chi2.filter.start(params, jnp.asarray(position), jnp.asarray(size))
         x = np.asarray(self.state.x)
         self.told = np.r_[x, np.diagonal(self.state.P)]  # x and variances after the last update
         self.radius = radius
@@ -107,7 +108,7 @@ def test_the_authors_association(data, name, offset):
         wanted = file["upd10" if offset else "upd8"]
         raw, config, columns = (file[key] for key in ("events_x_y_p_tus", "config_yaml", "columns"))
     values = {"preset": "authors", "polarity_offset": offset}
-    params = FilterParams(**values)
+    params = blob.chi2.Params(**values)
     rows = authors_rows(raw, str(config), params)
     assert len(wanted) == 1500 <= len(rows)  # the events go on to the end of the longer table
     rows = rows[:1500]

@@ -1,5 +1,6 @@
 """The blob filters against dense NumPy versions, the authors' program, and the laws they obey."""
 
+import functools
 import re
 
 import equinox as eqx
@@ -9,36 +10,41 @@ import numpy as np
 import pytest
 from scipy import integrate, linalg
 
-from jaxevent.blob import filters
-from jaxevent.blob.filters import Batch, FilterParams, filter_of
+from jaxevent import blob
+from jaxevent.blob.filters.ellipse import truncation
+from jaxevent.blob.filters.steps import Batch
 
 TRACKERS = ("moment", "chi2_split", "chi2", "constant_velocity")
 
 
-def params_of(**values):
-    return FilterParams(**values)
+def tracker_of(name):
+    return getattr(blob, name)
 
 
-def scanned(params, position, size, events, gate=None, report=None):
+def params_of(name="moment", **values):
+    return tracker_of(name).Params(**values)
+
+
+def scanned(name, params, position, size, events, gate=None, report=None):
     """`report(state)` after each step; a gate in standard deviations sets weights to 0."""
-    blob = filter_of(params)
-    report = report or blob.moments
+    steps = tracker_of(name).filter
+    report = report or (lambda state: steps.moments(params, state))
 
     def step(state, event):
         dt, xi, age, polarity, weight = event
-        state = blob.predict(params, state, dt)
+        state = steps.predict(params, state, dt)
         if gate:
-            ahead = blob.expected(params, state)
+            ahead = steps.expected(params, state)
             e = xi - (ahead.p - ahead.v * age[:, None])
             inverse = jnp.linalg.inv(ahead.spread + ahead.P_p)
             distance = jnp.einsum("mi,ij,mj->m", e, inverse, e)
             if params.gate_shape == "circle":
                 distance = (e**2).sum(1) / ahead.size.max() ** 2
             weight = weight * (distance < gate**2)
-        state = blob.update(params, state, Batch(xi, age, polarity), weight)
+        state = steps.update(params, state, Batch(xi, age, polarity), weight)
         return state, report(state)
 
-    start = blob.start(params, jnp.asarray(position), jnp.asarray(size))
+    start = steps.start(params, jnp.asarray(position), jnp.asarray(size))
     return jax.lax.scan(step, start, events)
 
 
@@ -124,9 +130,9 @@ def residual_rows(params, x, xi, age, polarity, weight):
     return e, C, m, weight @ age / m
 
 
-def moment_oracle(params, position, size, events):
+def moment_oracle(_, params, position, size, events):
     x, P = started(params, position, size)
-    kappa, fourth = (float(a) for a in filters._truncation(params))
+    kappa, fourth = (float(a) for a in truncation(params))
     for dt, xi, age, polarity, weight in zip(*events, strict=True):
         x, P = predicted(params, x, P, dt)
         if weight.sum() > 0:
@@ -185,10 +191,10 @@ def scaled(x, e, theta, polarity, age, weight):
 scaled_slopes = jax.jit(jax.jacfwd(scaled))
 
 
-def window_oracle(params, position, size, events):
+def window_oracle(name, params, position, size, events):
     """chi2 and chi2_split with whole past events, Jacobians by automatic differentiation."""
     x, P = started(params, position, size)
-    past, split, n = [], params.filter == "chi2_split", params.n
+    past, split, n = [], name == "chi2_split", params.n
     for dt, xi, age, polarity, weight in zip(*events, strict=True):
         x, P = predicted(params, x, P, dt)
         if weight.sum() > 0:
@@ -234,7 +240,7 @@ def window_oracle(params, position, size, events):
         yield in_px(x, P)
 
 
-def constant_velocity_oracle(params, position, size, events):
+def constant_velocity_oracle(_, params, position, size, events):
     x, P = started(params, position, size)
     for dt, xi, age, polarity, weight in zip(*events, strict=True):
         x, P = predicted(params, x, P, dt)
@@ -263,10 +269,10 @@ SETTINGS = [
 
 @pytest.mark.parametrize(("m", "name", "values", "oracle"), SETTINGS)
 def test_filters_equal_a_dense_joint_version(m, name, values, oracle):
-    params = params_of(filter=name, **values)
+    params = params_of(name, **values)
     events = random_events(3 + m, 70, m)
-    _, (mean, P) = jax.jit(lambda e: scanned(params, [3.0, -2.0], 12.0, e))(events)
-    for k, (x, S) in enumerate(oracle(params, [3.0, -2.0], 12.0, events)):
+    _, (mean, P) = jax.jit(lambda e: scanned(name, params, [3.0, -2.0], 12.0, e))(events)
+    for k, (x, S) in enumerate(oracle(name, params, [3.0, -2.0], 12.0, events)):
         np.testing.assert_allclose(mean[k], x, rtol=1e-9, atol=1e-9)
         scale = np.sqrt(np.diag(S)) + 1e-9
         np.testing.assert_allclose(
@@ -275,9 +281,10 @@ def test_filters_equal_a_dense_joint_version(m, name, values, oracle):
 
 
 def test_moving_moments_are_weighted_sums():
-    params = params_of(filter="moving_moments", tau_moments=0.004)
+    name = "moving_moments"
+    params = params_of(name, tau_moments=0.004)
     dt, xi, age, polarity, weight = random_events(5, 60, 3)
-    state, _ = jax.jit(lambda e: scanned(params, [3.0, -2.0], 12.0, e))(
+    state, _ = jax.jit(lambda e: scanned(name, params, [3.0, -2.0], 12.0, e))(
         (dt, xi, age, polarity, weight)
     )
     now = dt.sum()
@@ -290,7 +297,7 @@ def test_moving_moments_are_weighted_sums():
     center, when = w @ x, w @ t
     e, s = x - center, t - when
     spread = (w * e.T) @ e + w[0] * 144 * np.eye(2)
-    ahead = jax.jit(filter_of(params).expected)(params, state)
+    ahead = jax.jit(tracker_of(name).filter.expected)(params, state)
     np.testing.assert_allclose(ahead.p, center, rtol=1e-10)
     np.testing.assert_allclose(ahead.v, (w * s) @ e / (w @ s**2), rtol=1e-9)
     np.testing.assert_allclose(ahead.spread, spread, rtol=1e-10)
@@ -300,7 +307,7 @@ def test_moving_moments_are_weighted_sums():
 @pytest.mark.parametrize("gate", [1.0, 2.0, 3.0])
 def test_truncation_factors_are_integrals_over_the_gate(gate):
     params = params_of(gate=gate, gate_shape="ellipse")
-    kappa, fourth = filters._truncation(params)
+    kappa, fourth = truncation(params)
 
     def mean(f, size=1.0):
         """Over (size z1, z2) that fall into the gate, for z standard normal."""
@@ -343,9 +350,9 @@ def test_the_authors_updates(data, name, offset):
 
     (size,) = setting("lambda_init")
     starts = np.stack([setting("position_x_init"), setting("position_y_init")], 1)
-    params = params_of(preset="authors", polarity_offset=offset)
+    params = params_of("chi2", preset="authors", polarity_offset=offset)
     d = 10 if offset else 8
-    run = jax.jit(lambda e, p: scanned(params, p, size, e, report=lambda s: (s.x, s.P)))
+    run = jax.jit(lambda e, p: scanned("chi2", params, p, size, e, report=lambda s: (s.x, s.P)))
     for target, position in enumerate(starts):
         own = np.flatnonzero(rows[:, 1] == target)
         t, xi = rows[own, 0], rows[own, 2:4]
@@ -370,19 +377,19 @@ def leaves(state):
     return [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
 
 
-@jax.jit
-def later(params, events):
-    return scanned(params, [3.0, -2.0], 12.0, events)[0]
+@functools.partial(jax.jit, static_argnums=0)
+def later(name, params, events):
+    return scanned(name, params, [3.0, -2.0], 12.0, events)[0]
 
 
 @pytest.mark.parametrize("name", [*TRACKERS, "moving_moments"])
 def test_no_weight_and_no_events(name):
     """Weights of 0 change nothing bit for bit; two predictions are one over both gaps."""
-    blob = filter_of(params_of(filter=name))
-    update, predict = jax.jit(blob.update), jax.jit(blob.predict)
+    steps = tracker_of(name).filter
+    update, predict = jax.jit(steps.update), jax.jit(steps.predict)
     for tau_q in (0.0, 0.05):
-        params = params_of(filter=name, tau_q=tau_q, polarity_offset=name != "chi2_split")
-        state = later(params, random_events(0, 40, 2))
+        params = params_of(name, tau_q=tau_q, polarity_offset=name != "chi2_split")
+        state = later(name, params, random_events(0, 40, 2))
         batch = Batch(jnp.array([[1.0, jnp.nan], [2e9, 3]]), jnp.zeros(2), jnp.ones(2))
         after = update(params, state, batch, jnp.zeros(2))
         for new, old in zip(leaves(after), leaves(state), strict=True):
@@ -397,7 +404,7 @@ def test_no_weight_and_no_events(name):
 @pytest.mark.parametrize("name", [*TRACKERS, "moving_moments"])
 def test_nothing_breaks_the_numbers(name, float32):
     """Gaps of 1000 s, equal times and sizes, far outliers, no weight, 10,000 events at a pixel."""
-    params = params_of(filter=name, polarity_offset=True, gate_shape="ellipse")
+    params = params_of(name, polarity_offset=True, gate_shape="ellipse")
     xi = np.zeros((10_060, 1, 2), np.float32)
     xi[:20] = np.random.default_rng(0).normal(size=(20, 1, 2)) * 8
     xi[30] = [[1200, 700]]
@@ -410,15 +417,15 @@ def test_nothing_breaks_the_numbers(name, float32):
     weight[5:8] = 0
     sign = one * (1 - 2 * (np.arange(10_060) % 2))[:, None].astype(np.float32)
     events = tuple(jnp.asarray(a) for a in (dt, xi, 0 * one, sign, weight))
-    blob = filter_of(params)
+    steps = tracker_of(name).filter
 
     def report(state):
-        mean, P = blob.moments(state)
-        ahead = blob.expected(params, state)
+        mean, P = steps.moments(params, state)
+        ahead = steps.expected(params, state)
         return mean, jnp.diagonal(P), jnp.linalg.det(ahead.spread), ahead.P_p
 
     state, (mean, variances, det, P_p) = jax.jit(
-        lambda e: scanned(params, [3.0, -2.0], 10.0, e, report=report)
+        lambda e: scanned(name, params, [3.0, -2.0], 10.0, e, report=report)
     )(events)
     for part in (mean, variances, det, P_p, *leaves(state)):
         assert np.isfinite(part).all()
@@ -433,21 +440,21 @@ def test_gradient_of_the_likelihood(name):
     events[0][60] = 1.0
 
     def loss(params):
-        blob = filter_of(params)
+        steps = tracker_of(name).filter
 
         def step(state, event):
             dt, xi, age, polarity, weight = event
-            state = blob.predict(params, state, dt)
-            ahead = blob.expected(params, state)
+            state = steps.predict(params, state, dt)
+            ahead = steps.expected(params, state)
             S = ahead.spread + ahead.P_p
             e = xi[0] - ahead.p
             nll = e @ jnp.linalg.inv(S) @ e / 2 + jnp.log(jnp.linalg.det(S)) / 2
-            return blob.update(params, state, Batch(xi, age, polarity), weight), nll
+            return steps.update(params, state, Batch(xi, age, polarity), weight), nll
 
-        start = blob.start(params, jnp.zeros(2), jnp.asarray(8.0))
+        start = steps.start(params, jnp.zeros(2), jnp.asarray(8.0))
         return jax.lax.scan(step, start, events)[1].sum()
 
-    params = params_of(filter=name)
+    params = params_of(name)
     value = jax.jit(loss)
     slopes = jax.jit(jax.grad(loss))(params).raw
     for key in ("Q_p", "Q_v", "Q_lambda", "Q_theta", "Q_q"):
@@ -488,23 +495,23 @@ def random_walks(params, seeds, steps, dt, size, walk):
     return np.concatenate([p, velocity, sizes, theta[..., None], q[..., None]], -1), xi
 
 
-def errors(params, truth, xi, dt, size, gate=None, m=1):
+def errors(name, params, truth, xi, dt, size, gate=None, m=1):
     """Errors after each step, and normalised squared ones of the position and of each state."""
     seeds, steps = xi.shape[:2]
     k = steps // m
     one = np.ones((k, m))
     age = one * np.arange(m)[::-1] * dt
-    blob = filter_of(params)
+    steps = tracker_of(name).filter
 
     def report(state):
-        mean, P = blob.moments(state)
+        mean, P = steps.moments(params, state)
         return mean, jnp.diagonal(P), P[:2, :2]
 
     @jax.jit
     @jax.vmap
     def run(xi):
         events = (jnp.full(k, m * dt), xi.reshape(k, m, 2), age, one, one)
-        return scanned(params, [0.0, 0.0], size, events, gate, report)[1]
+        return scanned(name, params, [0.0, 0.0], size, events, gate, report)[1]
 
     mean, variances, P = run(xi)
     error = np.array(mean - truth[:, m - 1 :: m])
@@ -519,9 +526,9 @@ def errors(params, truth, xi, dt, size, gate=None, m=1):
 def test_bias_of_the_paper_and_without_it(n, target):
     """The stationary size of eq. 11-23 is sqrt((n + 1) / (n - 1)) times the true one."""
     dt, size = 1e-5, 8.0
-    params = params_of(filter="chi2", n=n, target=target, Q_lambda=1, beta=1e-4)
+    params = params_of("chi2", n=n, target=target, Q_lambda=1, beta=1e-4)
     truth, xi = random_walks(params, 64, 4000, dt, np.array([size, size]), False)
-    error, _, _ = errors(params, truth, xi, dt, size)
+    error, _, _ = errors("chi2", params, truth, xi, dt, size)
     measured = 1 + error[:, 1500:, 4:6].mean() / size
     law, tolerance = (np.sqrt((n + 1) / (n - 1)), 0.015) if target == "2n" else (1, 0.01)
     assert abs(measured - law) < tolerance, measured
@@ -540,9 +547,9 @@ def test_errors_are_as_large_as_predicted(name, gate, m):
     """With truth of the model's own noise; of sizes that stay constant the variance is half P."""
     dt, size = 1e-5, np.array([10.0, 5.0])
     values = {"P0_theta": 0.05, "gate_shape": gate or "circle"}
-    params = params_of(filter=name, events_per_step=m, **values)
+    params = params_of(name, events_per_step=m, **values)
     truth, xi = random_walks(params, 64, 6016, dt, size, True)
-    error, position, nees = errors(params, truth, xi, dt, 8.0, gate and 3.5, m)
+    error, position, nees = errors(name, params, truth, xi, dt, 8.0, gate and 3.5, m)
     tail = slice(2000 // m, None)
     bias = (error[:, tail, 4:6] / truth[:, m - 1 :: m][:, tail, 4:6]).mean((0, 1))
     assert np.abs(bias).max() < 0.025, bias
@@ -555,11 +562,11 @@ def test_errors_are_as_large_as_predicted(name, gate, m):
 
 def test_events_may_share_a_step():
     dt, size = 1e-5, np.array([10.0, 5.0])
-    params = params_of(filter="moment")
+    params = params_of("moment")
     truth, xi = random_walks(params, 16, 6016, dt, size, True)
 
     def rmse(m):
-        error, _, _ = errors(params, truth, xi, dt, 8.0, m=m)
+        error, _, _ = errors("moment", params, truth, xi, dt, 8.0, m=m)
         return np.sqrt((error[:, 1984 // m :: 32 // m, :2] ** 2).sum(-1).mean())
 
     assert abs(rmse(32) - rmse(1)) < 0.02

@@ -11,7 +11,9 @@ from PIL import Image
 from jaxevent import simulate
 from jaxevent.blob import quantities
 from jaxevent.errors import InputError
-from jaxevent.show import tracks as pictures
+from jaxevent.show import track_pictures as pictures
+from jaxevent.show.track_plots import plot_tracks
+from jaxevent.show.track_tables import COLUMNS, write_tracks
 
 RNG = np.random.default_rng
 INVERSE_TTC = jax.jit(quantities.inverse_ttc)
@@ -327,15 +329,15 @@ def test_calibration_finds_the_size_factor():
 
 
 def tracks(seed=0, T=12, N=2):
-    """Times (s), ids, mean, covariance and alive of N tracks; the second is born late."""
+    """Times (s), ids, mean, covariance and valid of N tracks; the second is born late."""
     rng = RNG(seed)
     times = 0.1 + 0.05 * np.arange(T)
     mean = rng.uniform(3, 9, (T, N, 8))
     mean[..., 0], mean[..., 1] = np.array([40.0, 90])[:N], np.array([30.0, 45])[:N]
-    alive = np.ones((T, N), bool)
-    alive[:4, 1:] = False
+    valid = np.ones((T, N), bool)
+    valid[:4, 1:] = False
     mean[:4, 1:] = np.nan
-    return times, np.array([3, 17])[:N], mean, covariance(rng, T, N, scale=0.1), alive
+    return times, np.array([3, 17])[:N], mean, covariance(rng, T, N, scale=0.1), valid
 
 
 def still(size=(120, 80)):
@@ -345,75 +347,75 @@ def still(size=(120, 80)):
 
 @pytest.mark.parametrize("flat", [False, True])
 def test_csv_holds_every_living_row(tmp_path, flat):
-    times, ids, mean, P, alive = tracks()
-    row, column = np.nonzero(alive)
+    times, ids, mean, P, valid = tracks()
+    row, column = np.nonzero(valid)
     if flat:
-        pictures.write_tracks(
+        write_tracks(
             tmp_path / "tracks.csv", times[row], ids[column], mean[row, column], P[row, column]
         )
     else:
-        pictures.write_tracks(tmp_path / "tracks.csv", times, ids, mean, P, alive)
+        write_tracks(tmp_path / "tracks.csv", times, ids, mean, P, valid)
     table = pd.read_csv(tmp_path / "tracks.csv")
     first = "t id x y vx vy lambda1 lambda2 theta q std_x std_y std_vx std_vy std_lambda1"
     assert list(table.columns) == [*first.split(), "std_lambda2", "std_theta", "std_q"]
     assert len(table) == 12 + 8
     np.testing.assert_allclose(table["t"], times[row], rtol=0, atol=1e-9)
     np.testing.assert_array_equal(table["id"], ids[column])
-    np.testing.assert_array_equal(table[list(pictures.COLUMNS)], mean[row, column])
+    np.testing.assert_array_equal(table[list(COLUMNS)], mean[row, column])
     deviation = np.sqrt(np.diagonal(P[row, column], axis1=1, axis2=2))
     np.testing.assert_array_equal(table.iloc[:, 10:], deviation)
 
 
 def test_hdf5_holds_means_and_covariances(tmp_path):
-    times, ids, mean, P, alive = tracks()
+    times, ids, mean, P, valid = tracks()
     path = tmp_path / "tracks.h5"
-    pictures.write_tracks(path, np.rint(times * 1e6).astype(int), ids, mean, P, alive)
-    row, column = np.nonzero(alive)
+    write_tracks(path, np.rint(times * 1e6).astype(int), ids, mean, P, valid)
+    row, column = np.nonzero(valid)
     with h5py.File(path) as file:
         np.testing.assert_array_equal(file["t"], np.rint(times[row] * 1e6))
         np.testing.assert_array_equal(file["id"], ids[column])
         np.testing.assert_array_equal(file["mean"], mean[row, column])
         np.testing.assert_array_equal(file["covariance"], P[row, column])
-        assert tuple(file["mean"].attrs["columns"]) == pictures.COLUMNS
+        assert tuple(file["mean"].attrs["columns"]) == COLUMNS
         assert file["t"].attrs["unit"].startswith("us")
 
 
 def test_tracks_that_cannot_be_written_are_named(tmp_path):
-    times, ids, mean, P, alive = tracks()
+    times, ids, mean, P, valid = tracks()
     with pytest.raises(InputError, match="cannot be stored as .txt"):
-        pictures.write_tracks(tmp_path / "tracks.txt", times, ids, mean, P, alive)
+        write_tracks(tmp_path / "tracks.txt", times, ids, mean, P, valid)
     with pytest.raises(InputError, match="do not fit"):
-        pictures.write_tracks(tmp_path / "tracks.csv", times[1:], ids, mean, P, alive)
+        write_tracks(tmp_path / "tracks.csv", times[1:], ids, mean, P, valid)
     with pytest.raises(InputError, match="do not fit"):
-        pictures.write_tracks(tmp_path / "tracks.csv", times, ids * 1.0, mean, P, alive)
+        write_tracks(tmp_path / "tracks.csv", times, ids * 1.0, mean, P, valid)
     with pytest.raises(InputError, match="not two of the tracks"):
-        pictures.plot_tracks(tmp_path / "a.png", times, ids, mean, P, alive, pair=(3, 4))
+        plot_tracks(tmp_path / "a.png", times, ids, mean, P, valid, pair=(3, 4))
     with pytest.raises(InputError, match="both the extent"):
-        pictures.plot_tracks(tmp_path / "a.png", times, ids, mean, P, alive, extent=1.0)
+        plot_tracks(tmp_path / "a.png", times, ids, mean, P, valid, extent=1.0)
     with pytest.raises(InputError, match="file without suffix"):
-        pictures.plot_tracks(tmp_path / "a", times, ids, mean, P, alive)
+        plot_tracks(tmp_path / "a", times, ids, mean, P, valid)
     with pytest.raises(InputError, match="not sorted"):
-        list(pictures.track_frames(still(), times[::-1], ids, mean, alive))
+        list(pictures.track_frames(still(), times[::-1], ids, mean, valid))
     with pytest.raises(InputError, match="image 0 of 12 .* shape"):
         images = np.zeros((12, 70, 120), np.uint8)
-        list(pictures.track_frames(still(), times, ids, mean, alive, images=images))
+        list(pictures.track_frames(still(), times, ids, mean, valid, images=images))
     with pytest.raises(InputError, match="image 5 of 12 .* none"):
         images = np.zeros((5, 80, 120), np.uint8)
-        list(pictures.track_frames(still(), times, ids, mean, alive, images=images))
+        list(pictures.track_frames(still(), times, ids, mean, valid, images=images))
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("scale", [1, 4])
 def test_ellipses_are_drawn_where_the_tracks_are(scale):
     """Each pixel of a track's colour is on its ellipse or in its number, and all angles are."""
-    times, ids, mean, _, alive = tracks(T=2)
-    alive[:], mean[:] = True, 5.0
+    times, ids, mean, _, valid = tracks(T=2)
+    valid[:], mean[:] = True, 5.0
     mean[:, 0] = 40, 30, 0, 0, 8, 4, 0.5, 0
     mean[:, 1] = 90, 50, 0, 0, 5, 5, 0, 0
     black = np.zeros((2, 80, 120), np.uint8)
     frames = list(
         pictures.track_frames(
-            still(), times, ids, mean, alive, images=black, scale=scale, trail=0.0
+            still(), times, ids, mean, valid, images=black, scale=scale, trail=0.0
         )
     )
     assert len(frames) == 2 and frames[0].shape == (80 * scale, 120 * scale, 3)
@@ -434,16 +436,16 @@ def test_ellipses_are_drawn_where_the_tracks_are(scale):
 
 
 def test_trails_and_numbers_end_with_their_track():
-    times, ids, mean, _, alive = tracks(N=1)
-    alive[:], mean[:, 0, 4:6] = True, 2.0
+    times, ids, mean, _, valid = tracks(N=1)
+    valid[:], mean[:, 0, 4:6] = True, 2.0
     mean[:, 0, 0], mean[:, 0, 1] = 20 + 6 * np.arange(12), 40
-    alive[3] = False
+    valid[3] = False
     mean[3] = np.nan
     black = np.zeros((12, 80, 120), np.uint8)
 
     def drawn(trail):
         settings = {"images": black, "scale": 1, "trail": trail}
-        frames = pictures.track_frames(still(), times, ids, mean, alive, **settings)
+        frames = pictures.track_frames(still(), times, ids, mean, valid, **settings)
         colour = pictures.track_colour(3)
         return [np.flatnonzero((frame == colour).all(2)[40]) for frame in frames]
 
@@ -462,9 +464,9 @@ def test_events_are_shown_behind():
     start, now = events.t[500], events.t[700]
     inside = (events.t > start) & (events.t <= now)
     assert 0 < inside.sum() < 205
-    _, ids, mean, _, alive = tracks(T=1)
+    _, ids, mean, _, valid = tracks(T=1)
     frames = pictures.track_frames(
-        recording, [now], ids, mean, np.zeros_like(alive), scale=1, window=float(now - start) / 1e6
+        recording, [now], ids, mean, np.zeros_like(valid), scale=1, window=float(now - start) / 1e6
     )
     (frame,) = frames
     expected = np.zeros((80, 120), int)
@@ -475,9 +477,9 @@ def test_events_are_shown_behind():
 
 def test_small_sensors_are_enlarged_in_a_video(tmp_path):
     imageio = pytest.importorskip("imageio_ffmpeg")
-    times, ids, mean, _, alive = tracks()
+    times, ids, mean, _, valid = tracks()
     path = tmp_path / "tracks.mp4"
-    pictures.write_track_video(path, still(), times, ids, mean, alive)
+    pictures.write_track_video(path, still(), times, ids, mean, valid)
     # Not by the reader of imageio, which forks; JAX warns that this may deadlock.
     decode = [imageio.get_ffmpeg_exe(), "-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "pipe:1"]
     decoded = subprocess.run(decode, capture_output=True, check=True)
@@ -488,12 +490,12 @@ def test_small_sensors_are_enlarged_in_a_video(tmp_path):
 
 def test_plots_are_written(tmp_path):
     pytest.importorskip("matplotlib")
-    times, ids, mean, P, alive = tracks(T=12)
-    pictures.plot_tracks(
-        tmp_path / "both.png", times, ids, mean, P, alive, pair=(3, 17), extent=0.2, focal=500.0
+    times, ids, mean, P, valid = tracks(T=12)
+    plot_tracks(
+        tmp_path / "both.png", times, ids, mean, P, valid, pair=(3, 17), extent=0.2, focal=500.0
     )
-    # None is alive, and no range is asked for.
-    pictures.plot_tracks(tmp_path / "none.png", times, ids, mean, P, np.zeros_like(alive))
+    # None is valid, and no range is asked for.
+    plot_tracks(tmp_path / "none.png", times, ids, mean, P, np.zeros_like(valid))
     sizes = []
     for name in ("both.png", "none.png"):
         with Image.open(tmp_path / name) as image:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import jaxevent
-from jaxevent.blob import Params
-from jaxevent.blob.tracker import Tracks, _begin, _run, _windows
+from jaxevent.blob import Tracks, moment
+from jaxevent.blob.prepare import Packing
+from jaxevent.blob.tracks import _run
 from jaxevent.recording import Events, Recording
 
 SCRIPT = Path(__file__).parents[2] / "experiments" / "blob_real.py"
@@ -32,9 +33,9 @@ def dot(data):
 
 
 def follow(recording, params, steps, chunks):
-    """`track` with chunks of a size that suits short slices."""
-    shape = {"steps": steps, "chunks": chunks}
-    return Tracks(_windows(recording, params, None, None, None, None, **shape), params)
+    """`estimate` with chunks of a size that suits short slices."""
+    packing = Packing(recording, params, steps=steps, chunks=chunks)
+    return Tracks(moment.filter, packing, params)
 
 
 def test_reference_finds_a_known_path(real):
@@ -59,7 +60,7 @@ def test_reference_finds_a_known_path(real):
 def test_spinning_dot_is_found_and_followed(real, dot, float32):
     path = real.fit_circling(dot)
     cut = dot[0:10_000]
-    tracks = follow(cut, Params.of({"preset": "fast", **real.DOT_FOUND}), 64, 128)
+    tracks = follow(cut, moment.Params(preset="fast", **real.DOT_FOUND), 64, 128)
     assert len(tracks) == 1  # not its tail, no hot pixel
     row = real.score_dot(tracks, path, (0.004, 0.01))
     assert row["tracked"] == 1
@@ -76,11 +77,10 @@ def test_tail_of_the_dot_begins_no_track(real, dot, float32):
     cut = dot[0:20_000]
     begun = {}
     for surround in (1.0, 2.0):
-        params = Params.of({"preset": "fast", **real.DOT_FOUND, "surround": surround})
-        shape = {"steps": 64, "chunks": 128}
-        features = _windows(cut, params, None, None, None, None, **shape).whole()
-        carry, _ = _run(params, _begin(params, features), features)
-        begun[surround] = int(carry.next_id)
+        params = moment.Params(preset="fast", **real.DOT_FOUND, surround=surround)
+        features = Packing(cut, params, steps=64, chunks=128).whole()
+        state, _ = _run(moment.filter, params, None, features)
+        begun[surround] = int(state.next_id)
     assert begun[2.0] == 1 < begun[1.0]
 
 
@@ -89,7 +89,7 @@ def test_cars_are_found_and_followed(real, data, float32):
     cars = real.find_cars(np.asarray(recording.frames.images))
     assert len(cars) == 3
     cut = recording.with_frames(slice(0))[0:500_000]
-    tracks = follow(cut, Params.of(real.STREET), 64, 128)
+    tracks = follow(cut, moment.Params(**real.STREET), 64, 128)
     row = real.score_cars(tracks, cars, recording.frames.t, (0.1, 0.5))
     assert row["tracks"] == 2
     assert row["coverage"] == 1

@@ -3,15 +3,16 @@
 import functools
 import math
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxevent.blob import tracker
-from jaxevent.blob.filters import Batch, filter_of
-from jaxevent.blob.tracker import Tracks, track
+from jaxevent import blob
+from jaxevent.blob.filters.steps import Batch
+from jaxevent.blob.prepare import Packing
+from jaxevent.blob.states import canonical
+from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
 
@@ -19,7 +20,7 @@ WIDTH, HEIGHT = 240, 180
 
 
 def Params(**values):  # noqa: N802
-    return tracker.Params.of(values)
+    return blob.moment.Params(**values)
 
 
 def recording(t, xy, width=WIDTH, height=HEIGHT, name="blobs"):
@@ -64,30 +65,27 @@ def pair():
     return rec, [(60.0, 80.0, 8.0), (168.0, 92.0, 8.0)]
 
 
-def follow(rec, params=None, seeds=None, detect=False, steps=64, chunks=32):
-    """`track` with chunks of one size, so that few programs are compiled."""
+def follow(rec, params=None, seeds=None, detect=False, steps=64, chunks=32, tracker=blob.moment):
+    """`estimate` with chunks of one size, so that few programs are compiled."""
     params = params or Params()
-    windows = tracker._windows(
-        rec, params, seeds, None, None, detect or seeds is None, steps=steps, chunks=chunks
+    packing = Packing(
+        rec, params, seeds, detect=detect or seeds is None, steps=steps, chunks=chunks
     )
-    return Tracks(windows, params)
+    return Tracks(tracker.filter, packing, params)
 
 
 @functools.cache
-def _steps_of(name):
-    blob = filter_of(Params(filter=name))
-    return tuple(
-        jax.jit(f) for f in (blob.start, blob.predict, blob.expected, blob.update, blob.moments)
-    )
+def _steps_of(f):
+    return tuple(jax.jit(one) for one in (f.start, f.predict, f.expected, f.update, f.moments))
 
 
-def oracle(rec, params, seeds):
+def oracle(rec, params, seeds, tracker=blob.moment):
     """Plain loops over steps, events and targets.
 
     Returns each event's target and weight, the mean negative log-likelihood of events inside a
     gate, and a function that gives mean and covariance of the targets at a time.
     """
-    start, predict, expected, update, moments = _steps_of(params.filter)
+    start, predict, expected, update, moments = _steps_of(tracker.filter)
     e, first, M = rec.events, rec.start, params.events_per_step
     b, alpha, g = float(params.gate), float(params.gate_decay), float(params.gate_position)
     low, high = float(params.gate_min), float(params.gate_max)
@@ -149,7 +147,7 @@ def oracle(rec, params, seeds):
         for path in paths:
             t, state = [one for one in path if one[0] <= time][-1]
             state = predict(params, state, jnp.asarray((time - t) * 1e-6))
-            rows.append(tracker.canonical(*moments(state)))
+            rows.append(canonical(*moments(params, state)))
         return [np.stack(part) for part in zip(*rows, strict=True)]
 
     return np.array([k for k, _ in whose]), np.array([w for _, w in whose]), np.mean(loss), at
@@ -177,11 +175,15 @@ def test_equals_a_plain_loop(pair, setting):
     assert np.array_equal(part, np.arange(*map(rec.events.index, (20_000, 21_000))))
     times = np.array([rec.start, rec.start + 3001, 61_234, int(rec.events.t[200]), rec.stop])
     states = tracks(times)
-    assert states.alive.all()
+    assert states.valid.all()
     for i, time in enumerate(times):
         mean, covariance = at(time)
         np.testing.assert_allclose(states.mean[i], mean, rtol=1e-8, atol=1e-8)
         np.testing.assert_allclose(states.covariance[i], covariance, rtol=1e-7, atol=1e-9)
+
+
+def parts(states):
+    return states.mean, states.covariance, states.valid, states.idle
 
 
 def same(a, b, exact=True):
@@ -198,11 +200,11 @@ def test_chunks_and_windows_do_not_matter(pair):
     times = np.arange(0, 125_000, 777)
     params = Params(**NEAREST)
     whole = follow(rec, params, seeds)
-    assert whole.birth[1] == 31_234 and not whole(31_233).alive[0, 1]
-    expected = whole(times)
+    assert whole.birth[1] == 31_234 and not whole(31_233).valid[0, 1]
+    expected = parts(whole(times, extrapolate=True))
     other = follow(rec, params, seeds, steps=3, chunks=5)
-    same(other(times), expected)
-    same(other(times[::-1]), [v[::-1] for v in expected])
+    same(parts(other(times, extrapolate=True)), expected)
+    same(parts(other(times[::-1], extrapolate=True)), [v[::-1] for v in expected])
     assert np.array_equal(other.death, whole.death) and len(other._begins) > 10
 
 
@@ -212,10 +214,10 @@ def test_shift_in_time_and_order_of_seeds(pair):
     later = Recording("later", WIDTH, HEIGHT, Events(e.t + 10**9 + 1, e.x, e.y, e.p))
     times = np.arange(0, 120_000, 5003) + rec.start
     first = follow(rec, seeds=seeds)
-    same(follow(later, seeds=seeds)(times + 10**9 + 1), first(times))
+    same(parts(follow(later, seeds=seeds)(times + 10**9 + 1)), parts(first(times)))
     turned = follow(rec, seeds=seeds[::-1])
-    same([v[:, ::-1] for v in turned(times)], first(times), exact=False)
-    same([v[:, 0] for v in turned(times, [1])], [v[:, 1] for v in turned(times)])
+    same([v[:, ::-1] for v in parts(turned(times))], parts(first(times)), exact=False)
+    same([v[:, 0] for v in parts(turned(times, [1]))], [v[:, 1] for v in parts(turned(times))])
 
 
 @pytest.fixture(scope="module")
@@ -236,7 +238,7 @@ def test_births(eight):
     assert len(tracks) == 2 + 8 and (tracks.birth[:2] == 29_990).all()
     assert tracks.confirmed[2:].max() < 10_000 and (tracks.birth < tracks.confirmed)[2:].all()
     states = tracks(29_000, tracks.id[2:])
-    assert states.alive.all()
+    assert states.valid.all()
     truth = np.stack([path(0.029) for path in paths])
     d = np.linalg.norm(states.mean[0, :, None, :2] - truth, axis=-1)
     assert sorted(np.argmin(d, axis=1)) == list(range(8)) and d.min(1).max() < 2.5
@@ -267,7 +269,7 @@ def test_life_cycle():
     assert len(again) == 1 and again[0] > max(idle, left) and tracks.birth[again[0]] > 50_000
     assert len(set(tracks.id)) == len(tracks) == 5
     states = tracks([int(tracks.death[idle]) - 1, int(tracks.death[idle])])
-    assert states.alive[:, idle].tolist() == [True, False]
+    assert states.valid[:, idle].tolist() == [True, False]
     assert states.idle[0, idle] == pytest.approx(0.02, abs=2e-6)
     assert np.isnan(states.mean[1, idle]).all()
 
@@ -309,15 +311,17 @@ def test_strange_streams():
             follow(rec, Params(**short), seeds, detect=True),
             follow(rec, Params(t_coast=1e6, sigma_max=1e30), seeds),
         ):
-            states = tracks(np.r_[rec.start, rec.stop, rec.stop // 2])
-            assert np.isfinite(states.mean[states.alive]).all(), name
-            assert np.isfinite(states.covariance[states.alive]).all(), name
-            assert (tracks.death > tracks.birth).all() and not tracks(-1).alive.any()
-        assert len(tracks) == 2 and (tracks(rec.stop).alive.all() or name == "hour")
+            states = tracks(np.r_[rec.start, rec.stop, rec.stop // 2], extrapolate=True)
+            assert np.isfinite(states.mean[states.valid]).all(), name
+            assert np.isfinite(states.covariance[states.valid]).all(), name
+            assert (tracks.death > tracks.birth).all() and not tracks(
+                -1, extrapolate=True
+            ).valid.any()
+        assert len(tracks) == 2 and (tracks(rec.stop).valid.all() or name == "hour")
     none = Recording("none", WIDTH, HEIGHT, Events.empty())
-    tracks = track(none)
+    tracks = blob.moment.estimate(none)
     assert list(tracks.events()) == []
-    assert len(tracks) == 0 and tracks([0, 1]).mean.shape == (2, 0, 8)
+    assert len(tracks) == 0 and tracks([0, 1], extrapolate=True).mean.shape == (2, 0, 8)
 
 
 def test_single_precision(pair, float32):
@@ -327,7 +331,7 @@ def test_single_precision(pair, float32):
     tracks, later = follow(rec, seeds=seeds), follow(late, seeds=seeds)
     states = tracks(np.array([50_000, 110_000]))
     assert states.mean.dtype == np.float32
-    same(later(np.array([50_000, 110_000]) + 10**12), states)
+    same(parts(later(np.array([50_000, 110_000]) + 10**12)), parts(states))
     with jax.enable_x64(True):
         exact = follow(rec, seeds=seeds)(np.array([50_000, 110_000]))
     np.testing.assert_allclose(states.mean[..., :2], exact.mean[..., :2], atol=0.02)
@@ -347,14 +351,14 @@ def test_prefilter():
         kept.append(len(pixels) >= 2)
     kept = np.flatnonzero(kept)
     for steps, chunks in ((4, 3), (64, 100)):
-        windows = tracker._windows(rec, params, [], None, None, False, steps=steps, chunks=chunks)
-        mark, rows = windows.first, []
+        packing = Packing(rec, params, [], steps=steps, chunks=chunks)
+        mark, rows = packing.first, []
         while mark is not None:
-            window = windows.prepare(mark)
-            t = window.start[:, None, None] + window.features.t
-            row = window.row[window.features.valid]
-            assert np.array_equal(t[window.features.valid], e.t[row])
-            rows, mark = [*rows, *row], window.next
+            stretch = packing.pack(mark)
+            t = stretch.start[:, None, None] + stretch.features.t
+            row = stretch.row[stretch.features.valid]
+            assert np.array_equal(t[stretch.features.valid], e.t[row])
+            rows, mark = [*rows, *row], stretch.next
         assert np.array_equal(rows, kept) and 0 < len(kept) < len(e) / 2
 
 
@@ -362,20 +366,22 @@ def test_gradient_and_vmap(pair):
     rec, seeds = pair
     rec = rec[0.05:0.09]
     seeds = [(*line(60, 80, 900)(0.05), 8.0), (*line(168, 92, -900)(0.05), 8.0)]
-    params = Params(clutter=1e-5, filter="constant_velocity")
-    features = tracker.prepare(rec, params, seeds)
+    tracker = blob.constant_velocity
+    params = tracker.Params(clutter=1e-5)
+    features, _ = tracker.prepare(rec, np.empty(0), params, seeds=seeds)
+    likelihood = functools.partial(blob.negative_log_likelihood, tracker)
     times = np.arange(51_000, 89_000, 1000)
     truth = np.stack([line(60, 80, 900)(times * 1e-6), line(168, 92, -900)(times * 1e-6)], 1)
     truth[3, 1] = np.nan
-    batch = tracker.prepare_positions(rec, params, seeds, times, truth)
+    batch = blob.prepare_positions(rec, params, seeds, times, truth)
 
-    value = jax.jit(tracker.negative_log_likelihood)(params, features)
-    assert value == pytest.approx(float(oracle(rec, params, seeds)[2]), rel=1e-9)
+    value = jax.jit(likelihood)(params, features)
+    assert value == pytest.approx(float(oracle(rec, params, seeds, tracker)[2]), rel=1e-9)
 
     def losses(raw, batch):
-        p = eqx.tree_at(lambda q: q.raw, params, {**params.raw, **raw})
-        likelihood = tracker.negative_log_likelihood(p, batch.features, "all")
-        return jnp.stack([likelihood, tracker.position_error(p, batch)])
+        p = params.with_raw(raw)
+        nll = likelihood(p, batch.features, "all")
+        return jnp.stack([nll, blob.position_error(tracker, p, batch)])
 
     names, h = ("Q_v", "Q_p", "P0_v", "P0_p", "outliers", "clutter"), 1e-5
     raw = {name: params.raw[name] for name in names}
@@ -395,7 +401,7 @@ def test_gradient_and_vmap(pair):
     slope = jax.jit(lambda raw: jax.jvp(lambda r: losses(r, batch)[1], (raw,), (ones,))[1])(raw)
     assert float(slope) == pytest.approx(expected[:, 1].sum(), rel=3e-4)
 
-    d2 = ((follow(rec, params, seeds)(times).mean[:, :, :2] - truth) ** 2).sum(-1)
+    d2 = ((follow(rec, params, seeds, tracker=tracker)(times).mean[:, :, :2] - truth) ** 2).sum(-1)
     error = np.nanmean(200 * (np.sqrt(1 + d2 / 100) - 1))
     assert values[12, 1] == pytest.approx(error, rel=1e-9)
 
@@ -413,4 +419,4 @@ def test_gradient_and_vmap(pair):
 )
 def test_bad_input(pair, given, words):
     with pytest.raises(InputError, match=words):
-        track(pair[0], **given)
+        blob.moment.estimate(pair[0], **given)

@@ -15,18 +15,20 @@ from PIL import Image
 
 import jaxevent
 from jaxevent import cli
-from jaxevent.blob import Params, track
+from jaxevent.blob import constant_velocity
 from jaxevent.blob.quantities import inverse_ttc, size_range
 from jaxevent.recording import Events, Frames, Recording
-from jaxevent.show import tracks as pictures
-from jaxevent.show.tracks import COLUMNS
+from jaxevent.show import tracks as written
+from jaxevent.show.track_pictures import track_colour
+from jaxevent.show.track_tables import COLUMNS
 from jaxevent.simulate import Line, Target, simulate_blobs
 
 WIDTH, HEIGHT = 120, 80
 SEEDS = [(30.0, 30.0, 6.0), (80.0, 50.0, 6.0)]
 HEADER = ["t", "id", *COLUMNS]
 # A filter that compiles fast.
-SETTINGS = 'filter = "constant_velocity"\nevents_per_step = 8\nQ_v = 1e4\nP0_v = 1e4\n'
+METHOD = ["--method", "constant_velocity"]
+SETTINGS = "events_per_step = 8\nQ_v = 1e4\nP0_v = 1e4\n"
 
 
 @functools.cache
@@ -52,8 +54,8 @@ def seeded(*more: object) -> list[str]:
 
 
 def followed(**more):
-    params = Params.of(tomllib.loads(SETTINGS))
-    return track(two(), params, SEEDS, **more)
+    params = constant_velocity.Params(**tomllib.loads(SETTINGS))
+    return constant_velocity.estimate(two(), params, seeds=SEEDS, **more)
 
 
 def read_table(path: Path) -> tuple[list[str], np.ndarray]:
@@ -69,7 +71,7 @@ def test_header_is_exact():
 def test_a_folder_of_everything(folder, capsys):
     out = folder / "out"
     argv = [
-        *("track", folder / "two.h5", "--params", folder / "mine.toml", "--rate", 500),
+        *("track", folder / "two.h5", *METHOD, "--params", folder / "mine.toml", "--rate", 500),
         *("--pair", "0,1", "--extent", 0.3, "--focal", 200, "--size-factor", 0.25, "--out", out),
     ]
     assert cli.main([*map(str, argv), *seeded()]) == 0
@@ -81,7 +83,7 @@ def test_a_folder_of_everything(folder, capsys):
     tracks = followed()
     times = tracks.start + 2000 * np.arange(25)
     states = tracks(times)
-    assert states.alive.all()
+    assert states.valid.all()
     header, table = read_table(out / "tracks.csv")
     assert header == [*HEADER, *(f"std_{name}" for name in COLUMNS)]
     assert np.array_equal(table[:, 0], np.repeat(times, 2) / 1e6)
@@ -102,7 +104,7 @@ def test_a_folder_of_everything(folder, capsys):
     for one, place in enumerate(states.mean[-1, :, :2]):
         x, y = np.rint((place + 0.5) * scale).astype(int)
         near = images[-1][max(y - 60, 0) : y + 60, max(x - 60, 0) : x + 60].astype(int)
-        wanted = pictures.track_colour(one)
+        wanted = track_colour(one)
         assert (abs(near - wanted).sum(2) < 60).sum() > 50
     with Image.open(out / "tracks.png") as figure:
         assert figure.width > 800 and figure.height > 1000  # three plots
@@ -126,8 +128,8 @@ def test_a_folder_of_everything(folder, capsys):
 
 
 def test_a_row_for_each_event(folder, capsys, monkeypatch):
-    monkeypatch.setattr(pictures, "_STRETCH", 300)
-    argv = ["track", folder / "two.h5", "--params", folder / "mine.toml", "--at", "events"]
+    monkeypatch.setattr(written, "_STRETCH", 300)
+    argv = ["track", folder / "two.h5", *METHOD, "--params", folder / "mine.toml", "--at", "events"]
     path = folder / "events.csv"
     span = ["--start", "0.01", "--stop", "0.04"]
     assert cli.main([*map(str, argv), *seeded(*span, "--out", path)]) == 0
@@ -153,7 +155,14 @@ def test_one_file_of_each_kind(folder, capsys):
     frames = Frames(stamps, np.zeros((2, HEIGHT, WIDTH), np.uint8), 0 * stamps)
     path = folder / "framed.h5"
     jaxevent.save(Recording("framed", WIDTH, HEIGHT, two().events, frames), path)
-    argv = ["track", str(path), "--params", str(folder / "mine.toml"), *seeded("--rate", 100)]
+    argv = [
+        "track",
+        str(path),
+        *METHOD,
+        "--params",
+        str(folder / "mine.toml"),
+        *seeded("--rate", 100),
+    ]
     for name, more in (
         ("a.csv", []),
         ("a.hdf5", []),
@@ -181,7 +190,15 @@ def test_nothing_found_is_an_empty_table(tmp_path, capsys):
     jaxevent.save(Recording("stray", WIDTH, HEIGHT, events), tmp_path / "stray.h5")
     out = tmp_path / "out"
     (tmp_path / "mine.toml").write_text(SETTINGS)
-    argv = ["track", tmp_path / "stray.h5", "--params", tmp_path / "mine.toml", "--out", out]
+    argv = [
+        "track",
+        tmp_path / "stray.h5",
+        *METHOD,
+        "--params",
+        tmp_path / "mine.toml",
+        "--out",
+        out,
+    ]
     assert cli.main([*map(str, argv)]) == 0
     said = capsys.readouterr().out
     assert "no blob was found" in said and "--seed" in said and f"{out}: 0 tracks" in said
@@ -217,10 +234,13 @@ def test_bad_ways_to_track(folder, capsys):
     for name, said in (
         ("wrong.toml", "did you mean 'Q_v'"),
         ("negative.toml", "gate"),
-        ("other.toml", "none of blob"),
+        ("other.toml", "none of moment"),
         ("none.toml", "cannot be read"),
     ):
         fails(capsys, ["track", path, "--params", folder / name, *to], folder / name, said)
+    fails(capsys, ["track", path, "--method", "chi", *to], "did you mean 'chi2'")
+    fails(capsys, ["track", path, "--method", "akf", *to], "is of reconstruction, not of blob")
+    fails(capsys, ["track", path, "--method", "no.such:thing", *to], "cannot be imported")
     for seed, said in (
         ("200,10,5", "outside the 120x80 sensor"),
         ("-9,10,5", "outside the 120x80 sensor"),
@@ -234,7 +254,7 @@ def test_bad_ways_to_track(folder, capsys):
     for rate in ("0", "-1", "nan", "1e7"):
         fails(capsys, ["track", path, f"--rate={rate}", *to], "--rate")
     fails(capsys, ["track", path, "--pair", "0,0", *to], "--pair 0,0 is one track")
-    pair = ["--params", folder / "mine.toml", *seeded("--pair", "0,7")]
+    pair = [*METHOD, "--params", folder / "mine.toml", *seeded("--pair", "0,7")]
     fails(capsys, ["track", path, *pair, *to], path, "--pair 0,7", "found, 0, 1")
     fails(capsys, ["track", path, "--extent", 1, *to], "--focal")
     fails(capsys, ["track", path, "--focal", 1, *to], "--extent")
@@ -267,7 +287,7 @@ def test_missing_extras_are_named(module, extra, needs, does_without, folder, ca
             f"jaxevent[{extra}]",
         )
         assert not (folder / name).exists()
-    argv = ["track", folder / "two.h5", "--params", folder / "mine.toml", *seeded()]
+    argv = ["track", folder / "two.h5", *METHOD, "--params", folder / "mine.toml", *seeded()]
     assert cli.main([*map(str, argv), "--rate", "100", "--out", str(folder / does_without)]) == 0
 
 

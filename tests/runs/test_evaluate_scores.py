@@ -12,7 +12,7 @@ from jaxevent import blob, egomotion
 from jaxevent.egomotion.truth import endpoint_error, read_motion
 from jaxevent.errors import InputError
 from jaxevent.runs import evaluate
-from jaxevent.runs.blob import read_positions
+from jaxevent.runs.blob_positions import read_positions
 from jaxevent.show.page import page
 from jaxevent.show.report import markdown_table
 from jaxevent.simulate import blob_scene, motion_scene
@@ -58,7 +58,7 @@ recordings = ["dot.h5"]
 protocol = "tracks"
 positions = "*.csv"
 [[method]]
-name = "blob"
+name = "moment"
 grid = { lambda0 = [4.0, 8.0] }
 """
 
@@ -104,8 +104,10 @@ def test_tracks(folder):
     known = read_positions(folder / "dot.csv")
     for row, size in zip(rows, (4.0, 8.0), strict=True):
         x, y = known.xi[0, 0]
-        params = blob.Params.of({"lambda0": size})
-        tracks = blob.track(recording, params, [(x, y, size, int(known.t[0]) / 1e6)])
+        params = blob.moment.Params(lambda0=size)
+        tracks = blob.moment.estimate(
+            recording, params, seeds=[(x, y, size, int(known.t[0]) / 1e6)]
+        )
         told = tracks(known.t)
         distance = np.linalg.norm(told.mean[:, 0, :2] - known.xi[:, 0], axis=1)
         alive = np.isfinite(distance)
@@ -128,7 +130,7 @@ def test_tracks(folder):
         (MOTION.replace('label = "coarse"', "normalise = 'affine'"), "no setting 'normalise'"),
         (MOTION.replace('"motion"', '"motions"'), "did you mean 'motion'"),
         (TRACKS.replace('positions = "*.csv"', ""), "positions are not given"),
-        (TRACKS.replace('"blob"', '"akf"'), "'akf' of tracks"),
+        (TRACKS.replace('"moment"', '"akf"'), "is of reconstruction, not of blob"),
         (TRACKS.replace('"*.csv"', '"none.csv"'), "none.csv: cannot be read"),
     ],
 )

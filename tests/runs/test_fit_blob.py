@@ -14,18 +14,17 @@ from commands import fails
 import jaxevent
 import jaxevent.runs.fit
 from jaxevent import cli
-from jaxevent.blob import Params, negative_log_likelihood, track
-from jaxevent.blob import prepare as pack
-from jaxevent.blob import prepare_positions as pack_positions
+from jaxevent.blob import constant_velocity as tracker
+from jaxevent.blob import negative_log_likelihood, prepare_positions
 from jaxevent.recording import Recording
-from jaxevent.runs.blob import BLOB, read_positions
+from jaxevent.runs.blob import FAMILY
+from jaxevent.runs.blob_positions import read_positions
 from jaxevent.runs.fit import fit
 from jaxevent.simulate import Circle, Target, simulate_blobs
 
 SPEED = 900.0  # px/s
 # A filter that compiles fast.
 START = {
-    "filter": "constant_velocity",
     "events_per_step": 16,
     "lambda0": 4.0,
     "Q_v": 1e3,
@@ -59,7 +58,8 @@ learning_rate = 0.5
 every = 4
 rounds = 1
 [[method]]
-name = "blob"
+name = "constant_velocity"
+label = "mine"
 params = "start.toml"
 fit = ["Q_v", "Q_p"]
 """
@@ -80,7 +80,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def goal(**given):
-    return BLOB.goal("blob", Params(**START), {"loss": "likelihood", **given})
+    return FAMILY.goal(tracker, tracker.Params(**START), {"loss": "likelihood", **given})
 
 
 def test_a_fit_improves_what_it_has_not_seen(folder, capsys):
@@ -92,7 +92,7 @@ def test_a_fit_improves_what_it_has_not_seen(folder, capsys):
     rows = json.loads((out / "results.json").read_text())["rows"]
     assert [(row["method"], row["recording"], row["split"]) for row in rows] == [
         (method, name, split)
-        for method in ("blob, before", "blob")
+        for method in ("mine, before", "mine")
         for name, split in (("a.h5", "fit"), ("b.h5", "test"))
     ]
     before, after = rows[1], rows[3]
@@ -102,12 +102,12 @@ def test_a_fit_improves_what_it_has_not_seen(folder, capsys):
     assert "b.h5" in said and "a.h5" not in said and f"{after['rmse']:.3f}" in said
 
     # The parameters are those that `jaxevent track` loads, and do what the table says.
-    params = Params.load(out / "params.toml", "blob")
+    params = tracker.Params.load(out / "params.toml", "mine")
     assert params.events_per_step == 16 and float(params.Q_v) > 2e3
     recording, path = simulated(1)
     times = np.rint(1e6 * path[:, 0]).astype(np.int64)
     seed = (*path[0, 1:], float(params.lambda0), int(times[0]))
-    error = track(recording, params, [seed])(times).mean[:, 0, :2] - path[:, 1:]
+    error = tracker.estimate(recording, params, seeds=[seed])(times).mean[:, 0, :2] - path[:, 1:]
     assert after["rmse"] == pytest.approx(np.sqrt((error**2).sum(1).mean()), rel=1e-6)
 
 
@@ -117,7 +117,7 @@ def test_batches_are_their_windows_filled_up_to_one_shape(loss, folder):
     recording, path = simulated(0)
     source = dataclasses.replace(recording, name=str(folder / "a.h5"))
     mine = goal(loss=loss, positions="*.csv", seeds=[[85.0, 45.0, 6.0]])
-    params = Params(**START)
+    params = tracker.Params(**START)
     sources = {"fit": [("a.h5", source)], "validation": [], "test": []}
     fitted, validation = mine.problem(sources, None, 0.1)(params)
     assert len(fitted) == 2 and not validation
@@ -134,7 +134,7 @@ def test_batches_are_their_windows_filled_up_to_one_shape(loss, folder):
         inside = (start <= times) & (times < stop)
         if loss == "positions":
             truth = path[inside, None, 1:]
-            packed = pack_positions(recording, params, [seed], times[inside], truth, **span)
+            packed = prepare_positions(recording, params, [seed], times[inside], truth, **span)
             count, features = inside.sum(), packed.features
             for name in ("chunk", "step", "time", "known"):
                 alone, filled = (np.asarray(getattr(one, name)) for one in (packed, batch.features))
@@ -144,7 +144,7 @@ def test_batches_are_their_windows_filled_up_to_one_shape(loss, folder):
             np.testing.assert_allclose(batch.features.xi[: len(truth)], truth, atol=1e-6)
             batch = dataclasses.replace(batch, features=batch.features.features)
         else:
-            features = pack(recording, params, [seed], **span)
+            features, _ = tracker.prepare(recording, np.empty(0), params, seeds=[seed], **span)
             count = features.valid.sum()
         assert float(batch.weight) == count
         # What is cut off or added of chunks and steps holds no events and ends no cycle.
@@ -160,7 +160,8 @@ def test_batches_are_their_windows_filled_up_to_one_shape(loss, folder):
         assert np.array_equal(batch.features.seed, features.seed)
     value = jax.jit(mine.loss)(params, fitted[1])
     if loss == "likelihood":
-        expected = jax.jit(negative_log_likelihood, static_argnums=2)(params, features, "all")
+        alone = functools.partial(negative_log_likelihood, tracker, events="all")
+        expected = jax.jit(alone)(params, features)
         assert float(value) == pytest.approx(float(expected), rel=1e-6)  # digits of the CSV
     else:
         assert 0 < float(value) < 200
@@ -170,7 +171,7 @@ def test_windows_are_shared_out_and_begin_where_tracks_are():
     recording, _ = simulated(0)
     sources = {"fit": [("a", recording)], "validation": [], "test": []}
     mine = goal(seeds=[[85.0, 45.0, 6.0]])
-    tracks = track(recording, Params(**START), [(85.0, 45.0, 6.0)])
+    tracks = tracker.estimate(recording, tracker.Params(**START), seeds=[(85.0, 45.0, 6.0)])
     parts = mine._parts(sources, (2, 1, 1), None)
     assert [part.split for part in parts] == [0, 1, 0, 2, 0, 1, 0, 2]
     assert parts[0].start == recording.start and parts[-1].stop == recording.stop + 1
@@ -191,7 +192,7 @@ def test_sizes_that_are_not_given_can_be_fitted(folder):
     sources = {"fit": [("a", recording)], "validation": [], "test": []}
     for seeds, size in ((None, 0.0), ([[85.0, 45.0, 6.0]], 6.0)):
         mine = goal(positions="*.csv", **({} if seeds is None else {"seeds": seeds}))
-        (batch,) = mine.problem(sources, None, None)(Params(**START))[0]
+        (batch,) = mine.problem(sources, None, None)(tracker.Params(**START))[0]
         assert batch.features.seed_size.tolist() == [size]
 
 
@@ -247,7 +248,7 @@ def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (CONFIG.replace('"blob"', '"blobs"'), "'blobs'; did you mean 'blob'"),
+        (CONFIG.replace("_velocity", "_velocit"), "did you mean 'constant_velocity'"),
         (CONFIG + 'loss = "held-out"', "no loss 'held-out'; known: likelihood, positions"),
         (CONFIG + 'events = "some"', "events is"),
         (CONFIG + 'error = "log"', "method 1: there is no setting 'error'"),
@@ -264,7 +265,7 @@ def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
         (CONFIG.replace('"Q_v"', '"Q_vv"'), "'Q_vv'; did you mean 'Q_v'"),
         (CONFIG.replace('"Q_v"', '"gate"'), "search = { gate = [from, to"),
         (CONFIG.replace('"Q_v"', '"n"'), "there is no parameter 'n'"),
-        (CONFIG.replace('"start.toml"', "{ filter = 3 }"), "the parameter filter is"),
+        (CONFIG.replace('"start.toml"', "{ association = 3 }"), "the parameter association is"),
     ],
 )
 def test_bad_configurations(text, said, folder, capsys):
@@ -277,7 +278,7 @@ def test_bad_configurations(text, said, folder, capsys):
 def test_both_systems_in_one_file(folder):
     text = CONFIG + '[[method]]\nname = "akf"\nloss = "reference"\nfit = ["c_on"]\n'
     plan = jaxevent.runs.fit.read_plan(write(folder, text))
-    assert [task.label for task in plan.tasks] == ["blob", "akf"] and plan.split is None
+    assert [task.label for task in plan.tasks] == ["mine", "akf"] and plan.split is None
 
 
 def test_the_example_is_read():

@@ -1,0 +1,390 @@
+"""The paper's extended Kalman filter: 0 = L^-1 e + N(0, I), and a window's sum of |L^-1 e|^2.
+
+`chi2` is eq. 11-23: the one sum is driven to 2 n (`target`) with the variance 4 n. `chi2_split` has
+one sum per axis, driven to n, with the variance 2 n n, as each residual counts n times; the
+pseudo-measurement L^-1 e then does not act on the sizes, so they are unbiased and positive. Of M
+events per step the mean of L^-1 e has the covariance I / m, and the window's slots hold the step's
+sums; n counts steps.
+
+While the window fills, and while the position's variance exceeds a quarter of the smaller size
+squared (beta would not hold), the shape stays.
+"""
+
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from jaxevent.blob.association import Expected
+from jaxevent.blob.filters.ellipse import spread, truncation, wrap
+from jaxevent.blob.filters.motion import decay
+from jaxevent.blob.filters.steps import Batch, Filter, choose
+from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.tracker import Tracker
+from jaxevent.parameters import Choice, Count, Positive
+
+P_POSITION_MAX = 1e6  # px^2; in single precision a longer pause would leave nothing of R
+
+
+class WindowParams(TrackerParams):
+    """Parameters of `chi2_split`."""
+
+    n = Count(10, "", "steps in the window of squared residuals")
+    beta = Positive(0.01, "", "variance of the position over that of the events, in the window")
+
+
+class Params(WindowParams):
+    """Parameters of `chi2`."""
+
+    target = Choice(
+        ("2n+4", "2n"),
+        "what the window's sum is driven to; 2n is biased by sqrt((n+1)/(n-1))",
+    )
+    current_in_jacobian = Choice(
+        (False, True), "whether the newest event's residual acts on p and theta in the window"
+    )
+    formulation = Choice(
+        ("corrected", "authors"),
+        "authors leaves the newest event out of the window, has no guards and keeps lambda itself "
+        "as state",
+    )
+
+    presets = {
+        **TrackerParams.presets,
+        # Published settings of the authors' program, for cars.
+        "authors": {
+            "formulation": "authors",
+            "target": "2n",
+            "beta": 0.0,
+            "polarity_offset": True,
+            "Q_p": 200.0,
+            "Q_v": 1e3,
+            "Q_lambda": 1.0,
+            "Q_theta": 0.005,
+            "Q_q": 0.01,
+            "P0_p": 10.0,
+            "P0_v": 500.0,
+            "P0_lambda": 5.0,
+            "P0_theta": 0.5,
+            "P0_q": 2.0,
+            "lambda0": 30.0,
+            "gate_shape": "circle",
+            "gate": 2.5,
+            "gate_decay": 1.4,
+            "gate_min": 10.0,
+        },
+    }
+
+
+class ResidualWindow(eqx.Module):
+    """The squared residuals of the last n steps, along the axes that the blob had then.
+
+    A row of `ring` holds a step's sums of w u1^2, w u2^2 and w over its events; as u is the
+    residual of the state predicted for the step, |L^-1 e|^2 with any later sizes is u1^2 /
+    lambda1^2 + u2^2 / lambda2^2. `sums` is that of the ring; `fresh` collects what came since slot
+    0 and replaces it once per turn, so that rounding does not add up.
+    """
+
+    ring: Float[Array, "n 3"]
+    sums: Float[Array, " 3"]
+    fresh: Float[Array, " 3"]
+    slot: Int[Array, ""]
+    filled: Int[Array, ""]
+
+    @classmethod
+    def empty(cls, n: int, dtype: Any) -> "ResidualWindow":
+        three, zero = jnp.zeros(3, dtype), jnp.zeros((), jnp.int32)
+        return cls(jnp.zeros((n, 3), dtype), three, three, zero, zero)
+
+    def push(self, new: Float[Array, " 3"]) -> "ResidualWindow":
+        n = len(self.ring)
+        here = (jnp.arange(n) == self.slot)[:, None]
+        old = jnp.where(here, self.ring, 0).sum(0)
+        fresh = self.fresh + new
+        last = self.slot == n - 1
+        return ResidualWindow(
+            jnp.where(here, new, self.ring),
+            jnp.where(last, fresh, jnp.maximum(self.sums + (new - old), new)),
+            jnp.where(last, 0, fresh),
+            jnp.where(last, 0, self.slot + 1),
+            jnp.minimum(self.filled + 1, n),
+        )
+
+
+class State(eqx.Module):
+    """The joint state and the window of residuals."""
+
+    x: Float[Array, " d"]  # px py vx vy lambda1 lambda2 theta q [dx dy]; lambda or its log
+    P: Float[Array, "d d"]
+    window: ResidualWindow
+    logarithmic: bool = eqx.field(static=True)  # whether x holds log lambda
+
+    @property
+    def size(self) -> Array:
+        """(2,), px."""
+        return jnp.exp(self.x[4:6]) if self.logarithmic else self.x[4:6]
+
+
+def _start(params: WindowParams, position: Array, size: Array, logarithmic: bool) -> State:
+    none = jnp.zeros_like(position)
+    P_size = params.P0_lambda / params.lambda0**2 if logarithmic else params.P0_lambda
+    blocks = [position, none, (jnp.log(size) if logarithmic else size) + none, none]
+    P = [params.P0_p, params.P0_p, params.P0_v, params.P0_v, P_size, P_size]
+    P += [params.P0_theta, params.P0_q] + [params.P0_d] * 2 * params.polarity_offset
+    return State(
+        jnp.concatenate(blocks + [none] * params.polarity_offset),
+        jnp.diag(jnp.stack(P)).astype(position.dtype),
+        ResidualWindow.empty(params.n, position.dtype),
+        logarithmic,
+    )
+
+
+def _predict(params: WindowParams, state: State, dt: Array, authors: bool) -> State:
+    x, P = state.x, state.P
+    to_theta, to_q, tt, tq, qq = decay(params, dt)
+    pp, pv, vv = params.Q_p * dt, params.Q_v * dt**2 / 2, params.Q_v * dt
+    if authors:
+        tt, tq, pv = params.Q_theta * dt, 0 * dt, 0 * dt
+    else:
+        pp = pp + params.Q_v * dt**3 / 3
+    Q_size = params.Q_lambda * dt * jnp.ones(2)
+    if state.logarithmic:
+        Q_size = Q_size * jnp.exp(-2 * x[4:6])
+
+    def advance(rows: Array) -> Array:
+        p, v, size, theta, q, rest = jnp.split(rows, [2, 4, 6, 7, 8])
+        return jnp.concatenate([p + dt * v, v, size, theta + to_theta * q, to_q * q, rest])
+
+    P = advance(advance(P).T)
+    own = [pp, pp, vv, vv, Q_size[0], Q_size[1], tt, qq]
+    Q = jnp.diag(jnp.stack(own + [params.Q_d * dt] * (len(x) - 8)))
+    for i, j, covariance in ((0, 2, pv), (1, 3, pv), (6, 7, tq)):
+        pair = np.zeros((len(x), len(x)))
+        pair[i, j] = pair[j, i] = 1
+        Q = Q + jnp.asarray(pair, P.dtype) * covariance
+    return dataclasses.replace(state, x=advance(x), P=P + Q)
+
+
+class _Residuals(NamedTuple):
+    """The events of a step along the blob's axes, of m in all."""
+
+    m: Array
+    age: Array  # s, their mean
+    sign: Array  # mean of their polarity
+    cos: Array
+    sin: Array
+    size: Array  # (2,), px
+    mean: Array  # (2,), px
+    energy: Array  # (2,), px^2, sums of squares
+
+
+class _Measurement(NamedTuple):
+    """A scalar one: its row of the Jacobian, innovation, noise, and how often it counts."""
+
+    row: Array  # (d,)
+    innovation: Array
+    noise: Array
+    times: Array
+
+
+def _residuals(params: WindowParams, state: State, batch: Batch, weight: Array) -> _Residuals:
+    x = state.x
+    m = weight.sum()
+    share = weight / jnp.where(m > 0, m, 1)
+    age = (share * batch.age).sum()
+    sign = jnp.sign(batch.polarity)
+    e = batch.xi - x[:2] + x[2:4] * batch.age[:, None]
+    if params.polarity_offset:
+        e = e - sign[:, None] * x[8:]
+    e = jnp.where(weight[:, None] > 0, e, 0)
+    theta = x[6] - age * x[7]
+    cos, sin = jnp.cos(theta), jnp.sin(theta)
+    u = jnp.stack([cos * e[:, 0] + sin * e[:, 1], cos * e[:, 1] - sin * e[:, 0]])
+    mean, energy = (share * u).sum(1), (weight * u**2).sum(1)
+    return _Residuals(m, age, (share * sign).sum(), cos, sin, state.size, mean, energy)
+
+
+def _cap(params: WindowParams, state: State) -> tuple[Array, Array]:
+    """P with limited variances, and whether the position is known well enough for the shape."""
+    P = state.P
+    limits = {0: P_POSITION_MAX, 1: P_POSITION_MAX, 6: params.P_theta_max}
+    if state.logarithmic:
+        limits |= {4: 1.0, 5: 1.0}
+    keep = [jnp.ones((), P.dtype)] * len(state.x)
+    for i, limit in limits.items():
+        keep[i] = limit / jnp.maximum(jnp.maximum(P[i, i], limit), 1e-30)
+    keep = jnp.stack(keep)
+    # Covariances shrink as much as variances: the gain of a velocity stays what it was.
+    P = P * keep[:, None] * keep + jnp.diag((keep - keep**2) * jnp.diagonal(P))
+    a, b, c = lax.stop_gradient((P[0, 0], P[0, 1], P[1, 1]))
+    radius = (a + c) / 2 + jnp.hypot((a - c) / 2, b)
+    return P, radius <= 0.25 * state.size.min() ** 2
+
+
+def _mean_measurements(
+    params: WindowParams,
+    state: State,
+    seen: _Residuals,
+    trusted: Array,
+    on_size: Array | None,
+) -> list[_Measurement]:
+    """0 = L^-1 e + N(0, I / m) along both axes.
+
+    `on_size` says whether it acts on lambda now; None: never.
+    """
+    unit = jnp.eye(len(state.x), dtype=state.P.dtype)
+    size, mean = seen.size, seen.mean
+    over = 1 / size
+    turning = (over[0] - over[1]) * (unit[6] - seen.age * unit[7]) * trusted
+    found = []
+    for i, (a, b) in enumerate(((seen.cos, seen.sin), (-seen.sin, seen.cos))):
+        along = a * (unit[0] - seen.age * unit[2]) + b * (unit[1] - seen.age * unit[3])
+        if params.polarity_offset:
+            along = along + seen.sign * (a * unit[8] + b * unit[9])
+        row = -over[i] * along + turning * mean[1 - i]
+        if on_size is not None:
+            per = _per(state)
+            row = row - on_size * over[i] ** 2 * mean[i] * per[i] * unit[4 + i]
+        found.append(_Measurement(row, -mean[i] * over[i], jnp.ones(()), seen.m))
+    return found
+
+
+def _per(state: State) -> Array:
+    """d lambda / d its state, (2,)."""
+    return state.size if state.logarithmic else jnp.ones_like(state.size)
+
+
+def _update_scalars(x: Array, P: Array, measurements: list[_Measurement]) -> tuple[Array, Array]:
+    """One scalar after the other, all at the predicted state: equal to the joint update."""
+    # Rounding may take a variance that falls a millionfold below 0; the last term is as large.
+    step, rounding = jnp.zeros_like(x), 4 * jnp.finfo(P.dtype).eps * jnp.diagonal(P)
+    for row, innovation, noise, times in measurements:
+        B = P @ row
+        gain = times * B / (times * jnp.maximum(row @ B, 0) + noise)
+        step = step + gain * (innovation - row @ step)
+        P = P - gain[:, None] * B
+    return x + step, P + jnp.diag(rounding)
+
+
+def _bound(params: WindowParams, x: Array, logarithmic: bool) -> Array:
+    """x with sizes between their limits and the angle in [-pi, pi]."""
+    low, high = params.lambda_min, params.lambda_max
+    if logarithmic:
+        low, high = jnp.log(low), jnp.log(high)
+    return jnp.concatenate([x[:4], jnp.clip(x[4:6], low, high), wrap(x[6])[None], x[7:]])
+
+
+# ---- chi2: one sum.
+
+
+def start(params: Params, position: Array, size: Array) -> State:
+    return _start(params, position, size, params.formulation == "corrected")
+
+
+def predict(params: Params, state: State, dt: Array) -> State:
+    return _predict(params, state, dt, params.formulation == "authors")
+
+
+def update(params: Params, state: State, batch: Batch, weight: Array) -> State:
+    authors = params.formulation == "authors"
+    seen = _residuals(params, state, batch, weight)
+    P, trusted = (state.P, jnp.bool(True)) if authors else _cap(params, state)
+    push = jnp.concatenate([seen.energy, seen.m[None]])
+    window = state.window.push(push)
+    full = window.filled >= params.n
+    shape = (trusted & (full | authors)).astype(P.dtype)
+    measurements = _mean_measurements(params, state, seen, trusted, shape)
+
+    unit = jnp.eye(len(state.x), dtype=P.dtype)
+    over = 1 / seen.size
+    past = window.sums - push
+    scale = 1.0 if authors else 1 / (1 + params.beta)
+    W = jnp.where(seen.m > 0, window.sums[2], 1)
+    inside = past[:2] * scale + (0 if authors else seen.energy)
+    found = (inside * over**2).sum()
+    pull = -2 * inside * over**3 * _per(state)
+    row = pull[0] * unit[4] + pull[1] * unit[5]
+    if params.current_in_jacobian and not authors:
+        for i in range(2):
+            other = measurements[i].row * (1 - unit[4] - unit[5])
+            row = row + 2 * seen.m * seen.mean[i] * over[i] * other
+    goal = 2 * W + (4 if params.target == "2n+4" else 0)
+    on = jnp.where(window.filled > 1, 1.0, 0.0) if authors else shape
+    measurements.append(_Measurement(row, goal - found, 4 * W, on))
+
+    x, P = _update_scalars(state.x, P, measurements)
+    if not authors:
+        x = _bound(params, x, state.logarithmic)
+    window = choose(trusted, window, state.window)
+    return choose(seen.m > 0, State(x, P, window, state.logarithmic), state)
+
+
+def expected(params: WindowParams, state: State) -> Expected:
+    x, size = state.x, state.size
+    return Expected(x[:2], x[2:4], spread(x[6], size), state.P[:2, :2], size)
+
+
+def moments(params: WindowParams, state: State) -> tuple[Array, Array]:
+    x, P = state.x[:8], state.P[:8, :8]
+    if state.logarithmic:
+        size = state.size
+        x = jnp.concatenate([x[:4], size, x[6:]])
+        per = jnp.concatenate([jnp.ones(4, P.dtype), size, jnp.ones(2, P.dtype)])
+        P = P * per[:, None] * per
+    return x, P
+
+
+# ---- chi2_split: one sum per axis.
+
+
+def _update_split(params: WindowParams, state: State, batch: Batch, weight: Array) -> State:
+    seen = _residuals(params, state, batch, weight)
+    P, trusted = _cap(params, state)
+    push = jnp.concatenate([seen.energy, seen.m[None]])
+    window = state.window.push(push)
+    full = window.filled >= params.n
+    shape = (trusted & full).astype(P.dtype)
+    measurements = _mean_measurements(params, state, seen, trusted, None)
+
+    unit = jnp.eye(len(state.x), dtype=P.dtype)
+    over = 1 / seen.size
+    past = window.sums - push
+    scale = 1 / (1 + params.beta)
+    W = jnp.where(seen.m > 0, window.sums[2], 1)
+    kappa, fourth = truncation(params)
+    variance = 3 * fourth / kappa**2 - 1
+    for i in range(2):
+        found = (seen.energy[i] + scale * past[i]) * over[i] ** 2 / kappa
+        slope = -kappa * variance * W
+        noise = variance * W * params.n
+        measurements.append(_Measurement(slope * unit[4 + i], W - found, noise, shape))
+
+    x, P = _update_scalars(state.x, P, measurements)
+    x = _bound(params, x, True)
+    window = choose(trusted, window, state.window)
+    return choose(seen.m > 0, State(x, P, window, True), state)
+
+
+chi2 = Tracker(
+    "chi2",
+    Params,
+    Filter(start, predict, update, expected, moments),
+    about="The asynchronous event-blob tracker (Wang et al. 2023), equations corrected.",
+)
+chi2_split = Tracker(
+    "chi2_split",
+    WindowParams,
+    Filter(
+        functools.partial(_start, logarithmic=True),
+        functools.partial(_predict, authors=False),
+        _update_split,
+        expected,
+        moments,
+    ),
+    about="The asynchronous event-blob tracker with one sum of squares per axis of the blob.",
+)

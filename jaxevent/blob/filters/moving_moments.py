@@ -1,0 +1,104 @@
+"""Baseline: mean and covariance of the events with weights exp(-age / tau_moments).
+
+The position lags by `tau_moments`; the velocity is the slope of the line through the events.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxevent.blob.association import Expected
+from jaxevent.blob.filters.ellipse import axes, spread
+from jaxevent.blob.filters.motion import Motion, moments_of
+from jaxevent.blob.filters.steps import Batch, Filter, choose
+from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.tracker import Tracker
+from jaxevent.parameters import Positive
+
+
+class State(eqx.Module):
+    """Weighted moments of the events; times are ages before the state's time."""
+
+    mass: Float[Array, ""]
+    center: Float[Array, " 2"]  # px
+    age: Float[Array, ""]  # s, mean
+    spread: Float[Array, "2 2"]  # px^2
+    drift: Float[Array, " 2"]  # px s, covariance of position and time
+    duration: Float[Array, ""]  # s^2, variance of time
+
+
+class Params(TrackerParams):
+    """Parameters of `moving_moments`."""
+
+    tau_moments = Positive(0.002, "s", "time constant of the window")
+
+
+def start(params: Params, position: Array, size: Array) -> State:
+    none = jnp.zeros((), position.dtype)
+    around = size**2 * jnp.eye(2, dtype=position.dtype)
+    return State(none + 1, position, none, around, 0 * position, none)
+
+
+def predict(params: Params, state: State, dt: Array) -> State:
+    mass = state.mass * jnp.exp(-dt / params.tau_moments)
+    return dataclasses.replace(state, mass=mass, age=state.age + dt)
+
+
+def update(params: Params, state: State, batch: Batch, weight: Array) -> State:
+    m = weight.sum()
+    share = weight / jnp.where(m > 0, m, 1)
+    xi = jnp.where(weight[:, None] > 0, batch.xi, 0)
+    center, age = (share[:, None] * xi).sum(0), (share * batch.age).sum()
+    e, t = jnp.where(weight[:, None] > 0, xi - center, 0), age - batch.age
+    own = [
+        (share[:, None, None] * e[:, :, None] * e[:, None]).sum(0),
+        (share[:, None] * e * t[:, None]).sum(0),
+        (share * t**2).sum(),
+    ]
+    mass = state.mass + m
+    new = m / jnp.where(mass > 0, mass, 1)
+    d, dt = center - state.center, state.age - age
+    between = [d[:, None] * d, d * dt, dt**2]
+    old = [state.spread, state.drift, state.duration]
+    around, drift, duration = (
+        (1 - new) * a + new * b + new * (1 - new) * c
+        for a, b, c in zip(old, own, between, strict=True)
+    )
+    moved = State(mass, state.center + new * d, state.age - new * dt, around, drift, duration)
+    return choose(m > 0, moved, state)
+
+
+def expected(params: Params, state: State) -> Expected:
+    theta, _, size = axes(state.spread)
+    size = jnp.clip(size, params.lambda_min, params.lambda_max)
+    around = spread(theta, size)
+    v, _, _ = _line(state)
+    return Expected(state.center, v, around, around / jnp.maximum(state.mass, 1e-6), size)
+
+
+def moments(params: Params, state: State) -> tuple[Array, Array]:
+    theta, _, size = axes(state.spread)
+    v, P_p, P_v = _line(state)
+    motion = Motion((state.center, v), (P_p, 0 * P_p, P_v))
+    turn = jnp.stack([theta, 0 * theta])
+    mass = jnp.maximum(state.mass, 1e-6)
+    return moments_of(motion, size, size**2 / (2 * mass), turn, jnp.zeros(4, theta.dtype))
+
+
+def _line(state: State) -> tuple[Array, Array, Array]:
+    """The velocity, and the variances of the position and of it."""
+    known = state.duration > 0
+    duration = jnp.where(known, state.duration, 1)
+    mass = jnp.maximum(state.mass, 1e-6)
+    P_v = jnp.where(known, state.spread / (mass * duration), 0)
+    return jnp.where(known, state.drift / duration, 0), state.spread / mass, P_v
+
+
+moving_moments = Tracker(
+    "moving_moments",
+    Params,
+    Filter(start, predict, update, expected, moments),
+    about="Moving mean and covariance of the events near a blob; a baseline.",
+)

@@ -1,0 +1,63 @@
+"""Where the user says that targets are."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError
+from jaxevent.recording import Recording, microseconds
+
+
+@dataclasses.dataclass(frozen=True)
+class Seeds:
+    """Tracks given by the user, sorted by time: t (n,) us, xi (n, 2) and size (n,) in px.
+
+    `given` is the place of each among those that the user gave.
+    """
+
+    t: NDArray[np.int64]
+    xi: NDArray[np.float64]
+    size: NDArray[np.float64]
+    given: NDArray[np.int64]
+
+
+def read_seeds(
+    recording: Recording, seeds: Sequence[Any] | np.ndarray | None, start: int, stop: int
+) -> Seeds:
+    """The user's seeds, sorted by time; raises `InputError` saying which one cannot be used."""
+    times, places, sizes = [], [], []
+    for number, seed in enumerate([] if seeds is None else seeds):
+        name = f"{recording.name}: seed {number}"
+        try:
+            x, y, size, *time = seed
+            x, y, size = (float(v) for v in (x, y, size))
+        except (TypeError, ValueError):
+            raise InputError(f"{name} is {seed!r}; give x, y, size in px, and its time") from None
+        if len(time) > 1 or not (math.isfinite(size) and size > 0):
+            raise InputError(
+                f"{name} is {seed!r}; give x, y, a size above 0 (standard deviation, px) and, if "
+                "it begins later, its time"
+            )
+        if not (-0.5 <= x <= recording.width - 0.5 and -0.5 <= y <= recording.height - 0.5):
+            raise InputError(
+                f"{name} at ({x:g}, {y:g}) is outside the {recording.width}x{recording.height} "
+                "sensor; give pixel coordinates from 0"
+            )
+        at = int(microseconds(time[0], f"the time of seed {number}")) if time else start
+        if not start <= at < stop:
+            raise InputError(
+                f"{name} begins at {at} us, but events are used from {start} to {stop - 1} us; "
+                "integers are microseconds, floats seconds, both on the recording's clock"
+            )
+        times.append(at)
+        places.append((x, y))
+        sizes.append(size)
+    given = np.argsort(times, kind="stable").astype(np.int64)
+    xi = np.array(places, np.float64).reshape(-1, 2)
+    return Seeds(
+        np.array(times, np.int64)[given], xi[given], np.array(sizes, np.float64)[given], given
+    )

@@ -1,0 +1,225 @@
+"""All targets of one moment, and one step of events: predict, gate, share out, update.
+
+Events are taken in steps of M. In each step every target predicts itself to the step's time, events
+inside its gate are shared out among the targets and update them. The steps of a `Filter` are of one
+target and are mapped over all of them here.
+"""
+
+import functools
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxevent.blob.association import gate_radius
+from jaxevent.blob.filters.steps import Batch, Filter, choose
+from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.prepare import LONGEST
+
+
+class Slots(eqx.Module):
+    """The targets of one moment; times are us since the chunk's start."""
+
+    state: Any  # the filter's, of the last update, with a leading axis of targets
+    gate: Float[Array, "*targets"]  # px, before the position's uncertainty is added
+    hits: Float[Array, "*targets"]  # events, by weight
+    last: Int[Array, "*targets"]  # of the last update
+    heard: Int[Array, "*targets"]  # of the last step with half an event or more
+    born: Int[Array, "*targets"]
+    apart: Int[Array, "*targets"]  # last found more than a lambda from all older tracks
+    id: Int[Array, "*targets"]  # serial number; -1: free
+    confirmed: Bool[Array, "*targets"]
+
+
+class Step(eqx.Module):
+    """What one step tells: filled in as far as it was asked for."""
+
+    unassociated: Bool[Array, " M"]
+    slots: Any = None  # after it
+    target: Any = None  # (M,) serial number of each event's likeliest target
+    weight: Any = None  # (M,)
+    path: Any = None  # see `place`
+    loss: Any = None  # sum over the events that count
+    count: Any = None
+
+
+class _Ahead(eqx.Module):
+    """One target at a step's time, before its events; or all of them."""
+
+    state: Any
+    alive: Bool[Array, "*targets"]
+    radius: Float[Array, "*targets"]  # of the gate, px
+    inside: Bool[Array, "*targets M"]  # which events are inside the gate
+    near: Bool[Array, "*targets M"]  # and which so near that they begin no other track
+    density: Float[Array, "*targets M"]  # ln(2 pi p) of the events
+
+
+def seconds(us: Any, like: Array) -> Array:
+    """Whole us as seconds."""
+    return us.astype(like.dtype) * 1e-6
+
+
+def begin_slots(
+    filter: Filter,
+    params: TrackerParams,
+    slots: Slots,
+    which: Array,
+    xi: Array,
+    size: Array,
+    time: Array,
+    ids: Array,
+    confirmed: bool,
+) -> Slots:
+    """Tracks begin in some slots, `which` (targets,), at rest at the positions given."""
+    state = jax.vmap(filter.start, (None, 0, 0))(params, xi, size)
+    gate = jnp.clip(params.gate * size, params.gate_min, params.gate_max).astype(xi.dtype)
+    at = jnp.broadcast_to(time, which.shape)
+    new = Slots(
+        state, gate, jnp.zeros_like(gate), at, at, at, at, ids, jnp.full_like(which, confirmed)
+    )
+    return jax.vmap(choose)(which, new, slots)
+
+
+def shift_slots(slots: Slots, elapsed: Array) -> Slots:
+    """The same with times since a later chunk's start; at most so far back that int32 lasts."""
+
+    def shift(t):
+        return jnp.maximum(t - elapsed, -2 * LONGEST)
+
+    times = lambda s: (s.last, s.heard, s.born, s.apart)  # noqa: E731
+    return eqx.tree_at(times, slots, tuple(shift(t) for t in times(slots)))
+
+
+def silence_limits(params: TrackerParams, slots: Slots) -> Int[Array, " targets"]:
+    """Us of silence that end each track."""
+    limit = jnp.where(slots.confirmed, params.t_coast, params.t_tentative)
+    us = jnp.minimum(jnp.round(lax.stop_gradient(limit) * 1e6), 2 * LONGEST).astype(jnp.int32)
+    return jnp.where(slots.id >= 0, us, -4 * LONGEST)
+
+
+def place(filter: Filter, params: TrackerParams, slots: Slots) -> tuple[Array, Array, Array]:
+    """Position, velocity and time of the last update of all targets."""
+    now = jax.vmap(filter.expected, (None, 0))(params, slots.state)
+    return now.p, now.v, slots.last
+
+
+def _look_ahead(
+    filter: Filter,
+    params: TrackerParams,
+    slot: Slots,
+    limit: Array,
+    time: Array,
+    batch: Batch,
+    valid: Array,
+) -> _Ahead:
+    """One target and what it expects of the events; `limit`: us of silence that end its track."""
+    alive = time - slot.heard <= limit
+    dt = jnp.where(alive, seconds(jnp.maximum(time - slot.last, 0), batch.xi), 0)
+    state = filter.predict(params, slot.state, dt)
+    expected = filter.expected(params, state)
+    e = batch.xi - (expected.p - expected.v * batch.age[:, None])
+    density = jax.vmap(filter.log_likelihood, (None, None, 0))(params, expected, e)
+
+    # Which events are whose has no derivative.
+    fixed, now, residual = lax.stop_gradient((params, expected, e))
+    radius = gate_radius(fixed, slot.gate, now.size.max(), dt)
+    gates = jax.vmap(filter.gate, (None, None, None, 0))
+    inside = gates(fixed, now, radius, residual) & alive & valid
+    near = gates(fixed, now, jnp.maximum(fixed.surround, 1) * radius, residual) & alive
+    return _Ahead(state, alive, radius, inside, near, density)
+
+
+def _update_slot(
+    filter: Filter,
+    params: TrackerParams,
+    slot: Slots,
+    ahead: _Ahead,
+    time: Array,
+    batch: Batch,
+    weight: Array,
+) -> Slots:
+    """One target after its events."""
+    touched = (weight > 0).any()
+    number = lax.stop_gradient(weight).sum()
+    state = choose(touched, filter.update(params, ahead.state, batch, weight), slot.state)
+    return Slots(
+        state,
+        jnp.where(touched, ahead.radius, slot.gate),
+        slot.hits + number,
+        jnp.where(touched, time, slot.last),
+        jnp.where(number >= 0.5, time, slot.heard),
+        slot.born,
+        slot.apart,
+        slot.id,
+        slot.confirmed,
+    )
+
+
+def step(
+    filter: Filter,
+    params: TrackerParams,
+    wanted: str,
+    frame: Any,
+    limit: Array,
+    slots: Slots,
+    events: Any,
+) -> tuple[Slots, Step]:
+    """One step: predict, gate, share out, update. `limit`: us of silence that end a track."""
+    times, xi, polarity, valid = events
+    time = times[-1]
+    # A single event's is 0 for the compiler too, which leaves out what it would multiply.
+    age = seconds(time - times, xi) if len(times) > 1 else jnp.zeros_like(xi[:, 0])
+    batch = Batch(xi, age, polarity)
+    look = functools.partial(_look_ahead, filter, params)
+    ahead = jax.vmap(look, (0, 0, None, None, None))(slots, limit, time, batch, valid)
+    shares = jax.vmap(functools.partial(filter.share, params), 1, 1)
+    weight = shares(ahead.inside, ahead.density)
+    update = functools.partial(_update_slot, filter, params)
+    slots = jax.vmap(update, (0, 0, None, None, 0))(slots, ahead, time, batch, weight)
+
+    told: dict[str, Any] = {}
+    if wanted == "states":
+        told["slots"] = slots
+    elif wanted == "associations":
+        best = jnp.argmax(weight, axis=0)
+        top = weight.max(0)
+        told["target"], told["weight"] = jnp.where(top > 0, slots.id[best], -1), top
+    elif wanted == "path":
+        told["path"] = place(filter, params, slots)
+    elif wanted in ("associated", "all"):
+        told["loss"], told["count"] = _loss(params, wanted, frame, ahead, valid)
+    return slots, Step(valid & ~ahead.near.any(0), **told)
+
+
+def _loss(
+    params: TrackerParams, events: str, frame: Any, ahead: _Ahead, valid: Array
+) -> tuple[Array, Array]:
+    """Sum of -ln p over the events that count, see `losses`, and their number."""
+    density = ahead.density - math.log(2 * math.pi)
+    alive = ahead.alive[:, None] & valid
+    if events == "associated":
+        counted = ahead.inside.any(0)
+        density = jnp.where(ahead.inside, density, -jnp.inf)
+    else:
+        counted = valid
+        density = jnp.where(alive, density, -jnp.inf)
+        number = ahead.alive.sum()
+        share = jnp.where(number > 0, params.outliers, 1)
+        targets = density + jnp.log1p(-params.outliers) - jnp.log(jnp.maximum(number, 1))
+        stray = jnp.broadcast_to(jnp.log(share / frame.prod()), valid.shape)
+        density = jnp.concatenate([targets, stray[None]])
+    density = jnp.where(counted, density, 0)
+    loss = -jnp.where(counted, jax.nn.logsumexp(density, axis=0), 0).sum()
+    return loss, counted.sum().astype(density.dtype)
+
+
+def scan_steps(
+    filter: Filter, params: TrackerParams, wanted: str, frame: Any, slots: Slots, events: Any
+) -> tuple[Slots, Step]:
+    """The steps of a chunk."""
+    limits = silence_limits(params, slots)
+    return lax.scan(functools.partial(step, filter, params, wanted, frame, limits), slots, events)

@@ -1,0 +1,351 @@
+"""Tracks of many blobs in one stream of events, as a function of time."""
+
+import dataclasses
+import functools
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from numpy.typing import NDArray
+
+from jaxevent.blob.filters.steps import Filter
+from jaxevent.blob.lifecycle import ENDS, Log, begin
+from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.prepare import Features, Mark, Packing, Stretch, count_steps
+from jaxevent.blob.run import run
+from jaxevent.blob.states import TrackStates, tell
+from jaxevent.blob.targets import Slots, scan_steps
+from jaxevent.errors import InputError
+from jaxevent.progress import bar
+from jaxevent.recording import Times, microseconds
+
+BEGINS = 32  # stretches from which tracking can be taken up again
+READS = 64  # times read per call
+
+_begin = jax.jit(begin, static_argnames="filter")
+_run = jax.jit(run, static_argnames=("filter", "wanted"))
+
+
+@functools.partial(jax.jit, static_argnames="filter")
+def _read(
+    filter: Filter,
+    params: TrackerParams,
+    features: Features,
+    begins: Slots,
+    chunk: Array,
+    step: Array,
+    time: Array,
+    slot: Array,
+) -> tuple[Array, Array, Array]:
+    """Mean, covariance and seconds without events, (times, tracks, ...), of some slots.
+
+    The chunk is run again from the targets at its start; a time is after `step` of its steps.
+    """
+    f = features
+    before = jax.tree.map(lambda a: a[chunk], begins)
+    events = f.t[chunk], f.xi[chunk], f.polarity[chunk], f.valid[chunk]
+    _, steps = scan_steps(filter, params, "states", f.frame, before, events)
+    path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), before, steps.slots)
+    slots = jax.tree.map(lambda a: a[step[:, None], slot], path)
+    of_one = functools.partial(tell, filter, params)
+    return jax.vmap(jax.vmap(of_one, (0, None)))(slots, time)
+
+
+class Events(NamedTuple):
+    """Whose events are, one entry for each event of a stretch of the recording."""
+
+    row: NDArray[np.int64]  # in `recording.events`
+    t: NDArray[np.int64]  # us
+    id: NDArray[np.int64]  # the likeliest track that holds it in its gate; -1: none
+    weight: NDArray[np.floating]  # how much of the event is this track's
+
+
+@dataclasses.dataclass
+class _History:
+    """Births, confirmations and deaths (us) by serial number; of deaths also why, see ENDS."""
+
+    birth: dict[int, int]
+    confirmed: dict[int, int]
+    death: dict[int, tuple[int, int]] = dataclasses.field(default_factory=dict)
+
+    def add(self, stretch: Stretch, told: Log) -> None:
+        """Enter those of a stretch."""
+        log = jax.tree.map(np.asarray, told)
+        end = stretch.start + stretch.features.stop
+        at = np.nonzero(log.confirmed & (log.before >= 0))
+        for one, first in zip(*np.unique(log.before[at], return_index=True), strict=True):
+            self.confirmed.setdefault(int(one), int(end[at[0][first]]))
+        for chunk, slot in zip(*np.nonzero(log.ended), strict=True):
+            when = int(stretch.start[chunk]) + int(log.death[chunk, slot])
+            self.death[int(log.before[chunk, slot])] = when, int(log.ended[chunk, slot])
+        new = (log.after >= 0) & (log.after != log.before)
+        for chunk, slot in zip(*np.nonzero(new), strict=True):
+            self.birth.setdefault(int(log.after[chunk, slot]), int(end[chunk]))
+
+
+class Tracks:
+    """Tracks of a recording: `mean, covariance, valid = tracks(times)`.
+
+    Times, arrays of shape (tracks,): `birth`, `death` (the first moment when it is no more; for a
+    track that lives to the end, that of the last event + 1) and `confirmed`, int64 us. `id` are
+    whole numbers that are never used again, the seeds' first and in the order given; tracks that
+    were never confirmed are left out. `ended` says why: "end" of the events, "idle", "left" the
+    image, "size" beyond limits, "uncertain" position, "merged" with an older one, "not finite".
+
+    Only the targets at the start of some stretches are kept. Reading tracks the stretches again
+    that hold the times asked for, so that memory does not grow with the recording's length.
+    """
+
+    def __init__(
+        self,
+        filter: Filter,
+        packing: Packing,
+        params: TrackerParams,
+        progress: bool | None = None,
+    ):
+        self.recording, self.params = packing.recording, params
+        self.start, self.stop = packing.start, packing.stop
+        self._filter, self._packing, self._progress = filter, packing, progress
+        self._begins: list[tuple[Mark, int, Any]] = []
+        self._number(self._follow())
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def __repr__(self) -> str:
+        return f"Tracks({len(self)} of {self.recording.name}, {self.start} to {self.stop} us)"
+
+    def __call__(
+        self,
+        times: Times,
+        ids: Sequence[int] | NDArray[np.integer] | None = None,
+        *,
+        extrapolate: bool = False,
+    ) -> TrackStates:
+        """States at `times`: integers (us) or floats (s), in any order.
+
+        What is told of a time is the prediction from the last step at or before it; with
+        `events_per_step` above 1, a step has the time of its last event. `ids` chooses tracks, by
+        default all. Raises `InputError` for times that are not finite or, unless told to
+        `extrapolate`, outside the recording (where no track is valid), and for ids that do not
+        exist.
+        """
+        times = np.atleast_1d(microseconds(times))
+        order = np.argsort(times, kind="stable")
+        found = self.batches(times[order], ids, extrapolate=extrapolate)
+        parts = [states for _, states in found]
+        chosen = self._chosen(ids)
+        if not parts:
+            return self._nothing(times, chosen)
+        back = np.argsort(order, kind="stable")
+        mean, covariance, valid, idle = (
+            np.concatenate([getattr(part, name) for part in parts])[back]
+            for name in ("mean", "covariance", "valid", "idle")
+        )
+        return TrackStates(mean, covariance, valid, idle, self.id[chosen])
+
+    def batches(
+        self,
+        times: Times,
+        ids: Sequence[int] | NDArray[np.integer] | None = None,
+        *,
+        extrapolate: bool = False,
+    ) -> Iterator[tuple[NDArray[np.int64], TrackStates]]:
+        """The same, one stretch of sorted times after another: `times, states`."""
+        times = np.atleast_1d(microseconds(times))
+        if (times[1:] < times[:-1]).any():
+            raise InputError("times must be sorted to be read in batches; sort them")
+        if not extrapolate:
+            self._packing.check_times(times)
+        chosen = self._chosen(ids)
+        first, end = (int(i) for i in np.searchsorted(times, [self.start, self.stop]))
+        if first:
+            yield times[:first], self._nothing(times[:first], chosen)
+        if not len(self) and end > first:
+            yield times[first:end], self._nothing(times[first:end], chosen)
+            first = end
+        for stretch, slots in self._again(times[first:end]):
+            features, id = jax.device_put(stretch.features), np.asarray(slots.id)
+            upto = end
+            if stretch.next is not None:
+                upto = int(np.searchsorted(times[:end], stretch.next.start))
+            while first < upto:
+                chunk = int(np.searchsorted(stretch.start, times[first], "right")) - 1
+                stop = upto
+                if chunk + 1 < len(stretch.start):
+                    stop = min(stop, int(np.searchsorted(times, stretch.start[chunk + 1])))
+                batch = times[first:stop]
+                yield batch, self._in_chunk(stretch, features, slots, id, chunk, batch, chosen)
+                first = stop
+        if first < len(times):
+            yield times[first:], self._nothing(times[first:], chosen)
+
+    def events(
+        self, start: int | float | None = None, stop: int | float | None = None
+    ) -> Iterator[Events]:
+        """Whose each event is, one stretch after another; events outside the tracking are left out.
+
+        Events that the prefilter drops are not told of. Raises `InputError` for times that are not
+        finite.
+        """
+        t0 = self.start if start is None else int(microseconds(start, "the start"))
+        t1 = self.stop if stop is None else int(microseconds(stop, "the stop"))
+        t0, t1 = max(t0, self.start), min(t1, self.stop)
+        if t0 >= t1 or not self._begins:
+            return
+        mark, state = self._begin_of(t0)
+        while mark is not None and mark.start < t1:
+            stretch = self._packing.pack(mark)
+            mark = stretch.next
+            wanted = "associations" if mark is None or mark.start > t0 else "begins"
+            state, told = _run(self._filter, self.params, state, stretch.features, wanted=wanted)
+            if told.association is None:
+                continue
+            valid = np.asarray(stretch.features.valid)
+            t = (stretch.start[:, None, None] + stretch.features.t)[valid]
+            serial = np.asarray(told.association.id)[valid]
+            now = (t >= t0) & (t < t1)
+            yield Events(
+                stretch.row[valid][now], t[now], self._id_of[serial[now]],
+                np.asarray(told.association.weight)[valid][now],
+            )  # fmt: skip
+
+    def _chosen(self, ids: Sequence[int] | NDArray[np.integer] | None) -> NDArray[np.int64]:
+        """Places of tracks in the arrays."""
+        if ids is None:
+            return np.arange(len(self))
+        for one in ids:
+            if one not in self.id:
+                raise InputError(
+                    f"{self.recording.name}: there is no track {one}; there are "
+                    f"{', '.join(map(str, self.id[:20])) or 'none'}"
+                )
+        return np.array([int(np.flatnonzero(self.id == one)[0]) for one in ids], np.int64)
+
+    def _nothing(self, times: NDArray[np.int64], chosen: NDArray[np.int64]) -> TrackStates:
+        shape, real = (len(times), len(chosen)), np.dtype(jnp.result_type(float))
+        return TrackStates(
+            np.full((*shape, 8), np.nan, real),
+            np.full((*shape, 8, 8), np.nan, real),
+            np.zeros(shape, bool),
+            np.full(shape, np.nan, real),
+            self.id[chosen],
+        )
+
+    def _in_chunk(
+        self,
+        stretch: Stretch,
+        features: Features,
+        slots: Slots,
+        id: NDArray,
+        chunk: int,
+        times: NDArray[np.int64],
+        chosen: NDArray[np.int64],
+    ) -> TrackStates:
+        states = self._nothing(times, chosen)
+        alive = (self.birth[chosen] <= times[:, None]) & (times[:, None] < self.death[chosen])
+        some = np.flatnonzero(alive.any(0))
+        if not len(some):
+            return states
+        slot = np.argmax(id[chunk] == self._serial[chosen[some]][:, None], axis=1)
+        slot = np.pad(slot, (0, -len(slot) % 8))
+        since = times - stretch.start[chunk]
+        step = count_steps(stretch.features, np.full(len(times), chunk), since)
+        mask = alive[:, some]
+        for first in range(0, len(times), READS):
+            part = slice(first, first + READS)
+            fill = (0, READS - len(times[part]))
+            read = _read(
+                self._filter,
+                self.params,
+                features,
+                slots,
+                np.int32(chunk),
+                np.pad(step[part], fill),
+                np.pad(since[part], fill).astype(np.int32),
+                slot,
+            )
+            now = mask[part]
+            for out, value in zip((states.mean, states.covariance, states.idle), read, strict=True):
+                value = np.asarray(value)[: len(now), : len(some)]
+                seen = now.reshape(*now.shape, *[1] * (value.ndim - 2))
+                out[part, some] = np.where(seen, value, np.nan)
+        states.valid[:] = alive
+        return states
+
+    def _again(self, times: NDArray[np.int64]) -> Iterator[tuple[Stretch, Any]]:
+        """The stretches that hold some of the sorted times, with the targets at chunks' starts."""
+        if not len(times):
+            return
+        mark, state = self._begin_of(int(times[0]))
+        done = 0
+        while done < len(times):
+            assert mark is not None
+            stretch = self._packing.pack(mark)
+            mark = stretch.next
+            upto = len(times) if mark is None else int(np.searchsorted(times, mark.start))
+            state, told = _run(self._filter, self.params, state, stretch.features, wanted="begins")
+            if upto > done:
+                yield stretch, told.slots
+            done = upto
+            if done < len(times) and mark is not None:
+                later, known = self._begin_of(int(times[done]))
+                if later is not None and later.start > mark.start:
+                    mark, state = later, known
+
+    def _begin_of(self, time: int) -> tuple[Mark | None, Any]:
+        known = [(mark, state) for mark, _, state in self._begins if mark.start <= time]
+        return known[-1]
+
+    def _follow(self) -> _History:
+        """The first pass: all births and deaths, and some targets on the way."""
+        born = {k: int(t) for k, t in enumerate(self._packing.seeds.t)}
+        history = _History(dict(born), dict(born))
+        rows = self._packing.rows
+        nothing = rows[0] == rows[1] and not born
+        mark: Mark | None = None if nothing else self._packing.first
+        state, number, every = None, 0, 1
+        logs: list[tuple[Stretch, Log]] = []
+        with bar(
+            total=rows[1] - rows[0], unit="event", unit_scale=True, progress=self._progress
+        ) as shown:
+            while mark is not None:
+                stretch = self._packing.pack(mark)
+                if state is None:
+                    state = _begin(self._filter, self.params, stretch.features)
+                if number % every == 0:
+                    self._begins.append((mark, number, state))
+                    if len(self._begins) > BEGINS:
+                        every *= 2
+                        self._begins = [one for one in self._begins if one[1] % every == 0]
+                state, told = _run(
+                    self._filter, self.params, state, stretch.features, wanted="begins"
+                )
+                logs.append((stretch, told.log))
+                if len(logs) > 1:  # while this stretch is on the device
+                    history.add(*logs.pop(0))
+                shown.update(int(np.count_nonzero(stretch.features.valid)))
+                mark, number = stretch.next, number + 1
+            for one in logs:
+                history.add(*one)
+        return history
+
+    def _number(self, history: _History) -> None:
+        """Give tracks that were confirmed their numbers."""
+        serial = np.array(sorted(history.confirmed), np.int64)
+        given = self._packing.seeds.given
+        public = np.arange(len(serial))
+        public[: len(given)] = given
+        order = np.argsort(public, kind="stable")
+        self._serial = serial[order]
+        self.id = public[order].astype(np.int64)
+        self.birth = np.array([history.birth[k] for k in self._serial], np.int64)
+        self.confirmed = np.array([history.confirmed[k] for k in self._serial], np.int64)
+        ends = [history.death.get(int(k), (self.stop, 0)) for k in self._serial]
+        self.death = np.array([when for when, _ in ends], np.int64)
+        self.ended = tuple(ENDS[why] for _, why in ends)
+        self._id_of = np.full(max([-1, *history.birth]) + 2, -1)  # its last serves the serial -1
+        self._id_of[self._serial] = self.id

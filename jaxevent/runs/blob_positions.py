@@ -1,0 +1,172 @@
+"""Known positions of targets, and tracks compared with them.
+
+Positions are a table with the columns t (s), x, y (px) and, of more than one target, id, as
+`jaxevent track` and `jaxevent simulate --truth` write them; further columns are left out. Targets
+by rising id are those of the seeds in their order.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from jaxevent.blob import Tracker, TrackerParams
+from jaxevent.errors import InputError
+from jaxevent.recording import Recording
+from jaxevent.runs.config import Check
+
+
+def _is_seed(value: Any) -> bool:
+    numbers = isinstance(value, list) and len(value) in (3, 4)
+    return numbers and all(type(n) in (int, float) and np.isfinite(n) for n in value)
+
+
+SETTINGS: Mapping[str, Check] = {
+    "seeds": (
+        lambda value: (
+            isinstance(value, list)
+            and len(value) > 0
+            and all(_is_seed(one) and one[2] > 0 for one in value)
+        ),
+        "a list of [x, y, size], in px, or [x, y, size, t], t in s",
+    ),
+    "positions": (
+        lambda value: isinstance(value, str) and value != "",
+        'the name of tables beside the recordings, as "*.csv"',
+    ),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """Given positions: times (T,) us, xi (T, targets, 2) in px, NaN where not known."""
+
+    t: NDArray[np.int64]
+    xi: NDArray[np.float64]
+
+
+def read_positions(path: str | Path) -> Known:
+    """Positions from a table; see the text of this module.
+
+    Raises `InputError` for a file that cannot be read and for missing columns or numbers.
+    """
+    path = Path(path)
+    try:
+        table = pd.read_csv(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+    except ValueError as error:
+        raise InputError(f"{path}: is no table ({error}); give columns t, x, y") from None
+    missing = [name for name in ("t", "x", "y") if name not in table.columns]
+    if missing:
+        raise InputError(f"{path}: has no column {missing[0]!r}; give the columns t (s), x, y (px)")
+    for name in ("t", "x", "y", *(["id"] if "id" in table.columns else [])):
+        numbers = np.asarray(pd.to_numeric(table[name], errors="coerce"), np.float64)
+        if not np.isfinite(numbers).all():
+            row = int(np.argmin(np.isfinite(numbers)))
+            raise InputError(
+                f"{path}: {name} is {str(table[name][row])[:40]!r} in line {row + 2}; give a "
+                "number, or leave the line out"
+            )
+    if not len(table):
+        raise InputError(f"{path}: holds no positions; give lines of t, x, y")
+    us = np.rint(table["t"].to_numpy(np.float64) * 1e6).astype(np.int64)
+    number = table["id"].to_numpy() if "id" in table.columns else np.zeros(len(us), np.int64)
+    t, row = np.unique(us, return_inverse=True)
+    targets, column = np.unique(number, return_inverse=True)
+    xi = np.full((len(t), len(targets), 2), np.nan)
+    xi[row, column] = table[["x", "y"]].to_numpy(np.float64)
+    return Known(t, xi)
+
+
+@dataclasses.dataclass(frozen=True)
+class Targets:
+    """What a configuration says of the targets: seeds, and the name of tables of positions."""
+
+    seeds: tuple[tuple[float, ...], ...] | None
+    positions: str | None
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> "Targets":
+        """From settings of a configuration, those named in `SETTINGS`."""
+        seeds = given.get("seeds")
+        seeds = None if seeds is None else tuple(tuple(map(float, seed)) for seed in seeds)
+        return cls(seeds, given.get("positions"))
+
+    def files(self, recording: Path) -> list[Path]:
+        """The tables beside a recording."""
+        if self.positions is None:
+            return []
+        name = recording.name if recording.is_dir() else recording.stem
+        return [recording.with_name(self.positions.replace("*", name))]
+
+    def known(self, recording: Recording) -> Known | None:
+        """The positions of a recording, those in the time of its events."""
+        for path in self.files(Path(recording.name)):
+            known = read_positions(path)
+            targets = known.xi.shape[1]
+            if self.seeds is not None and len(self.seeds) != targets:
+                raise InputError(
+                    f"{path}: holds {targets} targets, but there are {len(self.seeds)} seeds; "
+                    "give one for each, by rising id, or leave out the seeds"
+                )
+            first, stop = span_of_events(recording)
+            inside = (first <= known.t) & (known.t < stop)
+            if not inside.any():
+                raise InputError(
+                    f"{path}: no position is within {first * 1e-6:g} to {stop * 1e-6:g} s, the "
+                    f"events' time in {recording.name}; times are seconds on its clock"
+                )
+            return Known(known.t[inside], known.xi[inside])
+        return None
+
+    def first_seeds(self, known: Known | None, params: TrackerParams) -> list[Any] | None:
+        """Where tracking of a whole recording begins; None: tracks are born."""
+        if self.seeds is not None:
+            return [tuple(seed) for seed in self.seeds]
+        if known is None:
+            return None
+        size = float(params.lambda0)
+        first = int(known.t[0])
+        return [seed_at(known, k, first, size) for k in range(known.xi.shape[1])]
+
+    def errors(
+        self,
+        recording: Recording,
+        tracker: Tracker,
+        params: TrackerParams,
+        progress: bool | None,
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+        """Time (us) and distance (px) of all known positions; NaN where the track is not alive."""
+        known = self.known(recording)
+        if known is None:
+            return None
+        seeds = self.first_seeds(known, params)
+        tracks = tracker.estimate(recording, params, seeds=seeds, progress=progress)
+        found = [states.mean[..., :2] for _, states in tracks.batches(known.t)]
+        distance = np.linalg.norm(np.concatenate(found) - known.xi, axis=2)
+        given = np.isfinite(known.xi).all(2)
+        return np.broadcast_to(known.t[:, None], given.shape)[given], distance[given]
+
+
+def span_of_events(recording: Recording) -> tuple[int, int]:
+    """The first event's time and that after the last, us."""
+    events, count = recording.events, len(recording.events)
+    if not count:
+        raise InputError(f"{recording.name}: holds no events; choose another recording")
+    return int(events[:1].t[0]), int(events[count - 1 : count].t[0]) + 1
+
+
+def seed_at(known: Known, target: int, begin: int, size: float) -> tuple[float, float, float, int]:
+    """The seed of a target from a time on: there, or where it is seen first; NaN after the last."""
+    seen = np.isfinite(known.xi[:, target]).all(1)
+    t, xi = known.t[seen], known.xi[seen, target]
+    if t[-1] < begin:
+        return np.nan, np.nan, size, begin
+    at = max(begin, int(t[0]))
+    x, y = (float(np.interp(at, t, xi[:, axis])) for axis in (0, 1))
+    return x, y, size, at

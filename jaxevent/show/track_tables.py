@@ -1,0 +1,161 @@
+"""Tables of tracks, as CSV and HDF5.
+
+Tracks come as arrays: times (T,), int us or float s on the recording's clock; ids (N,); mean
+(T, N, 8) and covariance (T, N, 8, 8) of (px, py, vx, vy, lambda1, lambda2, theta, q) in px, s and
+rad; valid (T, N), False where a track does not exist and its numbers may be anything.
+"""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from jaxevent.errors import InputError
+from jaxevent.io.output import complete, complete_hdf5
+from jaxevent.recording import Times, microseconds
+
+COLUMNS = ("x", "y", "vx", "vy", "lambda1", "lambda2", "theta", "q")
+UNITS = ("px", "px", "px/s", "px/s", "px", "px", "rad", "rad/s")
+
+
+def write_tracks(
+    path: str | Path,
+    times: Times,
+    ids: ArrayLike,
+    mean: ArrayLike,
+    covariance: ArrayLike,
+    valid: ArrayLike | None = None,
+) -> None:
+    """Write tracks to a file that ends in .csv, .h5 or .hdf5, one row per time and valid track.
+
+    A table is written as it is instead where ids are (rows,), mean (rows, 8), covariance (rows, 8,
+    8) and `times` (rows,), say one row per event. CSV has the columns t (s), id, the state x, y,
+    vx, vy, lambda1, lambda2, theta, q and their standard deviations std_x ... std_q. HDF5 has t
+    (rows,) int64 us, id (rows,), mean (rows, 8) and covariance (rows, 8, 8), with the attributes
+    `columns` and `units`. Raises `InputError` for another suffix and shapes that do not fit.
+    """
+    with track_writer(path) as write:
+        write(times, ids, mean, covariance, valid)
+
+
+@contextlib.contextmanager
+def track_writer(path: str | Path) -> Iterator[Callable[..., None]]:
+    """Open a file as of `write_tracks` and give the function that appends to it.
+
+    The file appears at the end, complete.
+    """
+    path = Path(path)
+    kinds = {".csv": _csv_writer, ".h5": _hdf5_writer, ".hdf5": _hdf5_writer}
+    if path.suffix.lower() not in kinds:
+        raise InputError(
+            f"{path}: tracks cannot be stored as {path.suffix or 'a file without suffix'}; end the "
+            "name in .csv or .h5"
+        )
+    with kinds[path.suffix.lower()](path) as append:
+
+        def write(
+            times: Times,
+            ids: ArrayLike,
+            mean: ArrayLike,
+            covariance: ArrayLike,
+            valid: ArrayLike | None = None,
+        ) -> None:
+            t, number, m, P, seen = check_tracks(path, times, ids, mean, covariance, valid)
+            if m.ndim == 3:
+                row, column = np.nonzero(seen)
+                t, number, m, P = t[row], number[column], m[row, column], P[row, column]
+            append(t, number, m, P)
+
+        yield write
+
+
+@contextlib.contextmanager
+def _csv_writer(path: Path) -> Iterator[Callable[..., None]]:
+    with complete(path) as partial, partial.open("w", newline="") as file:
+        names = ("t", "id", *COLUMNS, *(f"std_{name}" for name in COLUMNS))
+        file.write(",".join(names) + "\n")
+
+        def append(t: NDArray, number: NDArray, mean: NDArray, covariance: NDArray) -> None:
+            deviation = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0))
+            columns = [t / 1e6, number, *mean.T, *deviation.T]
+            table = pd.DataFrame(dict(enumerate(columns)))
+            table.to_csv(file, index=False, header=False)
+
+        yield append
+
+
+@contextlib.contextmanager
+def _hdf5_writer(path: Path) -> Iterator[Callable[..., None]]:
+    with complete_hdf5(path) as (file, check):
+        file.attrs["format"] = "jaxevent tracks"
+        row = 0
+
+        def append(*arrays: NDArray) -> None:
+            nonlocal row
+            names = ("t", "id", "mean", "covariance")
+            for name, array in zip(names, arrays, strict=True):
+                if name not in file:
+                    file.create_dataset(
+                        name, (0, *array.shape[1:]), array.dtype, maxshape=(None, *array.shape[1:]),
+                        chunks=(4096, *array.shape[1:]),
+                    )  # fmt: skip
+                stored = file[name]
+                assert isinstance(stored, h5py.Dataset)
+                stored.resize(row + len(array), axis=0)
+                stored[row:] = array
+            row += len(arrays[0])
+            check()
+
+        yield append
+        if "t" not in file:
+            append(*no_rows())
+        file["t"].attrs["unit"] = "us on the recording's clock"
+        for name in ("mean", "covariance"):
+            file[name].attrs["columns"], file[name].attrs["units"] = COLUMNS, UNITS
+
+
+def no_rows() -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Times, ids, means and covariances of no row."""
+    none = np.empty(0, np.int64)
+    return none, none, np.empty((0, 8), np.float32), np.empty((0, 8, 8), np.float32)
+
+
+def write_states(path: str | Path, times: Times, states: ArrayLike, valid: ArrayLike) -> None:
+    """Write known states (T, N, 8), say the truth, as CSV: t, id, x, ... q, where valid (T, N)."""
+    t, ids = np.atleast_1d(microseconds(times)), np.arange(np.shape(states)[1])
+    t, ids, states, _, valid = check_tracks(path, t, ids, states, None, valid)
+    row, column = np.nonzero(valid)
+    columns = {"t": t[row] / 1e6, "id": ids[column]}
+    columns |= {name: states[row, column, i] for i, name in enumerate(COLUMNS)}
+    pd.DataFrame(columns).to_csv(path, index=False)
+
+
+def check_tracks(
+    place: str | Path,
+    times: Times,
+    ids: ArrayLike,
+    mean: ArrayLike,
+    covariance: ArrayLike | None,
+    valid: ArrayLike | None,
+) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
+    """The arrays, as arrays whose shapes fit."""
+    t, ids, mean = np.atleast_1d(microseconds(times)), np.asarray(ids), np.asarray(mean)
+    if covariance is None:
+        covariance = np.broadcast_to(0.0, (*mean.shape, 8))
+    covariance = np.asarray(covariance)
+    flat = mean.ndim == 2 and valid is None
+    shape = (len(t),) if flat else (len(t), ids.size)
+    valid = np.ones(shape, bool) if valid is None else np.asarray(valid, bool)
+    rows = ids.shape == ((len(t),) if flat else (ids.size,))
+    fit = mean.shape == (*shape, 8) and covariance.shape == (*shape, 8, 8) and valid.shape == shape
+    if not (rows and fit and ids.dtype.kind in "iu"):
+        raise InputError(
+            f"{place}: {len(t)} times, {ids.dtype} ids of {ids.shape}, mean {mean.shape}, "
+            f"covariance {covariance.shape} and valid {valid.shape} do not fit; give T times, N "
+            "integer ids, (T, N, 8), (T, N, 8, 8) and (T, N)"
+        )
+    return t, ids, mean, covariance, valid

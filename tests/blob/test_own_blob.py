@@ -1,0 +1,104 @@
+"""A tracker defined outside the package is evaluated, fitted and run from the command line."""
+
+import json
+
+import jax
+import numpy as np
+import own_blob
+import pytest
+
+import jaxevent
+from jaxevent import cli
+from jaxevent.estimator import Estimator
+from jaxevent.methods import find, names
+from jaxevent.runs.evaluate import evaluate
+from jaxevent.runs.fit import fit
+from jaxevent.simulate import Line, Target, simulate_blobs
+
+METHOD = "own_blob:student"
+PARAMS = {"events_per_step": 8, "lambda0": 4.0, "Q_v": 1e4, "P0_v": 1e4}
+TABLE = ", ".join(f"{name} = {value}" for name, value in PARAMS.items())
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A blob that moves along a line for 0.02 s, 800 events, and its path."""
+    folder = tmp_path_factory.mktemp("own")
+    line = Line((20, 20), (500, 100), size=(3.0, 3.0))
+    recording, truth = simulate_blobs([Target(line, 4e4)], (60, 40), 0.02, seed=3)
+    jaxevent.save(recording, folder / "a.h5")
+    times = np.arange(1000, 19_000, 1000)
+    rows = [f"{t / 1e6},{x},{y}" for t, (x, y) in zip(times, truth(times)[:, 0, :2], strict=True)]
+    (folder / "a.csv").write_text("\n".join(["t,x,y", *rows]) + "\n")
+    return folder
+
+
+def test_it_obeys_the_contract(folder):
+    """In three steps as in one: states before, between and after the events."""
+    student = find(METHOD, "blob")
+    assert isinstance(student, Estimator) and METHOD not in names()
+    recording = jaxevent.load(folder / "a.h5")
+    params = student.Params(nu=3.0, **PARAMS)
+    seeds = [(50.0, 5.0, 4.0, 0.01), (20.0, 20.0, 4.0)]  # no events near the first
+    times = np.arange(recording.start, recording.stop, 1500)
+    features, out = student.prepare(recording, times, params, seeds=seeds)
+    trajectory, _ = jax.jit(student.run)(params, features)
+    states = student.read(params, trajectory, out)
+    mean, covariance, valid = states
+    tracks = student.estimate(recording, params, seeds=seeds, progress=False)
+    expected = tracks(times)
+    assert np.array_equal(valid, expected.valid) and not valid.all() and valid.any()
+    np.testing.assert_allclose(mean, expected.mean, rtol=1e-9)
+    np.testing.assert_allclose(covariance, expected.covariance, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(states.idle, expected.idle, atol=1e-12)
+    assert np.array_equal(states.id[-1], [-1 if not v else k for k, v in enumerate(valid[-1])])
+
+    # In two parts, of which the second goes on from the first one's end.
+    middle = recording.start + 10_000
+    run = jax.jit(student.run)
+    features, _ = student.prepare(recording, times, params, seeds=seeds[1:], stop=middle)
+    _, state = run(params, features)
+    features, out = student.prepare(recording, times, params, seeds=[], start=middle)
+    later = student.read(params, run(params, features, state)[0], out)
+    assert np.array_equal(later.valid[:, 0], times >= middle)
+    np.testing.assert_allclose(later.mean[times >= middle, 0], mean[times >= middle, 1], rtol=1e-9)
+
+    with pytest.raises(jaxevent.InputError, match="extrapolate=True"):
+        tracks(recording.stop + 1)
+    assert not tracks(recording.stop + 1, extrapolate=True).valid.any()
+
+
+def test_it_is_evaluated(folder):
+    config = folder / "evaluate.toml"
+    config.write_text(
+        'recordings = ["a.h5"]\nprotocol = "tracks"\npositions = "*.csv"\n'
+        f'[[method]]\nname = "{METHOD}"\nparams = {{ nu = 3.0, {TABLE} }}\n'
+        f'[[method]]\nname = "constant_velocity"\nparams = {{ {TABLE} }}\n'
+    )
+    own, package = evaluate(config, progress=False)
+    assert own["method"] == METHOD and own["params"]["nu"] == pytest.approx(3.0)
+    assert own["covered"] == package["covered"] == 1
+    assert own["rmse"] < 1 and own["rmse"] != package["rmse"]
+
+
+def test_its_own_number_is_fitted(folder, capsys):
+    config, out = folder / "fit.toml", folder / "fitted"
+    config.write_text(
+        'recordings = ["a.h5"]\nvalidation = []\nsplit = [1, 0, 0]\nwindow = 1.0\n'
+        'positions = "*.csv"\niterations = 4\nlearning_rate = 0.5\nrounds = 1\n'
+        f'[[method]]\nname = "{METHOD}"\nlabel = "mine"\n'
+        f'params = {{ nu = 1.0, {TABLE} }}\nfit = ["nu"]\n'
+    )
+    before, after = fit(config, out, progress=False)
+    assert after["nll"] < before["nll"] and after["params"]["nu"] > 1.5
+    assert json.loads((out / "results.json").read_text())["rows"] == [before, after]
+
+    # What was fitted is what the command takes.
+    table = own_blob.Params.load(out / "params.toml", "mine").values()
+    mine = folder / "mine.toml"
+    mine.write_text("".join(f"{k} = {json.dumps(v)}\n" for k, v in table.items()))
+    argv = ["track", folder / "a.h5", "--method", METHOD, "--params", mine, "--seed=20,20,4"]
+    assert cli.main([*map(str, argv), "--out", str(folder / "a.tracks.csv")]) == 0
+    assert "1 tracks" in capsys.readouterr().out
+    x = np.genfromtxt(folder / "a.tracks.csv", delimiter=",", names=True)["x"]
+    assert abs(x[-1] - 29.5) < 1
