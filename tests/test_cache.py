@@ -1,0 +1,48 @@
+"""What the library tells JAX about keeping compiled programs, in fresh processes."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+THEIRS = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")
+LOOK = "; import jax; print(jax.config.jax_compilation_cache_dir)"
+
+
+def told(code: str, **variables: object) -> str:
+    """What the code prints with these variables, and none of JAX's own."""
+    kept = {k: v for k, v in os.environ.items() if k not in (*THEIRS, "JAXEVENT_CACHE")}
+    env = {**kept, **{k: str(v) for k, v in variables.items()}}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_programs_are_kept_in_the_users_folder(tmp_path):
+    folder = told("import jaxevent" + LOOK, XDG_CACHE_HOME=tmp_path, HOME=tmp_path)
+    assert folder.startswith(str(tmp_path)) and os.path.isdir(folder)
+    # Also where JAX was imported before.
+    assert told("import jax, jaxevent" + LOOK, XDG_CACHE_HOME=tmp_path, HOME=tmp_path) == folder
+
+
+@pytest.mark.parametrize("first", ["import jaxevent", "import jax, jaxevent"])
+def test_the_user_decides(first, tmp_path):
+    assert told(first + LOOK, JAXEVENT_CACHE=0) == "None"
+    mine = told(first + LOOK, JAXEVENT_CACHE=tmp_path / "mine")
+    assert mine.startswith(str(tmp_path / "mine"))
+    assert told(first + LOOK, JAX_COMPILATION_CACHE_DIR=tmp_path / "jax") == str(tmp_path / "jax")
+
+
+def test_without_a_place_everything_works():
+    assert told("import jaxevent" + LOOK, JAXEVENT_CACHE="/dev/null/no") == "None"
+
+
+def test_what_was_compiled_is_found_again(tmp_path):
+    code = (
+        "import jaxevent, jax; jax.config.update('jax_persistent_cache_min_compile_time_secs', 0)\n"
+        "jax.jit(lambda x: x * 2)(1.0); import os\n"
+        "print(len(os.listdir(jax.config.jax_compilation_cache_dir)))"
+    )
+    first = int(told(code, JAXEVENT_CACHE=tmp_path))
+    assert first > 0 and int(told(code, JAXEVENT_CACHE=tmp_path)) == first
