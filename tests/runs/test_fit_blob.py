@@ -222,7 +222,7 @@ def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
     monkeypatch.setattr(jaxevent.runs.fit, "PERIOD", 0.0)
     config, out = write(folder, CONFIG), folder / "out"
     fit(config, folder / "whole")
-    save, count = jaxevent.runs.fit._save, 0
+    save, count = jaxevent.runs.fit.save, 0
 
     def dying(*arguments):
         nonlocal count
@@ -232,7 +232,7 @@ def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
         save(*arguments)
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(jaxevent.runs.fit, "_save", dying)
+        patch.setattr(jaxevent.runs.fit, "save", dying)
         fit(config, out)
     assert [path.name for path in out.iterdir()] == ["checkpoint"]
     kept = (folder / "a.csv").read_bytes()
