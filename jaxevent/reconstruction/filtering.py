@@ -30,10 +30,10 @@ from jaxevent.reconstruction.pixels import (
     ReadOut,
     Tiles,
     Timing,
-    check_times,
     prepare,
+    time_span,
 )
-from jaxevent.recording import Recording, Times
+from jaxevent.recording import Recording, Times, check_times
 
 if TYPE_CHECKING:
     from jaxevent.reconstruction.video import Video
@@ -172,7 +172,8 @@ class ImageEstimator(Estimator[P]):
         self.check(recording)
         params = self.Params() if params is None else params
         if not extrapolate:
-            check_times(recording, times, params.clock_offset)
+            span = time_span(recording, params.clock_offset)
+            check_times(times, *span, recording.name)
         return prepare(recording, times, *Timing.of(params), filtering=self.filters)
 
     def estimate(self, recording: Recording, params: P | None = None, **options: Any) -> "Video[P]":

@@ -1010,23 +1010,14 @@ def _rate(breaks: NDArray) -> NDArray:
     return np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)
 
 
-def check_times(recording: Recording, times: Times, clock_offset: Any = 0.0) -> None:
-    """Raise `InputError` for times outside the recording.
+def time_span(recording: Recording, clock_offset: Any = 0.0) -> tuple[int, int]:
+    """The times (us) between which images rest on data.
 
-    It lasts from its first event or frame to its last, frames on the events' clock as well as
+    They reach from the first event or frame to the last, frames on the events' clock as well as
     stamped.
     """
-    us = np.atleast_1d(microseconds(times))
-    if not len(us):
-        return
     late = 0 if recording.frames is None else round(float(clock_offset) * 1e6)
-    start, stop = recording.start + min(late, 0), recording.stop + max(late, 0)
-    if us.min() < start or us.max() > stop:
-        raise InputError(
-            f"{recording.name}: times from {us.min()} to {us.max()} us were asked for, but it "
-            f"lasts from {start} to {stop} us; integers are microseconds, floats seconds, both on "
-            "the recording's clock"
-        )
+    return recording.start + min(late, 0), recording.stop + max(late, 0)
 
 
 def prepare(

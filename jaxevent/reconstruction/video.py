@@ -22,11 +22,11 @@ from jaxevent.reconstruction.pixels import (
     ReadOut,
     Timing,
     Windows,
-    check_times,
     over_pixels,
     pixel_mesh,
+    time_span,
 )
-from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.recording import Recording, Times, check_times, microseconds
 
 BEGINS = 32  # windows from which filtering can be taken up again
 BATCH = 8  # images read per call; 8 x 90,000 pixels stay in the second-level cache
@@ -130,7 +130,8 @@ class Video(Generic[P]):
         if (times[1:] < times[:-1]).any():
             raise InputError("times must be sorted to be read in batches; sort them")
         if not extrapolate:
-            check_times(self.recording, times, self.params.clock_offset)
+            span = time_span(self.recording, self.params.clock_offset)
+            check_times(times, *span, self.recording.name)
         start, stop = self.recording.start, self.recording.stop
         with bar(total=len(times), unit="image", progress=self.progress) as shown:
             # One batch is computed while the next one is looked up in the events.
