@@ -3,7 +3,7 @@
 Equation numbers are those of Wang et al., "An Asynchronous Kalman Filter for Hybrid Event Cameras",
 ICCV 2021. Letters: L log intensity ln(I + I0), c contrast threshold, T exposure, tau mid-exposure.
 Each model makes its tables, [rows, pixels], once per window; called with points (where they lie
-among the frames, `pixels.Points`) it looks them up.
+among the frames, `features.Points`) it looks them up.
 """
 
 import functools
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.parameters import Choice, Number, Parameters, Positive
-from jaxevent.reconstruction.pixels import FrameFeatures, Points
+from jaxevent.reconstruction.features import FrameFeatures, Points
 
 
 class FrameParams(Parameters):
@@ -158,7 +158,7 @@ def deblurred(
     s = frames.segments
     share = s.share + late(params, frames) * s.edge
     excess = share * jnp.expm1(brightness(params, s.on, s.off))
-    total = jax.ops.segment_sum(excess, s.cell, level.size).reshape(level.shape)
+    total = jax.ops.segment_sum(excess, s.frame_cell, level.size).reshape(level.shape)
     level = level - jnp.log1p(total) * params.deblur
     return (
         level - brightness(params, frames.head[0], frames.head[1]),
@@ -239,7 +239,7 @@ class Augmented(Level):
             ]
         from_base, from_ratio, to_base, to_ratio = rows
         self.params = params
-        self.lag = late(params, frames) * frames.piece_rate
+        self.lag = late(params, frames) * frames.weight_rate
         self.tilt = None
         if params.weighting == "certainty":
             trust = believed_rate(params, frames)
@@ -329,7 +329,7 @@ class BetweenFrames(eqx.Module):
     def __init__(
         self, params: FrameParams, frames: FrameFeatures, table: Float[Array, "frames pixels"]
     ):
-        lag = late(params, frames) * frames.level_rate[:, None]
+        lag = late(params, frames) * frames.blend_rate[:, None]
         self.here, self.there = _lagging(lag, table, jnp.roll(table, -1, axis=0))
 
     def __call__(self, points: Points) -> Float[Array, "*points"]:

@@ -19,8 +19,8 @@ from jaxevent.reconstruction.augment import (
     clipped_side,
     event_change,
 )
+from jaxevent.reconstruction.features import FrameFeatures, Points
 from jaxevent.reconstruction.filtering import Event, Filter, Observation, Observer, State
-from jaxevent.reconstruction.pixels import FrameFeatures, Points
 
 
 class Params(AugmentParams):

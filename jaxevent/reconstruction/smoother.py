@@ -39,8 +39,8 @@ from jaxevent.reconstruction.augment import (
     late,
     unclipped,
 )
-from jaxevent.reconstruction.filtering import ImageEstimator
-from jaxevent.reconstruction.pixels import (
+from jaxevent.reconstruction.estimator import ImageEstimator
+from jaxevent.reconstruction.features import (
     Features,
     FrameFeatures,
     ImagePoints,
@@ -164,7 +164,7 @@ def rows_of(params: Params, frames: FrameFeatures) -> tuple[Rows, Float[Array, "
         left, _ = deblurred(params, frames)
         z = left + brightness(params, frames.head[0], frames.head[1])
         counts = frames.span - frames.head - jnp.roll(frames.tail, -1, axis=1)
-    rate = jnp.asarray(frames.level_rate)
+    rate = jnp.asarray(frames.blend_rate)
     follows = (rate > 0)[:, None]  # another frame follows
     exists = jnp.concatenate([jnp.asarray(frames.present)[None], (rate > 0)[:-1]])[:, None]
     counts = jnp.where(follows, counts, 0)
@@ -310,8 +310,8 @@ def counts_around(
     Known are those since the left edge of the piece's exposure, or, before the first one, since
     the window's start. Also the seconds (times, 1) of both stretches.
     """
-    frames, f = passage.frames, jnp.asarray(points.level)
-    rate = jnp.asarray(frames.level_rate)[f][:, None]
+    frames, f = passage.frames, jnp.asarray(points.frame)
+    rate = jnp.asarray(frames.blend_rate)[f][:, None]
     elapsed = jnp.asarray(points.elapsed)[:, None] - late(params, frames)
     behind = jnp.asarray(points.elapsed)[:, None] < 0  # before the first frame
     since = jnp.stack([points.on, points.off])
@@ -372,7 +372,7 @@ class Smoother(ImageEstimator[Params]):
 
     def read(self, params: Params, trajectory: Passage, out: ReadOut) -> Estimate:
         points = out.at(params.rho_ref).points
-        f, behind = jnp.asarray(points.level), jnp.asarray(points.elapsed)[:, None] < 0
+        f, behind = jnp.asarray(points.frame), jnp.asarray(points.elapsed)[:, None] < 0
         since, until, elapsed, seconds = counts_around(params, trajectory, points)
 
         later = jax.tree.map(lambda v: v[f], trajectory.future)
