@@ -115,46 +115,41 @@ def _read(stream, own, row, times, frame, counts, slot_map, states, dead, reach,
 
     Begins with the event `row` of the window's `own` and returns the next one.
     """
-    pixels = len(states.last)
-    seen = np.full(pixels, -1)
+    # Arrays get names of their own: reading them from tuples in the loops takes far longer.
+    t, x, y, p, width = stream.t, stream.x, stream.y, stream.p, stream.width
+    count, last, at, rank_of = states.count, states.last, states.slot, states.rank
+    kind, lane_of, shapes = slot_map.kind, slot_map.lane, slot_map.shapes
+    round_tile, round_first = slot_map.round_tile, slot_map.round_first
+    slot, since, on, off = out.slot, out.since, out.on, out.off
+    seen = np.full(len(last), -1)
     for j in range(len(times)):
-        while row < own and stream.t[row] <= times[j]:
-            _take_event(stream, row, slot_map, states, dead)
+        while row < own and t[row] <= times[j]:
+            pixel = np.int64(y[row]) * width + x[row]
+            count[0 if p[row] else 1, pixel] += equivalent(t[row] - last[pixel], dead)
+            last[pixel] = t[row]
+            if slot_map.known:
+                k, lane, rank = kind[pixel], lane_of[pixel], rank_of[pixel]
+                ranks, lanes = shapes[k, 0], shapes[k, 1]
+                rank_of[pixel] = rank + 1
+                tile = round_tile[round_first[k] + rank // ranks] + lane // lanes
+                at[pixel] = tile * SLOTS + rank % ranks * lanes + lane % lanes
             row += 1
         base = counts.left[frame[j]] if frame[j] >= 0 else counts.start
-        for pixel in range(pixels):
-            out.slot[j, pixel] = states.slot[pixel]
-            out.since[j, pixel] = max(times[j] - states.last[pixel], 0) * 1e-6
-            out.on[j, pixel] = states.count[0, pixel] - base[0, pixel]
-            out.off[j, pixel] = states.count[1, pixel] - base[1, pixel]
+        for pixel in range(len(last)):
+            slot[j, pixel] = at[pixel]
+            since[j, pixel] = max(times[j] - last[pixel], 0) * 1e-6
+            on[j, pixel] = count[0, pixel] - base[0, pixel]
+            off[j, pixel] = count[1, pixel] - base[1, pixel]
         after = row
-        while after < len(stream.t) and stream.t[after] <= times[j] + reach:
-            pixel = np.int64(stream.y[after]) * stream.width + stream.x[after]
-            last = states.last[pixel]
-            gap = stream.t[after] - last
-            if seen[pixel] != j and last > origin and 0 < gap <= reach:
-                part = equivalent(gap, dead) * (times[j] - last) / gap
-                if stream.p[after]:
-                    out.on[j, pixel] += part
+        while after < len(t) and t[after] <= times[j] + reach:
+            pixel = np.int64(y[after]) * width + x[after]
+            gap = t[after] - last[pixel]
+            if seen[pixel] != j and last[pixel] > origin and 0 < gap <= reach:
+                part = equivalent(gap, dead) * (times[j] - last[pixel]) / gap
+                if p[after]:
+                    on[j, pixel] += part
                 else:
-                    out.off[j, pixel] += part
+                    off[j, pixel] += part
             seen[pixel] = j
             after += 1
     return row
-
-
-@compiled
-def _take_event(stream, row, slot_map, states, dead):
-    """Bring an event's pixel to it."""
-    t = stream.t[row]
-    pixel = np.int64(stream.y[row]) * stream.width + stream.x[row]
-    states.count[0 if stream.p[row] else 1, pixel] += equivalent(t - states.last[pixel], dead)
-    states.last[pixel] = t
-    if slot_map.known:
-        k = slot_map.kind[pixel]
-        ranks, lanes = slot_map.shapes[k, 0], slot_map.shapes[k, 1]
-        r = states.rank[pixel]
-        states.rank[pixel] = r + 1
-        lane = slot_map.lane[pixel]
-        tile = slot_map.round_tile[slot_map.round_first[k] + r // ranks] + lane // lanes
-        states.slot[pixel] = tile * SLOTS + r % ranks * lanes + lane % lanes

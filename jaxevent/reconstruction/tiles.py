@@ -197,8 +197,7 @@ def _sort(stream, top, bottom, origin, cursor, latest, order):
 @compiled
 def _fill(worker, workers, kind, order, times, counts, last, dead, slots):
     """Write the slots of 64 lanes at a time: 64 sequential streams in, whole cache lines out."""
-    first, lane_count = kind.first, len(kind.pixels)
-    counted, integer = counts.start.dtype, np.int64
+    lane_count, counted, integer = len(kind.pixels), counts.start.dtype, np.int64
     lanes = LaneStates(
         np.empty(64, integer), np.empty(64, integer), np.empty(64, integer),
         np.empty(64, counted), np.empty(64, counted),
@@ -206,99 +205,87 @@ def _fill(worker, workers, kind, order, times, counts, last, dead, slots):
     )  # fmt: skip
     jobs = (lane_count + kind.width - 1) // kind.width * kind.width // 64
     for job in range(worker, jobs, workers):
-        block, lane0 = job * 64 // kind.width, job * 64
-        busiest = first[block * kind.width + 1] - first[block * kind.width]
-        rounds = (busiest + kind.ranks - 1) // kind.ranks
-        for k in range(min(64, lane_count - lane0)):
-            _begin_lane(lanes, k, kind.pixels[lane0 + k], counts, last, times)
-        for rank in range(rounds * kind.ranks):
-            tile = kind.round_tile[rank // kind.ranks] + block
-            if rank % kind.ranks == 0:
-                slots.kind[tile] = kind.place
-                slots.lane[tile] = kind.offset + block * kind.width
-            base = rank % kind.ranks * kind.width + lane0 - block * kind.width
-            for k in range(64):
-                lane = lane0 + k
-                if lane >= lane_count or rank >= first[lane + 1] - first[lane]:
-                    _clear_slot(slots, tile, base + k)
-                else:
-                    event, pixel = first[lane] + rank, kind.pixels[lane]
-                    _fill_slot(
-                        slots, tile, base + k, order.key[event], order.near[event],
-                        lanes, k, pixel, times, counts, dead,
-                    )  # fmt: skip
-        for k in range(min(64, lane_count - lane0)):
-            last[kind.pixels[lane0 + k]] = lanes.before[k] + times.origin
+        lane0 = job * 64
+        mine = kind.pixels[lane0 : lane0 + 64]
+        for k, pixel in enumerate(mine):
+            lanes.piece[k] = -1
+            lanes.frame[k] = -1
+            lanes.on[k], lanes.off[k] = counts.start[0, pixel], counts.start[1, pixel]
+            lanes.before[k] = last[pixel] - times.origin
+        _fill_lanes(lane0, mine, lanes, kind, order, times, counts, dead, slots)
+        for k, pixel in enumerate(mine):
+            last[pixel] = lanes.before[k] + times.origin
 
 
 @compiled
-def _begin_lane(lanes, k, pixel, counts, last, times):
-    lanes.piece[k] = -1
-    lanes.frame[k] = -1
-    lanes.on[k], lanes.off[k] = counts.start[0, pixel], counts.start[1, pixel]
-    lanes.before[k] = last[pixel] - times.origin
-
-
-@compiled
-def _clear_slot(slots, tile, slot):
-    slots.since[tile, slot] = slots.near[tile, slot] = 0
-    slots.weight[tile, slot] = slots.blend[tile, slot] = 0
-    slots.piece_cell[tile, slot] = slots.frame_cell[tile, slot] = 0
-    slots.on[tile, slot] = slots.off[tile, slot] = 0
-    slots.polarity[tile, slot] = 0
-
-
-@compiled
-def _fill_slot(slots, tile, slot, key, near, lanes, k, pixel, times, counts, dead):
-    """Write an event of lane k and bring the lane to it."""
-    now, up, pixels = key >> 1, key & 1, counts.start.shape[1]
-    pieces, frames = len(times.breaks), len(times.mids)
-    piece = lanes.piece[k]
-    if piece < 0 or (piece < pieces and times.breaks[piece] <= now):
-        piece = _enter_piece(lanes, k, pixel, now, times, counts)
-    frame = lanes.frame[k]
-    while frame + 1 < frames and times.mids[frame + 1] <= now:
-        frame += 1
-    lanes.frame[k] = frame
-    slots.since[tile, slot] = (now - lanes.before[k]) * 1e-6
-    events = equivalent(now - lanes.before[k], dead)
-    lanes.before[k] = now
-    slots.near[tile, slot] = near
-    weight = 0.0
-    if piece > 0 and piece < pieces:
-        weight = (now - times.breaks[piece - 1]) * times.weight_rate[piece - 1]
-    slots.weight[tile, slot] = weight
-    blend = 0.0
-    if frame >= 0 and frame + 1 < frames:
-        blend = (now - times.mids[frame]) * times.blend_rate[frame]
-    slots.blend[tile, slot] = blend
-    slots.piece_cell[tile, slot] = piece * pixels + pixel
-    slots.frame_cell[tile, slot] = max(frame, 0) * pixels + pixel
-    slots.on[tile, slot] = lanes.on[k] - lanes.own_on[k]
-    slots.off[tile, slot] = lanes.off[k] - lanes.own_off[k]
-    if up:
-        lanes.on[k] += events
-    else:
-        lanes.off[k] += events
-    slots.polarity[tile, slot] = 2 * up - 1
-
-
-@compiled
-def _enter_piece(lanes, k, pixel, now, times, counts):
-    """Bring lane k to the piece that contains `now`, and to the counts where its exposure began."""
-    pieces, exposed = len(times.breaks), times.exposed
-    piece = lanes.piece[k]
-    fresh = piece < 0  # the window may start in the middle of a piece
-    own = (piece - 1) // 2 if exposed else piece - 1
-    piece = max(piece, 0)
-    while piece < pieces and times.breaks[piece] <= now:
-        piece += 1
-    lanes.piece[k] = piece
-    new = (piece - 1) // 2 if exposed else piece - 1
-    if new < 0:
-        lanes.own_on[k], lanes.own_off[k] = counts.start[0, pixel], counts.start[1, pixel]
-    elif fresh or not times.aligned[new]:
-        lanes.own_on[k], lanes.own_off[k] = counts.left[new, 0, pixel], counts.left[new, 1, pixel]
-    elif new != own:
-        lanes.own_on[k], lanes.own_off[k] = lanes.on[k], lanes.off[k]
-    return piece
+def _fill_lanes(lane0, mine, lanes, kind, order, times, counts, dead, slots):
+    """Write the slots of the lanes from `lane0` on, of the pixels `mine`, and bring `lanes` on."""
+    # Arrays get names of their own: reading them from tuples in the loop takes four times as long.
+    since, near, weight, blend = slots.since, slots.near, slots.weight, slots.blend
+    piece_cell, frame_cell, polarity = slots.piece_cell, slots.frame_cell, slots.polarity
+    on, off, key, gap = slots.on, slots.off, order.key, order.near
+    piece_at, frame_at, before = lanes.piece, lanes.frame, lanes.before
+    count_on, count_off, own_on, own_off = lanes.on, lanes.off, lanes.own_on, lanes.own_off
+    breaks, mids, aligned, exposed = times.breaks, times.mids, times.aligned, times.exposed
+    weight_rate, blend_rate = times.weight_rate, times.blend_rate
+    first, start, left, pixels = kind.first, counts.start, counts.left, counts.start.shape[1]
+    block = lane0 // kind.width
+    busiest = first[block * kind.width + 1] - first[block * kind.width]
+    rounds = (busiest + kind.ranks - 1) // kind.ranks
+    for rank in range(rounds * kind.ranks):
+        tile = kind.round_tile[rank // kind.ranks] + block
+        if rank % kind.ranks == 0:
+            slots.kind[tile] = kind.place
+            slots.lane[tile] = kind.offset + block * kind.width
+        base = rank % kind.ranks * kind.width + lane0 - block * kind.width
+        for k in range(64):
+            slot = base + k
+            if k >= len(mine) or rank >= first[lane0 + k + 1] - first[lane0 + k]:
+                since[tile, slot] = near[tile, slot] = 0
+                weight[tile, slot] = blend[tile, slot] = 0
+                piece_cell[tile, slot] = frame_cell[tile, slot] = 0
+                on[tile, slot] = off[tile, slot] = 0
+                polarity[tile, slot] = 0
+                continue
+            pixel, event = mine[k], first[lane0 + k] + rank
+            now, up = key[event] >> 1, key[event] & 1
+            piece = piece_at[k]
+            if piece < 0 or (piece < len(breaks) and breaks[piece] <= now):
+                fresh = piece < 0  # the window may start in the middle of a piece
+                own = (piece - 1) // 2 if exposed else piece - 1
+                piece = max(piece, 0)
+                while piece < len(breaks) and breaks[piece] <= now:
+                    piece += 1
+                piece_at[k] = piece
+                new = (piece - 1) // 2 if exposed else piece - 1
+                if new < 0:
+                    own_on[k], own_off[k] = start[0, pixel], start[1, pixel]
+                elif fresh or not aligned[new]:
+                    own_on[k], own_off[k] = left[new, 0, pixel], left[new, 1, pixel]
+                elif new != own:
+                    own_on[k], own_off[k] = count_on[k], count_off[k]
+            frame = frame_at[k]
+            while frame + 1 < len(mids) and mids[frame + 1] <= now:
+                frame += 1
+            frame_at[k] = frame
+            since[tile, slot] = (now - before[k]) * 1e-6
+            events = equivalent(now - before[k], dead)
+            before[k] = now
+            near[tile, slot] = gap[event]
+            w = 0.0
+            if piece > 0 and piece < len(breaks):
+                w = (now - breaks[piece - 1]) * weight_rate[piece - 1]
+            weight[tile, slot] = w
+            v = 0.0
+            if frame >= 0 and frame + 1 < len(mids):
+                v = (now - mids[frame]) * blend_rate[frame]
+            blend[tile, slot] = v
+            piece_cell[tile, slot] = piece * pixels + pixel
+            frame_cell[tile, slot] = max(frame, 0) * pixels + pixel
+            on[tile, slot] = count_on[k] - own_on[k]
+            off[tile, slot] = count_off[k] - own_off[k]
+            if up:
+                count_on[k] += events
+            else:
+                count_off[k] += events
+            polarity[tile, slot] = 2 * up - 1
