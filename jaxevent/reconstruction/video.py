@@ -189,16 +189,16 @@ class Video(Generic[P]):
             end = len(times) if stop is None else int(np.searchsorted(times, stop))
             for first in range(done, end, BATCH):
                 batch = times[first : min(first + BATCH, end)]
-                out = self._placed(reader(batch))
+                out = self._place(reader(batch))
                 yield batch, _read(self.estimator, self.params, trajectory, out)
             done = end
 
-    def _placed(self, part: Any) -> Any:
-        """Features or a read-out on the devices."""
+    def _place(self, part: Any) -> Any:
+        """Put features or a read-out on the devices."""
         return part if self._mesh is None else part.over(self._devices)
 
-    def _shared_out(self, state: Any) -> Any:
-        """A state or message on the devices; else every change of how it lies would be compiled."""
+    def _share_out(self, state: Any) -> Any:
+        """Put a state or message on the devices; else every change of where it lies is compiled."""
         return state if self._mesh is None else over_pixels(state, self._mesh, self._windows.pixels)
 
     def _window_of(self, time: int) -> FilteredWindow:
@@ -237,12 +237,12 @@ class Video(Generic[P]):
     def _filter(self, begin: Begin) -> tuple[FilteredWindow, Begin]:
         """Prepare and filter the window that begins there; and where the next one begins."""
         window, features = self._windows.prepare(begin.start, begin.before)
-        features = self._placed(features)
+        features = self._place(features)
         state = begin.state
         if state is None:
             state = _start(self.estimator, self.params, features)
         future = None if self._future is None else self._future[begin.start]
-        state, future = self._shared_out((state, future))
+        state, future = self._share_out((state, future))
         trajectory, end = _run(self.estimator, self.params, features, state, future)
         jax.block_until_ready(trajectory)  # before the next window's tiles overwrite these
         following = Begin(window.stop, window.after, end)
