@@ -4,7 +4,7 @@ import functools
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 import numpy as np
@@ -27,6 +27,7 @@ BEGINS = 32  # windows from which filtering can be taken up again
 BATCH = 8  # images read per call; 8 x 90,000 pixels stay in the second-level cache
 
 
+@runtime_checkable
 class ImageMethod(Protocol):
     """What a video needs of its estimator; see `estimator.ImageEstimator`."""
 
