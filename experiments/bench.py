@@ -35,7 +35,7 @@ from jaxevent.blob.filters.ellipse import truncation
 from jaxevent.blob.filters.steps import Batch
 from jaxevent.io import load, save
 from jaxevent.reconstruction.filtering import Observation, Observer, State, Trajectory
-from jaxevent.reconstruction.pixels import Windows
+from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate import blob_scene
 
@@ -211,9 +211,8 @@ def filter_seconds(recording: Recording) -> float:
     params = jaxevent.akf.Params()
     look = jax.jit(lambda observer, tiles: observer(tiles.points))
     windows = []
-    for window in Windows(recording):
-        assert window.features is not None
-        features = jax.device_put(window.features)
+    for _, features in WindowedRecording(recording):
+        features = jax.device_put(features)
         observer = jaxevent.akf.observe(params, features.frames)
         known = look(observer, features.tiles)
         tiles = eqx.tree_at(
@@ -240,7 +239,7 @@ def filter_seconds(recording: Recording) -> float:
 
 def prepare_seconds(recording: Recording) -> float:
     def run():
-        for _ in Windows(recording, reuse=True):
+        for _ in WindowedRecording(recording, reuse=True):
             pass
 
     return best(run)

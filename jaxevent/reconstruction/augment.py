@@ -3,7 +3,7 @@
 Equation numbers are those of Wang et al., "An Asynchronous Kalman Filter for Hybrid Event Cameras",
 ICCV 2021. Letters: L log intensity ln(I + I0), c contrast threshold, T exposure, tau mid-exposure.
 Each model makes its tables, [rows, pixels], once per window; called with points (where they lie
-among the frames, `pixels.Points`) it looks them up.
+among the frames, `features.Points`) it looks them up.
 """
 
 import functools
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.parameters import Choice, Number, Parameters, Positive
-from jaxevent.reconstruction.pixels import FrameFeatures, Points
+from jaxevent.reconstruction.features import FrameFeatures, Points
 
 
 class FrameParams(Parameters):
@@ -78,11 +78,11 @@ def event_change(params: FrameParams, polarity: Array, since: Array) -> Array:
 def unclipped(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
     """1 where a grey value says what the intensity was, 0 where it is black or white.
 
-    A clipped pixel with noise reads a few levels from the end; the edge at `margin` is soft, a
-    tenth of a level wide, so that the margin can be tuned by gradient.
+    A clipped pixel with noise reads a few grey values from the end; the edge at `margin` is soft, a
+    tenth of a grey value wide, so that the margin can be tuned by gradient.
     """
-    level = 255 * jnp.minimum(frames.grey, 1 - frames.grey)
-    inside = jax.nn.sigmoid(10 * (level - params.margin))
+    distance = 255 * jnp.minimum(frames.grey, 1 - frames.grey)
+    inside = jax.nn.sigmoid(10 * (distance - params.margin))
     return jnp.where(params.margin > 0, inside, 1)
 
 
@@ -112,13 +112,13 @@ def clipped_side(params: CertaintyParams, frames: FrameFeatures) -> Float[Array,
     return jnp.where(jnp.asarray(frames.grey) > 0.5, 1, -1) * (1 - unclipped(params, frames))
 
 
-def bound_of(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
+def clipping_bound(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
     """The log intensity at which pixels begin to clip: that of a grey `margin` from the end."""
-    levels, response = jnp.arange(256), jnp.asarray(frames.response)
+    greys, response = jnp.arange(256), jnp.asarray(frames.response)
     margin = jnp.clip(params.margin, 0, 127)
     gain = jnp.asarray(frames.gain)[:, None]
     dark, bright = (
-        jnp.log(jnp.interp(margin, levels, end) / gain + params.I0)
+        jnp.log(jnp.interp(margin, greys, end) / gain + params.I0)
         for end in (response, response[::-1])
     )
     return jnp.where(jnp.asarray(frames.grey) > 0.5, bright, dark)
@@ -138,12 +138,12 @@ def _spline(knots: int) -> NDArray[np.floating]:
     return kind(np.linspace(0, 1, SPLINE))
 
 
-def late(params: FrameParams, frames: FrameFeatures) -> Float[Array, ""]:
-    """Seconds by which the frames' clock differs from the one that was prepared; 0 in `video`."""
+def clock_lag(params: FrameParams, frames: FrameFeatures) -> Float[Array, ""]:
+    """Seconds by which the frames' clock differs from the one prepared for; 0 in a `Video`."""
     return params.clock_offset - frames.clock_offset
 
 
-def deblurred(
+def deblur_frames(
     params: FrameParams, frames: FrameFeatures
 ) -> tuple[Float[Array, "frames pixels"], Float[Array, "frames pixels"]]:
     """Log intensity at the left and right edge of each exposure (event double integral).
@@ -156,9 +156,9 @@ def deblurred(
     if frames.segments is None or frames.head is None or frames.tail is None:
         return level, level
     s = frames.segments
-    share = s.share + late(params, frames) * s.edge
+    share = s.share + clock_lag(params, frames) * s.edge
     excess = share * jnp.expm1(brightness(params, s.on, s.off))
-    total = jax.ops.segment_sum(excess, s.cell, level.size).reshape(level.shape)
+    total = jax.ops.segment_sum(excess, s.frame_cell, level.size).reshape(level.shape)
     level = level - jnp.log1p(total) * params.deblur
     return (
         level - brightness(params, frames.head[0], frames.head[1]),
@@ -178,7 +178,7 @@ def believed_rate(params: AugmentParams, frames: FrameFeatures) -> Float[Array, 
 
 
 class Level(eqx.Module):
-    """Base of the models of log intensity."""
+    """A model of the log intensity at any time, from what the frames say."""
 
     Params: ClassVar[type[FrameParams]] = FrameParams
 
@@ -210,7 +210,7 @@ class Augmented(Level):
     lag: Float[Array, " pieces"]
 
     def __init__(self, params: AugmentParams, frames: FrameFeatures):
-        left, right = deblurred(params, frames)
+        left, right = deblur_frames(params, frames)
         span = brightness(params, frames.span[0], frames.span[1])  # row f: from frame f to f + 1
         following = jnp.roll(right, -1, axis=0)
         ratio = (following - left) / jnp.where(span == 0, 1, span)
@@ -239,7 +239,7 @@ class Augmented(Level):
             ]
         from_base, from_ratio, to_base, to_ratio = rows
         self.params = params
-        self.lag = late(params, frames) * frames.piece_rate
+        self.lag = clock_lag(params, frames) * frames.weight_rate
         self.tilt = None
         if params.weighting == "certainty":
             trust = believed_rate(params, frames)
@@ -274,7 +274,7 @@ class EventIntegral(Level):
     base: Float[Array, "pieces pixels"]
 
     def __init__(self, params: FrameParams, frames: FrameFeatures):
-        left, right = deblurred(params, frames)
+        left, right = deblur_frames(params, frames)
         first = right[0] - brightness(params, frames.before[0], frames.before[1])
         if frames.head is not None:  # an exposure and the gap after it are two pieces
             left = jnp.repeat(left, 2, axis=0)
@@ -329,7 +329,7 @@ class BetweenFrames(eqx.Module):
     def __init__(
         self, params: FrameParams, frames: FrameFeatures, table: Float[Array, "frames pixels"]
     ):
-        lag = late(params, frames) * frames.level_rate[:, None]
+        lag = clock_lag(params, frames) * frames.blend_rate[:, None]
         self.here, self.there = _lagging(lag, table, jnp.roll(table, -1, axis=0))
 
     def __call__(self, points: Points) -> Float[Array, "*points"]:

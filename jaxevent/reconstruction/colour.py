@@ -34,7 +34,7 @@ def luminance(rgb: ArrayLike) -> NDArray[np.floating]:
 
     Raises `InputError` for arrays that are not floats of three channels.
     """
-    colours = _colours(rgb)
+    colours = _check_colours(rgb)
     return np.asarray(colours @ np.asarray(REC709, colours.dtype))
 
 
@@ -48,7 +48,7 @@ def chrominance(
     where the brightest channel is between `black` and 0 and noise makes the ratio; luminance 0 is
     grey in any case. Raises `InputError` for arrays that are not floats of three channels.
     """
-    colours = _colours(rgb)
+    colours = _check_colours(rgb)
     y = luminance(colours)[..., None]
     light = y > 0
     ratio = np.where(light, colours / np.where(light, y, 1), 1)
@@ -65,7 +65,7 @@ def apply_chrominance(luminance: ArrayLike, chroma: ArrayLike) -> NDArray[np.flo
     Hue and saturation are those of the chrominance at every luminance. Raises `InputError` for
     shapes that do not fit together.
     """
-    y, ratio = np.asarray(luminance), _colours(chroma)
+    y, ratio = np.asarray(luminance), _check_colours(chroma)
     try:
         return y[..., None] * ratio
     except ValueError as error:
@@ -75,7 +75,8 @@ def apply_chrominance(luminance: ArrayLike, chroma: ArrayLike) -> NDArray[np.flo
         ) from error
 
 
-def _colours(rgb: ArrayLike) -> NDArray[np.floating]:
+def _check_colours(rgb: ArrayLike) -> NDArray[np.floating]:
+    """The colours as an array; `InputError` unless they are floats of three channels."""
     colours = np.asarray(rgb)
     if colours.dtype.kind != "f" or colours.shape[-1:] != (3,):
         raise InputError(
@@ -111,7 +112,7 @@ def colour_video(video: Video[Any], recording: Recording) -> Callable[..., NDArr
             f"{own.width}x{own.height}; give the recording that was reconstructed"
         )
     table = np.asarray(recording.response.intensity(np.arange(256) / 255), np.float32)
-    # Levels within 3 of an end may be clipped ones that noise moved.
+    # Grey values within 3 of an end may be clipped ones that noise moved.
     black, white = float(table[3]), float(table[252])
     frame_t = frames.t + round(float(video.params.clock_offset) * 1e6)
 

@@ -20,6 +20,7 @@ from jaxevent.reconstruction.augment import (
     Nothing,
     event_change,
 )
+from jaxevent.reconstruction.features import FrameFeatures, Points
 from jaxevent.reconstruction.filtering import (
     Event,
     Filter,
@@ -28,7 +29,6 @@ from jaxevent.reconstruction.filtering import (
     State,
     without_variance,
 )
-from jaxevent.reconstruction.pixels import FrameFeatures, Points
 
 
 class Params(FrameParams):

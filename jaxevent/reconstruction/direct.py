@@ -13,6 +13,7 @@ from jaxevent.reconstruction.augment import (
     Held,
     Level,
 )
+from jaxevent.reconstruction.features import FrameFeatures, Points
 from jaxevent.reconstruction.filtering import (
     Filter,
     Observation,
@@ -20,7 +21,6 @@ from jaxevent.reconstruction.filtering import (
     State,
     without_variance,
 )
-from jaxevent.reconstruction.pixels import FrameFeatures, Points
 
 
 class Direct(Observer):

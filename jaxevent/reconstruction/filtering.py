@@ -1,4 +1,4 @@
-"""The one driver of all per-pixel methods: filter events tile by tile, read at any time.
+"""The one driver of all per-pixel filters: filter events tile by tile, read at any time.
 
 A `Filter` is a handful of pure functions of one pixel, written in scalars beside the paper's
 equations; this module supplies what all share: `run` scans the ranks of a window's tiles and maps
@@ -9,7 +9,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,27 +18,18 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxevent.estimator import Estimate, Estimator
+from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.pixels import (
-    SHAPES,
-    SLOTS,
+from jaxevent.reconstruction.estimator import ImageEstimator, P
+from jaxevent.reconstruction.features import (
     Features,
     FrameFeatures,
     Numeric,
     Points,
     ReadOut,
     Tiles,
-    Timing,
-    check_times,
-    prepare,
 )
-from jaxevent.recording import Recording, Times
-
-if TYPE_CHECKING:
-    from jaxevent.reconstruction.video import Video
-
-P = TypeVar("P", bound=FrameParams)
+from jaxevent.reconstruction.layout import SHAPES, SLOTS
 
 
 class State(eqx.Module):
@@ -76,7 +67,7 @@ class Event(eqx.Module):
 
 
 class Place(eqx.Module):
-    """Which lanes tiles serve, and in which shape (`pixels.Tiles`)."""
+    """Which lanes tiles serve, and in which shape (`features.Tiles`)."""
 
     kind: Int[Array, " tiles"]
     lane: Int[Array, " tiles"]
@@ -109,81 +100,6 @@ class Trajectory(eqx.Module):
             return jnp.where(slot < 0, start, path.at[slot].get(mode="clip"))
 
         return jax.tree.map(look, self.start, self.path)
-
-
-@dataclasses.dataclass(frozen=True)
-class ImageEstimator(Estimator[P]):
-    """A reconstruction method.
-
-    Images are `Estimate`s: `mean` is intensity, 0 the frames' black and 1 their white, and goes
-    beyond; `covariance` is the variance of log intensity ln(I + I0), NaN of methods that estimate
-    none; `valid` is false where the intensity is not a finite number.
-    """
-
-    family: ClassVar[str] = "reconstruction"
-    has_likelihood: ClassVar[bool] = False  # whether it has `log_likelihood` of the frames given
-    options: frozenset[str] = dataclasses.field(
-        default=frozenset({"window_events", "devices"}), kw_only=True
-    )
-
-    @property
-    @abc.abstractmethod
-    def filters(self) -> bool:
-        """Whether it passes over single events."""
-
-    @property
-    def looks_ahead(self) -> bool:
-        """Whether `run` needs what later windows say."""
-        return False
-
-    @abc.abstractmethod
-    def start(self, params: P, features: Features) -> Any:
-        """The state at the recording's start, from the features of its first window."""
-
-    @abc.abstractmethod
-    def run(
-        self, params: P, features: Features, state: Any = None, future: Any = None
-    ) -> tuple[Any, Any]:
-        """Estimate a window; pure, so it jits, vmaps over `params` and differentiates.
-
-        `state` is what the window before returned; omitted, the recording starts here. `future` is
-        what later windows say, for estimators that look ahead; omitted, there are none. Returns
-        the trajectory, to `read` images from, and the state for the next window.
-        """
-
-    @abc.abstractmethod
-    def read(self, params: P, trajectory: Any, out: ReadOut) -> Estimate:
-        """The images prepared in `out`, each array (times, pixels); pure, as `run`."""
-
-    def prepare(
-        self,
-        recording: Recording,
-        times: Times,
-        params: P | None = None,
-        *,
-        extrapolate: bool = False,
-    ) -> tuple[Features, ReadOut]:
-        """A whole recording for `run`, and points of images at sorted `times` for `read`.
-
-        See `pixels.prepare`; prepared for those of the `params` that act through comparisons with
-        event times. Raises `InputError` if the recording lacks what the method needs, and for times
-        that are not sorted or, unless told to `extrapolate`, outside the recording.
-        """
-        self.check(recording)
-        params = self.Params() if params is None else params
-        if not extrapolate:
-            check_times(recording, times, params.clock_offset)
-        return prepare(recording, times, *Timing.of(params), filtering=self.filters)
-
-    def estimate(self, recording: Recording, params: P | None = None, **options: Any) -> "Video[P]":
-        """Video of a recording: `image, variance, valid = estimate(recording, params)(times)`.
-
-        `options` are those of `Video`. Raises `InputError` if the recording lacks what the method
-        needs.
-        """
-        from jaxevent.reconstruction.video import Video
-
-        return Video(self, recording, self.Params() if params is None else params, **options)
 
 
 def log_intensity(params: FrameParams, state: Any) -> tuple[Array, Array]:

@@ -15,12 +15,12 @@ from jaxevent.reconstruction.augment import (
     BetweenFrames,
     belief,
     believed_rate,
-    bound_of,
     clipped_side,
+    clipping_bound,
     event_change,
 )
+from jaxevent.reconstruction.features import FrameFeatures, Points
 from jaxevent.reconstruction.filtering import Event, Filter, Observation, Observer, State
-from jaxevent.reconstruction.pixels import FrameFeatures, Points
 
 
 class Params(AugmentParams):
@@ -100,7 +100,7 @@ class Augmentation(Observer):
             self.density = BetweenFrames(params, frames, Rbar)
         side = clipped_side(params, frames)
         # A clipped value tells its side, no more: dark ones differ by how noise is rounded.
-        edge = bound_of(params, frames)
+        edge = clipping_bound(params, frames)
         self.clipped = abs(side)
         self.begin = edge + jnp.where(side > 0, params.above, -params.below)
         self.bound = self.push = None

@@ -31,16 +31,16 @@ from jaxevent.estimator import Estimate
 from jaxevent.parameters import Choice, Positive
 from jaxevent.reconstruction.augment import (
     CertaintyParams,
-    bound_of,
     brightness,
     certainty,
     clipped_side,
-    deblurred,
-    late,
+    clipping_bound,
+    clock_lag,
+    deblur_frames,
     unclipped,
 )
-from jaxevent.reconstruction.filtering import ImageEstimator
-from jaxevent.reconstruction.pixels import (
+from jaxevent.reconstruction.estimator import ImageEstimator
+from jaxevent.reconstruction.features import (
     Features,
     FrameFeatures,
     ImagePoints,
@@ -156,21 +156,23 @@ class Passage(eqx.Module):
     log_likelihood: Float[Array, " frames"]  # of the frames, a sum over pixels
 
 
-def rows_of(params: Params, frames: FrameFeatures) -> tuple[Rows, Float[Array, "2 frames pixels"]]:
+def make_rows(
+    params: Params, frames: FrameFeatures
+) -> tuple[Rows, Float[Array, "2 frames pixels"]]:
     """Measurements and steps; and the counts of ON and OFF events between mid-exposures."""
     level = jnp.log(frames.intensity + params.I0)
     z, counts = level, frames.span
     if frames.head is not None and frames.tail is not None:
-        left, _ = deblurred(params, frames)
+        left, _ = deblur_frames(params, frames)
         z = left + brightness(params, frames.head[0], frames.head[1])
         counts = frames.span - frames.head - jnp.roll(frames.tail, -1, axis=1)
-    rate = jnp.asarray(frames.level_rate)
+    rate = jnp.asarray(frames.blend_rate)
     follows = (rate > 0)[:, None]  # another frame follows
     exists = jnp.concatenate([jnp.asarray(frames.present)[None], (rate > 0)[:-1]])[:, None]
     counts = jnp.where(follows, counts, 0)
-    moves = shared(params, frames, counts)
+    moves = share_events(params, frames, counts)
     gap = jnp.where(follows, 1 / jnp.where(follows, rate[:, None], 1), 0)
-    q = added(params, moves[0], moves[1], gap)
+    q = added_variance(params, moves[0], moves[1], gap)
     noise = params.sigma_frame / certainty(params, frames) / (frames.intensity + params.I0)
     clear = unclipped(params, frames)
     side = clipped_side(params, frames) * params.one_sided
@@ -180,14 +182,14 @@ def rows_of(params: Params, frames: FrameFeatures) -> tuple[Rows, Float[Array, "
         clear * exists,
         1 / (frames.intensity + params.I0),
         side * exists,
-        jnp.broadcast_to(bound_of(params, frames), z.shape),
+        jnp.broadcast_to(clipping_bound(params, frames), z.shape),
         brightness(params, moves[0], moves[1]),
         jnp.broadcast_to(q, z.shape),
     )
     return measured, counts
 
 
-def shared(params: Params, frames: FrameFeatures, counts: Array) -> Array:
+def share_events(params: Params, frames: FrameFeatures, counts: Array) -> Array:
     """Event counts [..., pixels] of which each pixel gives the part `share` to its neighbours.
 
     Between two events of a pixel its intensity moves by less than a threshold, unseen; events
@@ -211,13 +213,13 @@ def shared(params: Params, frames: FrameFeatures, counts: Array) -> Array:
     return mixed.reshape(counts.shape)
 
 
-def added(params: Params, on: Array, off: Array, seconds: Array) -> Array:
+def added_variance(params: Params, on: Array, off: Array, seconds: Array) -> Array:
     """Variance that a stretch of time adds."""
     events = params.c_on**2 * on + params.c_off**2 * off
     return params.sigma_event**2 * events + params.sigma_bg**2 * seconds
 
 
-def beyond(state: Gaussian, row: Rows, floor: Array) -> tuple[Message, Array]:
+def one_sided_message(state: Gaussian, row: Rows, floor: Array) -> tuple[Message, Array]:
     """One-sided evidence as the message that keeps the first two moments; its log likelihood.
 
     L is above the bound (side 1) with probability Phi(d), d = (m - bound) / sqrt(P + floor). The
@@ -249,7 +251,7 @@ def measure(params: Params, state: Gaussian, row: Rows) -> tuple[Gaussian, Messa
     # Of the intensity, not of its logarithm, whose density depends on I0: p(I) = p(z) dz/dI.
     log_gauss = -0.5 * (jnp.log(2 * jnp.pi * s2) + (row.z - state.m) ** 2 / s2)
     log_gauss = log_gauss + jnp.log(row.slope)
-    said, log_side = beyond(state, row, params.sigma_floor**2)
+    said, log_side = one_sided_message(state, row, params.sigma_floor**2)
     said = said + Message(J * row.z, J)
     P = state.P / (1 + state.P * said.J)
     # m + P (h - J m) is the information form's mean without its cancellation.
@@ -310,9 +312,9 @@ def counts_around(
     Known are those since the left edge of the piece's exposure, or, before the first one, since
     the window's start. Also the seconds (times, 1) of both stretches.
     """
-    frames, f = passage.frames, jnp.asarray(points.level)
-    rate = jnp.asarray(frames.level_rate)[f][:, None]
-    elapsed = jnp.asarray(points.elapsed)[:, None] - late(params, frames)
+    frames, f = passage.frames, jnp.asarray(points.frame)
+    rate = jnp.asarray(frames.blend_rate)[f][:, None]
+    elapsed = jnp.asarray(points.elapsed)[:, None] - clock_lag(params, frames)
     behind = jnp.asarray(points.elapsed)[:, None] < 0  # before the first frame
     since = jnp.stack([points.on, points.off])
     between = jnp.take(passage.events, f, axis=1)
@@ -328,7 +330,12 @@ def counts_around(
         until = jnp.where(behind, first, between - since)
     gap = jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), 0)
     seconds = jnp.where(behind, -elapsed, jnp.where(rate > 0, gap - elapsed, 0))
-    return shared(params, frames, since), shared(params, frames, until), elapsed, seconds
+    return (
+        share_events(params, frames, since),
+        share_events(params, frames, until),
+        elapsed,
+        seconds,
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -359,7 +366,7 @@ class Smoother(ImageEstimator[Params]):
     ) -> tuple[Passage, Gaussian]:
         """As `ImageEstimator.run`; the state is (pixels,), before the next window's first frame."""
         frames = features.at(params.rho_ref).frames
-        rows, counts = rows_of(params, frames)
+        rows, counts = make_rows(params, frames)
         state = self.start(params, features) if state is None else state
         number, anchor, onward = frames.rows
         ahead, past, said, likelihood = filter_forward(params, rows, state)
@@ -372,16 +379,19 @@ class Smoother(ImageEstimator[Params]):
 
     def read(self, params: Params, trajectory: Passage, out: ReadOut) -> Estimate:
         points = out.at(params.rho_ref).points
-        f, behind = jnp.asarray(points.level), jnp.asarray(points.elapsed)[:, None] < 0
+        f, behind = jnp.asarray(points.frame), jnp.asarray(points.elapsed)[:, None] < 0
         since, until, elapsed, seconds = counts_around(params, trajectory, points)
 
         later = jax.tree.map(lambda v: v[f], trajectory.future)
         later = jax.tree.map(lambda a, b: jnp.where(behind, a, b), trajectory.first, later)
-        S, q = brightness(params, until[0], until[1]), added(params, until[0], until[1], seconds)
+        S, q = (
+            brightness(params, until[0], until[1]),
+            added_variance(params, until[0], until[1], seconds),
+        )
         later = later.earlier(S, q)
         # Before the first frame there is no past: its variance is without bound.
         m = jnp.where(behind, 0, trajectory.past.m[f] + brightness(params, since[0], since[1]))
-        P = trajectory.past.P[f] + added(params, since[0], since[1], elapsed)
+        P = trajectory.past.P[f] + added_variance(params, since[0], since[1], elapsed)
         P = 1 / (jnp.where(behind, 0, 1 / jnp.where(behind, 1, P)) + later.J)
         m = m + P * (later.h - later.J * m)
         image = jnp.exp(m) - params.I0

@@ -4,7 +4,7 @@ import functools
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, Generic, NamedTuple
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 import numpy as np
@@ -13,38 +13,57 @@ from numpy.typing import NDArray
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.progress import bar
-from jaxevent.reconstruction.filtering import ImageEstimator, P
-from jaxevent.reconstruction.pixels import (
-    WINDOW_EVENTS,
-    Carry,
-    Features,
-    Reader,
-    ReadOut,
-    Timing,
-    Windows,
-    check_times,
-    over_pixels,
-    pixel_mesh,
-)
-from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.reconstruction.augment import FrameParams
+from jaxevent.reconstruction.clock import Timing, time_span
+from jaxevent.reconstruction.features import Features, ReadOut, over_pixels, pixel_mesh
+from jaxevent.reconstruction.reading import Reader
+from jaxevent.reconstruction.stream import StreamState
+from jaxevent.reconstruction.windows import WINDOW_EVENTS, EventWindow, WindowedRecording
+from jaxevent.recording import Recording, Times, check_times, microseconds
+
+P = TypeVar("P", bound=FrameParams)
 
 BEGINS = 32  # windows from which filtering can be taken up again
 BATCH = 8  # images read per call; 8 x 90,000 pixels stay in the second-level cache
 
 
+@runtime_checkable
+class ImageMethod(Protocol):
+    """What a video needs of its estimator; see `estimator.ImageEstimator`."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def filters(self) -> bool: ...
+
+    @property
+    def looks_ahead(self) -> bool: ...
+
+    def check(self, recording: Recording) -> None: ...
+
+    def start(self, params: Any, features: Features) -> Any: ...
+
+    def run(
+        self, params: Any, features: Features, state: Any = None, future: Any = None
+    ) -> tuple[Any, Any]: ...
+
+    def read(self, params: Any, trajectory: Any, out: ReadOut) -> Estimate: ...
+
+
 # jax.jit returns before the result is there; eqx.filter_jit waits for it.
 @functools.partial(jax.jit, static_argnums=0)
-def _start(estimator: ImageEstimator, params, features: Features):
+def _start(estimator: ImageMethod, params, features: Features):
     return estimator.start(params, features)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _run(estimator: ImageEstimator, params, features: Features, state, future):
+def _run(estimator: ImageMethod, params, features: Features, state, future):
     return estimator.run(params, features, state, future)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _read(estimator: ImageEstimator, params, trajectory, out: ReadOut):
+def _read(estimator: ImageMethod, params, trajectory, out: ReadOut):
     return estimator.read(params, trajectory, out)
 
 
@@ -52,12 +71,24 @@ class Begin(NamedTuple):
     """What filtering from a window's start needs; no state: the recording's beginning."""
 
     start: int | None
-    before: Carry
+    before: StreamState
     state: Any
 
     @property
     def time(self) -> float:
         return -math.inf if self.start is None else float(self.start)
+
+
+class FilteredWindow(NamedTuple):
+    """A window that images can be read from."""
+
+    window: EventWindow
+    reader: Reader
+    trajectory: Any
+
+    def contains(self, time: int) -> bool:
+        start, stop = self.window.start, self.window.stop
+        return (start is None or start <= time) and (stop is None or time < stop)
 
 
 class Video(Generic[P]):
@@ -72,7 +103,7 @@ class Video(Generic[P]):
 
     def __init__(
         self,
-        estimator: ImageEstimator[P],
+        estimator: ImageMethod,
         recording: Recording,
         params: P,
         *,
@@ -84,7 +115,7 @@ class Video(Generic[P]):
         self.estimator, self.recording, self.params = estimator, recording, params
         self.progress, self._devices = progress, devices
         self._mesh = pixel_mesh(devices)
-        self._windows = Windows(
+        self._windows = WindowedRecording(
             recording,
             Timing.of(params),
             filtering=estimator.filters,
@@ -92,7 +123,7 @@ class Video(Generic[P]):
             reuse=True,
         )
         self._begins = [Begin(None, self._windows.initial(), None)]
-        self._open: tuple[Reader, Any] | None = None
+        self._open: FilteredWindow | None = None
         self._future: dict[int | None, Any] | None = None  # by the start of the window
 
     def __repr__(self) -> str:
@@ -130,7 +161,8 @@ class Video(Generic[P]):
         if (times[1:] < times[:-1]).any():
             raise InputError("times must be sorted to be read in batches; sort them")
         if not extrapolate:
-            check_times(self.recording, times, self.params.clock_offset)
+            span = time_span(self.recording, self.params.clock_offset)
+            check_times(times, *span, self.recording.name)
         start, stop = self.recording.start, self.recording.stop
         with bar(total=len(times), unit="image", progress=self.progress) as shown:
             # One batch is computed while the next one is looked up in the events.
@@ -153,37 +185,34 @@ class Video(Generic[P]):
         """Batches of images on their way on the device."""
         done = 0
         while done < len(times):
-            reader, trajectory = self._window_of(int(times[done]))
-            stop = reader.window.stop
+            window, reader, trajectory = self._window_of(int(times[done]))
+            stop = window.stop
             end = len(times) if stop is None else int(np.searchsorted(times, stop))
             for first in range(done, end, BATCH):
                 batch = times[first : min(first + BATCH, end)]
-                out = self._placed(reader(batch))
+                out = self._place(reader(batch))
                 yield batch, _read(self.estimator, self.params, trajectory, out)
             done = end
 
-    def _placed(self, part: Any) -> Any:
-        """Features or a read-out on the devices."""
+    def _place(self, part: Any) -> Any:
+        """Put features or a read-out on the devices."""
         return part if self._mesh is None else part.over(self._devices)
 
-    def _shared_out(self, state: Any) -> Any:
-        """A state or message on the devices; else every change of how it lies would be compiled."""
+    def _share_out(self, state: Any) -> Any:
+        """Put a state or message on the devices; else every change of where it lies is compiled."""
         return state if self._mesh is None else over_pixels(state, self._mesh, self._windows.pixels)
 
-    def _window_of(self, time: int) -> tuple[Reader, Any]:
+    def _window_of(self, time: int) -> FilteredWindow:
         """The filtered window that contains `time`; windows on the way are filtered in order."""
         if self.estimator.looks_ahead and self._future is None:
             self._look_ahead()
-        if self._open is not None:
-            reader, trajectory = self._open
-            start, stop = reader.window.start, reader.window.stop
-            if (start is None or start <= time) and (stop is None or time < stop):
-                return self._open
+        if self._open is not None and self._open.contains(time):
+            return self._open
         begin = [b for b in self._begins if b.time <= time][-1]
         while True:
             self._open = None  # so that two windows are never held at once
             self._open, begin = self._filter(begin)
-            stop = self._open[0].window.stop
+            stop = self._open.window.stop
             if stop is None or time < stop:
                 return self._open
 
@@ -194,28 +223,27 @@ class Video(Generic[P]):
         with bar(total=total, unit="event", unit_scale=True, progress=self.progress) as shown:
             while True:
                 starts.append(begin.start)
-                (reader, trajectory), begin = self._filter(begin)
-                links.append((trajectory.link, trajectory.last))
-                shown.update(len(reader.window._events))
-                if reader.window.stop is None:
+                filtered, begin = self._filter(begin)
+                links.append((filtered.trajectory.link, filtered.trajectory.last))
+                shown.update(filtered.window.events)
+                if filtered.window.stop is None:
                     break
         message, future = links[-1][1], {starts[-1]: None}
         for place in range(len(starts) - 1, 0, -1):
             message = links[place][0].before(message)
             future[starts[place - 1]] = message
         self._future = future
-        self._open = reader, trajectory  # the last window has nothing later to know of
+        self._open = filtered  # the last window has nothing later to know of
 
-    def _filter(self, begin: Begin) -> tuple[tuple[Reader, Any], Begin]:
+    def _filter(self, begin: Begin) -> tuple[FilteredWindow, Begin]:
         """Prepare and filter the window that begins there; and where the next one begins."""
-        window = self._windows.prepare(begin.start, begin.before)
-        assert window.features is not None
-        features, window.features = self._placed(window.features), None  # used once, and large
+        window, features = self._windows.prepare(begin.start, begin.before)
+        features = self._place(features)
         state = begin.state
         if state is None:
             state = _start(self.estimator, self.params, features)
         future = None if self._future is None else self._future[begin.start]
-        state, future = self._shared_out((state, future))
+        state, future = self._share_out((state, future))
         trajectory, end = _run(self.estimator, self.params, features, state, future)
         jax.block_until_ready(trajectory)  # before the next window's tiles overwrite these
         following = Begin(window.stop, window.after, end)
@@ -223,4 +251,4 @@ class Video(Generic[P]):
             self._begins = sorted([*self._begins, following], key=lambda b: b.time)
             if len(self._begins) > BEGINS:  # the first one, the last one, and half of the others
                 self._begins = [self._begins[0], *self._begins[1:-1][::2], self._begins[-1]]
-        return (window.reader(BATCH, self._windows.dtype), trajectory), following
+        return FilteredWindow(window, window.reader(BATCH), trajectory), following

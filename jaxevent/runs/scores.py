@@ -27,7 +27,7 @@ from jaxevent.metrics import (
 )
 from jaxevent.parameters import nearest
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.filtering import ImageEstimator
+from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.config import is_texts
 from jaxevent.runs.external import External, Normalise, check_normalise, fit_brightness

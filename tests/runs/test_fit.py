@@ -31,7 +31,8 @@ from jaxevent import cli
 from jaxevent.estimator import Estimate
 from jaxevent.methods import HOMES, METHODS
 from jaxevent.parameters import Number, Parameters, Positive
-from jaxevent.reconstruction.filtering import Filter, ImageEstimator
+from jaxevent.reconstruction.estimator import ImageEstimator
+from jaxevent.reconstruction.filtering import Filter
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.runs.fit import fit
 from jaxevent.runs.protocols import Reference, held_out

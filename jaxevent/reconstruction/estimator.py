@@ -1,0 +1,86 @@
+"""The contract of reconstruction methods: `jaxevent.estimator` for images."""
+
+import abc
+import dataclasses
+from typing import Any, ClassVar
+
+from jaxevent.estimator import Estimate, Estimator
+from jaxevent.reconstruction.clock import Timing, time_span
+from jaxevent.reconstruction.features import Features, ReadOut
+from jaxevent.reconstruction.video import P, Video
+from jaxevent.reconstruction.windows import prepare
+from jaxevent.recording import Recording, Times, check_times
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageEstimator(Estimator[P]):
+    """A reconstruction method.
+
+    Images are `Estimate`s: `mean` is intensity, 0 the frames' black and 1 their white, and goes
+    beyond; `covariance` is the variance of log intensity ln(I + I0), NaN of methods that estimate
+    none; `valid` is false where the intensity is not a finite number.
+    """
+
+    family: ClassVar[str] = "reconstruction"
+    has_likelihood: ClassVar[bool] = False  # whether it has `log_likelihood` of the frames given
+    options: frozenset[str] = dataclasses.field(
+        default=frozenset({"window_events", "devices"}), kw_only=True
+    )
+
+    @property
+    @abc.abstractmethod
+    def filters(self) -> bool:
+        """Whether it passes over single events."""
+
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether `run` needs what later windows say."""
+        return False
+
+    @abc.abstractmethod
+    def start(self, params: P, features: Features) -> Any:
+        """The state at the recording's start, from the features of its first window."""
+
+    @abc.abstractmethod
+    def run(
+        self, params: P, features: Features, state: Any = None, future: Any = None
+    ) -> tuple[Any, Any]:
+        """Estimate a window; pure, so it jits, vmaps over `params` and differentiates.
+
+        `state` is what the window before returned; omitted, the recording starts here. `future` is
+        what later windows say, for estimators that look ahead; omitted, there are none. Returns
+        the trajectory, to `read` images from, and the state for the next window.
+        """
+
+    @abc.abstractmethod
+    def read(self, params: P, trajectory: Any, out: ReadOut) -> Estimate:
+        """The images prepared in `out`, each array (times, pixels); pure, as `run`."""
+
+    def prepare(
+        self,
+        recording: Recording,
+        times: Times,
+        params: P | None = None,
+        *,
+        extrapolate: bool = False,
+    ) -> tuple[Features, ReadOut]:
+        """A whole recording for `run`, and points of images at sorted `times` for `read`.
+
+        See `windows.prepare`; prepared for those of the `params` that act through comparisons with
+        event times. Raises `InputError` if the recording lacks what the method needs, and for times
+        that are not sorted or, unless told to `extrapolate`, outside the recording.
+        """
+        self.check(recording)
+        params = self.Params() if params is None else params
+        if not extrapolate:
+            span = time_span(recording, params.clock_offset)
+            check_times(times, *span, recording.name)
+        return prepare(recording, times, Timing.of(params), filtering=self.filters)
+
+    def estimate(self, recording: Recording, params: P | None = None, **options: Any) -> Video[P]:
+        """Video of a recording: `image, variance, valid = estimate(recording, params)(times)`.
+
+        `options` are those of `Video`. Raises `InputError` if the recording lacks what the method
+        needs.
+        """
+        return Video(self, recording, self.Params() if params is None else params, **options)

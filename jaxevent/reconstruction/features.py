@@ -1,0 +1,298 @@
+"""Features: all that estimators need to know of a recording's events and frames, as pytrees.
+
+Events lie in tiles of 32768 slots, [ranks, lanes] (`layout`). Each slot holds what depends on data
+alone: times since the pixel's and the neighbourhood's last event, polarity, and where the event
+lies among the frames. The frames cut time into *pieces*: before the first exposure, within exposure
+f, in the gap after it. In each piece the augmented frame is a blend of two integrations of events
+(`augment`), and a piece's event counts start at the left edge of its exposure.
+
+On several devices (`Features.over`) each has a share of the lanes of every block of 64, which all
+kinds of tile are made of: as much work for each, and none waits for another.
+"""
+
+import abc
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float, Int
+from numpy.typing import NDArray
+
+from jaxevent.devices import AXIS, along
+from jaxevent.devices import mesh as devices_mesh
+from jaxevent.reconstruction.layout import LANES
+
+# Prepared on the host, where they stay until a jitted function takes them.
+if TYPE_CHECKING:
+    from typing import Any as Numeric
+else:
+    Numeric = Array | np.ndarray
+
+
+class Points(eqx.Module):
+    """Where points lie among the frames, and how to look a table [rows, pixels] up at them."""
+
+    weight: Float[Numeric, "*#points"]  # position in the piece, 0 to 1
+    blend: Float[Numeric, "*#points"]  # position between the mid-exposures of two frames, 0 to 1
+    on: Float[Numeric, "*points"]  # ON events since the left edge of the piece's exposure
+    off: Float[Numeric, "*points"]
+
+    @abc.abstractmethod
+    def of_piece(self, table: Float[Array, "pieces pixels"]) -> Float[Array, "..."]:
+        """The table's entries for the points' pieces and pixels."""
+
+    @abc.abstractmethod
+    def of_frame(self, table: Float[Array, "frames pixels"]) -> Float[Array, "..."]:
+        """The table's entries for the frames before the points."""
+
+    @abc.abstractmethod
+    def of_piece_alone(self, values: Float[Array, " pieces"], pixels: int) -> Float[Array, "..."]:
+        """The values of the points' pieces, equal for all pixels."""
+
+
+class EventPoints(Points):
+    """Points that each have their own pixel and time."""
+
+    piece_cell: Int[Numeric, "*points"]  # piece * pixels + pixel
+    frame_cell: Int[Numeric, "*points"]  # frame before the point * pixels + pixel
+
+    def of_piece(self, table: Float[Array, "pieces pixels"]) -> Float[Array, "..."]:
+        return table.reshape(-1).at[self.piece_cell].get(mode="clip")
+
+    def of_frame(self, table: Float[Array, "frames pixels"]) -> Float[Array, "..."]:
+        return table.reshape(-1).at[self.frame_cell].get(mode="clip")
+
+    def of_piece_alone(self, values: Float[Array, " pieces"], pixels: int) -> Float[Array, "..."]:
+        return values.at[self.piece_cell // pixels].get(mode="clip")
+
+
+class ImagePoints(Points):
+    """All pixels at a few times; weights are (times, 1)."""
+
+    piece: Int[Numeric, " times"]
+    frame: Int[Numeric, " times"]  # the frame before
+    elapsed: Float[Numeric, " times"]  # s since mid-exposure of the frame before; negative: none is
+
+    def of_piece(self, table: Float[Array, "pieces pixels"]) -> Float[Array, "..."]:
+        return table.at[self.piece].get(mode="clip")
+
+    def of_frame(self, table: Float[Array, "frames pixels"]) -> Float[Array, "..."]:
+        return table.at[self.frame].get(mode="clip")
+
+    def of_piece_alone(self, values: Float[Array, " pieces"], pixels: int) -> Float[Array, "..."]:
+        return values.at[self.piece].get(mode="clip")[:, None]
+
+
+class Tiles(eqx.Module):
+    """The events of a window; slots without an event have polarity 0 and change nothing.
+
+    Shared out over a mesh, the arrays' last axis is cut into blocks of `LANES`, which become the
+    last axis, and that is what is shared out.
+    """
+
+    pixel: Int[Numeric, "*lanes"]  # the pixel of each lane
+    kind: Int[Numeric, " tiles"]  # place in `layout.SHAPES`; their number: the tile is not used
+    lane: Int[Numeric, " tiles"]  # the tile's first lane
+    points: EventPoints
+    since: Float[Numeric, "tiles *slots"]  # s since the pixel's previous event
+    near: Float[Numeric, "tiles *slots"]  # s since the 3x3 neighbourhood's previous event
+    polarity: Int[Numeric, "tiles *slots"]  # +1, -1, or 0 where there is no event
+    mesh: Mesh | None = eqx.field(static=True, default=None)
+
+    def over(self, mesh: Mesh) -> "Tiles":
+        """The same, lanes shared out over a mesh whose size divides `LANES`."""
+
+        def put(leaf: Any, spec: PartitionSpec) -> Any:
+            if len(spec):
+                leaf = leaf.reshape(*leaf.shape[:-1], -1, LANES)
+            return jax.device_put(leaf, NamedSharding(mesh, spec))
+
+        placed = jax.tree.map(put, self, self._specs())
+        return dataclasses.replace(placed, mesh=mesh)
+
+    def _specs(self) -> Any:
+        """How every array is shared out; empty: not at all."""
+        slots = PartitionSpec(None, None, AXIS)
+        others = {
+            "kind": PartitionSpec(),
+            "lane": PartitionSpec(),
+            "pixel": PartitionSpec(None, AXIS),
+        }
+        return jax.tree_util.tree_map_with_path(
+            lambda path, _: others.get(path[0].name, slots), self
+        )
+
+    def each(self, function: Callable[..., Any], *whole: Any) -> Any:
+        """`function(tiles, *whole)`, arrays (tiles, slots), on every device with its lanes.
+
+        Nothing passes between devices but, backwards, the sum of derivatives by `whole`.
+        """
+        if self.mesh is None:
+            return function(self, *whole)
+
+        def here(tiles: Tiles, *whole: Any) -> Any:
+            def flat(leaf: Array, spec: PartitionSpec) -> Array:
+                return leaf.reshape(*leaf.shape[:-2], -1) if len(spec) else leaf
+
+            mine = jax.tree.map(flat, tiles, tiles._specs())
+            out = function(dataclasses.replace(mine, mesh=None), *whole)
+            return jax.tree.map(lambda v: v.reshape(*v.shape[:-1], -1, lanes), out)
+
+        lanes = LANES // self.mesh.size
+        return jax.shard_map(
+            here,
+            mesh=self.mesh,
+            in_specs=(self._specs(), *[PartitionSpec()] * len(whole)),
+            out_specs=PartitionSpec(None, None, AXIS),
+            check_vma=False,  # branches that skip a tile give zeros, which are the same everywhere
+        )(self, *whole)
+
+
+class Segments(eqx.Module):
+    """Events inside exposures: each bounds one segment of constant brightness (EDI)."""
+
+    frame_cell: Int[Numeric, " segments"]  # frame * pixels + pixel
+    share: Float[Numeric, " segments"]  # of the exposure that the segment fills
+    edge: Float[Numeric, " segments"]  # growth of `share` per second of later frame clock
+    on: Float[Numeric, " segments"]  # ON events from mid-exposure to the segment, negative before
+    off: Float[Numeric, " segments"]
+
+
+class FrameFeatures(eqx.Module):
+    """Frames of a window and the event counts that tie them together; spare rows repeat the last.
+
+    Counts are [frames, pixels]: `head` from the left edge to mid-exposure, `tail` from there to the
+    right edge, `span` from the left edge to the right edge of the next exposure; `before` counts
+    from the window's start to the first right edge.
+    """
+
+    grey: Float[Numeric, "frames pixels"]  # in [0, 1], as the camera gave it
+    intensity: Float[Numeric, "frames pixels"]  # the grey values through the inverse response
+    certainty: Float[Numeric, "frames pixels"]  # w of the response, at most 1
+    response: Float[Numeric, " 256"]  # intensities of evenly spaced grey values
+    gain: Float[Numeric, " frames"]  # the frames' exposure relative to the common one
+    span: Float[Numeric, "2 frames pixels"]  # ON, OFF
+    before: Float[Numeric, "2 pixels"]
+    head: Float[Numeric, "2 frames pixels"] | None  # None where no exposure is known
+    tail: Float[Numeric, "2 frames pixels"] | None
+    segments: Segments | None
+    weight_rate: Float[Numeric, " pieces"]  # d weight / dt of each piece, 1/s
+    blend_rate: Float[Numeric, " frames"]  # d blend / dt after each frame, 1/s
+    present: Float[Numeric, ""]  # 1, or 0 if the recording has no frames
+    rows: Int[Numeric, " 3"]  # number of frames; rows of the last one before, of the next's first
+    clock_offset: Float[Numeric, ""]  # s, for which the positions were prepared
+    width: int = eqx.field(static=True)  # of the sensor, whose pixels are in rows
+
+
+class Growth(eqx.Module):
+    """Derivatives of event counts with respect to the dead time `rho_ref` (1/s), array by array.
+
+    Counts are made for one dead time; around it they are continued linearly.
+    """
+
+    counts: list[Float[Numeric, "..."]]
+    rho_ref: Float[Numeric, ""]  # s, for which the counts were made
+
+
+class Features(eqx.Module):
+    """All that `run` needs to know about a window of a recording; a pytree of arrays."""
+
+    frames: FrameFeatures
+    tiles: Tiles | None  # None where the estimator does not filter
+    start: ImagePoints  # every pixel at the recording's start
+    last: Int[Numeric, " pixels"]  # the slot of each pixel's last event, -1 if it has none
+    growth: Growth | None = None
+
+    def counts(self) -> list[Any]:
+        """The arrays that count events."""
+        f, s = self.frames, self.frames.segments
+        tiles = [] if self.tiles is None else [self.tiles.points.on, self.tiles.points.off]
+        exposed = [] if s is None else [f.head, f.tail, s.on, s.off]
+        return [f.span, f.before, *exposed, *tiles]
+
+    def at(self, rho_ref: Array) -> "Features":
+        """The features for a dead time near the one that they were made for."""
+        return _grown(self, rho_ref)
+
+    def over(self, devices: Sequence[Any]) -> "Features":
+        """The features on several devices: lanes of tiles and pixels of images shared out."""
+        mesh = pixel_mesh(devices)
+        if mesh is None:
+            return self
+        pixels = self.last.shape[0]
+        growth = self.growth
+        if growth is not None:
+            counts = list(growth.counts)
+            if self.tiles is not None:
+                at = eqx.tree_at(lambda t: (t.points.on, t.points.off), self.tiles, counts[-2:])
+                points = at.over(mesh).points
+                counts[-2:] = [points.on, points.off]
+                counts[:-2] = over_pixels(counts[:-2], mesh, pixels)
+            else:
+                counts = over_pixels(counts, mesh, pixels)
+            growth = Growth(counts, over_pixels(growth.rho_ref, mesh, pixels))
+        rest = (self.frames, self.start, self.last)
+        frames, start, last = over_pixels(rest, mesh, pixels)
+        tiles = None if self.tiles is None else self.tiles.over(mesh)
+        return Features(frames, tiles, start, last, growth)
+
+
+class ReadOut(eqx.Module):
+    """Images to be read: one time each, and for every pixel its last event before it."""
+
+    points: ImagePoints
+    slot: Int[Numeric, "times pixels"]  # of the pixel's last event in the window, -1 if none
+    since: Float[Numeric, "times pixels"]  # s since the pixel's last event
+    growth: Growth | None = None
+
+    def counts(self) -> list[Any]:
+        """The arrays that count events."""
+        return [self.points.on, self.points.off]
+
+    def images(self, rows: NDArray) -> "ReadOut":
+        """Those of its images, in that order."""
+        parts, growth = (self.points, self.slot, self.since), self.growth
+        chosen = jax.tree.map(lambda leaf: leaf[rows], parts)
+        if growth is not None:
+            growth = Growth([count[rows] for count in growth.counts], growth.rho_ref)
+        points, slot, since = chosen
+        return ReadOut(points, slot, since, growth)
+
+    def at(self, rho_ref: Array) -> "ReadOut":
+        """The read-out for a dead time near the one that it was made for."""
+        return _grown(self, rho_ref)
+
+    def over(self, devices: Sequence[Any]) -> "ReadOut":
+        """The read-out on several devices, pixels shared out."""
+        mesh = pixel_mesh(devices)
+        return self if mesh is None else over_pixels(self, mesh, self.slot.shape[1])
+
+
+def pixel_mesh(devices: Sequence[Any]) -> Mesh | None:
+    """The mesh that pixels are shared out over; None where there is but one device."""
+    return devices_mesh(devices, LANES)
+
+
+def over_pixels(tree: Any, mesh: Mesh, pixels: int) -> Any:
+    """Arrays [..., pixels] shared out along pixels, all others whole on every device."""
+
+    def put(leaf: Any) -> Any:
+        return along(mesh, leaf, -1 if np.shape(leaf)[-1:] == (pixels,) else None)
+
+    return jax.tree.map(put, tree)
+
+
+Counting = TypeVar("Counting", Features, ReadOut)
+
+
+def _grown(counting: Counting, rho_ref: Array) -> Counting:
+    growth = counting.growth
+    if growth is None:
+        return counting
+    change = rho_ref - growth.rho_ref
+    moved = [n + change * g for n, g in zip(counting.counts(), growth.counts, strict=True)]
+    return eqx.tree_at(lambda c: c.counts(), counting, moved)

@@ -1,0 +1,361 @@
+"""Registrations made sub-pixel and sub-millisecond: alignment of what changes."""
+
+import contextlib
+import dataclasses
+import functools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage, sparse
+
+from jaxevent.errors import InputError
+from jaxevent.recording import Recording
+from jaxevent.register.frames import event_span, log_image
+from jaxevent.register.geometry import (
+    Grid,
+    bend,
+    check_homography,
+    grid_between,
+    keep_inside,
+    move,
+    step_size,
+    straight_pixels,
+)
+
+_SMOOTHINGS = (4.0, 2.0, 1.2)  # px of the event camera by which changes are smoothed, in turn
+_STEPS = 12  # Gauss-Newton steps of a smoothing at most
+_PAIRS = 32  # pairs of frames that are compared
+_MOST_PIXELS = 40_000  # of a pair that are compared
+_KNOWN = 0.75  # of a smoothed change that unclipped pixels tell, where it counts
+AGREE = 0.25  # correlation of changes below which a registration is refused
+
+
+@dataclasses.dataclass(frozen=True)
+class Registration:
+    """How another camera's frames fit the events.
+
+    `grid` as the module says; `offset` (s) is added to their time stamps; `homography` (3, 3) where
+    the grid is that of one. `agreement` is the correlation, over pixels and frames, of the change
+    of ln intensity between frames with what the events say of it (1: all the same), None where
+    nothing was estimated.
+    """
+
+    grid: Grid
+    offset: float
+    homography: NDArray[np.float64] | None = None
+    agreement: float | None = None
+
+
+def refine(
+    recording: Recording,
+    other: Recording,
+    offset: float | int,
+    grid: Grid | None = None,
+    homographies: Sequence[ArrayLike] | None = None,
+    *,
+    keep_offset: bool = False,
+) -> Registration:
+    """Make an offset (s), and a homography unless a `grid` is given, sub-ms and sub-pixel.
+
+    Between two frames ln intensity changes by D, and by what the events say of the same time: with
+    W the place that a pixel sees and o the offset,
+
+        D(W(x; h)) = a ON(x; o) - b OFF(x; o) + const,
+
+    ON and OFF being the numbers of events from one mid-exposure to the other. h, o and the
+    thresholds a, b minimise the sum of squares over pixels and 32 pairs of frames, under Huber's
+    weights, by Gauss-Newton steps from coarse to fine (smoothed by 4, 2 and 1.2 px): alignment as
+    that of Evangelidis and Psarakis, PAMI 2008, but of images of change, in which both cameras
+    measure the same, so that the lag of a reconstruction has no part in it. Clipped pixels do not
+    count. The homography is moved by the places of the image's corners.
+
+    Takes a start within about 5 px and half a frame; of several `homographies` (3, 3) the one
+    with which the changes agree best is. Raises `InputError` if frames and events share
+    nothing to compare.
+    """
+    if (grid is None) == (not homographies):
+        raise InputError("give either a grid or homographies to start from")
+    starts = [None] if grid is not None else [check_homography(one) for one in homographies or ()]
+    tries = []
+    for H in starts:
+        problem = _Alignment(recording, other, grid, H, keep_offset)
+        at = np.append(problem.corners, float(offset))
+        with contextlib.suppress(InputError):
+            problem.choose(float(offset))
+            tries.append((problem.fit(at, _SMOOTHINGS[0]).agreement, H, problem, at))
+    if not tries:
+        raise InputError(
+            f"{other.name}: with the offset {offset:g} s its frames show too little, unclipped, of "
+            "what the events show to compare them; give another offset, homography or calibration"
+        )
+    agreement, H, problem, at = max(tries, key=lambda one: one[0])
+    for sigma in _SMOOTHINGS:
+        at, agreement = problem.solve(at, sigma)
+        if agreement < AGREE / 2:  # hopeless; those that are right begin above a half
+            break
+    if H is not None:
+        H = problem.homography(at)
+        grid = grid_between(recording, other, H)
+    assert grid is not None
+    return Registration(grid, float(at[-1]), H, float(agreement))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Fit:
+    """What is compared at a place: (values, ...) of all pairs, and how well it fits."""
+
+    X: NDArray[np.float64]  # (values, 3): ON, OFF and 1
+    D: NDArray[np.float64]  # (values,)
+    slope: NDArray[np.float64]  # (values, 2) of D, per px of the other camera
+    use: NDArray[np.bool_]  # (pairs, n): which these are
+    weight: NDArray[np.float64]  # (values,)
+    b: NDArray[np.float64]  # (3,)
+    agreement: float
+
+
+class _Alignment:
+    """Changes between pairs of frames, of the frames and of the events; see `refine`."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        other: Recording,
+        grid: Grid | None,
+        homography: NDArray[np.float64] | None,
+        keep_offset: bool,
+    ):
+        self.recording, self.other, self.keep_offset = recording, other, keep_offset
+        self.size = recording.width, recording.height
+        width, height = self.size
+        self.shape = other.height, other.width
+        self.finest = max(1, math.ceil(math.sqrt(width * height / _MOST_PIXELS)))
+        self.stride = self.finest
+        self.fixed = None if grid is None or homography is not None else grid
+        self.corners = np.empty(0)
+        self.frame = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+        if homography is not None:
+            self.corners = move(homography, self.frame).ravel()
+        self.pixels = straight_pixels(recording.camera, self.size).reshape(height, width, 2)
+        self.pairs: NDArray[np.intp] | None = None
+        self._near: tuple[float, list] | None = None
+        self._images: tuple[Any, Any] = None, None
+
+    def homography(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The homography that moves the image's corners to at[:8] (Hartley, Zisserman, 4.1)."""
+        rows, values = [], []
+        for (x, y), (u, v) in zip(self.frame, at[:8].reshape(4, 2), strict=True):
+            rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]
+            values += [u, v]
+        return np.append(np.linalg.solve(np.array(rows), values), 1.0).reshape(3, 3)
+
+    def places(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where the compared pixels look, (n, 2), NaN outside."""
+        s = self.stride
+        if self.fixed is not None:
+            return self.fixed[s // 2 :: s, s // 2 :: s].reshape(-1, 2)
+        pixels = self.pixels[s // 2 :: s, s // 2 :: s].reshape(-1, 2)
+        seen = bend(self.other.camera, move(self.homography(at), pixels))
+        return keep_inside(seen, (self.other.width, self.other.height))
+
+    def choose(self, offset: float) -> None:
+        """The pairs of frames: those with the most events, with about an event per pixel each."""
+        assert self.other.frames is not None
+        t = self.other.frames.t + round(offset * 1e6)
+        begin, end = event_span(self.recording)
+        inside = np.flatnonzero((t >= begin) & (t <= end))
+        if len(inside) < 2:
+            raise InputError(
+                f"{self.other.name}: with the offset {offset:g} s no two of its frames fall into "
+                "the time of the events; give another offset"
+            )
+        index = np.array([self.recording.events.index(int(one)) for one in t[inside]])
+        each = max((index[-1] - index[0]) / (len(index) - 1), 1) / (self.size[0] * self.size[1])
+        apart = int(np.clip(round(1 / each), 1, max(1, (len(inside) - 1) // 4)))
+        first = np.arange(0, len(inside) - apart, max(1, apart // 2))
+        # Those that show something, of all times: translation is an offset if motion is the same.
+        clear = np.array([self._clear(int(k)) for k in inside])
+        worth = (index[first + apart] - index[first]) * np.minimum(
+            clear[first], clear[first + apart]
+        )
+        first = first[worth >= 0.2 * worth.max()]
+        first = first[np.unique(np.linspace(0, len(first) - 1, _PAIRS).astype(int))]
+        self.pairs = np.stack([inside[first], inside[first + apart]], 1)
+        self.apart = float(np.median(t[self.pairs[:, 1]] - t[self.pairs[:, 0]]))
+        self._near, self._images = None, (None, None)
+
+    @functools.lru_cache(maxsize=4096)  # noqa: B019, lives as long as one estimate
+    def _clear(self, row: int) -> float:
+        """The part of a frame that is not clipped."""
+        return float(log_image(self.other, row)[1].mean())
+
+    def fired(self, offset: float, sigma: float) -> NDArray[np.float64]:
+        """ON and OFF events of each pair, (pairs, n, 2), smoothed.
+
+        An event tells that a threshold has been crossed since the pixel's last one, so counts lag
+        behind intensity by half a threshold, in slow scenes by tens of ms. Each event therefore
+        counts evenly over the time since the one before it, or until the one after it if that is
+        shorter, where both are of its polarity.
+        """
+        assert self.other.frames is not None and self.pairs is not None
+        t = self.other.frames.t[self.pairs] + offset * 1e6
+        width, height = self.size
+        s, out = self.stride, []
+        for (begin, end), (place, first, last) in zip(t, self._crossings(offset), strict=True):
+            within = np.minimum(last, end) - np.maximum(first, begin)
+            part = np.clip(within / (last - first), 0, 1)
+            counts = np.bincount(place, part, 2 * width * height).reshape(2, height, width)
+            smooth = ndimage.gaussian_filter(counts.astype(np.float32), (0, sigma, sigma))
+            out.append(smooth[::-1, s // 2 :: s, s // 2 :: s].reshape(2, -1).T)
+        return np.stack(out).astype(np.float64)
+
+    def _crossings(self, offset: float) -> list[tuple[NDArray, NDArray, NDArray]]:
+        """Of each pair's events the place and polarity, and from when to when they count (us)."""
+        if self._near is None or abs(offset - self._near[0]) * 1e6 > self.apart / 2:
+            assert self.other.frames is not None and self.pairs is not None
+            width, height = self.size
+            found = []
+            for begin, end in self.other.frames.t[self.pairs] + round(offset * 1e6):
+                around = (begin - 2 * self.apart, end + 2 * self.apart)
+                rows = slice(*(self.recording.events.index(int(one)) for one in around))
+                events = self.recording.events[rows]
+                pixel = events.y.astype(np.intp) * width + events.x
+                order = np.argsort(pixel, kind="stable")
+                t, p, pixel = events.t[order].astype(np.float64), events.p[order], pixel[order]
+                same = (pixel[1:] == pixel[:-1]) & (p[1:] == p[:-1])
+                gap = np.where(same, np.diff(t), np.inf)
+                since = np.minimum(np.append(np.inf, gap), np.append(gap, np.inf))
+                # Alone: no more than its polarity is known.
+                since = np.maximum(np.where(np.isfinite(since), since, 1), 1)
+                found.append((p * (height * width) + pixel, t - since, t))
+            self._near = offset, found
+        return self._near[1]
+
+    def shown(self, at: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+        """D, its two slopes and how far it counts at the places, (pairs, n, 4)."""
+        where = self.places(at)
+        part = self.pixels[self.stride // 2 :: self.stride, self.stride // 2 :: self.stride]
+        scale = step_size(where.reshape(part.shape)) / self.stride
+        images = self._smoothed(sigma, scale)
+        inside = ~np.isnan(where[:, 0])
+        values = _bilinear(np.where(inside[:, None], where, 0), self.shape) @ images
+        values = values.reshape(len(where), -1, 4).swapaxes(0, 1)
+        values[..., 3] *= inside
+        return values
+
+    def _smoothed(self, sigma: float, scale: float) -> NDArray[np.float64]:
+        """D of each pair, its slopes and where it is known: (other pixels, pairs * 4)."""
+        blur = sigma * scale
+        if self._images[0] is None or abs(math.log(self._images[0] / blur)) > 0.1:
+            assert self.pairs is not None
+            images = []
+            for one, two in self.pairs:
+                (low, known), (high, well) = (log_image(self.other, int(k)) for k in (one, two))
+                good = (known & well).astype(np.float32)
+                change = (high - low).astype(np.float32) * good
+                weight = ndimage.gaussian_filter(good, blur)
+                D = ndimage.gaussian_filter(change, blur) / np.maximum(weight, 0.1)
+                known = (weight > _KNOWN).astype(np.float32)
+                images += [D, np.gradient(D, axis=1), np.gradient(D, axis=0), known]
+            self._images = blur, np.stack([one.ravel() for one in images], 1).astype(np.float64)
+        return self._images[1]
+
+    def solve(self, at: NDArray[np.float64], sigma: float) -> tuple[NDArray[np.float64], float]:
+        """Gauss-Newton steps until they are small; the place and the correlation there."""
+        self.choose(float(at[-1]))
+        self.stride = max(self.finest, int(sigma / 1.3))  # smooth images say the same next door
+        fit = self.fit(at, sigma)
+        for _ in range(_STEPS):
+            step, moved = self.step(at, sigma, fit), None
+            for _ in range(4):
+                now = self.fit(at + step, sigma)
+                if now.agreement > fit.agreement:
+                    moved = at + step
+                    break
+                step = step / 3
+            if moved is None:
+                break
+            at, fit = moved, now
+            if np.abs(step[:-1]).max(initial=0) < 5e-3 and abs(step[-1]) < 3e-6:
+                break
+        return at, fit.agreement
+
+    def fit(self, at: NDArray[np.float64], sigma: float) -> _Fit:
+        """The thresholds at a place, and the correlation of changes under Huber's weights."""
+        D, slope_x, slope_y, counts = np.moveaxis(self.shown(at, sigma), -1, 0)
+        use = counts > 0.99
+        if use.sum() < 100:
+            raise InputError(
+                f"{self.other.name}: shows too little of what the events show, unclipped, to "
+                "compare them; correct the calibration or homography, or give other frames"
+            )
+        X = self.fired(float(at[-1]), sigma)[use]
+        X, D = np.concatenate([X, np.ones((len(X), 1))], -1), D[use]
+        weight, b = np.ones(len(D)), np.zeros(3)
+        for _ in range(3):
+            b = _least_squares(X, D, weight)
+            r = np.abs(D - X @ b)
+            spread = 1.345 * 1.4826 * float(np.median(r[:: max(1, len(r) // 20_000)])) + 1e-9
+            weight = np.minimum(1, spread / np.maximum(r, 1e-12))
+        agreement = _correlate_weighted(D, X @ b, weight)
+        return _Fit(X, D, np.stack([slope_x[use], slope_y[use]], -1), use, weight, b, agreement)
+
+    def step(self, at: NDArray[np.float64], sigma: float, fit: _Fit) -> NDArray[np.float64]:
+        """The Gauss-Newton step from a place, at most as long as the smoothing can bear.
+
+        D + D' dh = X(o) b + (X' b) do + X db is linear in dh, do and b + db.
+        """
+        offset, free = float(at[-1]), len(at) - 1
+        columns = [fit.X]
+        if not self.keep_offset:
+            delta = min(self.apart / 8, 2000.0) * 1e-6
+            later, earlier = (self.fired(offset + d, sigma)[fit.use] for d in (delta, -delta))
+            columns.append(((later - earlier) @ fit.b[:2] / (2 * delta))[:, None])
+        pixel, eps = np.nonzero(fit.use)[1], 0.01
+        for k in range(free):
+            ahead, back = at.copy(), at.copy()
+            ahead[k] += eps
+            back[k] -= eps
+            move = np.nan_to_num((self.places(ahead) - self.places(back)) / (2 * eps))
+            columns.append(-(fit.slope * move[pixel]).sum(-1, keepdims=True))
+        found = _least_squares(np.concatenate(columns, 1), fit.D, fit.weight)[3:]
+        step = np.zeros(len(at))
+        if not self.keep_offset:
+            step[-1], found = found[0], found[1:]
+        step[:free] = found
+        far = np.abs(step[:free]).max(initial=0) / (4 * sigma)
+        return step / max(far, abs(step[-1]) / (self.apart * 5e-7), 1)
+
+
+def _bilinear(at: NDArray[np.float64], shape: tuple[int, int]) -> Any:
+    """The matrix (n, pixels) of bilinear interpolation at places x, y (n, 2)."""
+    height, width = shape
+    i = np.clip(np.floor(at).astype(int), 0, [max(width - 2, 0), max(height - 2, 0)])
+    u, v = (at - i).T
+    first = i[:, 1] * width + i[:, 0]
+    source = first[:, None] + np.array([0, min(1, width - 1), width, width + 1])
+    weight = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], 1)
+    source = np.minimum(source, height * width - 1)
+    ends = np.arange(len(at) + 1) * 4
+    return sparse.csr_array((weight.ravel(), source.ravel(), ends), (len(at), height * width))
+
+
+def _least_squares(
+    A: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The weighted least-squares solution; columns that are 0 or the others' copies get 0."""
+    size = np.sqrt((weight[:, None] * A**2).sum(0)) + 1e-30
+    A = A / size
+    W = weight[:, None] * A
+    return np.linalg.lstsq(A.T @ W, W.T @ y, rcond=1e-9)[0] / size
+
+
+def _correlate_weighted(
+    a: NDArray[np.float64], b: NDArray[np.float64], weight: NDArray[np.float64]
+) -> float:
+    total = weight.sum()
+    a, b = (one - (weight * one).sum() / total for one in (a, b))
+    size = math.sqrt(float((weight * a * a).sum() * (weight * b * b).sum()))
+    return float((weight * a * b).sum()) / size if size > 0 else 0.0
