@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.seeds import read_seeds
 from jaxevent.errors import InputError
+from jaxevent.estimator import Described
 from jaxevent.kernels import compiled
 from jaxevent.recording import Recording, Times, check_times, microseconds
 
@@ -30,7 +31,7 @@ LONGEST = 2**29  # us between boundaries; two of them fit into int32
 Numeric = Array | np.ndarray
 
 
-class Features(eqx.Module):
+class Features(Described):
     """Chunks of events. An event that only fills up is not valid and has its step's time."""
 
     t: Int[Numeric, "chunks steps M"]  # us since the chunk's start
@@ -48,7 +49,7 @@ class Features(eqx.Module):
     cells: tuple[int, int] = eqx.field(static=True)  # rows and columns of the grid of births
 
 
-class ReadOut(eqx.Module):
+class ReadOut(Described):
     """Where times are in the chunks of `Features`."""
 
     chunk: Int[Numeric, " times"]

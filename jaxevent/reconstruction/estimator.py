@@ -12,7 +12,7 @@ from jaxevent.reconstruction.windows import prepare
 from jaxevent.recording import Recording, Times, check_times
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class ImageEstimator(Estimator[P]):
     """A reconstruction method.
 

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from jaxevent.devices import AXIS, along
 from jaxevent.devices import mesh as devices_mesh
+from jaxevent.estimator import Described
 from jaxevent.reconstruction.layout import LANES
 
 # Prepared on the host, where they stay until a jitted function takes them.
@@ -87,7 +88,7 @@ class ImagePoints(Points):
         return values.at[self.piece].get(mode="clip")[:, None]
 
 
-class Tiles(eqx.Module):
+class Tiles(Described):
     """The events of a window; slots without an event have polarity 0 and change nothing.
 
     Shared out over a mesh, the arrays' last axis is cut into blocks of `LANES`, which become the
@@ -162,7 +163,7 @@ class Segments(eqx.Module):
     off: Float[Numeric, " segments"]
 
 
-class FrameFeatures(eqx.Module):
+class FrameFeatures(Described):
     """Frames of a window and the event counts that tie them together; spare rows repeat the last.
 
     Counts are [frames, pixels]: `head` from the left edge to mid-exposure, `tail` from there to the
@@ -198,7 +199,7 @@ class Growth(eqx.Module):
     rho_ref: Float[Numeric, ""]  # s, for which the counts were made
 
 
-class Features(eqx.Module):
+class Features(Described):
     """All that `run` needs to know about a window of a recording; a pytree of arrays."""
 
     frames: FrameFeatures
@@ -241,7 +242,7 @@ class Features(eqx.Module):
         return Features(frames, tiles, start, last, growth)
 
 
-class ReadOut(eqx.Module):
+class ReadOut(Described):
     """Images to be read: one time each, and for every pixel its last event before it."""
 
     points: ImagePoints

@@ -18,7 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxevent.estimator import Estimate
+from jaxevent.estimator import Described, Estimate
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import ImageEstimator, P
 from jaxevent.reconstruction.features import (
@@ -84,7 +84,7 @@ class Observer(eqx.Module):
         return self(points).level
 
 
-class Trajectory(eqx.Module):
+class Trajectory(Described):
     """A filtered window: enough to read an image at any time inside it."""
 
     observer: Observer
@@ -107,7 +107,7 @@ def log_intensity(params: FrameParams, state: Any) -> tuple[Array, Array]:
     return state.L, state.P
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Filter(ImageEstimator[P]):
     """A causal method, made of pure functions of one pixel.
 

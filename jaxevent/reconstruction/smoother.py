@@ -27,7 +27,7 @@ from jax import lax
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float
 
-from jaxevent.estimator import Estimate
+from jaxevent.estimator import Described, Estimate
 from jaxevent.parameters import Choice, Positive
 from jaxevent.reconstruction.augment import (
     CertaintyParams,
@@ -143,7 +143,7 @@ class Rows(eqx.Module):
     q: Float[Array, "frames pixels"]  # variance that is added until then
 
 
-class Passage(eqx.Module):
+class Passage(Described):
     """A smoothed window: enough to read an image at any time inside it."""
 
     past: Gaussian  # [frames, pixels], after the frame
@@ -338,7 +338,7 @@ def counts_around(
     )
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Smoother(ImageEstimator[Params]):
     """The estimator of this module."""
 
@@ -402,4 +402,11 @@ class Smoother(ImageEstimator[Params]):
         return self.run(params, features)[0].log_likelihood.sum()
 
 
-aks = Smoother("aks", Params, needs_frames=True)
+aks = Smoother(
+    "aks",
+    Params,
+    needs_frames=True,
+    about="The asynchronous Kalman smoother. Per pixel it estimates the log intensity from all "
+    "frames and events, earlier and later ones, with its variance; an event's change is shared "
+    "with the neighbours, and the frames' likelihood can be fitted.",
+)
