@@ -32,7 +32,7 @@ from bench_motion import motion_bench
 import jaxevent
 from jaxevent.blob import moment
 from jaxevent.blob.filters.ellipse import truncation
-from jaxevent.blob.filters.steps import Batch
+from jaxevent.blob.steps import Batch
 from jaxevent.io import load, save
 from jaxevent.reconstruction.filtering import Observation, Observer, State, Trajectory
 from jaxevent.reconstruction.windows import WindowedRecording

@@ -13,9 +13,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxevent.blob.association import largest_eigenvalue
-from jaxevent.blob.filters.steps import Filter, choose
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import LONGEST, Features
+from jaxevent.blob.steps import Filter, choose
 from jaxevent.blob.targets import Slots, begin_slots, seconds, shift_slots, silence_limits
 
 ENDS = ("end", "idle", "unconfirmed", "left", "size", "uncertain", "merged", "not finite")

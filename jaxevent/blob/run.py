@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxevent.blob.filters.steps import Filter
 from jaxevent.blob.lifecycle import Log, State, begin, count_strays, end_cycle, shift, sow
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features
+from jaxevent.blob.steps import Filter
 from jaxevent.blob.targets import Slots, place, scan_steps
 
 

@@ -5,8 +5,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxevent.blob.filters.steps import Filter
 from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.steps import Filter
 from jaxevent.blob.targets import Slots, seconds
 from jaxevent.estimator import Estimate
 

@@ -16,9 +16,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxevent.blob.association import gate_radius
-from jaxevent.blob.filters.steps import Batch, Filter, choose
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import LONGEST
+from jaxevent.blob.steps import Batch, Filter, choose
 
 
 class Slots(eqx.Module):

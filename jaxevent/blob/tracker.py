@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxevent.blob.filters.steps import Filter
 from jaxevent.blob.lifecycle import State, shift
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Packing, ReadOut
 from jaxevent.blob.run import run
 from jaxevent.blob.states import TrackStates, tell
+from jaxevent.blob.steps import Filter
 from jaxevent.blob.targets import Slots, silence_limits
 from jaxevent.blob.tracks import Tracks
 from jaxevent.estimator import Estimator

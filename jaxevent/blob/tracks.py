@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
-from jaxevent.blob.filters.steps import Filter
 from jaxevent.blob.lifecycle import ENDS, Log, begin
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Mark, Packing, Stretch, count_steps
 from jaxevent.blob.run import run
 from jaxevent.blob.states import TrackStates, tell
+from jaxevent.blob.steps import Filter
 from jaxevent.blob.targets import Slots, scan_steps
 from jaxevent.errors import InputError
 from jaxevent.progress import bar

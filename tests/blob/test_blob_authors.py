@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxevent import blob
-from jaxevent.blob.filters.steps import Batch
+from jaxevent.blob.steps import Batch
 
 
 def step_of(params):

@@ -12,7 +12,7 @@ from scipy import integrate, linalg
 
 from jaxevent import blob
 from jaxevent.blob.filters.ellipse import truncation
-from jaxevent.blob.filters.steps import Batch
+from jaxevent.blob.steps import Batch
 
 TRACKERS = ("moment", "chi2_split", "chi2", "constant_velocity")
 

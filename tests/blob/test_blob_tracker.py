@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from jaxevent import blob
-from jaxevent.blob.filters.steps import Batch
 from jaxevent.blob.prepare import Packing
 from jaxevent.blob.states import canonical
+from jaxevent.blob.steps import Batch
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording

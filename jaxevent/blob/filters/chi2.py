@@ -23,8 +23,8 @@ from jaxtyping import Array, Float, Int
 from jaxevent.blob.association import Expected
 from jaxevent.blob.filters.ellipse import spread, truncation, wrap
 from jaxevent.blob.filters.motion import decay
-from jaxevent.blob.filters.steps import Batch, Filter, choose
 from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.steps import Batch, Filter, choose
 from jaxevent.blob.tracker import Tracker
 from jaxevent.parameters import Choice, Count, Positive
 

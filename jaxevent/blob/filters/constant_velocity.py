@@ -6,8 +6,8 @@ from jaxtyping import Array, Float
 
 from jaxevent.blob.association import Expected
 from jaxevent.blob.filters.motion import Motion, expected_of, moments_of
-from jaxevent.blob.filters.steps import Batch, Filter, choose
 from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.steps import Batch, Filter, choose
 from jaxevent.blob.tracker import Tracker
 
 

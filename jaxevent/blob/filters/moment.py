@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 from jaxevent.blob.association import Expected
 from jaxevent.blob.filters.ellipse import geometric_step, spread, truncation, wrap
 from jaxevent.blob.filters.motion import Motion, decay, expected_of, moments_of
-from jaxevent.blob.filters.steps import Batch, Filter, choose
 from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.steps import Batch, Filter, choose
 from jaxevent.blob.tracker import Tracker
 
 

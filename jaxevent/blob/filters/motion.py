@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 
 from jaxevent.blob.association import Expected
 from jaxevent.blob.filters.ellipse import spread
-from jaxevent.blob.filters.steps import Batch
 from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.steps import Batch
 
 
 def _product(a: Float[Array, "2 2"], b: Float[Array, "2 2"]) -> Float[Array, "2 2"]:

@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 from jaxevent.blob.association import Expected
 from jaxevent.blob.filters.ellipse import axes, spread
 from jaxevent.blob.filters.motion import Motion, moments_of
-from jaxevent.blob.filters.steps import Batch, Filter, choose
 from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.steps import Batch, Filter, choose
 from jaxevent.blob.tracker import Tracker
 from jaxevent.parameters import Positive
 
