@@ -275,7 +275,7 @@ def score_cars(
     one covers it, and a change is a switch. A stray is a (track, frame) that covers no car.
     """
     now = (times >= span[0] * 1e6) & (times < span[1] * 1e6)
-    states = tracks(times)
+    states = tracks(times, extrapolate=True)  # frames may come before and after events
     centre, covers = states.mean[..., :2], np.zeros(states.valid.shape, bool)
     instants, distances, relative, switches, each = 0, [], [], 0, []
     for car in cars:
@@ -347,7 +347,7 @@ def street(recording: Recording, out: Path) -> tuple[dict, str]:
 def draw_street(out: Path, recording: Recording, tracks: Tracks, cars: list[Car]) -> None:
     assert recording.frames is not None
     times, scale = recording.frames.t[1:], 3
-    states = tracks(times)
+    states = tracks(times, extrapolate=True)
     settings: dict[str, Any] = {"trail": 1.0, "scale": scale, "window": 0.02}
     frames = np.asarray(recording.frames.images)[1:]
     arrays = recording, times, tracks.id, states.mean, states.valid

@@ -30,7 +30,7 @@ from jaxevent.blob import (
 from jaxevent.simulate import blob_scene
 from jaxevent.tuning import Settings, optimise
 
-STEP = {"events_per_step": 32}
+STEP: dict[str, Any] = {"events_per_step": 32}
 # Process noises times these.
 STARTS: dict[str, dict[str, float]] = {
     "stiff": {"Q_p": 10, "Q_v": 1e-2, "Q_lambda": 10, "Q_theta": 10},

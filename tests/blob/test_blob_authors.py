@@ -11,18 +11,14 @@ from jaxevent import blob
 from jaxevent.blob.steps import Batch
 
 
-def step_of(params):
-    """One prediction and update, compiled; also x and the variances, in one array."""
+@jax.jit
+def step(params, state, dt, xi, sign):
+    """One prediction and update; also x and the variances, in one array."""
     chi2 = blob.chi2.filter
-
-    @jax.jit
-    def step(state, dt, xi, sign):
-        state = chi2.predict(params, state, dt)
-        batch = Batch(xi[None], jnp.zeros(1), sign[None])
-        state = chi2.update(params, state, batch, jnp.ones(1))
-        return state, jnp.concatenate([state.x, jnp.diagonal(state.P)])
-
-    return step
+    state = chi2.predict(params, state, dt)
+    batch = Batch(xi[None], jnp.zeros(1), sign[None])
+    state = chi2.update(params, state, batch, jnp.ones(1))
+    return state, jnp.concatenate([state.x, jnp.diagonal(state.P)])
 
 
 class Target:
@@ -52,7 +48,6 @@ def authors_rows(raw, config, params):
     (size,), (least,) = setting("lambda_init"), setting("dist_threshold")
     starts = np.stack([setting("position_x_init"), setting("position_y_init")], 1)
     targets = [Target(params, position, size, least) for position in starts]
-    step = step_of(params)
     skipped, period = int(setting("event_num_start")[0]), 1 / setting("publish_framerate")[0]
     decay, factor = float(params.gate_decay), float(params.gate)
     d = 10 if params.polarity_offset else 8
@@ -87,7 +82,7 @@ def authors_rows(raw, config, params):
                 for a, at in replayed or [(xi, t)]:
                     dt = 0.0 if target.updated is None else at - target.updated
                     sign = 1.0 if p > 0 else -1.0
-                    target.state, told = step(target.state, dt, a, np.asarray(sign))
+                    target.state, told = step(params, target.state, dt, a, np.asarray(sign))
                     target.told, target.updated = np.asarray(told), at
                     x, P = np.zeros(10), np.zeros(10)
                     x[:d], P[:d] = target.told[:d], target.told[d:]
