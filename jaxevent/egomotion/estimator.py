@@ -59,7 +59,7 @@ class Batch(eqx.Module):
         raise NotImplementedError
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class MotionEstimator(Estimator[P]):
     """A method that tells the camera's motion.
 
@@ -196,7 +196,7 @@ class Given(NamedTuple):
     more: Mapping[str, Any]  # its own options
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class OnHost(MotionEstimator[P]):
     """A method of which `solve(params, given)` tells the motion of a whole recording."""
 

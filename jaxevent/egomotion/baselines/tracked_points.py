@@ -102,7 +102,7 @@ def _undistorted(at: NDArray[np.floating], positions: NDArray[np.float64]) -> ND
     return (1 - v) * upper + v * lower
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class TrackedPoints(OnHost[Params]):
     """Points from each frame to the next; it needs two frames, and OpenCV."""
 

@@ -56,7 +56,7 @@ class ReadOut(eqx.Module):
     inside: Bool[Array | np.ndarray, " times"]  # of the recording, from the first batch on
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Voting(MotionEstimator[Params]):
     """Motion by voting, batch by batch, as events arrive.
 
