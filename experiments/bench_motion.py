@@ -18,12 +18,15 @@ import jax.numpy as jnp
 import numba
 import numpy as np
 
-from jaxevent.egomotion import particle_filter as voting
+from jaxevent.egomotion import voting
 from jaxevent.egomotion.batch_fit import photometric
 from jaxevent.egomotion.batch_fit import windows as batch
 from jaxevent.egomotion.batch_fit.path import ROWS, Path, advanced
 from jaxevent.egomotion.candidates import Candidates
+from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.particle_filter import filtering
+from jaxevent.egomotion.particle_filter.parameters import Params
 from jaxevent.simulate import motion_scene
 
 PUBLISHED = 0.1  # M events/s, N = 100
@@ -33,7 +36,7 @@ CASES = (("planar", "planar", 200), ("rotation", "rotation", 200), ("general", "
 
 @numba.njit(cache=True, fastmath=True)
 def votes(dx, dy, age, count, xi, scale, particles, model, f, tau, exponent, rho, s0, alpha):
-    """The log-likelihood of every particle: what `voting.score` adds up, in float32."""
+    """The log-likelihood of every particle: what `likelihood.score` adds up, in float32."""
     total = np.zeros(len(particles), np.float32)
     one = np.float32(1)
     for e in range(len(count)):
@@ -76,7 +79,7 @@ def timed(function: Any, repeat: int = 3) -> float:
 
 
 def loop_seconds(
-    made: Candidates, particles: np.ndarray, kind: voting.Model, params: voting.Params, tau: float
+    made: Candidates, particles: np.ndarray, kind: Model, params: Params, tau: float
 ) -> tuple[float, np.ndarray]:
     """Seconds of the numba loop over candidates of ages in [youngest tau, tau], and its sums."""
     age = np.moveaxis(np.asarray(made.age), 1, 2).reshape(-1, made.age.shape[1])
@@ -100,33 +103,28 @@ def voting_bench() -> tuple[dict[str, float], dict[str, float]]:
     speed, ratio = {}, {}
     for model, scene, N in CASES:
         recording, truth = motion_scene(scene, "constant", 200, size=SIZE, duration=0.3)
-        params = voting.Params.of({"radius": RADIUS, "baseline": BASELINE, "particles": N})
-        kind, gatherer = voting.prepare(recording, params, model)
+        params = Params(radius=RADIUS, baseline=BASELINE, particles=N)
+        kind, gatherer = voting.gatherer(recording, params, model)
         rng = np.random.default_rng(0)
         at = np.array([0.2])
-        T, Omega = (part[0] for part in truth.twist(at))
-        middle = {
-            "planar": lambda truth=truth, at=at: truth.velocity(at)[0],
-            "rotation": lambda Omega=Omega: Omega,
-            "general": lambda T=T, Omega=Omega: np.r_[T / np.linalg.norm(T), Omega],
-        }[model]()
+        middle = kind.of_scene(truth, at)[0]
         particles = middle + 0.02 * np.abs(middle).max() * rng.normal(size=(N, len(middle)))
         particles = particles.astype(np.float32)
-        oldest = float(params.tau_general if model == "general" else params.tau_max)
+        oldest = float(kind.oldest(params))
         made = jax.device_put(gatherer.whole(0.2 * oldest, oldest).candidates)
         events = int(np.asarray(made.valid).sum())
-        noise = voting.draw(jax.random.key(0), len(made.elapsed), params, kind)
-        start = voting.begin(params, kind, noise)
+        noise = filtering.draw(jax.random.key(0), len(made.elapsed), params, kind)
+        start = filtering.begin(params, kind, noise)
         start = eqx.tree_at(
             lambda c: (c.particles, c.searching),
             start,
             (jnp.asarray(particles), jnp.asarray(False)),
         )
-        run = eqx.filter_jit(voting.run)
+        run = eqx.filter_jit(filtering.run)
         seconds = timed(lambda a=(run, params, kind, made, noise, start): a[0](*a[1:])[1].mean)
         # The loop's ages: those that the filter has for planar motion; there one tau is all.
         tau = oldest
-        if model == "planar":
+        if kind.uniform:
             tau = min(BASELINE / float(np.linalg.norm(middle)), oldest)
         slow, _ = loop_seconds(made, particles, kind, params, tau)
         whole = timed(
@@ -170,7 +168,7 @@ def batch_bench() -> tuple[dict[str, float], dict[str, float]]:
             return windows.ended(250_000, [windows.followed(250_000, warm)])
 
         def every(params: batch.Params = params) -> Motion:
-            return batch.estimate(recording, params)
+            return batch.batch.estimate(recording, params)
 
         name = f"batch general motion, s per window, {events // 1000} k events"
         speed[f"{name}, from nothing"] = timed(whole, 2)

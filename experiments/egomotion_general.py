@@ -57,9 +57,9 @@ def window(scene: str, motion: str, seed: int, params: batch.Params) -> dict[str
 def whole(scene: str, seed: int, params: batch.Params, seconds: float) -> dict[str, Any]:
     recording, source = motion_scene(scene, "varying", seed, duration=seconds)
     clock = time.perf_counter()
-    found = batch.estimate(recording, params)
+    found = batch.batch.estimate(recording, params)
     spent = time.perf_counter() - clock
-    kept = ~found.lost
+    kept = found.valid
     T, Omega = source.twist(found.t[kept])
     heading = truth.axis_error(found.mean[kept, :3], T)
     turn = 100 * truth.relative_error(found.mean[kept, 3:], Omega)
@@ -67,7 +67,7 @@ def whole(scene: str, seed: int, params: batch.Params, seconds: float) -> dict[s
         "scene": f"{scene} varying",
         "seed": seed,
         "estimates": len(heading),
-        "lost": int(found.lost.sum()),
+        "lost": int((~kept).sum()),
         "heading deg, median": float(np.median(heading)),
         "max": float(heading.max()),
         "Omega %, median": float(np.median(turn)),

@@ -36,9 +36,7 @@ from scipy.optimize import least_squares
 import jaxevent
 from jaxevent import egomotion
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion import particle_filter as voting
-from jaxevent.egomotion.baselines import contrast_maximisation as contrast
-from jaxevent.egomotion.batch_fit import windows as batch
+from jaxevent.egomotion import batch, contrast, voting
 from jaxevent.egomotion.geometry import rotation_exp, twist_exp
 from jaxevent.errors import InputError, require
 
@@ -68,7 +66,8 @@ def disk(data: Path) -> Rows:
         ),
         ("contrast", contrast.estimate(recording, model="rotation", camera=camera)),
     ):
-        mean, _, lost = motion(times, centred="smooth" not in name)
+        mean, _, valid = motion(times, centred="smooth" not in name, extrapolate=True)
+        lost = ~valid
         sign = np.sign((mean[~lost, 2] * gyro[~lost]).sum())
         error = 100 * np.abs(sign * mean[:, 2] - gyro) / np.abs(gyro)
         failed = lost | (error > 20)
@@ -111,7 +110,7 @@ def tubrip(data: Path, name: str) -> Rows:
             )
         )
     for method, motion in found:
-        kept = motion.mean[~motion.lost]
+        kept = motion.mean[motion.valid]
         if not len(kept):
             rows.append({"recording": name, "method": method, "estimates": 0})
             continue
@@ -140,7 +139,7 @@ def evbench(data: Path) -> Rows:
     rows: Rows = []
     motion = batch.estimate(recording)
     for sign, convention in ((1, "camera's twist"), (-1, "scene's twist")):
-        mean = motion.mean[~motion.lost]
+        mean = motion.mean[motion.valid]
         turn = np.degrees(np.linalg.norm(mean[:, 3:] - sign * omega, axis=1))
         heading = angle(mean[:, :3], np.broadcast_to(sign * T, mean[:, :3].shape))
         rows.append(
@@ -210,7 +209,8 @@ def slider(data: Path) -> Rows:
     rows: Rows = []
     motion = voting.estimate(recording, model="planar", smooth=True)
     times = np.arange(recording.start + 400_000, 3_200_000, 20_000)
-    mean, _, lost = motion(times, centred=True)
+    mean, _, valid = motion(times, centred=True, extrapolate=True)
+    lost = ~valid
     direction = np.degrees(np.arctan2(mean[:, 1], -mean[:, 0]))
     rows.append(
         {
@@ -230,14 +230,14 @@ def slider(data: Path) -> Rows:
         for centre in np.arange(0.3, 3.1, 0.4):
             cut = recording[float(centre - 0.2) : float(centre + 0.2)]
             found = batch.estimate(cut, params)
-            mean, _, lost = found(np.array([round(centre * 1e6)]))
+            mean, _, valid = found(np.array([round(centre * 1e6)]))
             rows.append(
                 {
                     "recording": f"slider, {centre - 0.2:.1f} to {centre + 0.2:.1f} s",
                     "method": label,
                     "heading deg": angle(mean[0, :3], np.array([1.0, 0, 0]))[0],
                     "|Omega| deg/s": np.degrees(np.linalg.norm(mean[0, 3:])),
-                    "lost": int(lost[0]),
+                    "lost": int(not valid[0]),
                 }
             )
     return rows

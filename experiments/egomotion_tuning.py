@@ -20,7 +20,9 @@ import jax
 import numpy as np
 from bench import machine
 
-from jaxevent.egomotion import particle_filter as voting
+from jaxevent.egomotion import voting
+from jaxevent.egomotion.models import Planar
+from jaxevent.egomotion.particle_filter.parameters import Params
 from jaxevent.egomotion.truth import Known
 from jaxevent.recording import Events, Recording
 from jaxevent.runs.egomotion import Goal, Loss
@@ -64,7 +66,7 @@ def points(seed: int, size: tuple[int, int], seconds: float = 0.4) -> tuple[Reco
     t, x, y, p = table[np.argsort(table[:, 0], kind="stable")].T
     events = Events(t.astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), p > 0)
     grid = np.arange(0, round(seconds * 1e6) + 1, 1000)
-    known = Known("planar", grid, velocity(grid * 1e-6, angle))
+    known = Known(Planar, grid, velocity(grid * 1e-6, angle))
     return Recording("points", *size, events), known
 
 
@@ -75,7 +77,7 @@ def wall(seed: int, size: tuple[int, int], seconds: float = 0.4) -> tuple[Record
         "planar", "varying", seed, size=size, duration=seconds, texture=texture
     )
     t = np.arange(0, round(seconds * 1e6) + 1, 1000)
-    return recording, Known("planar", t, source.velocity(t))
+    return recording, Known(Planar, t, source.velocity(t))
 
 
 class Problem:
@@ -91,23 +93,23 @@ class Problem:
             "test": [],
         }
 
-    def __call__(self, params: voting.Params) -> tuple[Loss, list, list]:
+    def __call__(self, params: Params) -> tuple[Loss, list, list]:
         """The loss, and windows to fit to and unseen ones."""
-        goal = Simulated(params, Loss(), "planar", "", 8, 0.05, (0.0, 0.0, 0.0), self.truths)
+        goal = Simulated(voting, Loss(), "planar", "", 8, 0.05, (0.0, 0.0, 0.0), self.truths)
         return goal.loss, *goal.problem(self.sources, None, None)(params)
 
 
 value = jax.jit(lambda loss, params, batch: loss(params, batch), static_argnums=0)
 
 
-def error(loss: Loss, params: voting.Params, batches: list) -> float:
+def error(loss: Loss, params: Params, batches: list) -> float:
     """%, over all windows."""
     return 100 * float(np.sqrt(np.mean([float(value(loss, params, b)) for b in batches])))
 
 
 def fitted(problem: Problem, label: str, given: dict[str, Any], names: list[str]) -> None:
     """Print a line of the table."""
-    params = voting.Params.of({"particles": 100, "batch": 32, **given})
+    params = Params.of({"particles": 100, "batch": 32, **given})
     loss, mine, unseen = problem(params)
     settings = Settings(
         iterations=40, learning_rate=0.3, rounds=1, every=40, patience=1000, forward=True
@@ -131,7 +133,7 @@ def main() -> None:
     literal: dict[str, Any] = {"likelihood": "literal"}
     problem, curve = Problem(points, arguments.seeds, size), []
     for r_t in GRID:
-        params = voting.Params.of({"particles": 100, "batch": 32, **literal, "r_t": float(r_t)})
+        params = Params.of({"particles": 100, "batch": 32, **literal, "r_t": float(r_t)})
         loss, mine, unseen = problem(params)
         curve.append(error(loss, params, mine))
         told = f"{error(loss, params, unseen):.2f} (of those fitted to {curve[-1]:.2f})"
@@ -139,7 +141,7 @@ def main() -> None:
     best = float(GRID[np.argmin(curve)])
     for factor in (10.0, 0.1):
         fitted(problem, f"literal, r_t x {factor:g}", {**literal, "r_t": best * factor}, ["r_t"])
-    problem, default = Problem(wall, arguments.seeds, size), voting.Params.of({})
+    problem, default = Problem(wall, arguments.seeds, size), Params.of({})
     for factor in (10.0, 0.1):
         given = {name: factor * float(getattr(default, name)) for name in ("noise", "alpha")}
         fitted(problem, f"soft, noise and alpha x {factor:g}", given, ["noise", "alpha"])

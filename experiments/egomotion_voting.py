@@ -8,7 +8,7 @@ apart on 32 x 32 pixels. Parameters are the defaults and the presets of `voting.
 chosen on seeds 0 to 9. Errors are means over a sequence after its start-up of 200 ms (100 frames),
 in three readings: "at once", as the filter tells it; "fixed lag", when what is told counts for the
 time that the candidates show; "smoothed", after a backward pass over the whole sequence
-(`voting.smoothed`). A run is lost if the filter says so at any time after the start-up, or if its
+(`smoothed`). A run is lost if the filter says so at any time after the start-up, or if its
 mean error is 50 % or more. Start-up is until the filter first says that it has found the motion.
 Writes a table of every part as Markdown and CSV.
 """
@@ -25,9 +25,10 @@ import numpy as np
 from bench import machine
 from numpy.typing import NDArray
 
-from jaxevent.egomotion import particle_filter as voting
+from jaxevent.egomotion import voting
 from jaxevent.egomotion.motion import Motion
-from jaxevent.egomotion.particle_filter import Params
+from jaxevent.egomotion.particle_filter.parameters import Params
+from jaxevent.egomotion.particle_filter.smoothing import smoothed
 from jaxevent.egomotion.truth import axis_error, relative_error, relative_magnitude_error
 from jaxevent.io.output import complete
 from jaxevent.recording import Recording
@@ -78,11 +79,11 @@ def errors(
 ) -> dict[str, float]:
     """Mean relative errors, %, in three readings, and whether the run is lost."""
     true = truth(times)
-    smooth = voting.smoothed(motion, params)
+    smooth = smoothed(motion, params)
     told = {
-        "at once": motion(times),
-        "fixed lag": motion(times, centred=True),
-        "smoothed": smooth(times),
+        "at once": motion(times, extrapolate=True),
+        "fixed lag": motion(times, centred=True, extrapolate=True),
+        "smoothed": smooth(times, extrapolate=True),
     }
     scores = {name: 100 * float(relative_error(s.mean, true).mean()) for name, s in told.items()}
     mean = told["smoothed"].mean
@@ -93,9 +94,9 @@ def errors(
                 relative_magnitude_error(states.mean, true).mean()
             )
             scores[f"AAE {name}"] = float(axis_error(states.mean, true).mean())
-    found = np.flatnonzero(~motion.lost)
+    found = np.flatnonzero(motion.valid)
     scores["start-up"] = 1e-3 * float(motion.t[found[0]]) if len(found) else np.nan
-    scores["lost"] = float(told["at once"].lost.any() or scores["smoothed"] >= 50)
+    scores["lost"] = float((~told["at once"].valid).any() or scores["smoothed"] >= 50)
     return scores
 
 
@@ -297,11 +298,11 @@ def part_general(seeds: range) -> list[Table]:
 def general(recording: Recording, source: MovingCamera, settings: Row, seed: int) -> dict:
     times = np.arange(0.25, source.duration - 1e-6, 0.005)
     motion = voting.estimate(recording, Params.of(settings), model="general", seed=seed)
-    told, (T, Omega) = motion(times), source.twist(times)
+    told, (T, Omega) = motion(times, extrapolate=True), source.twist(times)
     return {
         "heading, degrees": float(axis_error(told.mean[:, :3], T).mean()),
         "Omega, %": 100 * float(relative_error(told.mean[:, 3:], Omega).mean()),
-        "lost, % of the time": 100 * float(told.lost.mean()),
+        "lost, % of the time": 100 * float((~told.valid).mean()),
     }
 
 

@@ -44,10 +44,10 @@ def page() -> str:
         "`.choices`. Presets: `slow`, `fast`, `ttc`; of `chi2` also `authors`.",
         "\n".join(rows(trackers)),
         "## Egomotion",
-        "Each method of `jaxevent.egomotion.METHODS` has its own `Params`.",
+        "Each method of `jaxevent.METHODS` for egomotion has its own `Params`.",
     ]
-    for name, method in jaxevent.egomotion.METHODS.items():
-        parts += [f"### {name}", "\n".join(rows([method.Params]))]
+    for name in names("egomotion"):
+        parts += [f"### {name}", "\n".join(rows([jaxevent.METHODS[name].Params]))]
     return "\n\n".join(parts) + "\n"
 
 

@@ -30,7 +30,7 @@ HOMES = {
         "moving_moments": "jaxevent.blob:moving_moments",
     },
     "egomotion": {
-        "voting": "jaxevent.egomotion.particle_filter:voting",
+        "voting": "jaxevent.egomotion.particle_filter.estimator:voting",
         "batch": "jaxevent.egomotion.batch_fit.windows:batch",
         "contrast": "jaxevent.egomotion.baselines.contrast_maximisation:contrast",
         "planes": "jaxevent.egomotion.baselines.local_planes:planes",

@@ -18,10 +18,9 @@ from commands import fails
 
 import jaxevent
 from jaxevent import devices
-from jaxevent.egomotion.particle_filter import Params
 from jaxevent.errors import InputError
 from jaxevent.methods import METHODS
-from jaxevent.runs.egomotion import VOTING
+from jaxevent.runs import egomotion
 from jaxevent.runs.evaluate import evaluate
 from jaxevent.runs.fit import fit
 from jaxevent.runs.reconstruction import Objective, Problem, parts
@@ -123,8 +122,10 @@ def video(folder: Path) -> dict[str, Any]:
 def motions(folder: Path) -> dict[str, Any]:
     """The loss of voting, of a number of runs that four does not divide, but it does particles."""
     recording = dataclasses.replace(jaxevent.load(folder / SOURCE), name=str(folder / SOURCE))
-    params = Params.of(VOTES)
-    goal = VOTING.goal("voting", params, {"truth": "*.csv", "runs": 4, "settle": 0.02})
+    params = METHODS["voting"].Params.of(VOTES)
+    goal = egomotion.FAMILY.goal(
+        METHODS["voting"], params, {"truth": "*.csv", "runs": 4, "settle": 0.02}
+    )
     problem = goal.problem({"fit": [("", recording)], "validation": [], "test": []}, None, None)
     four = problem(params)[0][0]
     three = dataclasses.replace(four, noise=jax.tree.map(lambda leaf: leaf[:3], four.noise))

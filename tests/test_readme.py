@@ -14,8 +14,7 @@ README = (ROOT / "README.md").read_text()
 def test_table_of_parameters_is_that_of_the_code():
     page = runpy.run_path(str(ROOT / "experiments" / "parameters.py"))["page"]()
     assert (ROOT / "docs" / "parameters.md").read_text() == page
-    kinds = [jaxevent.METHODS[name].Params for name in names("reconstruction") + names("blob")]
-    kinds += [method.Params for method in jaxevent.egomotion.METHODS.values()]
+    kinds = [jaxevent.METHODS[name].Params for name in names()]
     for kind in kinds:
         for name in (*kind.numbers, *kind.choices):
             assert f"| `{name}` |" in page

@@ -30,12 +30,14 @@ def add(commands: Any) -> None:
         metavar="MODEL",
         required=True,
         help="planar: image velocity vx, vy (px/s); rotation: angular velocity wx, wy, wz (rad/s); "
-        "general: heading tx, ty, tz, a unit vector, and angular velocity",
+        "general: heading tx, ty, tz, a unit vector, and angular velocity; or one of your own, "
+        "package.module:Class",
     )
     one.add_argument(
         "--method",
         metavar="NAME",
-        help="voting, batch, contrast, planes or frames; default: voting, for general motion batch",
+        help="voting, batch, contrast, planes or frames, or one of your own, "
+        "package.module:object; default: voting, for general motion batch",
     )
     one.add_argument(
         "--params",
@@ -53,7 +55,9 @@ def add(commands: Any) -> None:
         "recording's poses or else its gyro",
     )
     one.add_argument(
-        "--gyro", action="store_true", help="let the recording's gyro help the method batch"
+        "--gyro",
+        action="store_true",
+        help="let the recording's gyro help, with batch",
     )
     one.add_argument(
         "--still",
@@ -106,24 +110,29 @@ def run(
     size: tuple[int, int] | None,
     out: Path,
 ) -> None:
-    import inspect
     import json
 
     from jaxevent.camera import PinholeCamera
-    from jaxevent.egomotion import METHODS, find_method, from_gyro, gyro_bias
+    from jaxevent.egomotion import MODELS, find_model, from_gyro, gyro_bias
     from jaxevent.io import load
+    from jaxevent.methods import names
+    from jaxevent.runs.egomotion import find_estimator
     from jaxevent.show.motion import Output
 
-    estimator = find_method(method, model)
-    method = next(name for name, one in METHODS.items() if one is estimator)
-    values = estimator.Params.of({}) if params is None else estimator.Params.load(params, method)
+    kind = find_model(model)
+    estimator = find_estimator(method or kind.method)
+    estimator.find_model(kind)
+    values = (
+        estimator.start(kind) if params is None else estimator.Params.load(params, estimator.name)
+    )
     if seed < 0:
         raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
-    takes = inspect.signature(estimator.estimate).parameters
-    for option, used, other in (("gyro", gyro, "batch"), ("smooth", smooth, "voting")):
-        if used and option not in takes:
+    for option, used in (("gyro", gyro), ("smooth", smooth)):
+        if used and option not in estimator.options:
+            others = [name for name in names("egomotion") if option in find_estimator(name).options]
             raise InputError(
-                f"--{option} is not for the method {method}; leave it out or use {other}"
+                f"--{option} is not for the method {estimator.name}; leave it out or use "
+                f"{' or '.join(others)}"
             )
     output = Output(out, rate, truth, centred, flow)
     recording = load(path, size, in_memory=False, progress=show_progress())
@@ -137,10 +146,11 @@ def run(
             raise InputError(f"{path}: has a calibration; leave out --focal")
         centre = (recording.width - 1) / 2, (recording.height - 1) / 2
         recording = dataclasses.replace(recording, camera=PinholeCamera(focal, focal, *centre))
-    if model != "planar" and recording.camera is None:
+    if kind.needs_camera and recording.camera is None:
+        others = [name for name, one in MODELS.items() if not one.needs_camera]
         raise InputError(
-            f"{path}: has no calibration, which {model} motion needs; give --focal or choose "
-            "--model planar"
+            f"{path}: has no calibration, which {kind.title} needs; give --focal or choose "
+            f"--model {' or '.join(others)}"
         )
     imu = recording.imu
     if imu is None and (gyro or still is not None):
@@ -149,8 +159,8 @@ def run(
             "recording"
         )
     bias = None if imu is None or still is None else gyro_bias(imu, *still)
-    true = output.known(recording, model, bias)
-    settings: dict[str, Any] = {"cloud": CLOUD} if "cloud" in takes else {}
+    true = output.known(recording, kind, bias)
+    settings: dict[str, Any] = {"cloud": CLOUD} if "cloud" in estimator.options else {}
     if smooth:
         settings["smooth"] = True
     if imu is not None and gyro:
@@ -162,13 +172,13 @@ def run(
             raise InputError(f"{path}: holds no events from --start to --stop; choose other times")
     clock = time.perf_counter()
     told = estimator.estimate(
-        recording, values, model=model, seed=seed, progress=show_progress(), **settings
+        recording, values, model=kind, seed=seed, progress=show_progress(), **settings
     )
     seconds = time.perf_counter() - clock
-    about = {"method": method, "parameters": json.dumps(values.values()), "seed": seed}
+    about = {"method": estimator.name, "parameters": json.dumps(values.values()), "seed": seed}
     about |= {"smooth": smooth, "gyro": gyro, "centred": centred}
     written = output.write(recording, told, about, true, show_progress())
-    print("\n".join([f"{model} motion by {method}:", *written.summary()]))
+    print("\n".join([f"{kind.title} by {estimator.name}:", *written.summary()]))
     count = len(recording.events)
     print(
         f"\n{', '.join(written.files)} in {out}: {count:,} events in {seconds:.2f} s, "

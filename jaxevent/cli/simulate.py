@@ -221,6 +221,7 @@ def _simulate_motion(
 ) -> None:
     import numpy as np
 
+    from jaxevent.egomotion.models import MODELS, General
     from jaxevent.io import save
     from jaxevent.io.output import complete
     from jaxevent.show.motion import write_known
@@ -243,9 +244,7 @@ def _simulate_motion(
         save(recording, partial)
         if table is not None:
             times = np.arange(0, round(1e6 * duration) + 1, 1000)
-            T, Omega = source.twist(times)
-            heading = T / np.maximum(np.linalg.norm(T, axis=1, keepdims=True), 1e-12)
-            kinds = {"planar": source.velocity, "rotation": lambda _: Omega}
-            values = kinds.get(name, lambda _: np.concatenate([heading, Omega], 1))(times)
-            write_known(table, name if name in kinds else "general", times, values)
+            # Scenes of a name that is no model's move in general.
+            model = MODELS.get(name, General)
+            write_known(table, model, times, model.of_scene(source, times))
     print_stored(recording, out)

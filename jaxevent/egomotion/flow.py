@@ -1,6 +1,6 @@
 """Optical flow of each event, once the camera's motion is known; and how many events contradict it.
 
-    U, valid, residual = flow(recording, estimate(recording, model="rotation"))
+    U, valid, residual = flow(recording, voting.estimate(recording, model="rotation"))
 
 Planar motion is the flow, a rotation makes B Omega. General motion leaves the speed rho along the
 half-line B Omega + rho a, a = A T / |A T|, to the depth. It is told by the event's candidates: with
@@ -19,19 +19,21 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.candidates import Candidates, Gatherer
-from jaxevent.egomotion.geometry import A, B, length
+from jaxevent.egomotion.geometry import length
+from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import Motion
 from jaxevent.errors import InputError
 from jaxevent.parameters import Count, Number, Parameters, Positive
+from jaxevent.progress import bar
 from jaxevent.recording import Recording
 
 BATCH, BATCHES = 256, 32  # events that are looked at together, and how often before the host acts
@@ -83,7 +85,7 @@ def flow(
     params: Params | None = None,
     *,
     camera: PinholeCamera | None = None,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> Flow:
     """The flow of every event of a recording; see `Flow`, and `iterate`, which says what it takes.
 
@@ -106,7 +108,7 @@ def iterate(
     params: Params | None = None,
     *,
     camera: PinholeCamera | None = None,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> Iterator[Flow]:
     """The same in stretches of up to 8192 events, one after another, in constant memory.
 
@@ -115,9 +117,9 @@ def iterate(
     """
     params = params or Params.of({})
     camera = camera or recording.camera
-    if motion.model != "planar" and camera is None:
+    if motion.model.needs_camera and camera is None:
         raise InputError(
-            f"{recording.name}: has no calibration, which the flow of {motion.model} motion needs; "
+            f"{recording.name}: has no calibration, which the flow of {motion.model.title} needs; "
             "give a camera"
         )
     gatherer = Gatherer(
@@ -133,10 +135,10 @@ def iterate(
     )
     real = np.dtype(jnp.result_type(float))
     ages = _ages(params, motion, gatherer)
-    with tqdm(
-        total=len(recording.events), unit="event", unit_scale=True, desc="flow",
-        delay=2, disable=not progress, leave=False,
-    ) as bar:  # fmt: skip
+    model = motion.model(gatherer.f)
+    with bar(
+        total=len(recording.events), unit="event", unit_scale=True, desc="flow", progress=progress
+    ) as shown:
         while not gatherer.done:
             made = gatherer.gather(BATCHES, *ages)
             seen = made.row >= 0
@@ -144,37 +146,37 @@ def iterate(
             if not len(rows):
                 break
             t = recording.events[int(rows[0]) : int(rows[-1]) + 1].t
-            states = motion(t, centred=True)
-            known = ~states.lost & np.isfinite(states.mean).all(1)
-            mean = np.zeros((*seen.shape, states.mean.shape[1]), real)
-            mean[seen] = np.where(known[:, None], states.mean, 0)
-            U, residual = _flows(params, motion.model, gatherer.f, made.candidates, mean)
+            told = motion(t, centred=True, extrapolate=True)
+            known = told.valid & np.isfinite(told.mean).all(1)
+            mean = np.zeros((*seen.shape, told.mean.shape[1]), real)
+            mean[seen] = np.where(known[:, None], told.mean, 0)
+            U, residual = _flows(params, model, made.candidates, mean)
             U, residual = np.asarray(U)[seen], np.asarray(residual)[seen]
-            valid = known & ((motion.model != "general") | (residual <= float(params.limit)))
+            valid = known & (residual <= float(params.limit)) if model.half_line else known
             yield Flow(
                 np.where(valid[:, None], U, np.nan).astype(np.float32),
                 valid,
                 np.where(known, residual, np.nan).astype(np.float32),
             )
-            bar.update(len(rows))
+            shown.update(len(rows))
 
 
 def _ages(params: Params, motion: Motion, gatherer: Gatherer) -> tuple[float, float]:
     """Youngest and oldest candidates (s) that any event can need, from the flow at the border."""
     tau_max, b = float(params.tau_max), float(params.baseline)
-    mean = np.asarray(motion.mean[~motion.lost], float)
+    mean = np.asarray(motion.mean[motion.valid], float)
     if not len(mean):
         return tau_max / 2, tau_max
     border = np.concatenate(
         [gatherer.xi[0], gatherer.xi[-1], gatherer.xi[:, 0], gatherer.xi[:, -1]]
     )
-    if motion.model == "planar":
-        speed = float(np.linalg.norm(mean, axis=1).max())
+    model = motion.model(gatherer.f)
+    basis = np.asarray(model.basis(border))
+    if model.uniform:
+        speed = float(np.linalg.norm(mean @ basis[0].T, axis=1).max())
     else:
-        x, y = border.T
-        most = np.abs(np.asarray(B(x, y, gatherer.f))).max(0) @ np.abs(mean[:, -3:]).max(0)
-        speed = float(np.linalg.norm(most))
-    if motion.model == "general":
+        speed = float(np.linalg.norm(np.abs(basis).max(0) @ np.abs(mean).max(0)))
+    if model.half_line:
         speed += float(params.fastest)
     return min(b / 2 / max(speed, 1e-9), tau_max / 2), tau_max
 
@@ -182,8 +184,7 @@ def _ages(params: Params, motion: Motion, gatherer: Gatherer) -> tuple[float, fl
 @eqx.filter_jit
 def _flows(
     params: Params,
-    model: str,
-    f: float | Array,
+    model: Model,
     candidates: Candidates,
     mean: Float[Array | NDArray, "batches K dimension"],
 ) -> tuple[Float[Array, "batches K 2"], Float[Array, "batches K"]]:
@@ -193,19 +194,13 @@ def _flows(
 
     def one(batch: tuple[Array, Array, Array, Array]):
         d, age, xi, mean = batch
-        x, y = xi[:, 0], xi[:, 1]
-        if model == "planar":
-            base, a = mean, jnp.zeros_like(mean)
-        else:
-            base = _apply(B(x, y, f), mean[:, -3:])
-            a = _apply(A(x, y, f), mean[:, :3]) if model == "general" else jnp.zeros_like(base)
-        size = length(a)[:, None]
-        a = a / jnp.where(size > 0, size, 1)
+        base = jax.vmap(model.flow)(xi, mean)
+        a = jax.vmap(model.line)(xi, mean) if model.half_line else jnp.zeros_like(base)
         q = jnp.moveaxis(d, 0, -1) - age[..., None] * base  # C K 2
         along = (q * a).sum(-1)
         off = ((q - along[..., None] * a) ** 2).sum(-1)
         rho = jnp.zeros_like(along[0])
-        if model == "general":
+        if model.half_line:
             rho = _voted(params, grid, age, along, off, base, a)
         U = base + rho[:, None] * a
         moved = _moved(params, age, length(U))
@@ -245,7 +240,3 @@ def _voted(
         fitted = (votes * along * age).sum(0) / jnp.where(moment > 0, moment, 1)
         rho = jnp.where(moment > 0, jnp.clip(fitted, 0, params.fastest), rho)
     return rho
-
-
-def _apply(matrix: Array, vector: Array) -> Array:
-    return (matrix * vector[:, None, :]).sum(-1)

@@ -14,6 +14,7 @@ product. All functions broadcast over leading axes and are differentiable.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -35,7 +36,21 @@ def A(x: Scalars, y: Scalars, f: Scalars) -> Float[Array, "... 2 3"]:
 def B(x: Scalars, y: Scalars, f: Scalars) -> Float[Array, "... 2 3"]:
     """The matrix of rotation (px): B Omega is the flow in px/s of a camera that turns by Omega."""
     x, y, f = jnp.broadcast_arrays(*map(_real, (x, y, f)))
-    return _rows([x * y / f, -(f + x * x / f), y], [f + y * y / f, -x * y / f, -x])
+    return jnp.stack([jnp.stack(row, -1) for row in _turning_rows(x, y, f)], -2)
+
+
+def rotation_basis(
+    xi: Float[Array | np.ndarray, "*places 2"], f: float
+) -> Float[Array | np.ndarray, "*places 2 3"]:
+    """`B` at places xi (px): of NumPy arrays in NumPy, in their precision, else in JAX."""
+    if not isinstance(xi, np.ndarray):
+        return B(xi[..., 0], xi[..., 1], jnp.asarray(f, xi.dtype))
+    x, y = xi[..., 0], xi[..., 1]
+    return np.stack([np.stack(row, -1) for row in _turning_rows(x, y, f)], -2)
+
+
+def _turning_rows(x: Any, y: Any, f: Any) -> tuple[list, list]:
+    return [x * y / f, -(f + x * x / f), y], [f + y * y / f, -x * y / f, -x]
 
 
 def flow(
@@ -120,6 +135,12 @@ def length(v: Float[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
     """The Euclidean length along the last axis; its gradient at 0 is 0."""
     square = jnp.sum(_real(v) ** 2, -1)
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+
+
+def unit(v: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    """The vector of length 1 along the last axis; that of 0 is 0."""
+    square = (v**2).sum(-1, keepdims=True)
+    return jnp.where(square > 0, v / jnp.sqrt(jnp.where(square > 0, square, 1)), v)
 
 
 def rotation_exp(phi: Float[Array | np.ndarray, "*batch 3"]) -> Float[Array, "*batch 3 3"]:

@@ -16,7 +16,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from jaxevent.egomotion.motion import COMPONENTS
+from jaxevent.egomotion.models import Model, find_model, in_words
 from jaxevent.errors import InputError
 from jaxevent.recording import Imu, Poses, Recording, Times, microseconds
 
@@ -135,12 +135,9 @@ def gyro_bias(imu: Imu, start: Times, stop: Times) -> NDArray[np.float64]:
 
 @dataclasses.dataclass(frozen=True)
 class Known:
-    """A motion that is known at times t (us), n of them: values (n, components) of `model`.
+    """A motion that is known at times t (us), n of them: values (n, components) of `model`."""
 
-    The components are those of `motion.COMPONENTS`, in px/s, or rad/s and unit headings.
-    """
-
-    model: str
+    model: type[Model]
     t: NDArray[np.int64]
     values: NDArray[np.float64]
 
@@ -156,8 +153,9 @@ class Known:
                 f"to {us.max()} us; integers are microseconds, floats seconds"
             )
         between = np.stack([np.interp(us, self.t, column) for column in self.values.T], 1)
-        if self.model == "general":
-            between[:, :3] = _unit(between[:, :3])
+        for part in self.model.parts:
+            if part.direction:
+                between[:, part.rows] = _unit(between[:, part.rows])
         return between
 
     def within(self, times: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -167,7 +165,7 @@ class Known:
 
 def known(
     recording: Recording,
-    model: str,
+    model: str | type[Model],
     source: str | Path = "auto",
     bias: ArrayLike = (0.0, 0.0, 0.0),
     span: float | int = 0.02,
@@ -176,45 +174,48 @@ def known(
 
     Args:
         recording: With poses or an IMU, unless `source` is a table.
-        model: Of `motion.COMPONENTS`. Planar motion is known from tables alone.
+        model: See `models`; `Model.known_from` says what tells its motion.
         source: "poses", "gyro", "auto" (poses, else the gyro), or the path of a table.
         bias: Taken off the gyro, rad/s.
         span: Time (s) over which velocities are taken from poses.
 
     Raises:
-        InputError: The recording holds no such truth, or the table cannot be read.
+        InputError: The model is unknown, the recording holds no such truth, or the table cannot be
+            read.
     """
+    model = find_model(model)
     if source not in ("auto", "poses", "gyro"):
         return read_motion(source, model)
-    if model == "planar":
+    parts = in_words([part.name for part in model.parts])
+    if not model.known_from:
         raise InputError(
-            f"{recording.name}: image velocity is known neither from poses nor from a gyro; give "
-            "a table with the columns t, vx, vy"
+            f"{recording.name}: {parts} is known neither from poses nor from a gyro; give a table "
+            f"with the columns {', '.join(('t', *model.components))}"
         )
     poses, imu = recording.poses, recording.imu
-    if source != "gyro" and poses is not None and len(poses):
+    by_gyro = imu is not None and len(imu) > 0 and "gyro" in model.known_from
+    by_poses = poses is not None and len(poses) > 0 and "poses" in model.known_from
+    if source != "gyro" and by_poses and poses is not None:
         twists = from_poses(poses, span)
-    elif source != "poses" and imu is not None and len(imu) and model == "rotation":
+    elif source != "poses" and by_gyro and imu is not None:
         twists = from_gyro(imu, bias)
     else:
         what = {"auto": "neither poses nor an IMU", "poses": "no poses", "gyro": "no IMU"}[
             str(source)
         ]
-        if source != "poses" and model == "general" and imu is not None:
-            what = "no poses, and its gyro does not tell the heading"
+        if source != "poses" and imu is not None and "gyro" not in model.known_from:
+            what = f"no poses, and its gyro does not tell {parts}"
         raise InputError(f"{recording.name}: holds {what}; give a table of the true motion")
-    if model == "rotation":
-        return Known(model, twists.t, twists.Omega)
-    assert twists.T is not None
-    return Known(model, twists.t, np.concatenate([_unit(twists.T), twists.Omega], 1))
+    return Known(model, twists.t, model.of_twist(twists.T, twists.Omega))
 
 
-def read_motion(path: str | Path, model: str) -> Known:
+def read_motion(path: str | Path, model: str | type[Model]) -> Known:
     """The true motion from a table: columns t (s) and the components; further ones are left out.
 
     Raises `InputError` for a file that cannot be read, missing columns or numbers, times that do
     not rise.
     """
+    model = find_model(model)
     path = Path(path)
     try:
         table = pd.read_csv(path)
@@ -222,7 +223,7 @@ def read_motion(path: str | Path, model: str) -> Known:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
     except ValueError as error:
         raise InputError(f"{path}: is no table ({error}); give columns t and components") from None
-    names = ("t", *COMPONENTS[model])
+    names = ("t", *model.components)
     for name in names:
         if name not in table.columns:
             raise InputError(f"{path}: has no column {name!r}; give the columns {', '.join(names)}")
@@ -304,13 +305,15 @@ def motion_errors(
     U: tuple[ArrayLike, ArrayLike] | None = None,
     T: tuple[ArrayLike, ArrayLike] | None = None,
     Omega: tuple[ArrayLike, ArrayLike] | None = None,
+    V: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> dict[str, float]:
     """The thesis' figures for pairs of (estimate, truth), each (n, components), n > 0.
 
     - U, image velocity in px/s: AEE (px/s), AEE_rel (%), AAE_U (degrees);
     - T, translation in any unit and of any length: AAE_T (degrees);
     - Omega, in rad/s: AAE_Omega (degrees), AME (degrees/s), AME_rel (%), AME_N (%), vector_error
-      (%), outliers (%).
+      (%), outliers (%);
+    - V, any other vector: AME_rel (%), vector_error (%), outliers (%).
 
     All are means over the n times except outliers. Scaling the estimate or the truth of T by a
     positive number changes nothing. Raises `InputError` for pairs of other shapes, none at all,
@@ -330,6 +333,10 @@ def motion_errors(
         scores["AME_N"] = _percent(normalised_magnitude_error(*Omega))
         scores["vector_error"] = _percent(relative_error(*Omega))
         scores["outliers"] = outlier_percentage(*Omega)
+    if V is not None:
+        scores["AME_rel"] = _percent(relative_magnitude_error(*V))
+        scores["vector_error"] = _percent(relative_error(*V))
+        scores["outliers"] = outlier_percentage(*V)
     return scores
 
 

@@ -15,16 +15,20 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import jaxevent
-from jaxevent import cli, egomotion
+from jaxevent import cli, egomotion, methods
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion import particle_filter as voting
-from jaxevent.egomotion.motion import COMPONENTS, Motion, States
+from jaxevent.egomotion import voting
+from jaxevent.egomotion.comparison import compare
+from jaxevent.egomotion.models import MODELS, General, Planar
+from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.particle_filter.estimator import Voting
 from jaxevent.egomotion.truth import Known
 from jaxevent.errors import InputError
+from jaxevent.estimator import Estimate
 from jaxevent.parameters import read_toml
 from jaxevent.recording import Events, Frames, Imu, Recording
-from jaxevent.runs import egomotion_scores as scores
 from jaxevent.show import motion as pictures
+from jaxevent.show.motion_pictures import warped_events
 from jaxevent.simulate import motion_scene
 
 WIDTH, HEIGHT = 96, 72
@@ -63,7 +67,7 @@ def run(folder: Path, *words: object) -> None:
 
 
 def test_columns_are_exact():
-    assert COMPONENTS == {
+    assert {name: model.components for name, model in MODELS.items()} == {
         "planar": ("vx", "vy"),
         "rotation": ("wx", "wy", "wz"),
         "general": ("tx", "ty", "tz", "wx", "wy", "wz"),
@@ -84,7 +88,7 @@ def test_a_folder_of_everything(folder, capsys):
 
     recording = jaxevent.load(path)[:0.2]
     params = voting.Params.of(read_toml(folder / "mine.toml"))
-    motion = egomotion.estimate(recording, params, seed=3, cloud=64)
+    motion = voting.estimate(recording, params, seed=3, cloud=64)
     header, table = read_table(out / "motion.csv")
     assert header == ["t", "vx", "vy", "sigma_vx", "sigma_vy", "lost"]
     events = recording.events
@@ -94,10 +98,11 @@ def test_a_folder_of_everything(folder, capsys):
     np.testing.assert_allclose(table[:, 1:3], states.mean, rtol=1e-12)
     variance = np.diagonal(states.covariance, axis1=1, axis2=2)
     np.testing.assert_allclose(table[:, 3:5] ** 2, variance, rtol=1e-9)
-    assert np.array_equal(table[:, 5], states.lost)
+    assert np.array_equal(table[:, 5], ~states.valid)
     with h5py.File(out / "motion.h5") as file:
-        for name in ("t", "mean", "covariance", "lost", "lag", "contrast", "evidence", "cloud"):
+        for name in ("t", "mean", "covariance", "lag", "contrast", "evidence", "cloud"):
             assert np.array_equal(file[name], getattr(motion, name))
+        assert np.array_equal(file["lost"], ~motion.valid)
         about = dict(file.attrs)
     assert (about["model"], about["method"], about["seed"]) == ("planar", "voting", 3)
     assert list(about["components"]) == ["vx", "vy"] and list(about["units"]) == ["px/s"] * 2
@@ -106,8 +111,8 @@ def test_a_folder_of_everything(folder, capsys):
     # The errors by hand.
     _, truth = read_table(folder / "planar.csv")
     true = np.stack([np.interp(times / 1e6, truth[:, 0], column) for column in truth.T[1:]], 1)
-    first = int(np.argmin(states.lost))
-    keep = ~states.lost & (times <= 1e6 * truth[-1, 0])
+    first = int(np.argmax(states.valid))
+    keep = states.valid & (times <= 1e6 * truth[-1, 0])
     far = np.linalg.norm(states.mean - true, axis=1)[keep]
     with (out / "errors.csv").open() as file:
         figures = {
@@ -178,11 +183,14 @@ def test_a_gyro_helps_a_method_that_takes_one(folder, monkeypatch):
     jaxevent.save(dataclasses.replace(recording, imu=imu), folder / "imu.h5")
     given = []
 
-    def estimate(recording, params, *, model, seed, progress, gyro):
-        given.append((len(recording.events), seed, gyro))
-        return Motion.nothing(model)
+    class WithGyro(Voting):
+        def estimate(self, recording, params, *, model, seed, progress, gyro):
+            given.append((len(recording.events), seed, gyro))
+            return Motion.nothing(model)
 
-    monkeypatch.setattr(voting, "estimate", estimate)
+    mine = WithGyro("voting", voting.Params, options=frozenset({"gyro"}))
+    monkeypatch.setattr("jaxevent.egomotion.particle_filter.estimator.voting", mine)
+    monkeypatch.setattr(methods, "_load", methods._load.__wrapped__)
     words = ("--model", "planar", "--gyro", "--still=-0.1,0", "--seed", 7, "--stop", 0.1)
     run(folder, folder / "imu.h5", *words)
     [(events, seed, told)] = given
@@ -194,13 +202,13 @@ def known_general(source, span=(0, 250_000)):
     t = np.arange(span[0], span[1] + 1, 5_000)
     T, Omega = source.twist(t)
     T = T / np.linalg.norm(T, axis=1, keepdims=True)
-    return Known("general", t, np.concatenate([T, Omega], 1))
+    return Known(General, t, np.concatenate([T, Omega], 1))
 
 
-def motion_of(known: Known, lost=None) -> Motion:
+def motion_of(known: Known, valid=None) -> Motion:
     n = known.values.shape[1]
     covariance = np.broadcast_to(0.01 * np.eye(n), (len(known.t), n, n))
-    return Motion.of(known.model, known.t, known.values, covariance, lost)
+    return Motion.of(known.model, known.t, known.values, covariance, valid)
 
 
 def test_general_motion_is_written_too(tmp_path):
@@ -208,7 +216,7 @@ def test_general_motion_is_written_too(tmp_path):
     known = known_general(source)
     lost = (known.t < 50_000) | (known.t == 200_000)
     motion = dataclasses.replace(
-        motion_of(known, lost), cloud=np.zeros((len(known.t), 3, 6)) + known.values[:, None]
+        motion_of(known, ~lost), cloud=np.zeros((len(known.t), 3, 6)) + known.values[:, None]
     )
     output = pictures.Output(tmp_path / "out")
     written = output.write(recording, motion, {}, (lambda _: known, "itself"))
@@ -244,18 +252,18 @@ def test_events_moved_back_fall_together():
     x, y = np.rint(at[inside]).astype(np.uint16).T
     events = Events(t[inside], x, y, np.ones(inside.sum(), bool))
     recording = Recording("points", WIDTH, HEIGHT, events, camera=camera)
-    known = Known("rotation", np.array([0, 60_000]), np.stack([Omega, Omega]))
-    back = pictures.warped_events(recording, motion_of(known), events, 30_000)
+    known = Known(MODELS["rotation"], np.array([0, 60_000]), np.stack([Omega, Omega]))
+    back = warped_events(recording, motion_of(known), events, 30_000)
     middle = (80 * P[:, :2] / P[:, 2:] + (47.5, 35.5))[inside]
     assert np.abs(back - middle).max() < 0.75  # half a pixel, and what the turn makes of it
     assert np.abs(at[inside] - middle).max() > 4
 
     # Planar, of changing speed: U = (0, 1000 + 1e5 t) moves by 1000 t + 5e4 t^2.
     t = np.array([0, 10_000, 40_000])
-    flat = Known("planar", np.array([0, 50_000]), np.array([[0.0, 1000.0], [0.0, 6000.0]]))
+    flat = Known(Planar, np.array([0, 50_000]), np.array([[0.0, 1000.0], [0.0, 6000.0]]))
     x = np.array([5, 6, 7], np.uint16)
     part = Events(t, x, x, np.ones(3, bool))
-    back = pictures.warped_events(recording, motion_of(flat), part, 10_000)
+    back = warped_events(recording, motion_of(flat), part, 10_000)
     way = 1000 * t * 1e-6 + 5e4 * (t * 1e-6) ** 2
     np.testing.assert_allclose(back, np.c_[x, x - (way - way[1])], atol=0.02)
 
@@ -263,19 +271,19 @@ def test_events_moved_back_fall_together():
 def test_errors_of_centred_estimates():
     """What was 20 ms ago, told 20 ms late, is right when centred."""
     t = np.arange(0, 300_001, 10_000)
-    truth = Known("planar", t, np.c_[1e-3 * t, 300 - 1e-3 * t])
+    truth = Known(Planar, t, np.c_[1e-3 * t, 300 - 1e-3 * t])
     late = dataclasses.replace(motion_of(truth), t=t + 20_000, lag=np.full(len(t), 0.02))
     times = np.arange(40_000, 280_000, 1000)
-    told = scores.errors(late, truth, times, centred=True)
+    told = compare(late, truth, times, centred=True)
     assert told.figures["AEE"] < 1e-9 and told.count == len(times) and told.startup == 0
-    told = scores.errors(late, truth, times, start=30_000)
+    told = compare(late, truth, times, start=30_000)
     assert told.figures["AEE"] == pytest.approx(20 * np.sqrt(2)) and told.startup == 0.01
 
 
 def test_velocity_of_poses_at_the_depth_that_fits():
     recording, source = motion_scene("planar", "varying", size=(8, 6), focal=80.0, duration=0.3)
     t = np.arange(0, 300_001, 1000)
-    motion = motion_of(Known("planar", t, 1.02 * source.velocity(t)))
+    motion = motion_of(Known(Planar, t, 1.02 * source.velocity(t)))
     told = pictures.fitted_velocity(recording, motion)
     np.testing.assert_allclose(told.values, 1.02 * source.velocity(told.t), rtol=0.02)
     for missing in ("poses", "camera"):
@@ -397,7 +405,7 @@ def test_simulated_motion_and_its_truth(folder, capsys):
     assert f"{folder / 'wall.h5'}: " in capsys.readouterr().out
     _, source = motion_scene("wall", "varying", 1, **SEEN, duration=0.05)
     header, table = read_table(folder / "wall.csv")
-    assert header == ["t", *COMPONENTS["general"]]
+    assert header == ["t", *General.components]
     T, Omega = source.twist(np.arange(51) * 1000)
     np.testing.assert_allclose(np.linalg.norm(table[:, 1:4], axis=1), 1)
     np.testing.assert_allclose(table[:, 1:4] * np.linalg.norm(T, axis=1)[:, None], T, rtol=1e-9)
@@ -419,7 +427,9 @@ def test_simulated_motion_and_its_truth(folder, capsys):
 
 
 def test_a_table_of_states_is_exact(tmp_path):
-    states = States(np.array([[1.5, -2.0]]), np.array([[[4.0, 1.0], [1.0, 9.0]]]), np.array([True]))
+    states = Estimate(
+        np.array([[1.5, -2.0]]), np.array([[[4.0, 1.0], [1.0, 9.0]]]), np.array([False])
+    )
     pictures.write_motion_table(tmp_path / "a.csv", "planar", np.array([1_500_000]), states)
     lines = (tmp_path / "a.csv").read_text().splitlines()
     assert lines == ["t,vx,vy,sigma_vx,sigma_vy,lost", "1.5,1.5,-2.0,2.0,3.0,1"]

@@ -415,21 +415,21 @@ def test_priors_pull():
 
 
 def test_a_recording_from_end_to_end():
-    motion = batch.estimate(seen(), PARAMS)
-    mean, covariance, lost = motion(motion.t[len(motion) // 2 :][:1])
-    assert not lost[0] and covariance.shape == (1, 6, 6)
+    motion = batch.batch.estimate(seen(), PARAMS)
+    mean, covariance, valid = motion(motion.t[len(motion) // 2 :][:1])
+    assert valid[0] and covariance.shape == (1, 6, 6)
     assert np.linalg.norm(mean[0, :3]) == pytest.approx(1)
     assert np.degrees(np.arccos(mean[0, :3] @ T / np.linalg.norm(T))) < 15
-    again = batch.estimate(seen(), PARAMS)
+    again = batch.batch.estimate(seen(), PARAMS)
     np.testing.assert_array_equal(again.mean, motion.mean)
-    few = batch.estimate(seen()[0.0:0.01], PARAMS)
-    assert few.lost.all() and np.isfinite(few.mean).all()
+    few = batch.batch.estimate(seen()[0.0:0.01], PARAMS)
+    assert not few.valid.any() and np.isfinite(few.mean).all()
     at_once = seen().events[:3000]
     at_once = dataclasses.replace(at_once, t=np.full(3000, 150_000))
-    instant = batch.estimate(dataclasses.replace(seen(), events=at_once), PARAMS)
+    instant = batch.batch.estimate(dataclasses.replace(seen(), events=at_once), PARAMS)
     assert all(np.isfinite(part).all() for part in (instant.mean, instant.covariance))
     empty = dataclasses.replace(seen(), events=seen().events[:0])
-    assert len(batch.estimate(empty, PARAMS)) == 0
+    assert len(batch.batch.estimate(empty, PARAMS)) == 0
 
 
 def a_fit(path, cost):
@@ -471,7 +471,7 @@ def test_a_path_that_is_lost_is_not_followed(monkeypatch):
     recording = seen()
     first = int(recording.events.t[0]) + 20_000
     short = {"half_window": 0.02, "step": 0.02, "fresh": 100}
-    batch.estimate(recording, batch.Params.of({**GIVEN, **short}))
+    batch.batch.estimate(recording, batch.Params.of({**GIVEN, **short}))
     assert [(kind, (centre - first) // 20_000) for kind, centre in asked][:10] == [
         ("anew", 0),
         ("followed", 1),
@@ -498,7 +498,7 @@ def test_new_starts_that_agree_are_made_less_often(monkeypatch):
     recording = seen()
     first = int(recording.events.t[0]) + 10_000
     short = {"half_window": 0.01, "step": 0.01, "fewest": 1, "fresh": 2}
-    batch.estimate(recording, batch.Params.of({**GIVEN, **short}))
+    batch.batch.estimate(recording, batch.Params.of({**GIVEN, **short}))
     anew = [(centre - first) // 10_000 for kind, centre in asked if kind == "anew"]
     # 2 windows after the first, 4, 8, where they do not agree, again 2.
     assert anew == [0, 2, 6, 14, 16, 20]
@@ -524,7 +524,7 @@ def test_a_wrong_beginning_is_fitted_again(monkeypatch, cheaper):
         follow,
     )
     params = batch.Params.of({**GIVEN, "half_window": 0.05, "step": 0.05, "fresh": 3})
-    motion = batch.estimate(recording, params)
+    motion = batch.batch.estimate(recording, params)
     at = np.searchsorted(motion.t, first + 50_000 * np.arange(4))
     along = motion.mean[at, :3] @ right.twist(0.0)[0].ravel()
     assert (along > 0).tolist() == [cheaper == "all", *2 * [cheaper != "none"], True]
@@ -532,6 +532,6 @@ def test_a_wrong_beginning_is_fitted_again(monkeypatch, cheaper):
 
 def test_what_cannot_be_estimated_is_refused():
     with pytest.raises(InputError, match="calibration"):
-        batch.estimate(dataclasses.replace(seen(), camera=None), PARAMS)
+        batch.batch.estimate(dataclasses.replace(seen(), camera=None), PARAMS)
     with pytest.raises(InputError, match="general"):
-        batch.estimate(seen(), PARAMS, model="generl")
+        batch.batch.estimate(seen(), PARAMS, model="generl")

@@ -9,7 +9,8 @@ import pytest
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import flow as module
 from jaxevent.egomotion.flow import Params, flow, iterate
-from jaxevent.egomotion.motion import COMPONENTS, Motion
+from jaxevent.egomotion.models import find_model
+from jaxevent.egomotion.motion import Motion
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
 from jaxevent.simulate import motion_scene
@@ -25,10 +26,10 @@ def textured():
     return recording[0.05:0.15], source
 
 
-def known(model, mean, t=(0, 300_000), lost=None):
-    n = len(COMPONENTS[model])
+def known(model, mean, t=(0, 300_000), valid=None):
+    n = len(find_model(model).components)
     mean = np.broadcast_to(np.asarray(mean, float), (len(t), n))
-    return Motion.of(model, np.array(t), mean, np.zeros((len(t), n, n)), lost)
+    return Motion.of(model, np.array(t), mean, np.zeros((len(t), n, n)), valid)
 
 
 def true_motion(source, sign=1):
@@ -161,7 +162,7 @@ def test_pieces_are_the_whole(monkeypatch):
 
 def test_where_the_motion_is_lost_there_is_no_flow():
     recording = scattered()
-    motion = known("planar", [100.0, 50.0], t=(0, 20_000, 40_000), lost=np.array([0, 1, 0], bool))
+    motion = known("planar", [100.0, 50.0], t=(0, 20_000, 40_000), valid=np.array([1, 0, 1], bool))
     told = flow(recording, motion)
     between = (recording.events.t > 0) & (recording.events.t < 40_000)
     assert np.array_equal(told.valid, ~between)

@@ -71,11 +71,11 @@ def test_motion(folder, tmp_path):
     truth = read_motion(folder / "wall.csv", "planar")
     for row, settings in zip(rows, ({}, {"step": 0.04}), strict=True):
         params = egomotion.planes.Params.of(settings)
-        motion = egomotion.estimate(recording, params, method="planes")
+        motion = egomotion.planes.estimate(recording, params)
         times = np.array(row["per_time"]["t"])
         assert times[0] >= 100_000 and set(np.diff(times)) == {5000}
-        mean, _, lost = motion(times)
-        assert row["lost"] == 0 and not lost.any() and row["times"] == len(times)
+        mean, _, valid = motion(times)
+        assert row["lost"] == 0 and valid.all() and row["times"] == len(times)
         np.testing.assert_allclose(row["AEE"], endpoint_error(mean, truth(times)).mean())
         speed = np.linalg.norm(truth(times), axis=1)
         each = 100 * np.linalg.norm(mean - truth(times), axis=1) / speed
@@ -124,7 +124,7 @@ def test_tracks(folder):
         (MOTION.replace('truth = "*.csv"', 'truth = "*.csv"\nmodel = "planer"'), "planar"),
         (MOTION.replace("settle = 0.1", "settle = -1"), "settle is -1"),
         (MOTION.replace("settle = 0.1", "metrics = ['lpips']"), "no setting 'metrics'"),
-        (MOTION.replace("planes", "akf", 1), "'akf' of motion"),
+        (MOTION.replace("planes", "akf", 1), "'akf' is of reconstruction"),
         (MOTION.replace("*.csv", "*.txt"), "wall.txt: cannot be read"),
         (MOTION.replace("*.csv", "poses"), "neither from poses"),
         (MOTION.replace('label = "coarse"', "normalise = 'affine'"), "no setting 'normalise'"),

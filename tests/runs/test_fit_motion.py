@@ -15,9 +15,10 @@ from points import moved
 import jaxevent
 import jaxevent.runs.fit
 from jaxevent import cli
-from jaxevent.egomotion import particle_filter as voting
+from jaxevent.egomotion import voting
+from jaxevent.egomotion.particle_filter import filtering
 from jaxevent.errors import InputError
-from jaxevent.runs.egomotion import VOTING, Loss
+from jaxevent.runs.egomotion import FAMILY, Loss
 
 VELOCITIES = ((150.0, 80.0), (-90.0, 60.0), (40.0, -170.0))
 START = {"particles": 32, "batch": 16, "every": 4, "noise": 3.0, "tau_max": 0.06}
@@ -89,7 +90,7 @@ def test_the_gradient_with_resampling_is_that_of_common_random_numbers():
         }
     )  # candidates are so young at every velocity: their ages are held fixed in derivatives
     recording = recorded(0)[0.05:0.13]
-    kind, gatherer = voting.prepare(recording, params, "planar")
+    kind, gatherer = voting.gatherer(recording, params, "planar")
     made = gatherer.whole(0.01, 0.02).candidates
     made = jax.tree.map(lambda leaf: jnp.asarray(leaf[-30:]), made)
     truth = jnp.asarray(VELOCITIES[0])
@@ -98,11 +99,11 @@ def test_the_gradient_with_resampling_is_that_of_common_random_numbers():
 
     def loss(theta, key):
         raw = {name: params.raw[name] + theta[k] for k, name in enumerate(names)}
-        noise = voting.draw(key, len(made.elapsed), params, kind)
+        noise = filtering.draw(key, len(made.elapsed), params, kind)
         start = 0.8 * truth + 30.0 * jax.random.normal(jax.random.fold_in(key, 1), (48, 2))
-        carry = voting.begin(params, kind, noise)
+        carry = filtering.begin(params, kind, noise)
         carry = dataclasses.replace(carry, particles=start, searching=jnp.asarray(False))
-        _, told = voting.run(params.with_raw(raw), kind, made, noise, carry)
+        _, told = filtering.run(params.with_raw(raw), kind, made, noise, carry)
         return jnp.mean(told.mean @ truth) / jnp.sum(truth**2)
 
     value = jax.jit(jax.vmap(loss, (None, 0)))
@@ -135,7 +136,7 @@ def test_bad_settings(tmp_path, capsys):
 
 def test_loss_of_a_perfect_filter_is_small():
     params = voting.Params.of({**START, "particles": 100, "noise": 0.1})
-    goal = VOTING.goal("voting", params, {"truth": "*.csv"})
-    assert goal.loss == Loss(False) and "tau_max" in goal.prepared
+    goal = FAMILY.goal(voting, params, {"truth": "*.csv"})
+    assert goal.loss == Loss(False) and "tau_max" in params.without_gradient()
     with pytest.raises(InputError, match="true motion"):
-        VOTING.goal("voting", params, {})
+        FAMILY.goal(voting, params, {})

@@ -35,18 +35,18 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 from scipy.optimize import minimize
-from tqdm import tqdm
 
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion.baselines.local_planes import Fit, arms, check_model, held
+from jaxevent.egomotion.baselines.local_planes import Fit, held
 from jaxevent.egomotion.candidates import coordinates
-from jaxevent.egomotion.geometry import rotation_exp
-from jaxevent.egomotion.motion import COMPONENTS, Motion
+from jaxevent.egomotion.estimator import Given, OnHost
+from jaxevent.egomotion.models import Model
+from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.warped import blur, splat
-from jaxevent.parameters import Choice, Count, Parameters, Positive
+from jaxevent.parameters import Choice, Count, Parameters, Positive, Share
+from jaxevent.progress import bar
 from jaxevent.recording import Recording
 
-MODELS = ("planar", "rotation")
 COARSE = 8  # times [1 2 1] in a search: 2 px
 MIDDLE = 2  # times, next
 SPACING = 2.0  # px at the end of the short window between motions of the grid
@@ -76,7 +76,7 @@ class Params(Parameters):
     margin = Count(16, "px", "of the image around the sensor")
 
     duration = Positive(0.1, "s", "length of a window; motion is taken to be constant in it")
-    overlap = Positive(0.5, "", "share of a window that the next one has too; below 1")
+    overlap = Share(0.5, "", "share of a window that the next one has too")
     speed_max = Positive(600.0, "px/s", "planar: motions of the search are in +- this")
     omega_max = Positive(4.0, "rad/s", "rotation: motions of the search are in +- this")
     contrast = Positive(1.2, "", "lost where J's square is less than this, in chance's")
@@ -92,8 +92,7 @@ class Window(eqx.Module):
     mask: Float[Numeric, "height width"]  # 1 where the image counts; see `in_view`
     ends: Float[Numeric, "2"]  # s from the middle
     scale: Float[Numeric, " dimension"]  # the motion per px at the window's end
-    model: str = eqx.field(static=True)
-    f: float = eqx.field(static=True)  # px
+    model: Model
     shape: tuple[int, int] = eqx.field(static=True)  # of the image, height and width
     offset: tuple[float, float] = eqx.field(static=True)  # px, where its pixel [0, 0] lies
     box: tuple[float, float, float, float] = eqx.field(static=True)  # px, x0, y0, x1, y1 of events
@@ -106,14 +105,7 @@ def warp(window: Window, motion: Float[Numeric, " dimension"]) -> Float[Array, "
 
 def _moved(window: Window, xi: Array, t: Array, motion: Array) -> Array:
     """Places xi (n, 2) of times t (n,) at the middle."""
-    if window.model == "planar":
-        return xi - motion * t[:, None]
-    R, f = rotation_exp(motion * t[:, None]), window.f
-    x, y, z = (R[:, k, 0] * xi[:, 0] + R[:, k, 1] * xi[:, 1] + R[:, k, 2] * f for k in range(3))
-    # A direction behind the camera has no place: far outside the image.
-    ahead = z > 1e-3 * f
-    z = jnp.where(ahead, z, 1)
-    return jnp.where(ahead[:, None], f * jnp.stack([x, y], -1) / z[:, None], 1e6)
+    return window.model.warp(xi, motion * t[:, None])
 
 
 def in_view(window: Window, motion: Float[Numeric, " dimension"]) -> Window:
@@ -288,25 +280,23 @@ class Windows:
         self,
         recording: Recording,
         params: Params | None = None,
-        model: str = "planar",
+        model: str | type[Model] = "planar",
         camera: PinholeCamera | None = None,
         seed: int = 0,
     ):
-        self.recording, self.params = recording, params or Params.of({})
-        self.model = model
-        camera = camera or recording.camera
-        check_model(recording, model, camera, MODELS)
-        self.xi, self.f = coordinates(recording.width, recording.height, camera)
+        self.recording, self.params = recording, params or Params()
+        kind, camera = contrast.place(recording, model, camera)
+        self.xi, f = coordinates(recording.width, recording.height, camera)
+        self.model = kind(f)
         margin = self.params.margin
         low = np.floor(self.xi.min((0, 1))) - margin
         width, height = (np.ceil(self.xi.max((0, 1))) + margin - low).astype(int) + 1
         self.shape, self.offset = (int(height), int(width)), (float(low[0]), float(low[1]))
         x0, y0, x1, y1 = (float(v) for v in (*self.xi.min((0, 1)), *self.xi.max((0, 1))))
         self.box = x0, y0, x1, y1
-        self.arms = arms(model, self.xi, self.f)
+        self.arms = self.model.arms(self.xi)
         p = self.params
-        extent = p.speed_max if model == "planar" else p.omega_max
-        self.extent = float(extent)
+        self.extent = float(self.model.extent(p))
         self._rng = np.random.default_rng(seed)
         share = max(1 - float(p.overlap), 0.01)
         events = recording.events
@@ -377,12 +367,12 @@ class Windows:
         ends, mask = np.array([-half, half], real), np.ones(self.shape, real)
         return Window(
             xi, times[0], weight, times[1], mask, ends, scale,
-            self.model, self.f, self.shape, self.offset, self.box,
+            self.model, self.shape, self.offset, self.box,
         )  # fmt: skip
 
     def search(self, t: int, start: int, stop: int) -> NDArray[np.float64]:
         """The motion of a window of which nothing is known."""
-        dimension, number = len(COMPONENTS[self.model]), self.params.starts
+        dimension, number = self.model.dimension, self.params.starts
         axis = np.linspace(-self.extent, self.extent, number) if number > 1 else np.zeros(1)
         motions = np.stack(np.meshgrid(*[axis] * dimension, indexing="ij"), -1)
         short, whole = self.cut(t, start, stop, short=True), self.cut(t, start, stop)
@@ -398,40 +388,18 @@ class Windows:
         return max(tried, key=lambda one: one[1])[0]
 
 
-def estimate(
-    recording: Recording,
-    params: Params | None = None,
-    *,
-    model: str = "planar",
-    camera: PinholeCamera | None = None,
-    seed: int = 0,
-    progress: bool = False,
-) -> Motion:
+def solve(params: Params, given: Given) -> Motion:
     """The motion in overlapping windows of time, each by itself; estimates are at their middles.
 
-    `contrast` is the objective in units of what it is after the events' times have been shuffled.
-    Where that is too small, or events are too few, it is lost: the motion before is held, and the
-    next window is searched anew. For the covariance see `covariance`.
-
-    Args:
-        recording: Events; nothing else is looked at but the calibration.
-        params: See `Params`.
-        model: "planar" (vx, vy) in px/s, or "rotation" (wx, wy, wz) in rad/s.
-        camera: The calibration, by default the recording's.
-        seed: Of the shuffled times that tell what contrast chance has.
-        progress: Show a bar on stderr.
-
-    Raises:
-        InputError: The model is unknown, or rotation is asked for without a camera.
+    `contrast` is the objective in units of what it is after the events' times have been shuffled,
+    by the seed. Where that is too small, or events are too few, it is lost: the motion before is
+    held, and the next window is searched anew. For the covariance see `covariance`.
     """
-    params = params or Params.of({})
-    windows = Windows(recording, params, model, camera, seed)
+    windows = Windows(given.recording, params, given.model, given.camera, given.seed)
     if not len(windows):
-        return Motion.nothing(model)
+        return Motion.nothing(given.model)
     motion, t, fits, contrasts = None, [], [], []
-    for middle, start, stop in tqdm(
-        windows, unit="window", delay=2, disable=not progress, leave=False
-    ):
+    for middle, start, stop in bar(windows, unit="window", progress=given.progress):
         t.append(middle)
         if stop - start < params.fewest:
             motion = None
@@ -447,4 +415,14 @@ def estimate(
         motion = None if fit is None else fit.mean
         fits.append(fit)
         contrasts.append(told.contrast)
-    return held(model, np.array(t), fits, np.array(contrasts))
+    return held(given.model, np.array(t), fits, np.array(contrasts))
+
+
+contrast = OnHost(
+    "contrast",
+    Params,
+    solve,
+    linear=True,
+    about="The motion that makes the image of warped events sharpest (Gallego et al., CVPR 2018), "
+    "in overlapping windows of time, each by itself.",
+)

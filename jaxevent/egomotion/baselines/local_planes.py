@@ -24,18 +24,17 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.candidates import NEVER, READ_ROWS, coordinates
-from jaxevent.egomotion.motion import COMPONENTS, Motion
-from jaxevent.errors import InputError
+from jaxevent.egomotion.estimator import Given, OnHost
+from jaxevent.egomotion.models import Model
+from jaxevent.egomotion.motion import Motion
 from jaxevent.kernels import compiled
-from jaxevent.parameters import Choice, Count, Parameters, Positive, nearest
+from jaxevent.parameters import Choice, Count, Parameters, Positive
+from jaxevent.progress import bar
 from jaxevent.recording import Recording
 
-MODELS = ("planar", "rotation")
-UNKNOWN = {"planar": 1e3, "rotation": 10.0}  # spread of a motion that nothing tells, in its unit
 CELL = 16  # px; constraints of a cell are taken to err together
 HUBER = 1.345  # standard deviations from which a residual counts linearly: 95 % efficient
 ROUNDS = 20  # of reweighting
@@ -79,21 +78,19 @@ def normal_flow(
     params: Params | None = None,
     *,
     camera: PinholeCamera | None = None,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> NormalFlow:
     """The normal flow of each event (of one in `params.every`) from the events up to it.
 
     Raises `InputError` for a camera without an inverse; see `geometry.undistorted`.
     """
-    params = params or Params.of({})
+    params = params or Params()
     xi, _ = coordinates(recording.width, recording.height, camera or recording.camera)
     shape = (2, recording.height, recording.width)
     surface, latest = np.full(shape, NEVER), np.full(shape, NEVER)
     scratch = np.zeros((3, (2 * params.radius + 1) ** 2))
     end, parts = len(recording.events), []
-    with tqdm(
-        total=end, unit="event", unit_scale=True, delay=2, disable=not progress, leave=False
-    ) as bar:
+    with bar(total=end, unit="event", unit_scale=True, progress=progress) as shown:
         for start in range(0, end, READ_ROWS):
             events = recording.events[start : start + READ_ROWS]
             row = np.arange(start, start + len(events))
@@ -108,7 +105,7 @@ def normal_flow(
                 float(params.speed_max), flow, age, valid,
             )  # fmt: skip
             parts.append((events.t[wanted], row[wanted], flow[wanted], valid[wanted], age[wanted]))
-            bar.update(len(row))
+            shown.update(len(row))
     if not parts:
         none = np.zeros(0)
         return NormalFlow(
@@ -117,57 +114,37 @@ def normal_flow(
     return NormalFlow(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def estimate(
-    recording: Recording,
-    params: Params | None = None,
-    *,
-    model: str = "planar",
-    camera: PinholeCamera | None = None,
-    seed: int = 0,
-    progress: bool = False,
-) -> Motion:
+def solve(params: Params, given: Given) -> Motion:
     """The motion in windows of time, by robust least squares of the normal flow.
 
     Estimates are at the windows' middles; their `lag` is the mean age of the planes' neighbours.
     The covariance is that of the fit; see `robust_fit`. A window with too few planes, or with edges
-    of one direction only, is lost: the motion before is held.
-
-    Args:
-        recording: Events; nothing else is looked at but the calibration.
-        params: See `Params`.
-        model: "planar" (vx, vy) in px/s, or "rotation" (wx, wy, wz) in rad/s.
-        camera: The calibration, by default the recording's.
-        seed: Nothing is drawn.
-        progress: Show a bar on stderr.
-
-    Raises:
-        InputError: The model is unknown, or rotation is asked for without a camera.
+    of one direction only, is lost: the motion before is held. Nothing is drawn.
     """
-    params = params or Params.of({})
-    camera = camera or recording.camera
-    check_model(recording, model, camera, MODELS)
+    recording, camera = given.recording, given.camera
     if not len(recording.events):
-        return Motion.nothing(model)
-    planes = normal_flow(recording, params, camera=camera, progress=progress)
+        return Motion.nothing(given.model)
+    flows = normal_flow(recording, params, camera=camera, progress=given.progress)
     xi, f = coordinates(recording.width, recording.height, camera)
-    size = arms(model, xi, f)
+    model = given.model(f)
+    size = model.arms(xi)
     window, step = (round(1e6 * float(s)) for s in (params.window, params.step))
-    first, last = int(planes.t[0]), int(planes.t[-1])
+    first, last = int(flows.t[0]), int(flows.t[-1])
     begins = np.arange(first, max(first, last - window) + 1, max(step, 1))
-    rows = np.searchsorted(planes.t, np.stack([begins, begins + window], 1))
+    rows = np.searchsorted(flows.t, np.stack([begins, begins + window], 1))
     fits, lags = [], []
     for begin, stop in rows:
-        valid = np.arange(begin, stop)[planes.valid[begin:stop]]
-        flow = planes.flow[valid]
-        events = _events(recording, planes.row[valid])
+        valid = np.arange(begin, stop)[flows.valid[begin:stop]]
+        flow = flows.flow[valid]
+        events = _events(recording, flows.row[valid])
         at = xi[events[1], events[0]]
         speed = np.linalg.norm(flow, axis=1)
-        rows_of = np.einsum("ni,nid->nd", flow / speed[:, None] ** 2, basis(model, at, f))
+        rows_of = np.einsum("ni,nid->nd", flow / speed[:, None] ** 2, basis_on_host(model, at))
         cells = events[1] // CELL * (recording.width // CELL + 1) + events[0] // CELL
         enough = len(valid) >= params.constraints
         fits.append(robust_fit(rows_of, np.ones(len(valid)), cells, size) if enough else None)
-        lags.append(planes.age[valid].mean() if len(valid) else 0.0)
-    motion = held(model, begins + window // 2, fits)
+        lags.append(flows.age[valid].mean() if len(valid) else 0.0)
+    motion = held(given.model, begins + window // 2, fits)
     return dataclasses.replace(motion, lag=np.array(lags))
 
 
@@ -180,37 +157,9 @@ def _events(recording: Recording, rows: NDArray) -> tuple[NDArray, NDArray]:
     return events.x[rows].astype(int), events.y[rows].astype(int)
 
 
-def check_model(
-    recording: Recording, model: str, camera: PinholeCamera | None, models: tuple[str, ...]
-) -> None:
-    """Raise `InputError` for a model that is none of `models` and rotation without a camera."""
-    if model not in models:
-        raise InputError(f"there is no motion model {model!r}; {nearest(model, models)}")
-    if model == "rotation" and camera is None:
-        raise InputError(
-            f"{recording.name}: has no calibration, which rotation needs; give a camera"
-        )
-
-
-def basis(model: str, xi: NDArray[np.floating], f: float) -> NDArray[np.float64]:
-    """U = basis @ motion at xi (n, 2): (n, 2, dimension), 1 or `geometry.B`, on the host."""
-    if model == "planar":
-        return np.broadcast_to(np.eye(2), (len(xi), 2, 2))
-    x, y = xi.T
-    return np.stack(
-        [
-            np.stack([x * y / f, -(f + x * x / f), y], -1),
-            np.stack([f + y * y / f, -x * y / f, -x], -1),
-        ],
-        -2,
-    )
-
-
-def arms(model: str, xi: NDArray[np.floating], f: float) -> NDArray[np.float64]:
-    """How far (px) a unit of each component moves the image at places xi (..., 2), about."""
-    if model == "planar":
-        return np.ones(2)
-    return np.array([f, f, float(np.sqrt((xi**2).sum(-1).mean()))])
+def basis_on_host(model: Model, xi: NDArray[np.floating]) -> NDArray[np.float64]:
+    """U = basis @ motion at xi (n, 2): (n, 2, d)."""
+    return np.asarray(model.basis(xi), np.float64)
 
 
 class Fit(NamedTuple):
@@ -233,7 +182,7 @@ def robust_fit(
     simulated scenes squared errors of motions by planes are 10 to 20 times what it tells, whatever
     the cells' size. None where a direction of m is not told: its information is less than
     `LEAST_NORMALS` of the best told one's, of components in units of 1 / `size` (dimension,); see
-    `arms`.
+    `Model.arms`.
     """
     dimension = rows.shape[1]
     if len(rows) <= dimension:
@@ -262,22 +211,20 @@ def robust_fit(
 
 
 def held(
-    model: str,
+    model: type[Model],
     t: NDArray[np.int64],
     fits: list[Fit | None],
     contrast: NDArray[np.floating] | None = None,
 ) -> Motion:
     """A `Motion` of fits at times t (us); where there is none it is lost and the last one held."""
-    dimension = len(COMPONENTS[model])
+    dimension = len(model.components)
     last, mean, covariance = np.zeros(dimension), [], []
     for fit in fits:
         last = last if fit is None else fit.mean
         mean.append(last)
-        covariance.append(
-            UNKNOWN[model] ** 2 * np.eye(dimension) if fit is None else fit.covariance
-        )
-    lost = np.array([fit is None for fit in fits], bool)
-    return Motion.of(model, t, np.array(mean), np.array(covariance), lost, contrast)
+        covariance.append(model.unknown**2 * np.eye(dimension) if fit is None else fit.covariance)
+    valid = np.array([fit is not None for fit in fits], bool)
+    return Motion.of(model, t, np.array(mean), np.array(covariance), valid, contrast)
 
 
 @compiled
@@ -347,3 +294,13 @@ def _planes(
                     valid[i] = True
                 break
             n = kept
+
+
+planes = OnHost(
+    "planes",
+    Params,
+    solve,
+    linear=True,
+    about="Motion from planes through the latest events (Benosman et al., TNNLS 2014): the normal "
+    "flow of a window tells the motion by robust least squares.",
+)

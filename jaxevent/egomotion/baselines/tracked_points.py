@@ -7,29 +7,21 @@ the way. For a rotation that is B(x) Omega, of second order in the angle between
 OpenCV: pip install 'jaxevent[vision]'.
 """
 
+import dataclasses
 import itertools
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
-from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion.baselines.local_planes import (
-    CELL,
-    arms,
-    basis,
-    check_model,
-    held,
-    robust_fit,
-)
+from jaxevent.egomotion.baselines.local_planes import CELL, basis_on_host, held, robust_fit
 from jaxevent.egomotion.candidates import coordinates
+from jaxevent.egomotion.estimator import Given, OnHost
 from jaxevent.egomotion.motion import Motion
 from jaxevent.errors import InputError, require
-from jaxevent.parameters import Count, Parameters, Positive
+from jaxevent.parameters import Count, Parameters, Positive, Share
+from jaxevent.progress import bar
 from jaxevent.recording import Recording
-
-MODELS = ("planar", "rotation")
 
 
 class Params(Parameters):
@@ -41,62 +33,36 @@ class Params(Parameters):
     iterations = Count(30, "", "most of a level")
     fewest = Count(5, "", "points that an estimate needs")
 
-    quality = Positive(0.01, "", "a corner's strength, in shares of the best one's")
+    quality = Share(0.01, "", "a corner's strength, in shares of the best one's")
     spacing = Positive(5.0, "px", "least distance of two corners")
     returns = Positive(0.5, "px", "points that come back farther off do not count")
 
 
-def estimate(
-    recording: Recording,
-    params: Params | None = None,
-    *,
-    model: str = "planar",
-    camera: PinholeCamera | None = None,
-    seed: int = 0,
-    progress: bool = False,
-) -> Motion:
+def solve(params: Params, given: Given) -> Motion:
     """The motion between each two frames, at the middle of their times.
 
-    The covariance is that of the fit; see `planes.robust_fit`. Where too few points could be
-    followed it is lost, and the motion before is held.
-
-    Args:
-        recording: Frames, and nothing else but the calibration.
-        params: See `Params`.
-        model: "planar" (vx, vy) in px/s, or "rotation" (wx, wy, wz) in rad/s.
-        camera: The calibration, by default the recording's.
-        seed: Nothing is drawn.
-        progress: Show a bar on stderr.
-
-    Raises:
-        InputError: The model is unknown, rotation is asked for without a camera, the recording has
-            fewer than two frames, or OpenCV is not installed.
+    The covariance is that of the fit; see `local_planes.robust_fit`. Where too few points could be
+    followed it is lost, and the motion before is held. Nothing is drawn.
     """
-    params = params or Params.of({})
-    camera = camera or recording.camera
-    check_model(recording, model, camera, MODELS)
-    frames = recording.frames
-    if frames is None or len(frames) < 2:
-        raise InputError(
-            f"{recording.name}: has {0 if frames is None else len(frames)} frames and tracking "
-            "needs two; take a method that uses events, as voting or contrast"
-        )
+    recording, frames = given.recording, given.recording.frames
+    assert frames is not None
     cv2 = require("cv2", "vision")
-    positions, f = coordinates(recording.width, recording.height, camera)
-    size = arms(model, positions, f)
+    positions, f = coordinates(recording.width, recording.height, given.camera)
+    model = given.model(f)
+    size = model.arms(positions)
     fits, pairs = [], itertools.pairwise(range(len(frames)))
-    for one, two in tqdm(list(pairs), unit="pair", delay=2, disable=not progress, leave=False):
+    for one, two in bar(list(pairs), unit="pair", progress=given.progress):
         images = [np.rint(255 * i).astype(np.uint8) for i in frames[one : two + 1].intensity]
         begin, end = _tracks(cv2, params, *images)
         before, after = _undistorted(begin, positions), _undistorted(end, positions)
         dt = (frames.t[two] - frames.t[one]) * 1e-6
-        rows = basis(model, (before + after) / 2, f).reshape(-1, len(size))
+        rows = basis_on_host(model, (before + after) / 2).reshape(-1, len(size))
         # Points of a cell share what they show.
         cells = np.floor(begin / CELL).astype(int) @ np.array([1, recording.width // CELL + 1])
         enough = len(begin) >= params.fewest
         values = ((after - before) / dt).reshape(-1)
         fits.append(robust_fit(rows, values, np.repeat(cells, 2), size) if enough else None)
-    return held(model, (frames.t[:-1] + frames.t[1:]) // 2, fits)
+    return held(given.model, (frames.t[:-1] + frames.t[1:]) // 2, fits)
 
 
 def _tracks(
@@ -134,3 +100,28 @@ def _undistorted(at: NDArray[np.floating], positions: NDArray[np.float64]) -> ND
     upper = (1 - u) * positions[y, x] + u * positions[y, right]
     lower = (1 - u) * positions[below, x] + u * positions[below, right]
     return (1 - v) * upper + v * lower
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class TrackedPoints(OnHost[Params]):
+    """Points from each frame to the next; it needs two frames, and OpenCV."""
+
+    needs_frames: bool = dataclasses.field(default=True, kw_only=True)
+
+    def check(self, recording: Recording) -> None:
+        frames = recording.frames
+        if frames is None or len(frames) < 2:
+            raise InputError(
+                f"{recording.name}: has {0 if frames is None else len(frames)} frames and tracking "
+                "needs two; take a method that uses events, as voting or contrast"
+            )
+
+
+frames = TrackedPoints(
+    "frames",
+    Params,
+    solve,
+    linear=True,
+    about="Motion from frames alone: points tracked by Lucas and Kanade's method tell the motion "
+    "between each two frames. It needs OpenCV.",
+)

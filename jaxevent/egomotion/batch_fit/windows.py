@@ -21,7 +21,6 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.batch_fit.alignment import Window, refine, score
@@ -38,13 +37,14 @@ from jaxevent.egomotion.batch_fit.starts import (
     start,
 )
 from jaxevent.egomotion.candidates import coordinates
+from jaxevent.egomotion.estimator import COMMON, Given, OnHost
+from jaxevent.egomotion.models import General
 from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.truth import Twists
-from jaxevent.errors import InputError
-from jaxevent.parameters import Count, Number, Parameters, Positive, nearest
+from jaxevent.parameters import Count, Number, Parameters, Positive
+from jaxevent.progress import bar
 from jaxevent.recording import Recording
 
-MODELS = ("general",)
 MARGIN = 24  # px of the reference view around the sensor
 APART = np.cos(np.radians(6))  # headings of rivals
 TURN = 0.1  # rad/s, likewise
@@ -452,57 +452,29 @@ def _adjusted(
     return scene, report
 
 
-def estimate(
-    recording: Recording,
-    params: Params | None = None,
-    *,
-    model: str = "general",
-    camera: PinholeCamera | None = None,
-    seed: int = 0,
-    gyro: Twists | None = None,
-    progress: bool = False,
-) -> Motion:
+def solve(params: Params, given: Given) -> Motion:
     """The general motion of a camera, from windows that overlap.
 
     The motion at a time is the mean of what the windows around it tell, of those nearer the more
-    (a raised cosine). Estimates are a fifth of a `step` apart.
-
-    Args:
-        recording: Events, and the calibration if no `camera` is given.
-        params: See `Params`.
-        model: "general"; (tx, ty, tz) is a unit vector, (wx, wy, wz) in rad/s.
-        camera: The calibration, by default the recording's.
-        seed: Chooses events where a window has more than `events`.
-        gyro: What a gyro measured (`truth.from_gyro`), which settles Omega.
-        progress: Show a bar on stderr.
-
-    Raises:
-        InputError: The model is another, or there is no calibration.
+    (a raised cosine). Estimates are a fifth of a `step` apart. The seed chooses events where a
+    window has more than `events`. The option `gyro` (`truth.from_gyro`) settles Omega.
     """
-    params = params or Params.of({})
-    if model not in MODELS:
-        raise InputError(
-            f"batch does not know the motion model {model!r}; {nearest(model, MODELS)}"
-        )
-    camera = camera or recording.camera
-    if camera is None:
-        raise InputError(
-            f"{recording.name}: has no calibration, which general motion needs; give a camera"
-        )
+    recording, camera, gyro = given.recording, given.camera, given.more.get("gyro")
+    assert camera is not None
     if not len(recording.events):
-        return Motion.nothing(model)
-    windows = Windows(recording, params, camera, gyro, seed)
+        return Motion.nothing(given.model)
+    windows = Windows(recording, params, camera, gyro, given.seed)
     first, last = int(recording.events[:1].t[0]), int(recording.events[-1:].t[0])
     half, step = (round(1e6 * float(value)) for value in (params.half_window, params.step))
     centres = np.arange(first + half, last - half + 1, step)
     if not len(centres):
         centres = np.array([(first + last) // 2])
-    fits = _followed(windows, centres.tolist(), step, half, progress)
+    fits = _followed(windows, centres.tolist(), step, half, given.progress)
     return _blended(centres, fits, half, step, first, last)
 
 
 def _followed(
-    windows: Windows, centres: list[int], step: int, half: int, progress: bool
+    windows: Windows, centres: list[int], step: int, half: int, progress: bool | None
 ) -> list[Fit | None]:
     """The windows one after the other, each from where the one before goes on.
 
@@ -518,9 +490,9 @@ def _followed(
     def onward(path: Path, steps: int = 1) -> Path:
         return advanced(path, steps * step * 1e-6, half * 1e-6)
 
-    bar = tqdm(centres, unit="window", disable=not progress, leave=False, delay=2)
+    shown = bar(centres, unit="window", progress=progress)
     with ThreadPoolExecutor(1) as beside:
-        for row, centre in enumerate(bar):
+        for row, centre in enumerate(shown):
             if not enough[row]:
                 warm = ahead = None
                 fits.append(None)
@@ -605,4 +577,15 @@ def _blended(
     size = np.linalg.norm(heading, axis=1, keepdims=True)
     heading = np.where(size > 0, heading / np.where(size > 0, size, 1), np.array([0.0, 0, 1]))
     mean = np.concatenate([heading, Omega / safe[:, None]], 1)
-    return Motion.of("general", t, mean, covariance / safe[:, None, None], lost, contrast / safe)
+    return Motion.of(General, t, mean, covariance / safe[:, None, None], ~lost, contrast / safe)
+
+
+batch = OnHost(
+    "batch",
+    Params,
+    solve,
+    models=(General.name,),
+    options=COMMON | {"gyro"},
+    about="General motion by fitting a whole window of events: the camera's path and the scene's "
+    "depth. Estimates of overlapping windows are blended, a fifth of a `step` apart.",
+)

@@ -1,0 +1,287 @@
+"""What candidates say of hypotheses: the votes of an event for a motion, and what chance would.
+
+The functions that are equations of the thesis are of one candidate, one event and one particle, in
+scalars; `score` maps them. Shapes there: K events, N particles, which are the last axis, C
+candidates.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from jaxevent.egomotion.candidates import Candidates
+from jaxevent.egomotion.models import Model
+from jaxevent.egomotion.particle_filter.parameters import Params
+
+WIDER = 2.0  # sigma_x while searching, in sigma_x
+LEAST = 0.2  # votes of chance per event; a point that moves alone gets about 1.5
+PAD = 2.0  # sigma_x, how far within the sensor an event must have come from to be asked
+BLOCK = 8  # candidates per event that are scored together
+
+
+class Score(NamedTuple):
+    """What a batch says: of every particle, and how much more than chance votes for them."""
+
+    log_likelihood: Float[Array, "K N"]
+    votes: Float[Array, ""]
+    chance: Float[Array, ""]
+    lag: Float[Array, ""]
+
+
+class Event(eqx.Module):
+    """One event, or K, but for candidates; see `Candidates`."""
+
+    xi: Float[Array, "2 *K"]
+    room: Float[Array, "2 2 *K"]
+    valid: Bool[Array, "*K"]
+    scale: Float[Array, "*K"]
+    rate: Float[Array, "*K"]
+
+
+class Common(eqx.Module):
+    """What holds for an event, or K, whatever the particle."""
+
+    tau: Float[Array, "*K"]  # s, age of the oldest candidates of a motion that is about known
+    asked: Bool[Array, "*K"]  # whether it counts while the motion is followed
+    searched: Bool[Array, "*K"]  # and where every hypothesis has ages of its own
+
+
+class Ages(eqx.Module):
+    """From which to which age (s) candidates are looked at."""
+
+    youngest: Float[Array, "*K_N"]
+    oldest: Float[Array, "*K_N"]
+
+
+def common(params: Params, model: Model, event: Event, usual: Float[Array, "2"]) -> Common:
+    """Of an event, where `usual` (px/s) is the cloud's mean flow.
+
+    tau = b / |U_mean|. It is not asked if what it shows would have come from outside the sensor.
+    """
+    b = params.baseline
+    # A little less: room is often in whole px, as b may be, but for rounding.
+    everywhere = jnp.minimum(-event.room[0], event.room[1]).min() >= 0.99 * b
+    if model.half_line:
+        return Common(params.tau_general, event.valid & everywhere, event.valid & everywhere)
+    tau = jnp.minimum(b / jnp.sqrt((usual**2).sum() + 1e-12), params.tau_max)
+    pad, back = PAD * params.sigma_x, usual * tau
+    there = ((back >= event.room[0] + pad) & (back <= event.room[1] - pad)).all()
+    return Common(tau, event.valid & there, event.valid & everywhere)
+
+
+def ages(params: Params, common: Common, speed: Float[Array, ""], band: Bool[Array, ""]) -> Ages:
+    """dt_c in [0.7 tau, tau]; in a `band` [0.7 b, b] / |U_i| for a flow of that speed (px/s)."""
+    own = params.baseline / speed
+    return Ages(
+        params.youngest * jnp.where(band, own, common.tau),
+        jnp.where(band, jnp.minimum(own, params.tau_max), common.tau),
+    )
+
+
+def vote(
+    d: tuple[Float[Array, ""], Float[Array, ""]],
+    dt: Float[Array, ""],
+    U: Float[Array, "2"],
+    line: Float[Array, "2"] | None,
+    ages: Ages,
+    exponent: Float[Array, ""],
+    rho_max: Float[Array, ""],
+) -> Float[Array, ""]:
+    """exp(exponent r_c^2) of a candidate at d (px), of age dt (s); 0 of an age not asked for.
+
+    r_c is the distance of d_c from U dt_c, or from the half-line that begins there.
+    """
+    x, y = d[0] - U[0] * dt, d[1] - U[1] * dt
+    distance2 = x**2 + y**2
+    if line is not None:
+        s = x * line[0] + y * line[1]
+        to = jnp.clip(s, 0, rho_max * dt)
+        distance2 = distance2 + to * (to - 2 * s)
+    inside = (dt >= ages.youngest) & (dt <= ages.oldest)
+    return jnp.where(inside, jnp.exp(distance2 * exponent), 0)
+
+
+def gain(
+    params: Params, S: Float[Array, ""], rate: Float[Array, ""], seen: Bool[Array, ""]
+) -> Float[Array, ""]:
+    """log w += alpha log(1 + S / s0): of an event and a particle for which S candidates vote."""
+    return jnp.where(seen, params.alpha * jnp.log1p(S * rate / params.s0), 0)
+
+
+def chance(
+    params: Params,
+    model: Model,
+    event: Event,
+    common: Common,
+    sigma: Float[Array, ""],
+    reach: int,
+) -> Float[Array, ""]:
+    """How many votes an event would get of candidates without order.
+
+    That of as many candidates of the common range of ages anywhere in the window: 2 pi sigma_x^2 /
+    (2 R + 1)^2 each, and at least `LEAST`, so that a motion so fast that no candidate is young
+    enough counts as one that explains nothing.
+    """
+    number = event.rate * (1 - params.youngest) * common.tau
+    # The area of a vote, (px^2) over that of the window; of a half-line it is a strip's.
+    area = jnp.sqrt(2 * jnp.pi) * sigma
+    area = area * (area / 2 + reach if model.half_line else area)
+    return jnp.maximum(number * (area / (2 * reach + 1) ** 2), LEAST)
+
+
+EVENT, PARTICLE, BOTH, SAME = "event", "particle", "both", "same"
+_INNER = {EVENT: None, PARTICLE: 0, BOTH: -1, SAME: None}
+_OUTER = {EVENT: -1, PARTICLE: None, BOTH: -2, SAME: None}
+
+
+def each(function: Callable[..., Any], *over: str) -> Callable[..., Any]:
+    """The function of an event and a particle, of all: K and N are the last axes of results.
+
+    An argument is of an EVENT, K its last axis, of a PARTICLE, N its first, of BOTH, K and N its
+    last, or the SAME for all.
+    """
+    inner, outer = ([axes[kind] for kind in over] for axes in (_INNER, _OUTER))
+    return jax.vmap(jax.vmap(function, inner, -1), outer, -2)
+
+
+def score(
+    params: Params,
+    model: Model,
+    batch: Candidates,
+    particles: Float[Array, "N d"],
+    weights: Float[Array, " N"],
+    searching: Bool[Array, ""] | bool,
+) -> Score:
+    """Log-likelihoods of events for all particles, and how much more than chance votes for them."""
+    real = particles.dtype
+    event = Event(
+        jnp.asarray(batch.xi).T, *map(jnp.asarray, (batch.room, batch.valid, batch.scale,
+                                                    batch.rate)),
+    )  # fmt: skip
+    U = each(model.flow, EVENT, PARTICLE)(event.xi, particles)
+    line = each(model.line, EVENT, PARTICLE)(event.xi, particles) if model.half_line else None
+    speed = each(_speed, BOTH)(U)
+    fixed, now, usual = lax.stop_gradient((params, speed, U @ weights))
+    shared = jax.vmap(functools.partial(common, fixed, model), -1)(event, usual)
+    number = jnp.maximum(event.valid.sum(), 1)
+    # Candidates of one age see the mean flow since then, that of half the age ago.
+    lag = (1 + fixed.youngest) / 4 * jnp.where(event.valid, shared.tau, 0).sum() / number
+    if params.likelihood == "literal":
+        one = jnp.ones((), real)
+        return Score(_literal(params, model, batch, U, line, speed), one, one, lag)
+    band = jnp.asarray(searching) | (params.likelihood == "band")
+    band = band & (not model.half_line)
+    looked = each(functools.partial(ages, fixed, band=band), EVENT, BOTH)(shared, now)
+    sigma = params.sigma_x * jnp.where(searching, WIDER, 1.0)
+    S = _sum(batch, U, line, looked, -0.5 / sigma**2, fixed.rho_max)
+    S = S * batch.scale[:, None]
+    rate = jnp.where(band, speed / jnp.maximum(speed @ weights, 1e-12)[:, None], 1)
+    seen = jnp.where(band, shared.searched, shared.asked)
+    log_likelihood = each(functools.partial(gain, params), BOTH, BOTH, EVENT)(S, rate, seen)
+    by_chance = jax.vmap(
+        lambda event, common: chance(
+            fixed, model, event, common, lax.stop_gradient(sigma), batch.reach
+        ),
+        -1,
+    )(event, shared)
+    votes = lax.stop_gradient(S) @ lax.stop_gradient(weights)
+    return Score(
+        log_likelihood,
+        jnp.where(seen, votes, 0).sum(),
+        jnp.where(seen, by_chance, 0).sum(),
+        lag,
+    )
+
+
+def _speed(U: Float[Array, "2"]) -> Float[Array, ""]:
+    return jnp.sqrt((U**2).sum() + 1e-12)
+
+
+def _sum(
+    batch: Candidates,
+    U: Float[Array, "2 K N"],
+    line: Float[Array, "2 K N"] | None,
+    ages: Ages,
+    exponent: Array,
+    rho_max: Array,
+) -> Float[Array, "K N"]:
+    """S = sum_c `vote` over candidates of the ages asked for.
+
+    Candidates fill their places from the first, so the later blocks of most batches hold none and
+    are skipped: by a condition outside of the maps, within which both sides would be computed.
+    """
+    C, K = batch.age.shape
+    pad = -C % BLOCK
+    age = jnp.pad(jnp.asarray(batch.age), [(0, pad), (0, 0)]).reshape(-1, BLOCK, K)
+    d = jnp.pad(jnp.asarray(batch.d), [(0, 0), (0, pad), (0, 0)]).reshape(2, -1, BLOCK, K)
+    votes = each(vote, EVENT, EVENT, BOTH, BOTH, BOTH, SAME, SAME)
+
+    def add(S, dx, dy, age):
+        for c in range(BLOCK):
+            S = S + votes((dx[c], dy[c]), age[c], U, line, ages, exponent, rho_max)
+        return S
+
+    def body(S, block):
+        return lax.cond((block[2] > 0).any(), add, lambda S, *_: S, S, *block), None
+
+    return lax.scan(body, jnp.zeros_like(U[0]), (d[0], d[1], age))[0]
+
+
+def miss(
+    params: Params,
+    model: Model,
+    d: Float[Array, "2"],
+    age: Float[Array, ""],
+    before: Float[Array, ""],
+    U: Float[Array, "2"],
+    line: Float[Array, "2"] | None,
+    speed: Float[Array, ""],
+) -> Float[Array, ""]:
+    """How far (px) a candidate is off the one that a hypothesis expects, as the thesis has it.
+
+    Of a uniform flow eqs 5.2, 5.3, 5.7, else 6.9 to 6.16, with distances in px. 6.12 is printed as
+    a norm and squared, in px^2/s^2, and 6.9 is signed, in px^2/s; only px suit V_max = 2 to 3 and
+    r_t in px/s. So 6.9 is taken as |F| dt / |A T|, the distance from the whole line of all depths,
+    positive or not. The time penalty of 6.10 compares with the last event at the same pixel, whose
+    age is `before`; where that is infinite, there is no penalty.
+    """
+    if model.uniform:
+        past = 1 / speed if params.horizon == "crossing" else params.past
+        ex, ey, late = d[0] - U[0] * past, d[1] - U[1] * past, age - past
+    else:
+        late = jnp.where(jnp.isfinite(before), age - before, 0)
+        ex, ey = d[0] - U[0] * age, d[1] - U[1] * age
+        if line is not None:
+            ex, ey = ex * line[1] - ey * line[0], jnp.zeros_like(ex)
+    return jnp.sqrt(ex**2 + ey**2 + 1e-12) + params.r_t * jnp.abs(late)
+
+
+def _literal(
+    params: Params,
+    model: Model,
+    batch: Candidates,
+    U: Float[Array, "2 K N"],
+    line: Float[Array, "2 K N"] | None,
+    speed: Float[Array, "K N"],
+) -> Float[Array, "K N"]:
+    """-alpha_p times the least `miss` of an event's candidates, which is at most d_max or V_max.
+
+    The last event at the same pixel is itself no candidate where the flow is not uniform: to a
+    camera that does not move it would always be the best.
+    """
+    d, age = jnp.asarray(batch.d), jnp.asarray(batch.age)
+    there, before, most = age > 0, jnp.full_like(age[0], jnp.inf), params.d_max
+    if not model.uniform:
+        own = there & (d == 0).all(0)
+        before, there, most = jnp.where(own, age, jnp.inf).min(0), there & ~own, params.V_max
+    misses = each(functools.partial(miss, params, model), EVENT, EVENT, EVENT, BOTH, BOTH, BOTH)
+    over = jax.vmap(lambda d, age: misses(d, age, before, U, line, speed), (1, 0))
+    least = jnp.where(there[..., None], over(d, age), jnp.inf).min(0)
+    loss = jnp.where(batch.valid[:, None], jnp.minimum(least, most), 0)
+    return -params.alpha_literal * loss

@@ -1,0 +1,399 @@
+"""Pictures of a motion: its components over time, events moved back along it, their flow."""
+
+import dataclasses
+import functools
+import math
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from numpy.typing import NDArray
+
+from jaxevent.egomotion import flow as event_flow
+from jaxevent.egomotion.candidates import coordinates
+from jaxevent.egomotion.flow import Flow
+from jaxevent.egomotion.models import Model, Numeric
+from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.truth import Known, axis_error, endpoint_error
+from jaxevent.egomotion.warped import blur, contrast, splat
+from jaxevent.errors import require
+from jaxevent.estimator import Estimate
+from jaxevent.io.output import complete
+from jaxevent.recording import Events, Recording
+
+_PLOTTED = 4096  # most times of the plot
+_PARTICLES = 30_000  # most particles of a component in the plot
+_WAY, _SHORTEST, _LONGEST = 8.0, 0.02, 0.05  # px and s: of the window that is warped
+_MOST = 500_000  # events that are warped or coloured
+_TRUE, _ESTIMATE, _LOST, _CLOUD = "black", "#c8401e", "#bbbbbb", "#3a78b5"
+
+
+def plot_motion(
+    path: str | Path,
+    motion: Motion,
+    times: NDArray[np.int64],
+    truth: Known | None = None,
+    *,
+    centred: bool = False,
+) -> None:
+    """Draw the components over times (us) as PNG, against the truth and with errors where known.
+
+    Bands are two standard deviations, grey spans those in which the motion is lost, dots some of
+    the particles, where the motion has a `cloud` (estimates, particles, components).
+    """
+    figure = _figure(path)
+    if len(times) > _PLOTTED:
+        times = times[np.linspace(0, len(times) - 1, _PLOTTED).astype(int)]
+    told = motion(times, centred=centred)
+    model, seconds = motion.model, times * 1e-6
+    judged = _judged(model, times, told, truth)
+    trust = np.where(told.valid, 1.0, np.nan)
+    extra = judged or _contrasts(motion, times)
+    sizes = [len(model.components[part.rows]) for part in model.parts]
+    rows, columns = max(sizes), len(sizes)  # a column for each part
+    figure.set_size_inches(6.0 * columns + 2 * (columns == 1), 1.9 * rows + 1.9 * bool(extra))
+    grid = figure.subplots(rows + bool(extra), columns, sharex=True, squeeze=False)
+    order = {
+        i: (row, column, part)
+        for column, part in enumerate(model.parts)
+        for row, i in enumerate(range(len(model.components))[part.rows])
+    }
+    sigma = np.sqrt(np.diagonal(told.covariance, axis1=1, axis2=2).clip(0))
+    for i, name in enumerate(model.components):
+        row, column, part = order[i]
+        axis = grid[row, column]
+        value = told.mean[:, i] * trust
+        _cloud(axis, motion, i, centred)
+        low, high = value - 2 * sigma[:, i], value + 2 * sigma[:, i]
+        axis.fill_between(seconds, low, high, color=_ESTIMATE, alpha=0.25, lw=0)
+        axis.plot(seconds, value, color=_ESTIMATE, lw=1.3, label="estimate, 2 sigma")
+        seen = [band[np.isfinite(band)] for band in (low, value, high)]
+        seen = [np.percentile(band, [2, 98]) for band in seen if len(band)]
+        if truth is not None:
+            inside = truth.within(times)
+            true = truth(times[inside])[:, i]
+            axis.plot(seconds[inside], true, color=_TRUE, lw=1.0, ls="--", label="truth")
+            seen.append(true)
+        unit = model.units[i]
+        axis.set_ylabel(name if unit == "1" else f"{name} ({unit})")
+        if part.direction:
+            axis.set_ylim(-1.08, 1.08)
+        elif any(map(len, seen)):
+            # A component that hardly changes is not enlarged until its noise fills the axis.
+            low, high = np.concatenate(seen).min(), np.concatenate(seen).max()
+            half = max(0.6 * (high - low), 0.08 * np.abs(told.mean[told.valid]).max(initial=0))
+            axis.set_ylim((low + high) / 2 - half - 1e-9, (low + high) / 2 + half + 1e-9)
+    for k, (label, series) in enumerate(extra):
+        axis = grid[rows, min(k, columns - 1)]
+        axis.plot(seconds, series, color=_ESTIMATE, lw=1.1)
+        axis.set_ylabel(label)
+        good = series[np.isfinite(series)]
+        if len(good):
+            axis.set_ylim(0, 1.15 * max(np.percentile(good, 99), 1e-9))
+    for axis in grid.ravel():
+        _shade(axis, seconds, ~told.valid)
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.set_xlim(seconds[0], max(seconds[-1], seconds[0] + 1e-6))
+    for axis in grid[-1]:
+        axis.set_xlabel("t (s)")
+    grid[0, 0].legend(
+        fontsize=8, frameon=False, ncols=4, loc="lower left", bbox_to_anchor=(0, 1), borderpad=0.2
+    )
+    _save(figure, path)
+
+
+def _judged(
+    model: type[Model], times: NDArray[np.int64], told: Estimate, truth: Known | None
+) -> list[tuple[str, NDArray[np.float64]]]:
+    """Errors over time, with the labels of their axes."""
+    if truth is None:
+        return []
+    inside = truth.within(times) & told.valid
+    if not inside.any():
+        return []
+    true, mean = truth(times[inside]), told.mean[inside]
+
+    def spread(values: NDArray) -> NDArray[np.float64]:
+        series = np.full(len(times), np.nan)
+        series[inside] = values
+        return series
+
+    judged = []
+    for part in model.parts:
+        pair = mean[:, part.rows], true[:, part.rows]
+        if part.direction:
+            judged.append((f"{part.name} error (deg)", spread(axis_error(*pair))))
+            continue
+        far, unit = endpoint_error(*pair), part.unit
+        if unit.startswith("rad"):
+            far, unit = np.degrees(far), unit.replace("rad", "deg", 1)
+        of = f" of {part.name}" if len(model.parts) > 1 else ""
+        judged.append((f"|error{of}| ({unit})", spread(far)))
+    return judged
+
+
+def _contrasts(motion: Motion, times: NDArray[np.int64]) -> list[tuple[str, NDArray[np.float64]]]:
+    """Without a truth: how much better than chance the motion explains the events."""
+    if not np.isfinite(motion.contrast).any():
+        return []
+    return [("contrast", np.interp(times, motion.t, np.nan_to_num(motion.contrast)))]
+
+
+def _cloud(axis: Any, motion: Motion, component: int, centred: bool) -> None:
+    cloud = motion.cloud
+    if cloud is None or not len(cloud):
+        return
+    keep = np.unique(
+        np.linspace(0, len(cloud) - 1, max(1, min(len(cloud), _PARTICLES // cloud.shape[1])))
+        .round().astype(int)
+    )  # fmt: skip
+    t = (motion.t * 1e-6 - (motion.lag if centred else 0))[keep]
+    values = cloud[keep][..., component]
+    axis.plot(
+        np.repeat(t, values.shape[1]), values.ravel(), ".", color=_CLOUD, ms=2.5, mew=0, alpha=0.3,
+        zorder=0, rasterized=True,
+    )  # fmt: skip
+    axis.plot([], [], ".", color=_CLOUD, label="particles")
+
+
+def _shade(axis: Any, seconds: NDArray, lost: NDArray[np.bool_]) -> None:
+    edges = np.flatnonzero(np.diff(np.r_[False, lost, False].astype(int)))
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        last = seconds[min(end, len(seconds) - 1)]
+        axis.axvspan(seconds[begin], last, color=_LOST, alpha=0.4, lw=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Window:
+    """Rows start to stop of the events, and the time (us) to which they are moved."""
+
+    start: int
+    stop: int
+    reference: int
+
+
+def span_of(recording: Recording) -> tuple[int, int]:
+    """The times (us) of the first and the last event."""
+    first, last = (recording.events[i : i + 1].t[0] for i in (0, len(recording.events) - 1))
+    return int(first), int(last)
+
+
+def window_of(recording: Recording, motion: Motion) -> Window:
+    """In the middle of the recording, or of where the motion is found: 20 to 50 ms.
+
+    So long that the image moves by 8 px, at the median speed over the sensor. Events beyond the
+    first half million are left out.
+    """
+    events = recording.events
+    middle = sum(span_of(recording)) // 2
+    good = motion.t[motion.valid]
+    if len(good) and not motion(middle, extrapolate=True).valid[0]:
+        middle = int(good[np.argmin(np.abs(good - middle))])
+    told = motion(middle, extrapolate=True)
+    span = _LONGEST
+    if told.valid[0] and np.isfinite(told.mean).all():
+        xi, f = coordinates(recording.width, recording.height, recording.camera)
+        xi = xi[::8, ::8].reshape(-1, 2)
+        U = _linear_flow(
+            motion.model(f), xi, np.broadcast_to(told.mean, (len(xi), told.mean.shape[1]))
+        )
+        speed = float(np.median(np.hypot(*U.T)))
+        span = min(max(_WAY / max(speed, 1e-9), _SHORTEST), _LONGEST)
+    half = round(5e5 * span)
+    begin = events.index(middle - half)
+    end = min(events.index(middle + half), begin + _MOST)
+    return Window(begin, end, middle)
+
+
+def flow_of(recording: Recording, motion: Motion, part: Window) -> Flow:
+    """The flow of a window's events, given those of the 100 ms before, which are candidates."""
+    if part.start == part.stop:
+        return Flow(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0, np.float32))
+    begin = recording.events.index(
+        int(recording.events[part.start : part.start + 1].t[0]) - 100_000
+    )
+    cut = dataclasses.replace(recording, events=recording.events[begin : part.stop])
+    flows = event_flow.flow(cut, motion)
+    rows = slice(part.start - begin, None)
+    return Flow(flows.flow[rows], flows.valid[rows], flows.residual[rows])
+
+
+def warped_events(
+    recording: Recording,
+    motion: Motion,
+    events: Events,
+    reference: int,
+    moved: NDArray[np.floating] | None = None,
+) -> NDArray[np.float64]:
+    """Where events (n,) would be at the time `reference` (us): (n, 2) px, columns and rows.
+
+    They are moved by the model's `warp` of the motion's integral. Of motion along half-lines
+    `moved` (n, 2) is the flow (px/s) due to translation at each event. Without a calibration
+    coordinates are those of pixels, else undistorted ones about the principal point.
+    """
+    xi, f = coordinates(recording.width, recording.height, recording.camera)
+    xy = xi[events.y, events.x]
+    since = (events.t - reference) * 1e-6
+    # The motion is smooth: its integral on a grid of 1 ms or less.
+    low, high = int(events.t.min(initial=reference)), int(events.t.max(initial=reference))
+    grid = np.linspace(low, high, 2 + math.ceil((high - low) / 1000))
+    mean = np.asarray(
+        motion(np.rint(grid).astype(np.int64), centred=True, extrapolate=True).mean, float
+    )
+    mean = np.nan_to_num(mean)
+    steps = (mean[1:] + mean[:-1]) / 2 * np.diff(grid)[:, None] * 1e-6
+    total = np.concatenate([np.zeros((1, mean.shape[1])), np.cumsum(steps, 0)])
+    way = np.stack(
+        [np.interp(events.t, grid, c) - np.interp(reference, grid, c) for c in total.T], 1
+    )
+    # In single precision a place is off by some 1e-5 px.
+    xy = np.asarray(_warped(motion.model(f), _padded(xy), _padded(way)), float)[: len(xy)]
+    if moved is not None:
+        xy = xy - moved * since[:, None]
+    centre = _centre(recording)
+    return xy + centre
+
+
+def _centre(recording: Recording) -> NDArray[np.float64]:
+    camera = recording.camera
+    if camera is None:
+        return np.array([(recording.width - 1) / 2, (recording.height - 1) / 2])
+    return np.array([camera.cx, camera.cy])
+
+
+def plot_warped(
+    path: str | Path,
+    recording: Recording,
+    motion: Motion,
+    part: Window | None = None,
+    flows: Flow | None = None,
+) -> None:
+    """Draw the events of a window as they fell and moved back along the motion, side by side, PNG.
+
+    Images are sums of polarities under a bilinear kernel, of one grey scale; the titles tell their
+    contrast, the variance in the sensor, relative to that of the events as they fell. `flows` are
+    of the window's events; motion along half-lines needs them for its translation, and events whose
+    flow is not known are left out of both images.
+    """
+    part = part or window_of(recording, motion)
+    events = recording.events[part.start : part.stop]
+    moved = None
+    if motion.model.half_line:
+        flows = flows or flow_of(recording, motion, part)
+        keep = flows.valid
+        events = Events(events.t[keep], events.x[keep], events.y[keep], events.p[keep])
+        xi, f = coordinates(recording.width, recording.height, recording.camera)
+        mean = motion(events.t, centred=True, extrapolate=True).mean
+        moved = flows.flow[keep] - _linear_flow(motion.model(f), xi[events.y, events.x], mean)
+    xi, _ = coordinates(recording.width, recording.height, recording.camera)
+    shape = recording.height, recording.width
+    sign = np.where(events.p, 1.0, -1.0)
+    places = (
+        xi[events.y, events.x] + _centre(recording),
+        warped_events(recording, motion, events, part.reference, moved),
+    )
+    sign = _padded(sign)
+    told = [_image(_padded(xy), sign, shape) for xy in places]
+    images, sharp = [np.asarray(one[0]) for one in told], [float(one[1]) for one in told]
+    limit = max(np.percentile(np.abs(images[1]), 99.7), 1e-9)
+    figure = _figure(path)
+    wide = 5.2
+    figure.set_size_inches(2 * wide, wide * shape[0] / shape[1] + 0.8)
+    span = (int(events.t[-1] - events.t[0]) * 1e-3) if len(events) else 0.0
+    figure.suptitle(
+        f"{len(events):,} events of {span:.0f} ms at {part.reference * 1e-6:.3f} s", fontsize=10
+    )
+    gain = sharp[1] / sharp[0] if sharp[0] > 0 else math.nan
+    titles = (f"as they fell: contrast {sharp[0]:.3g}", f"warped: {sharp[1]:.3g}, {gain:.2f} times")
+    for axis, image, title in zip(figure.subplots(1, 2), images, titles, strict=True):
+        axis.imshow(image, cmap="gray", vmin=-limit, vmax=limit, interpolation="nearest")
+        axis.set_title(title, fontsize=10)
+        axis.set_axis_off()
+    _save(figure, path)
+
+
+def _padded(array: NDArray) -> NDArray:
+    """The rows, and zeros up to a power of two: programs are compiled for few lengths."""
+    more = (1 << max(len(array) - 1, 0).bit_length()) - len(array)
+    return np.concatenate([array, np.zeros((more, *array.shape[1:]), array.dtype)])
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _image(xy: Array, weight: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
+    image = splat(xy, weight, shape)
+    return image, contrast(blur(image, 1))
+
+
+def _linear_flow(
+    model: Model, xi: NDArray[np.floating], mean: NDArray[np.floating]
+) -> NDArray[np.floating]:
+    """What each of n motions makes at a place (n, 2), px/s; of half-lines their begins."""
+    return np.asarray(_flows(model, _padded(xi), _padded(mean)))[: len(xi)]
+
+
+@eqx.filter_jit
+def _flows(model: Model, xi: Numeric, mean: Numeric) -> Array:
+    return jax.vmap(model.flow)(jnp.asarray(xi), jnp.asarray(mean))
+
+
+@eqx.filter_jit
+def _warped(model: Model, xi: Numeric, way: Numeric) -> Array:
+    return model.warp(jnp.asarray(xi), jnp.asarray(way))
+
+
+def plot_flow(path: str | Path, recording: Recording, part: Window, flows: Flow) -> None:
+    """Draw a window's events in colours of their flow (PNG): hue the direction, depth the speed.
+
+    The wheel shows which. Events without flow are grey, of several at a pixel the last is drawn.
+    """
+    from matplotlib.colors import hsv_to_rgb
+
+    events = recording.events[part.start : part.stop]
+    speed = np.hypot(*flows.flow.T.astype(float))
+    most = float(np.percentile(speed[flows.valid], 95)) if flows.valid.any() else 1.0
+    most = max(most, 1e-9)
+
+    def colours(u: NDArray, v: NDArray) -> NDArray:
+        hue = (np.arctan2(v, u) / (2 * np.pi)) % 1
+        depth = np.clip(np.hypot(u, v) / most, 0, 1)
+        return hsv_to_rgb(np.stack([hue, depth, np.ones_like(hue)], -1))
+
+    image = np.full((recording.height, recording.width, 3), 0.06)
+    # The middle third of the window: more would smear fast edges.
+    third = (events.t[-1] - events.t[0]) // 6 if len(events) else 0
+    now = np.abs(events.t - part.reference) <= third
+    image[events.y[now], events.x[now]] = 0.35
+    ok = flows.valid & now
+    image[events.y[ok], events.x[ok]] = colours(*flows.flow[ok].T.astype(float))
+    figure = _figure(path)
+    wide = 7.0
+    figure.set_size_inches(wide + 1.7, wide * recording.height / recording.width + 0.5)
+    left, right = figure.subplots(1, 2, width_ratios=(wide, 1.5))
+    left.imshow(image, interpolation="nearest")
+    left.set_title(f"flow at {part.reference * 1e-6:.3f} s", fontsize=10)
+    left.set_axis_off()
+    v, u = np.mgrid[-1:1:121j, -1:1:121j] * most
+    wheel = np.where((np.hypot(u, v) <= most)[..., None], colours(u, v), 1.0)
+    right.imshow(wheel, interpolation="nearest")
+    right.set_title(f"{most:.3g} px/s\nat the rim", fontsize=9)
+    right.set_axis_off()
+    _save(figure, path)
+
+
+def _figure(path: str | Path) -> Any:
+    require("matplotlib", "plot")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _save(figure: Any, path: str | Path) -> None:
+    with complete(Path(path)) as partial:
+        figure.savefig(partial, format="png", dpi=130)
