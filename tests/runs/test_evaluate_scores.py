@@ -122,7 +122,7 @@ def test_tracks(folder):
     [
         (MOTION.replace('truth = "*.csv"', ""), "true motion is not given"),
         (MOTION.replace('truth = "*.csv"', 'truth = "*.csv"\nmodel = "planer"'), "planar"),
-        (MOTION.replace("settle = 0.1", "settle = -1"), "settle is -1"),
+        (MOTION.replace("settle = 0.1", "settle = -1"), "settle is '-1'"),
         (MOTION.replace("settle = 0.1", "metrics = ['lpips']"), "no setting 'metrics'"),
         (MOTION.replace("planes", "akf", 1), "'akf' is of reconstruction"),
         (MOTION.replace("*.csv", "*.txt"), "wall.txt: cannot be read"),
