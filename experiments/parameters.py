@@ -24,10 +24,9 @@ def rows(kind: type[Parameters]) -> list[str]:
             meaning += "; in [0, 1)"
         if isinstance(setting, Choice):
             meaning += f"; one of {', '.join(map(cell, setting.options))}"
-        lines.append(
-            f"| `{name}` | {cell(setting.default)} | {setting.unit} | {'' if name in fixed else 'yes'} "
-            f"| {meaning.replace('|', chr(92) + '|')} |"
-        )
+        gradient = "" if name in fixed else "yes"
+        parts = (f"`{name}`", cell(setting.default), setting.unit, gradient, meaning)
+        lines.append(f"| {' | '.join(part.replace('|', chr(92) + '|') for part in parts)} |")
     return lines
 
 
@@ -44,8 +43,8 @@ def page() -> str:
     parts = [
         "# Parameters",
         "Made by `python experiments/parameters.py`. Numbers with a gradient can be named under "
-        "`fit` in a fit's configuration, the others under `search`. A positive number that is 0 stays "
-        "0: give it a value first. The column of gradients holds as the other parameters "
+        "`fit` in a fit's configuration, the others under `search`. A positive number that is 0 "
+        "stays 0: give it a value first. The column of gradients holds as the other parameters "
         "stand by default.",
     ]
     for family, homes in HOMES.items():
