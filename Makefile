@@ -1,4 +1,4 @@
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint docs bench clean
 .DELETE_ON_ERROR:
 
 bin := .venv/bin
@@ -15,11 +15,14 @@ lint: .venv/test.stamp
 	$(bin)/ruff format --check
 	$(bin)/pyright --pythonpath $(bin)/python
 
+docs: .venv/docs.stamp
+	NO_MKDOCS_2_WARNING=1 $(bin)/mkdocs build --strict
+
 bench: .venv/bench.stamp
 	$(bin)/python experiments/bench.py
 
 clean:
-	rm -rf .venv build dist jaxevent-demo .pytest_cache .hypothesis .ruff_cache *.egg-info
+	rm -rf .venv build dist site jaxevent-demo .pytest_cache .hypothesis .ruff_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 .venv/demo.stamp: pyproject.toml constraints.txt | .venv/made.stamp
@@ -28,6 +31,10 @@ clean:
 
 .venv/test.stamp: pyproject.toml constraints.txt | .venv/made.stamp
 	$(install) '.[test]'
+	@touch $@
+
+.venv/docs.stamp: pyproject.toml constraints.txt | .venv/made.stamp
+	$(install) '.[docs]'
 	@touch $@
 
 .venv/bench.stamp: pyproject.toml constraints.txt | .venv/made.stamp

@@ -1,53 +1,59 @@
-"""Print docs/parameters.md, the table of all parameters: python experiments/parameters.py"""
+"""Print docs/parameters.md, all parameters of all methods: python experiments/parameters.py"""
 
-from collections.abc import Iterable
+from typing import Any
 
 import jaxevent
-from jaxevent.methods import names
-from jaxevent.parameters import Choice, Number, Parameters
+from jaxevent.methods import HOMES
+from jaxevent.parameters import Choice, Parameters, Share, shown
+
+TITLES = {"reconstruction": "Reconstruction", "blob": "Tracking", "egomotion": "Egomotion"}
 
 
-def rows(kinds: Iterable[type[Parameters]]) -> list[str]:
-    """One row for each parameter of some classes: name, default or options, unit, meaning."""
-    numbers: dict[str, Number] = {}
-    choices = {}
-    for kind in kinds:
-        numbers |= kind.numbers
-        choices |= kind.choices
-    lines = ["| parameter | default | unit | |", "|---|---|---|---|"]
-    for name, number in numbers.items():
-        default = number.default if isinstance(number.default, tuple) else (number.default,)
-        text = ", ".join(f"{value:.4g}" for value in default)
-        lines.append(f"| `{name}` | {text} | {number.unit} | {number.meaning} |")
-    for name, choice in choices.items():
-        if isinstance(choice, Choice):
-            options = " or ".join(str(option).lower() for option in choice.options)
-            lines.append(f"| `{name}` | {options} | | {choice.meaning} |")
-        else:
-            lines.append(f"| `{name}` | {choice.default} | {choice.unit} | {choice.meaning} |")
+def cell(value: Any) -> str:
+    """A value as TOML has it."""
+    return str(value).lower() if isinstance(value, bool) else shown(value).replace("'", '"')
+
+
+def rows(kind: type[Parameters]) -> list[str]:
+    """A row for each setting of a class: name, default, unit, gradient, meaning."""
+    lines = ["| parameter | default | unit | gradient | |", "|---|---|---|---|---|"]
+    fixed = {**kind.choices, **kind().without_gradient()}
+    for name, setting in kind.settings().items():
+        meaning = setting.meaning
+        if isinstance(setting, Share):
+            meaning += "; in [0, 1)"
+        if isinstance(setting, Choice):
+            meaning += f"; one of {', '.join(map(cell, setting.options))}"
+        gradient = "" if name in fixed else "yes"
+        parts = (f"`{name}`", cell(setting.default), setting.unit, gradient, meaning)
+        lines.append(f"| {' | '.join(part.replace('|', chr(92) + '|') for part in parts)} |")
+    return lines
+
+
+def presets(kind: type[Parameters]) -> list[str]:
+    """A line for each preset: what it sets."""
+    lines = []
+    for name, values in kind.presets.items():
+        parts = ", ".join(f"{key} = {cell(value)}" for key, value in values.items())
+        lines.append(f'- `preset = "{name}"`: {parts or "the defaults"}')
     return lines
 
 
 def page() -> str:
-    methods = (jaxevent.METHODS[name].Params for name in names("reconstruction"))
-    trackers = [jaxevent.METHODS[name].Params for name in names("blob")]
     parts = [
         "# Parameters",
-        "Made by `python experiments/parameters.py`. Of several options the first is the default. "
-        "Numbers with a gradient can be named under `fit` in a fit's configuration.",
-        "## Reconstruction",
-        "A method has those of them that it uses: `jaxevent.akf.Params.numbers`, `.choices`. "
-        "Presets of `akf`: `paper`, `hdr`; of `aks`: `hdr`.",
-        "\n".join(rows(methods)),
-        "## Blob tracking",
-        "A tracker has those of them that it uses: `jaxevent.blob.moment.Params.numbers`, "
-        "`.choices`. Presets: `slow`, `fast`, `ttc`; of `chi2` also `authors`.",
-        "\n".join(rows(trackers)),
-        "## Egomotion",
-        "Each method of `jaxevent.METHODS` for egomotion has its own `Params`.",
+        "Made by `python experiments/parameters.py`. Numbers with a gradient can be named under "
+        "`fit` in a fit's configuration, the others under `search`. A positive number that is 0 "
+        "stays 0: give it a value first. The column of gradients holds as the other parameters "
+        "stand by default.",
     ]
-    for name in names("egomotion"):
-        parts += [f"### {name}", "\n".join(rows([jaxevent.METHODS[name].Params]))]
+    for family, homes in HOMES.items():
+        parts.append(f"## {TITLES[family]}")
+        for name in homes:
+            kind = jaxevent.METHODS[name].Params
+            parts += [f"### {name}", "\n".join(rows(kind))]
+            if kind.presets:
+                parts.append("\n".join(presets(kind)))
     return "\n\n".join(parts) + "\n"
 
 

@@ -1,7 +1,9 @@
 """Tracking of blobs: bright spots and other compact sources of events.
 
-tracks = blob.moment.estimate(recording, blob.moment.Params(events_per_step=32))
-mean, covariance, valid = tracks(times)
+    tracks = blob.moment.estimate(recording, blob.moment.Params(events_per_step=32))
+    mean, covariance, valid = tracks(times)
+
+Every method here is used in this way, each with its own `Params`.
 """
 
 from jaxevent.blob.filters.chi2 import chi2, chi2_split

@@ -1,8 +1,8 @@
 """What the camera's motion was, from poses or a gyro, and how far an estimate is from it.
 
-truth = from_poses(recording.poses, span=0.02)
-T, Omega = truth(times)
-scores = motion_errors(Omega=(estimate, Omega), T=(heading, T))
+    truth = from_poses(recording.poses, span=0.02)
+    T, Omega = truth(times)
+    scores = motion_errors(Omega=(estimate, Omega), T=(heading, T))
 
 Twists are the camera's, as in `jaxevent.egomotion.geometry`: T in m/s and Omega in rad/s in its own
 axes. Errors follow the egomotion thesis, 5.20 to 5.21 and 6.22 to 6.29. All on the host.

@@ -1,18 +1,18 @@
 """Recordings with known truth: events and frames of HDR scenes, or of ordinary video.
 
-panorama = jaxevent.simulate.scene("lake")
-recording = jaxevent.simulate.simulate(jaxevent.simulate.Pan(panorama, speed="fast"))
-recording.extra["hdr"], recording.extra["hdr_t"]  # the truth, and when
+    panorama = jaxevent.simulate.scene("lake")
+    recording = jaxevent.simulate.simulate(jaxevent.simulate.Pan(panorama, speed="fast"))
+    recording.extra["hdr"], recording.extra["hdr_t"]  # the truth, and when
 
 Moving blobs, discs and lights, events only:
 
-recording, truth = jaxevent.simulate.blob_scene("lissajous")
-truth(recording.events.t)  # the state of every target at every event
+    recording, truth = jaxevent.simulate.blob_scene("lissajous")
+    truth(recording.events.t)  # the state of every target at every event
 
 A camera that moves in a rigid world:
 
-recording, truth = jaxevent.simulate.motion_scene("texture", motion="varying")
-truth.twist(recording.events.t)  # T and Omega of the camera at every event
+    recording, truth = jaxevent.simulate.motion_scene("texture", motion="varying")
+    truth.twist(recording.events.t)  # T and Omega of the camera at every event
 """
 
 from jaxevent.simulate.blobs import (

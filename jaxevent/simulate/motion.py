@@ -1,8 +1,8 @@
 """A camera that moves in a rigid, textured world, with the truth of its twist and of depth.
 
-recording, truth = motion_scene("texture", motion="varying", seed=3)
-truth.twist(0.2)   # T (1, 3) in m/s and Omega (1, 3) in rad/s, the camera's own
-truth.depth(0.2)   # (height, width) in m
+    recording, truth = motion_scene("texture", motion="varying", seed=3)
+    truth.twist(0.2)   # T (1, 3) in m/s and Omega (1, 3) in rad/s, the camera's own
+    truth.depth(0.2)   # (height, width) in m
 
 Camera axes are x to the right, y down, z forward; the world's are the camera's at time 0. Pixel
 centres are whole numbers. `frame_events` is the egomotion thesis' own generator instead: events

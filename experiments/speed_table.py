@@ -1,4 +1,4 @@
-"""Print the README's table of speed: python experiments/readme_tables.py bench.json
+"""Print the table of docs/results/speed.md: python experiments/speed_table.py bench.json
 
 bench.json is what `bench.py --json bench.json` writes.
 """

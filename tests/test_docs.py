@@ -1,0 +1,67 @@
+"""The site builds without a warning, its examples run, its tables are those of the code."""
+
+import os
+import re
+import runpy
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from pages import run_page
+
+import jaxevent
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+WITH_CODE = [
+    page.relative_to(DOCS).as_posix()
+    for page in sorted(DOCS.rglob("*.md"))
+    if "```" in page.read_text()
+]
+
+
+def test_the_site_builds(tmp_path):
+    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet"]
+    done = subprocess.run(
+        [*build, "--site-dir", tmp_path / "site"], cwd=ROOT, capture_output=True, text=True,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    pages = list((tmp_path / "site").rglob("*.html"))
+    assert len(pages) > 20
+    # Nothing is fetched from elsewhere when a page is looked at.
+    fetched = re.compile(r'<(?:script|img|link rel="stylesheet")[^>]+(?:src|href)="?https?://')
+    assert not [page for page in pages if fetched.search(page.read_text())]
+
+
+@pytest.mark.parametrize("page", WITH_CODE)
+def test_examples_run(page, tmp_path, monkeypatch, float32):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "environ", os.environ.copy())
+    scope = run_page((DOCS / page).read_text())
+    if page == "fitting.md":  # frames that the filter is given would lead to 0.033
+        fitted = scope["fitted"].params
+        assert 0.065 < float(fitted.c_on) < 0.095 and 0.045 < float(fitted.c_off) < 0.065
+
+
+def test_table_of_parameters_is_that_of_the_code():
+    text = runpy.run_path(str(ROOT / "experiments" / "parameters.py"))["page"]()
+    assert (DOCS / "parameters.md").read_text() == text
+    for name, method in jaxevent.METHODS.items():
+        own = text.split(f"### {name}\n")[1].split("\n### ")[0].split("\n## ")[0]
+        for setting in method.Params.settings():
+            assert f"| `{setting}` |" in own
+
+
+def test_toml_is_toml():
+    for page in DOCS.rglob("*.md"):
+        for block in re.findall(r"```toml\n(.*?)```", page.read_text(), re.DOTALL):
+            tomllib.loads(block)
+
+
+def test_every_page_is_in_the_navigation():
+    nav = (ROOT / "mkdocs.yml").read_text()
+    for page in DOCS.rglob("*.md"):
+        assert page.relative_to(DOCS).as_posix() in nav
