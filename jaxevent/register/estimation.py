@@ -22,7 +22,7 @@ def estimate(
     homography: ArrayLike | None = None,
     offset: float | int | None = None,
     search: float | int | None = None,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> Registration:
     """How another camera's frames fit the events: what is not given is estimated.
 

@@ -22,7 +22,7 @@ def read_frames(
     reference: bool = False,
     exposure: float | int | None = None,
     white: float | int | None = None,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> Recording:
     """Another camera's frames, as a recording that need not hold events.
 

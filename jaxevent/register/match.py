@@ -22,7 +22,7 @@ _APART = (1, 3)  # frames between which changes are matched
 
 
 def match(
-    recording: Recording, other: Recording, offset: float, progress: bool
+    recording: Recording, other: Recording, offset: float, progress: bool | None
 ) -> list[NDArray[np.float64]]:
     """Homographies that most matches of features agree on, to a few pixels.
 
@@ -91,7 +91,7 @@ def _pair_images(
     other: Recording,
     t: NDArray[np.int64],
     rows: NDArray[np.intp],
-    progress: bool,
+    progress: bool | None,
 ) -> Iterator[tuple[NDArray[np.floating], NDArray[np.floating]]]:
     """Pairs of images of the same by the events and by the frames `rows`, whose times are t."""
     from jaxevent.reconstruction import high_pass

@@ -135,7 +135,7 @@ class TrackGoal(Goal):
         split: Shares,
         window: float | int | None,
         params: TrackerParams,
-        progress: bool,
+        progress: bool | None,
     ) -> Iterator[dict[str, Any]]:
         found = self._parts(sources, split, window)
         packed = self._packed(found, params, "likelihood")

@@ -187,7 +187,7 @@ class Output:
         motion: Motion,
         about: Mapping[str, Any] = MappingProxyType({}),
         truth: tuple[Callable[[Motion], Known], str] | None = None,
-        progress: bool = False,
+        progress: bool | None = None,
     ) -> "Written":
         """Write everything, complete or not at all; `about` are attributes of motion.h5."""
         if not len(recording.events):

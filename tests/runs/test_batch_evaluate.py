@@ -25,7 +25,7 @@ from pyarrow import parquet
 
 import jaxevent
 from jaxevent import cli
-from jaxevent.reconstruction import METHODS
+from jaxevent.methods import METHODS
 from jaxevent.reconstruction.video import BATCH
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.evaluate import evaluate
