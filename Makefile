@@ -1,4 +1,4 @@
-.PHONY: demo test lint docs bench clean
+.PHONY: demo test quick lint docs bench clean
 .DELETE_ON_ERROR:
 
 bin := .venv/bin
@@ -8,11 +8,18 @@ demo: .venv/demo.stamp
 	$(bin)/jaxevent demo
 
 test: lint
-	$(bin)/python -m pytest -n auto --dist worksteal
+	$(bin)/python -m pytest -n auto --dist loadfile
+
+# For the edit loop: no types, and none of the tests that take long.
+quick: .venv/test.stamp
+	$(bin)/ruff check
+	$(bin)/ruff format --check
+	$(bin)/python -m pytest -n auto --dist loadfile -m "not slow"
 
 lint: .venv/test.stamp
 	$(bin)/ruff check
 	$(bin)/ruff format --check
+	$(bin)/lint-imports --no-cache
 	$(bin)/pyright --pythonpath $(bin)/python
 
 docs: .venv/docs.stamp

@@ -20,5 +20,9 @@ def bar(
 
     `progress` shows or hides it; None: shown where somebody looks on (`watched`).
     """
-    shown = watched() if progress is None else progress
-    return tqdm(items, unit=unit, delay=2, leave=False, disable=not shown, **more)
+    return tqdm(items, unit=unit, delay=2, leave=False, disable=not is_shown(progress), **more)
+
+
+def is_shown(progress: bool | None) -> bool:
+    """Whether a bar is shown: as `progress` says, and if it says nothing, where `watched`."""
+    return watched() if progress is None else progress

@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from jaxevent.errors import InputError
 from jaxevent.io import checked_events, pinhole, reading, sensor_size, times
+from jaxevent.progress import is_shown
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
 
@@ -111,7 +112,13 @@ def _table(
         reading(source),
         file.open("rb") as stream,
         tqdm.wrapattr(
-            stream, "read", unit="B", unit_scale=True, delay=2, disable=not progress, leave=False
+            stream,
+            "read",
+            unit="B",
+            unit_scale=True,
+            delay=2,
+            disable=not is_shown(progress),
+            leave=False,
         ) as watched,
     ):
         table = pd.read_csv(
