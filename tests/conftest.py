@@ -8,8 +8,9 @@ import platformdirs
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 # What one test, worker or command has compiled, the others take from the user's cache folder, and
 # so does the next run. The environment reaches the commands that tests start.
-_CACHE = platformdirs.user_cache_path("jaxevent", appauthor=False) / "tests"
-os.environ.setdefault("JAXEVENT_CACHE", str(_CACHE))  # see `jaxevent.cache`
+os.environ.setdefault(
+    "JAXEVENT_CACHE", str(platformdirs.user_cache_path("jaxevent", appauthor=False) / "tests")
+)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.05")
 
 import hypothesis
