@@ -19,7 +19,8 @@ import numba
 import numpy as np
 
 from jaxevent.egomotion import voting
-from jaxevent.egomotion.batch_fit import photometric
+from jaxevent.egomotion.batch_fit import equations, lattice
+from jaxevent.egomotion.batch_fit import tracks as tracks_of
 from jaxevent.egomotion.batch_fit import windows as batch
 from jaxevent.egomotion.batch_fit.path import ROWS, Path, advanced
 from jaxevent.egomotion.candidates import Candidates
@@ -217,9 +218,9 @@ def normal_bench() -> tuple[dict[str, float], dict[str, float]]:
     T, Omega = (part[0] for part in truth.twist(np.array([0.2])))
     depths = np.full(math.prod(tracks.nodes), np.log(np.linalg.norm(T)))
     path = Path.constant(T / np.linalg.norm(T), Omega, depths, jnp.float32)
-    X, Y = photometric.placed(path, tracks)
-    at = photometric._spline(X, Y, tracks.corner, tracks.shape)
-    node = photometric._corners(X, Y, tracks.corner, tracks.node, tracks.nodes)
+    X, Y = tracks_of.placed(path, tracks)
+    at = lattice.spline(X, Y, tracks.corner, tracks.shape)
+    node = lattice.bilinear(X, Y, tracks.corner, tracks.node, tracks.nodes)
     rng, E, n = np.random.default_rng(0), len(tracks.x), 6 * ROWS + 4
 
     def drawn(*shape: int) -> jax.Array:
@@ -227,21 +228,21 @@ def normal_bench() -> tuple[dict[str, float], dict[str, float]]:
 
     slopes, v = (drawn(n, E), drawn(E)), (drawn(*tracks.shape), drawn(n), drawn(len(depths)))
     weight = tracks.on * at.inside
-    total = photometric.totals(weight, tracks)
-    jacobian = photometric.Jacobian(tracks, at, node, *slopes, weight, total)
+    total = tracks_of.totals(weight, tracks)
+    jacobian = equations.Jacobian(tracks, at, node, *slopes, weight, total)
 
-    def product(jacobian: photometric.Jacobian, v: tuple) -> tuple:
-        return jacobian.back(weight * jacobian.less_mean(jacobian.of(v)))
+    def product(jacobian: equations.Jacobian, v: tuple) -> tuple:
+        return jacobian.back(weight * jacobian.subtract_mean(jacobian.of(v)))
 
-    def step(jacobian: photometric.Jacobian, v: tuple) -> tuple:
+    def step(jacobian: equations.Jacobian, v: tuple) -> tuple:
         def one(_: Any, v: tuple) -> tuple:
             return jax.tree.map(lambda part: part / jnp.abs(part).max(), product(jacobian, v))
 
-        return jax.lax.fori_loop(0, photometric.SOLVE, one, v)
+        return jax.lax.fori_loop(0, equations.SOLVE, one, v)
 
     arguments = [np.asarray(part).ravel() for part in v]
     for near, shape in ((at, tracks.shape), (node, tracks.nodes)):
-        steps = np.array(photometric._steps(near, shape), np.int32)
+        steps = np.array(lattice.offsets(near, shape), np.int32)
         arguments += [np.asarray(near.first), steps, np.ascontiguousarray(near.share.T)]
     arguments += [np.ascontiguousarray(slopes[0].T)]
     arguments += map(np.asarray, (slopes[1], weight, tracks.pixel, total))
@@ -249,7 +250,7 @@ def normal_bench() -> tuple[dict[str, float], dict[str, float]]:
         its = its.reshape(ours.shape)
         np.testing.assert_allclose(ours, its, rtol=0, atol=1e-4 * np.abs(its).max())
     compiled = jax.jit(step)
-    seconds = timed(lambda: compiled(jacobian, v), 10) / photometric.SOLVE
+    seconds = timed(lambda: compiled(jacobian, v), 10) / equations.SOLVE
     slow = timed(lambda: normal_loop(*arguments), 100)
     name = "batch general motion, one J' W J v"
     speed = {name: E / seconds / 1e6, f"{name}, as a numba loop": E / slow / 1e6}

@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.batch_fit.alignment import Window, refine, score
+from jaxevent.egomotion.batch_fit.depths import depths
 from jaxevent.egomotion.batch_fit.path import SEGMENTS, Path, Prior, advanced
-from jaxevent.egomotion.batch_fit.photometric import NODE, Report, Scene, Tracks, adjust, depths
+from jaxevent.egomotion.batch_fit.photometric import Report, adjust, compute_covariance
 from jaxevent.egomotion.batch_fit.starts import (
     Plane,
     before_a_plane,
@@ -36,6 +37,7 @@ from jaxevent.egomotion.batch_fit.starts import (
     side_by_side,
     start,
 )
+from jaxevent.egomotion.batch_fit.tracks import Scene, Tracks
 from jaxevent.egomotion.candidates import coordinates
 from jaxevent.egomotion.estimator import COMMON, Given, OnHost
 from jaxevent.egomotion.models import General
@@ -45,6 +47,7 @@ from jaxevent.parameters import Count, Number, Parameters, Positive
 from jaxevent.progress import bar
 from jaxevent.recording import Recording
 
+NODE = 4  # px between nodes of depth
 MARGIN = 24  # px of the reference view around the sensor
 APART = np.cos(np.radians(6))  # headings of rivals
 TURN = 0.1  # rad/s, likewise
@@ -224,8 +227,8 @@ class Windows:
             found += [start(window, flows, *one) for one in best]
 
         def follow(path: Path) -> Path:
-            path, _ = refine(window, path, prior, 0, 4, 6)
-            return refine(window, path, prior, 0, 1, 6)[0]
+            path, _ = refine(window, path, prior, degree=0, blurs=4, steps=6)
+            return refine(window, path, prior, degree=0, blurs=1, steps=6)[0]
 
         ranked = side_by_side(lambda path: self.scored(window, follow(path)), found)
         return self.best(ranked)[:STARTED]
@@ -287,7 +290,9 @@ class Windows:
 
         def follow(paths: list[Path], window: Window, prior: Prior, degree: int, n: int) -> list:
             def one(path: Path) -> tuple[float, Path]:
-                return self.scored(window, refine(window, path, prior, degree, 2, n)[0])
+                return self.scored(
+                    window, refine(window, path, prior, degree=degree, blurs=2, steps=n)[0]
+                )
 
             return self.best(side_by_side(one, paths))
 
@@ -388,10 +393,11 @@ class Windows:
             return None
         scene, report = min(left, key=lambda one: self.cost(*one))
         sigma = max(stages[-1].sigma, SHARP * float(report.noise))
-        scene, report = adjust(tracks, scene, prior, sigma, 0, 1, True)
+        covariance = compute_covariance(tracks, scene, prior, sigma=sigma)
+        scene, report = adjust(tracks, scene, prior, sigma=sigma, settle=0, steps=1)
         return Fit(
             scene.path,
-            np.asarray(report.covariance, np.float64),
+            np.asarray(covariance, np.float64),
             float(report.inliers),
             float(report.cost),
             np.asarray(scene.map),
@@ -431,7 +437,9 @@ def _begun(
     """Through stages, from a path alone: first the map is made."""
     real = tracks.x.dtype
     scene = Scene(path, jnp.zeros(tracks.shape, real), jnp.zeros((), real))
-    scene, report = adjust(tracks, scene, prior, ROUNDS[0].sigma, 2, 2, plane=plane)
+    scene, report = adjust(
+        tracks, scene, prior, sigma=ROUNDS[0].sigma, settle=2, steps=2, plane=plane
+    )
     return _adjusted(tracks, scene, report, prior, stages, plane)
 
 
@@ -448,7 +456,9 @@ def _adjusted(
         flat, change = stage.flatter * prior.flat, stage.stiffer * prior.change
         seen = prior._replace(flat=flat, change=change)
         sigma = max(stage.sigma, SHARP * float(report.noise))
-        scene, report = adjust(tracks, scene, seen, sigma, 0, stage.steps, plane=plane)
+        scene, report = adjust(
+            tracks, scene, seen, sigma=sigma, settle=0, steps=stage.steps, plane=plane
+        )
     return scene, report
 
 
