@@ -408,7 +408,7 @@ def test_no_weight_and_no_events(name):
 
 
 @pytest.mark.parametrize("name", [*TRACKERS, "moving_moments"])
-def test_nothing_breaks_the_numbers(name, float32):
+def test_nothing_breaks_the_numbers(name, float32, optimised):
     """Gaps of 1000 s, equal times and sizes, far outliers, no weight, 10,000 events at a pixel."""
     params = params_of(name, polarity_offset=True, gate_shape="ellipse")
     xi = np.zeros((10_060, 1, 2), np.float32)

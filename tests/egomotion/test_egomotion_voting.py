@@ -337,7 +337,7 @@ def test_resampling_carries_the_score():
 
 
 @pytest.mark.parametrize("likelihood", ["soft", "literal"])
-def test_gradient_without_resampling(likelihood):
+def test_gradient_without_resampling(likelihood, optimised):
     params, kind, c = prepared(likelihood, number=300, resample_below=0.0, r_t=50.0, memory=1e9)
     noise = filtering.draw(jax.random.key(3), len(c.elapsed), params, kind)
     carry = filtering.begin(params, kind, noise)
