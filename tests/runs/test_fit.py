@@ -349,17 +349,19 @@ def test_errors_by_hand(error, clipped):
     objective = Objective(Shown("shown", jaxevent.akf.Params), error, clipped)
     one = jnp.asarray(1.0)
 
+    @jax.jit
+    @jax.value_and_grad
     def loss(image, weights):
-        batch = Images(None, image, true, jnp.asarray(weights), jnp.asarray(white), one)
+        batch = Images(None, image, true, weights, jnp.asarray(white), one)
         return objective(jaxevent.akf.Params(), batch)
 
     expected = [by_hand(error, i, t, clipped, white) for i, t in zip(image, truth, strict=True)]
-    value = loss(shown, weights)
+    value, slope = loss(shown, weights)
     assert float(value) == pytest.approx(np.average(expected, weights=weights[0]))
-    evenly = loss(shown, np.full((1, 1), 2.0))
+    evenly, _ = loss(shown, np.full((1, 1), 2.0))
     assert float(evenly) == pytest.approx(np.mean(expected))
     # It slopes wherever it is not 0, and never jumps.
-    slope = np.asarray(jax.grad(loss)(shown, weights))[0]
+    slope = np.asarray(slope)[0]
     assert np.isfinite(slope).all()
     if error != "nll":
         counted = (np.array(expected) > 1e-12) & (weights[0] > 0)
