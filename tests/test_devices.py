@@ -191,6 +191,7 @@ def both(folder) -> tuple[dict[str, Any], dict[str, Any]]:
     return one, pickle.loads((folder / "four" / "found").read_bytes())
 
 
+@pytest.mark.slow
 def test_pixels_are_the_same_on_four_devices(both):
     one, four = both
     assert (one["shared out"], four["shared out"]) == (1, 4)
@@ -297,6 +298,7 @@ def test_processes_that_make_no_sense(given, said, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_two_processes_fit_as_one(folder, both):
     with socket.socket() as free:
         free.bind(("localhost", 0))

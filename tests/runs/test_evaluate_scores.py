@@ -98,6 +98,7 @@ def test_motion(folder, tmp_path):
     assert 40 < far[0]["AEE_rel"] < 60
 
 
+@pytest.mark.slow
 def test_tracks(folder):
     rows = evaluate.evaluate(configured(folder, "tracks", TRACKS))
     recording = jaxevent.load(folder / "dot.h5")

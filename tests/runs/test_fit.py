@@ -368,6 +368,7 @@ def test_errors_by_hand(error, clipped):
         assert (slope[counted] != 0).all() and counted.sum() > 10
 
 
+@pytest.mark.slow
 def test_the_loss_bounds_the_evaluated_error():
     """It equals what evaluation says of images within [0, 1], and is more for others."""
     recording = moving()
@@ -470,6 +471,7 @@ def fitted(tmp_path_factory) -> tuple[Path, list[dict]]:
     return folder, rows
 
 
+@pytest.mark.slow
 def test_thresholds_and_clock_are_recovered(fitted):
     folder, _ = fitted
     edi = METHODS["edi"]
@@ -591,6 +593,7 @@ def interrupted(monkeypatch, after: int) -> None:
     monkeypatch.setattr(jaxevent.runs.fit, "save", dying)
 
 
+@pytest.mark.slow
 def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
     monkeypatch.setattr(jaxevent.runs.fit, "PERIOD", 0.0)
     config, out = write(folder, TWO), folder / "out"
@@ -638,6 +641,7 @@ def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
     fails(capsys, ["fit", other, "--out", folder / "whole", "--resume"], "another run")
 
 
+@pytest.mark.slow
 def test_a_fit_that_is_killed_ends_as_if_it_had_not_been(folder):
     """kill -9 in a search and in a descent."""
     one = TWO[: TWO.rindex("[[")].replace("iterations = 6", "iterations = 150")
@@ -679,6 +683,7 @@ def test_a_fit_that_is_killed_ends_as_if_it_had_not_been(folder):
         assert (out / name).read_bytes() == (folder / "whole" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_recordings_for_each_split_and_in_place_of_those_named(folder, capsys, monkeypatch):
     for name in ("a", "b", "c"):
         jaxevent.save(moving(), folder / f"{name}.h5")
@@ -810,6 +815,7 @@ def test_bad_ways_to_fit(folder, capsys, monkeypatch):
     assert sorted(folder.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_relaxed_refractory_bound_finds_the_optimum_of_a_scan():
     """Changes that follow the pixel's last event within 10 ms are ten times less certain."""
     bound, size, stop = 0.01, 16, 800_000

@@ -83,6 +83,7 @@ def goal(**given):
     return FAMILY.goal(tracker, tracker.Params(**START), {"loss": "likelihood", **given})
 
 
+@pytest.mark.slow
 def test_a_fit_improves_what_it_has_not_seen(folder, capsys):
     config, out = write(folder, CONFIG), folder / "out"
     assert cli.main(["fit", str(config), "--out", str(out)]) == 0
@@ -218,6 +219,7 @@ class Killed(BaseException):
     pass
 
 
+@pytest.mark.slow
 def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
     monkeypatch.setattr(jaxevent.runs.fit, "PERIOD", 0.0)
     config, out = write(folder, CONFIG), folder / "out"

@@ -48,6 +48,7 @@ def calls(folder: Path) -> dict[str, int]:
     return {path.stem: path.read_text().count("\n") for path in folder.glob("*.calls")}
 
 
+@pytest.mark.slow
 def test_outcomes_are_in_order_and_finished_tasks_are_kept(place, tmp_path):
     folder = tmp_path / "kept" / "here"
     some = tasks_of(tmp_path, a="", b="refuse", c="fail", d="not a number")
