@@ -203,6 +203,7 @@ def test_pixels_are_the_same_on_four_devices(both):
     np.testing.assert_allclose(one["loss"], four["loss"], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_runs_or_particles_are_shared_out(both):
     one, four = both
     assert (one["4 runs"][0], four["4 runs"][0]) == (4, 1)
@@ -210,6 +211,7 @@ def test_runs_or_particles_are_shared_out(both):
     np.testing.assert_allclose(one["votes"], four["votes"], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_fits_on_four_devices_end_the_same(both):
     one, four = both
     np.testing.assert_allclose(one["whole"], four["whole"], rtol=1e-12)
@@ -217,6 +219,7 @@ def test_fits_on_four_devices_end_the_same(both):
     assert one["fit"] == four["fit"] and one["history"] == four["history"]
 
 
+@pytest.mark.slow
 def test_evaluation_on_four_devices_has_the_same_rows(both):
     one, four = both
     assert one["rows"] == four["rows"]
@@ -245,6 +248,7 @@ def test_few_batches_are_spread_and_many_are_shared_out(monkeypatch):
     assert places(mine) is places(mine)
 
 
+@pytest.mark.slow
 def test_meshes_take_as_many_devices_as_divide(both):
     one, four = both
     assert one["meshes"] == [None] * 4 and four["meshes"] == [4, 3, 3, None]
