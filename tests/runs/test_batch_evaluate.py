@@ -89,7 +89,7 @@ def test_a_grid_is_every_combination(tmp_path):
         ("grid = { I0 = [1, 1] }", "another one is labelled 'blend, I0 1' too"),
         ('grid = { preset = ["paper"] }', r"add a \[\[method\]\] for each preset"),
         ('[[method]]\nname = "blend"', "2: another one is labelled 'blend' too; add a label"),
-        ('normalise = "yes"', "no normalise 'yes'; give 'none' or 'affine'"),
+        ('normalise = "yes"', "normalise is 'yes'; give 'none' or 'affine'"),
     ],
 )
 def test_grids_that_cannot_be(text, said, tmp_path):

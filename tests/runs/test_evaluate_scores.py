@@ -63,6 +63,7 @@ grid = { lambda0 = [4.0, 8.0] }
 """
 
 
+@pytest.mark.slow
 def test_motion(folder, tmp_path):
     config = configured(folder, "motion", MOTION)
     rows = evaluate.evaluate(config, tmp_path / "out")

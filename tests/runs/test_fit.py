@@ -262,6 +262,7 @@ def test_what_cannot_be_fitted(names, search, said):
         optimise(toy, Toy(), ["a"], [])
 
 
+@pytest.mark.slow
 def test_a_run_taken_up_anywhere_ends_the_same():
     settings = Settings(iterations=7, starts=2, every=3, patience=4, batch=1, learning_rate=0.3)
     batches = [ONE, (jnp.ones(()), jnp.asarray(1.1))]
@@ -402,6 +403,7 @@ def test_windows_use_every_image_once(window):
         assert len(part.recording.events) and set(part.recording.frames.t) <= set(given.frames.t)
 
 
+@pytest.mark.slow
 def test_batches_of_windows_weigh_their_images():
     recording = moving()
     blend = METHODS["blend"]
@@ -493,6 +495,7 @@ def test_thresholds_and_clock_are_recovered(fitted):
     assert abs(scan[int(np.argmin(losses))] - float(params.clock_offset)) <= 2.5e-4
 
 
+@pytest.mark.slow
 def test_what_a_fit_writes(fitted):
     folder, rows = fitted
     out = folder / "out"

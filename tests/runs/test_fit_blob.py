@@ -112,6 +112,7 @@ def test_a_fit_improves_what_it_has_not_seen(folder, capsys):
     assert after["rmse"] == pytest.approx(np.sqrt((error**2).sum(1).mean()), rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", ["likelihood", "positions"])
 def test_batches_are_their_windows_filled_up_to_one_shape(loss, folder):
     """Against windows packed alone; the second one is shorter."""
@@ -168,6 +169,7 @@ def test_batches_are_their_windows_filled_up_to_one_shape(loss, folder):
         assert 0 < float(value) < 200
 
 
+@pytest.mark.slow
 def test_windows_are_shared_out_and_begin_where_tracks_are():
     recording, _ = simulated(0)
     sources = {"fit": [("a", recording)], "validation": [], "test": []}

@@ -85,6 +85,7 @@ def test_a_task_that_another_run_has_finished_is_read(tmp_path):
     assert attempt(errand, task, tmp_path) == first and calls(tmp_path) == {"a": 1}
 
 
+@pytest.mark.slow
 def test_a_dead_worker_loses_nothing_and_blames_only_its_task(tmp_path):
     some = tasks_of(tmp_path, a="", b="die", c="", d="die", e="")
     some[3].arguments["times"] = 9  # type: ignore[index]
