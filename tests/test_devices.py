@@ -191,6 +191,7 @@ def both(folder) -> tuple[dict[str, Any], dict[str, Any]]:
     return one, pickle.loads((folder / "four" / "found").read_bytes())
 
 
+@pytest.mark.slow
 def test_pixels_are_the_same_on_four_devices(both):
     one, four = both
     assert (one["shared out"], four["shared out"]) == (1, 4)
@@ -202,6 +203,7 @@ def test_pixels_are_the_same_on_four_devices(both):
     np.testing.assert_allclose(one["loss"], four["loss"], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_runs_or_particles_are_shared_out(both):
     one, four = both
     assert (one["4 runs"][0], four["4 runs"][0]) == (4, 1)
@@ -209,6 +211,7 @@ def test_runs_or_particles_are_shared_out(both):
     np.testing.assert_allclose(one["votes"], four["votes"], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_fits_on_four_devices_end_the_same(both):
     one, four = both
     np.testing.assert_allclose(one["whole"], four["whole"], rtol=1e-12)
@@ -216,6 +219,7 @@ def test_fits_on_four_devices_end_the_same(both):
     assert one["fit"] == four["fit"] and one["history"] == four["history"]
 
 
+@pytest.mark.slow
 def test_evaluation_on_four_devices_has_the_same_rows(both):
     one, four = both
     assert one["rows"] == four["rows"]
@@ -244,6 +248,7 @@ def test_few_batches_are_spread_and_many_are_shared_out(monkeypatch):
     assert places(mine) is places(mine)
 
 
+@pytest.mark.slow
 def test_meshes_take_as_many_devices_as_divide(both):
     one, four = both
     assert one["meshes"] == [None] * 4 and four["meshes"] == [4, 3, 3, None]
@@ -297,6 +302,7 @@ def test_processes_that_make_no_sense(given, said, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_two_processes_fit_as_one(folder, both):
     with socket.socket() as free:
         free.bind(("localhost", 0))

@@ -22,6 +22,7 @@ WITH_CODE = [
 ]
 
 
+@pytest.mark.slow
 def test_the_site_builds(tmp_path):
     build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet"]
     done = subprocess.run(
@@ -36,6 +37,7 @@ def test_the_site_builds(tmp_path):
     assert not [page for page in pages if fetched.search(page.read_text())]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_CODE)
 def test_examples_run(page, tmp_path, monkeypatch, float32):
     monkeypatch.chdir(tmp_path)

@@ -64,6 +64,7 @@ def test_one_value_is_replaced():
         params.replace(c_off=-0.3)
 
 
+@pytest.mark.slow
 def test_objects_say_what_they_are_in_a_line():
     recording = small()
     video = jaxevent.akf.estimate(recording)
@@ -97,6 +98,7 @@ def test_times_outside_the_recording_are_refused():
     assert video(np.array([20_000, recording.stop])).valid.all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["akf", "aks", "cf", "edi"])
 def test_steps_on_all_leaves_stay_with_what_was_prepared(name):
     """Adam on every leaf: the loss falls, and what acts in `prepare` stays where it was."""

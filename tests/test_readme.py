@@ -12,6 +12,7 @@ from jaxevent.methods import names
 README = (Path(__file__).parents[1] / "README.md").read_text()
 
 
+@pytest.mark.slow
 def test_examples_run_in_order(tmp_path, monkeypatch, float32):
     pytest.importorskip("matplotlib").use("Agg")
     monkeypatch.chdir(tmp_path)

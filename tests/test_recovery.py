@@ -16,6 +16,7 @@ def recovery():
     return module
 
 
+@pytest.mark.slow
 def test_the_likelihood_finds_what_the_data_were_drawn_with(recovery):
     for name, (true, found) in recovery.model_recovery(100).items():
         assert abs(found / true - 1) < 0.1, (name, true, found)

@@ -8,6 +8,7 @@ import pytest
 TOUR = Path(__file__).parents[1] / "experiments" / "tour.ipynb"
 
 
+@pytest.mark.slow
 def test_the_tour_runs():
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.use("Agg")

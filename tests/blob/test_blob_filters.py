@@ -388,6 +388,7 @@ def later(name, params, events):
     return scanned(name, params, [3.0, -2.0], 12.0, events)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*TRACKERS, "moving_moments"])
 def test_no_weight_and_no_events(name):
     """Weights of 0 change nothing bit for bit; two predictions are one over both gaps."""
@@ -440,6 +441,7 @@ def test_nothing_breaks_the_numbers(name, float32, optimised):
     assert np.abs(mean[-1, :2]).max() < 5  # 50 events after the last gap
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["moment", "chi2"])
 def test_gradient_of_the_likelihood(name):
     events = random_events(8, 100, 1)
@@ -526,6 +528,7 @@ def errors(name, params, truth, xi, dt, size, gate=None, m=1):
     return error, position / 2, error**2 / np.maximum(variances, 1e-30)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "target"), [(5, "2n"), (10, "2n"), (20, "2n"), (5, "2n+4"), (10, "2n+4")]
 )
@@ -540,6 +543,7 @@ def test_bias_of_the_paper_and_without_it(n, target):
     assert abs(measured - law) < tolerance, measured
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "gate", "m"),
     [
@@ -566,6 +570,7 @@ def test_errors_are_as_large_as_predicted(name, gate, m):
     assert ((0.7 < sizes) & (sizes < 1.3)).all(), nees
 
 
+@pytest.mark.slow
 def test_events_may_share_a_step():
     dt, size = 1e-5, np.array([10.0, 5.0])
     params = params_of("moment", gate_shape="circle")  # a program that has been compiled above

@@ -57,6 +57,7 @@ def test_reference_finds_a_known_path(real):
     assert path.turned == pytest.approx(0.1, abs=0.02)
 
 
+@pytest.mark.slow
 def test_spinning_dot_is_found_and_followed(real, dot, float32):
     path = real.fit_circling(dot)
     cut = dot[0:10_000]
@@ -73,6 +74,7 @@ def test_spinning_dot_is_found_and_followed(real, dot, float32):
     assert row["theta"] < 2
 
 
+@pytest.mark.slow
 def test_tail_of_the_dot_begins_no_track(real, dot, float32):
     cut = dot[0:20_000]
     begun = {}
@@ -84,6 +86,7 @@ def test_tail_of_the_dot_begins_no_track(real, dot, float32):
     assert begun[2.0] == 1 < begun[1.0]
 
 
+@pytest.mark.slow
 def test_cars_are_found_and_followed(real, data, float32):
     recording = jaxevent.load(data / "davis346_street.npz")
     cars = real.find_cars(np.asarray(recording.frames.images))

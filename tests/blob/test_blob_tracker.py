@@ -156,6 +156,7 @@ def oracle(rec, params, seeds, tracker=blob.moment):
 NEAREST = {"association": "nearest", "gate_shape": "circle", "events_per_step": 4}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "setting", [{}, NEAREST, {"clutter": 1e-3, "gate_min": 2.0, "gate_decay": 20.0}]
 )
@@ -194,6 +195,7 @@ def same(a, b, exact=True):
         compare(one, other)
 
 
+@pytest.mark.slow
 def test_chunks_and_windows_do_not_matter(pair):
     rec, seeds = pair
     seeds = [seeds[0], (*line(168, 92, -900)(0.0312345), 8.0, 0.0312345)]
@@ -231,6 +233,7 @@ def eight():
     return together(*clouds, noise(rng, 150_000, 0.03)), paths
 
 
+@pytest.mark.slow
 def test_births(eight):
     rec, paths = eight
     params, seeds = Params(lambda0=8.0), [(5, 5, 3, 29_990), (230, 5, 3, 29_990)]
@@ -274,6 +277,7 @@ def test_life_cycle():
     assert np.isnan(states.mean[1, idle]).all()
 
 
+@pytest.mark.slow
 def test_pause_and_crossing():
     """50 and 100 ms without events at 600 px/s, and a head-on crossing at 1200 px/s."""
     rng = np.random.default_rng(4)
@@ -292,6 +296,7 @@ def test_pause_and_crossing():
         assert np.linalg.norm(ends - [p(0.18) for p in paths], axis=1).max() < 3
 
 
+@pytest.mark.slow
 def test_strange_streams():
     at = np.full(500, 7, np.int64)
     rng = np.random.default_rng(5)
@@ -324,6 +329,7 @@ def test_strange_streams():
     assert len(tracks) == 0 and tracks([0, 1], extrapolate=True).mean.shape == (2, 0, 8)
 
 
+@pytest.mark.slow
 def test_single_precision(pair, float32):
     rec, seeds = pair
     e = rec.events
@@ -362,6 +368,7 @@ def test_prefilter():
         assert np.array_equal(rows, kept) and 0 < len(kept) < len(e) / 2
 
 
+@pytest.mark.slow
 def test_gradient_and_vmap(pair):
     rec, seeds = pair
     rec = rec[0.05:0.09]

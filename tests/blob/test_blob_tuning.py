@@ -17,6 +17,7 @@ def tuning():
     return module
 
 
+@pytest.mark.slow
 def test_the_likelihood_finds_the_process_noise(tuning):
     """On other recordings; the true positions of those choose the point of the grid."""
     start, fitted, best = tuning.tuned(

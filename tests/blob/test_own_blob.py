@@ -33,6 +33,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_it_obeys_the_contract(folder):
     """In three steps as in one: states before, between and after the events."""
     student = find(METHOD, "blob")
@@ -68,6 +69,7 @@ def test_it_obeys_the_contract(folder):
     assert not tracks(recording.stop + 1, extrapolate=True).valid.any()
 
 
+@pytest.mark.slow
 def test_it_is_evaluated(folder):
     config = folder / "evaluate.toml"
     config.write_text(
@@ -81,6 +83,7 @@ def test_it_is_evaluated(folder):
     assert own["rmse"] < 1 and own["rmse"] != package["rmse"]
 
 
+@pytest.mark.slow
 def test_its_own_number_is_fitted(folder, capsys):
     config, out = folder / "fit.toml", folder / "fitted"
     config.write_text(

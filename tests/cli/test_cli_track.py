@@ -68,6 +68,7 @@ def test_header_is_exact():
     assert HEADER == ["t", "id", "x", "y", "vx", "vy", "lambda1", "lambda2", "theta", "q"]
 
 
+@pytest.mark.slow
 def test_a_folder_of_everything(folder, capsys):
     out = folder / "out"
     argv = [
@@ -127,6 +128,7 @@ def test_a_folder_of_everything(folder, capsys):
     np.testing.assert_allclose([float(row["std_range"]) ** 2 for row in one], variance, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_row_for_each_event(folder, capsys, monkeypatch):
     monkeypatch.setattr(written, "_STRETCH", 300)
     argv = ["track", folder / "two.h5", *METHOD, "--params", folder / "mine.toml", "--at", "events"]
@@ -149,6 +151,7 @@ def test_a_row_for_each_event(folder, capsys, monkeypatch):
     np.testing.assert_allclose(table[order, 2:10], mean, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_one_file_of_each_kind(folder, capsys):
     # The frames, which nobody looks at, begin before the events and end after.
     stamps = np.array([-5_000, 90_000])
@@ -183,6 +186,7 @@ def test_one_file_of_each_kind(folder, capsys):
     assert abs(np.median(images[0]) - 128) < 20  # grey where nothing happened
 
 
+@pytest.mark.slow
 def test_nothing_found_is_an_empty_table(tmp_path, capsys):
     t = np.arange(0, 60_000, 3_000)
     x, y = (37 * np.arange(20)) % WIDTH, (23 * np.arange(20)) % HEIGHT

@@ -327,6 +327,7 @@ def test_in_view_is_what_the_sensor_sees_all_the_time():
     assert np.asarray(fast.mask).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["planar", "rotation"])
 def test_contrast_finds_the_motion(straight, turning, model):
     """From nothing; and the covariance tells the error."""
@@ -356,6 +357,7 @@ def test_windows_of_a_number_of_events(straight):
     assert (off < 0.05).all()
 
 
+@pytest.mark.slow
 def test_silence_and_noise_are_lost_and_the_motion_found_again(straight):
     recording, truth = straight
     e, rng = recording.events, np.random.default_rng(0)

@@ -58,6 +58,7 @@ def test_it_is_found_by_its_path():
             find_model(path)
 
 
+@pytest.mark.slow
 def test_methods_find_the_true_motion():
     recording, params = turning(), voting.Params(**SMALL)
     motion = voting.estimate(recording, params, model=MODEL)
@@ -128,6 +129,7 @@ def test_it_is_evaluated(folder, capsys):
     assert "guess" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_it_is_fitted(folder, capsys):
     settings = ", ".join(f"{k} = {v}" for k, v in SMALL.items())
     config = folder / "fit.toml"

@@ -139,6 +139,7 @@ def test_sensor_size_is_told_or_asked_for(name, tmp_path):
         load(path, (20, 15))
 
 
+@pytest.mark.slow
 def test_events_left_on_disk_need_no_memory(tmp_path):
     """What a pass holds does not grow with the file, but for the index of its blocks.
 

@@ -69,6 +69,7 @@ def test_it_equals_a_loop_over_events():
     assert valid.all() and (variance <= 0.01).all() and np.ptp(variance) > 0
 
 
+@pytest.mark.slow
 def test_its_gradients_are_right():
     recording, params = small(), Params(gain=0.3)
     times = np.array([9_000, 30_000, 52_000])
@@ -104,6 +105,7 @@ def test_it_is_evaluated(folder, capsys):
     assert "trend, gain 0.3" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_it_is_fitted(folder, capsys):
     config = folder / "fit.toml"
     config.write_text(

@@ -339,6 +339,7 @@ def several(tmp_path_factory) -> tuple[Path, list[dict]]:
         return folder, evaluate(write_config(folder, SEVERAL))
 
 
+@pytest.mark.slow
 def test_processes_may_die(several, tmp_path, float32, monkeypatch):
     monkeypatch.setattr("jaxevent.show.page.page", lambda *arguments: "")
     folder, expected = several
@@ -347,6 +348,7 @@ def test_processes_may_die(several, tmp_path, float32, monkeypatch):
     check_nothing_twice(out, rows, expected)
 
 
+@pytest.mark.slow
 def test_workers_and_client_of_a_cluster_may_die(several, tmp_path, float32, monkeypatch):
     import distributed
 

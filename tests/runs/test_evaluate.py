@@ -102,6 +102,7 @@ def test_recordings_that_cannot_be_scored(recording, said):
         score(recording, METHODS["blend"], protocol="heldout")
 
 
+@pytest.mark.slow
 def test_results_of_a_configuration(folder, monkeypatch):
     (folder / "sub").mkdir()
     jaxevent.save(small(name="b"), folder / "sub" / "b.h5")
@@ -505,6 +506,7 @@ def test_parameters_of_other_kinds_are_listed():
     )
 
 
+@pytest.mark.slow
 def test_real_recording(data, float32, monkeypatch):
     """The table of slider_depth, and that thresholds and clock by hand make the AKF better."""
     monkeypatch.setenv("JAXEVENT_DATA", str(data.parent))

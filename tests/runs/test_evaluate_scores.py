@@ -63,6 +63,7 @@ grid = { lambda0 = [4.0, 8.0] }
 """
 
 
+@pytest.mark.slow
 def test_motion(folder, tmp_path):
     config = configured(folder, "motion", MOTION)
     rows = evaluate.evaluate(config, tmp_path / "out")
@@ -98,6 +99,7 @@ def test_motion(folder, tmp_path):
     assert 40 < far[0]["AEE_rel"] < 60
 
 
+@pytest.mark.slow
 def test_tracks(folder):
     rows = evaluate.evaluate(configured(folder, "tracks", TRACKS))
     recording = jaxevent.load(folder / "dot.h5")

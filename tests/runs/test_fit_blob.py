@@ -83,6 +83,7 @@ def goal(**given):
     return FAMILY.goal(tracker, tracker.Params(**START), {"loss": "likelihood", **given})
 
 
+@pytest.mark.slow
 def test_a_fit_improves_what_it_has_not_seen(folder, capsys):
     config, out = write(folder, CONFIG), folder / "out"
     assert cli.main(["fit", str(config), "--out", str(out)]) == 0
@@ -111,6 +112,7 @@ def test_a_fit_improves_what_it_has_not_seen(folder, capsys):
     assert after["rmse"] == pytest.approx(np.sqrt((error**2).sum(1).mean()), rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", ["likelihood", "positions"])
 def test_batches_are_their_windows_filled_up_to_one_shape(loss, folder):
     """Against windows packed alone; the second one is shorter."""
@@ -167,6 +169,7 @@ def test_batches_are_their_windows_filled_up_to_one_shape(loss, folder):
         assert 0 < float(value) < 200
 
 
+@pytest.mark.slow
 def test_windows_are_shared_out_and_begin_where_tracks_are():
     recording, _ = simulated(0)
     sources = {"fit": [("a", recording)], "validation": [], "test": []}
@@ -218,6 +221,7 @@ class Killed(BaseException):
     pass
 
 
+@pytest.mark.slow
 def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
     monkeypatch.setattr(jaxevent.runs.fit, "PERIOD", 0.0)
     config, out = write(folder, CONFIG), folder / "out"

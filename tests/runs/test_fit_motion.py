@@ -56,6 +56,7 @@ fit = ["noise"]
 """
 
 
+@pytest.mark.slow
 def test_a_fit_of_process_noise_improves_what_it_has_not_seen(tmp_path, capsys):
     """Of a constant motion none is right; it starts ten times as large as the default."""
     for number in (0, 1):
@@ -71,6 +72,7 @@ def test_a_fit_of_process_noise_improves_what_it_has_not_seen(tmp_path, capsys):
     assert float(params.noise) < 2.5 and params.particles == START["particles"]
 
 
+@pytest.mark.slow
 def test_the_gradient_with_resampling_is_that_of_common_random_numbers():
     """Of the mean estimate, over 256 seeds, within three standard errors.
 

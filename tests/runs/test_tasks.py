@@ -48,6 +48,7 @@ def calls(folder: Path) -> dict[str, int]:
     return {path.stem: path.read_text().count("\n") for path in folder.glob("*.calls")}
 
 
+@pytest.mark.slow
 def test_outcomes_are_in_order_and_finished_tasks_are_kept(place, tmp_path):
     folder = tmp_path / "kept" / "here"
     some = tasks_of(tmp_path, a="", b="refuse", c="fail", d="not a number")
@@ -84,6 +85,7 @@ def test_a_task_that_another_run_has_finished_is_read(tmp_path):
     assert attempt(errand, task, tmp_path) == first and calls(tmp_path) == {"a": 1}
 
 
+@pytest.mark.slow
 def test_a_dead_worker_loses_nothing_and_blames_only_its_task(tmp_path):
     some = tasks_of(tmp_path, a="", b="die", c="", d="die", e="")
     some[3].arguments["times"] = 9  # type: ignore[index]
