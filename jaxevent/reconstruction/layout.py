@@ -79,7 +79,8 @@ class Layout:
             rounds.append(first[:-1].astype(np.int32))
             tiles = int(first[-1])
         # Full tiles, one partly used block of lanes per round, one partly used rank per block.
-        room = events // SLOTS + -(-pixels // SHAPES[0][1]) + 32
+        spare = 32 if events > SLOTS else 8
+        room = events // SLOTS + -(-pixels // SHAPES[0][1]) + spare
         ordinary = tiles <= room
         while room < tiles:
             room *= 2
