@@ -15,6 +15,8 @@ from jaxevent.camera import (
 
 GREY = np.arange(256) / 255
 
+pytestmark = pytest.mark.slow
+
 
 def test_table_of_a_gamma_curve_inverts_it_and_gives_its_slope():
     grey = np.linspace(0, 1, 4001)

@@ -210,6 +210,7 @@ def test_chunks_and_windows_do_not_matter(pair):
     assert np.array_equal(other.death, whole.death) and len(other._begins) > 10
 
 
+@pytest.mark.slow
 def test_shift_in_time_and_order_of_seeds(pair):
     rec, seeds = pair
     e = rec.events
@@ -250,6 +251,7 @@ def test_births(eight):
         assert np.array_equal(getattr(tracks, name), getattr(other, name))
 
 
+@pytest.mark.slow
 def test_life_cycle():
     """A blob leaves the image, another pauses too long and comes back, two seeds share a third."""
     rng = np.random.default_rng(3)

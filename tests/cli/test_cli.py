@@ -26,6 +26,8 @@ from jaxevent.show import describe, export
 from jaxevent.show.report import tone_map
 from jaxevent.simulate import SCENES, SENSORS, Pan, from_video, scene, simulate
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
@@ -244,7 +246,6 @@ def test_interrupted_and_broken_pipe(error, status, monkeypatch, capsys):
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.slow
 def test_interrupted_while_it_writes(folder):
     """And what it compiles is kept, by default in the user's cache."""
     env = {k: v for k, v in os.environ.items() if not k.startswith("JAX")}
@@ -382,7 +383,6 @@ def test_info(tmp_path, capsys, monkeypatch):
     }
 
 
-@pytest.mark.slow
 def test_one_event_is_enough(tmp_path, capsys):
     path = tmp_path / "one.npz"
     one: dict = {name: np.array([value]) for name, value in zip("txyp", (7, 3, 4, 1), strict=True)}
@@ -526,7 +526,6 @@ def equal(one: Recording, other: Recording) -> None:
         np.testing.assert_array_equal(values, other.extra[name], name)
 
 
-@pytest.mark.slow
 def test_simulate_a_scene(tmp_path, capsys):
     out = tmp_path / "night.h5"
     argv = "simulate --scene night --speed fast --sensor poor --seed 3 --duration 0.3 --size 24,20"
@@ -624,7 +623,6 @@ def test_evaluate(folder, capsys):
     assert "| small.h5  | blend" in said
 
 
-@pytest.mark.slow
 def test_demo(tmp_path, capsys, float32):
     out = tmp_path / "demo"
     assert cli.main(["demo", "--out", str(out)]) == 0

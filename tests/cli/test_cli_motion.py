@@ -31,6 +31,8 @@ from jaxevent.show import motion as pictures
 from jaxevent.show.motion_pictures import warped_events
 from jaxevent.simulate import motion_scene
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT = 96, 72
 SETTINGS = "particles = 100\ncandidates = 64\n"
 SEEN: dict[str, Any] = {"size": (WIDTH, HEIGHT), "focal": 80.0}
@@ -74,7 +76,6 @@ def test_columns_are_exact():
     }
 
 
-@pytest.mark.slow
 def test_a_folder_of_everything(folder, capsys):
     path, table = folder / "planar.h5", folder / "planar.csv"
     words = ("--model", "planar", "--truth", table, "--flow", "--seed", 3, "--stop", 0.2)
@@ -141,7 +142,6 @@ def test_a_folder_of_everything(folder, capsys):
             assert figure.width > 800 and figure.height > 500
 
 
-@pytest.mark.slow
 def test_a_rotation_against_poses_and_gyro(folder, capsys):
     words = ("--model", "rotation", "--start", 0.02, "--stop", 0.18, "--rate", 500)
     run(folder, folder / "turn.h5", *words, "--truth", "--centred", "--smooth")
@@ -213,7 +213,6 @@ def motion_of(known: Known, valid=None) -> Motion:
     return Motion.of(known.model, known.t, known.values, covariance, valid)
 
 
-@pytest.mark.slow
 def test_general_motion_is_written_too(tmp_path):
     recording, source = motion_scene("shapes", **SEEN, duration=0.25)
     known = known_general(source)

@@ -340,6 +340,7 @@ def test_contrast_finds_the_motion(straight, turning, model):
     assert spread.mean() < 5 * len(truth)
 
 
+@pytest.mark.slow
 def test_contrast_is_the_same_at_another_time(straight):
     recording, _ = straight
     e = recording.events
@@ -407,6 +408,7 @@ def test_no_frames(straight, number):
         frames.estimate(recording)
 
 
+@pytest.mark.slow
 def test_single_precision(float32, straight):
     recording, truth = straight
     motion = contrast.estimate(recording, SMALL)

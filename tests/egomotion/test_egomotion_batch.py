@@ -23,6 +23,8 @@ from jaxevent.egomotion.truth import Twists
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT, F = 96, 72, 80.0
 CAMERA = PinholeCamera(F, F, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 T, OMEGA = np.array([0.5, -0.3, 0.6]), np.array([0.3, -0.5, 0.4])
@@ -144,7 +146,6 @@ def fitted() -> tuple[batch.Windows, batch.Fit]:
     return windows, fit
 
 
-@pytest.mark.slow
 def test_the_motion_of_a_window_is_found():
     """As far as 96 x 72 pixels tell it: a heading beside a turn, and a turn beside a heading."""
     _, fit = fitted()
@@ -155,7 +156,6 @@ def test_the_motion_of_a_window_is_found():
     assert (np.linalg.eigvalsh(fit.covariance) > -1e-12).all()
 
 
-@pytest.mark.slow
 def test_the_motion_before_a_wall_is_found():
     """The homography has two, the true one costs less with a plane's depths."""
     more = batch.Params.of({**GIVEN, "events": 20_000})
@@ -287,7 +287,6 @@ def test_two_motions_before_a_plane_have_the_same_flow():
     assert all(np.isfinite(np.concatenate(one)).all() for one in still)
 
 
-@pytest.mark.slow
 def test_the_map_is_the_least_squares_one():
     """For a path held fixed, against a sparse solver on splines' weights written out."""
     windows, fit = fitted()
@@ -333,7 +332,6 @@ def test_the_map_is_the_least_squares_one():
     assert found[3] < 0.5 * np.linalg.norm(level)
 
 
-@pytest.mark.slow
 def test_the_photometric_fit_ends_at_the_truth():
     """From 6 degrees beside it, and depths of a plane that faces the camera."""
     windows, _ = fitted()
@@ -351,7 +349,6 @@ def test_the_photometric_fit_ends_at_the_truth():
     assert report.noise < 0.05 and report.inliers > 0.9
 
 
-@pytest.mark.slow
 def test_the_covariance_is_that_of_repeated_fits():
     """Of the same events at times that are off by some ms, anew each time."""
     windows, fit = fitted()
@@ -368,7 +365,6 @@ def test_the_covariance_is_that_of_repeated_fits():
     assert 0.5**2 < ratio < 2**2, ratio
 
 
-@pytest.mark.slow
 def test_steps_never_cost_more():
     """Beside true depths, with a sigma rather small for how far they are."""
     windows, _ = fitted()
@@ -385,7 +381,6 @@ def test_steps_never_cost_more():
     assert (np.diff(costs) <= 1e-3 * np.array(costs[:-1])).all()
 
 
-@pytest.mark.slow
 def test_the_gradient_of_misfits():
     """Before a smooth surface: beside edges of depth misfits jump from one surface to the other."""
     windows, fit = fitted()
@@ -409,7 +404,6 @@ def test_the_gradient_of_misfits():
     assert value(given.O[0]) < 0.9 * value(given.O[0] + 0.2)
 
 
-@pytest.mark.slow
 def test_priors_pull():
     windows, fit = fitted()
     tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
@@ -429,7 +423,6 @@ def test_priors_pull():
     assert np.sqrt(np.diag(covariance)[3:]).max() < 1e-4
 
 
-@pytest.mark.slow
 def test_a_recording_from_end_to_end(monkeypatch):
     """With fewer steps than `fitted`, which are enough to come near."""
     monkeypatch.setattr(batch, "ROUNDS", (batch.Stage(0.3, 6),))

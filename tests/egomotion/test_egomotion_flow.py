@@ -15,6 +15,8 @@ from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
 from jaxevent.simulate import motion_scene
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT, F = 96, 72, 80.0
 CAMERA = PinholeCamera(F, F, 47.5, 35.5)
 
@@ -46,7 +48,6 @@ def by_hand(x, y, T, Omega, inverse_depth):
     return F * (P_later[..., :2] / P_later[..., 2:] - P[..., :2] / P[..., 2:]) / h
 
 
-@pytest.mark.slow
 def test_flow_of_a_scene_is_the_true_one():
     recording, source = textured()
     told = flow(recording, true_motion(source))
@@ -176,7 +177,6 @@ def test_where_the_motion_is_lost_there_is_no_flow():
     assert not nothing.valid.any() and nothing.outliers() == 0
 
 
-@pytest.mark.slow
 def test_noise_is_an_outlier():
     recording, source = textured()
     rng = np.random.default_rng(0)

@@ -11,6 +11,8 @@ from jaxevent.egomotion import truth as tr
 from jaxevent.errors import InputError
 from jaxevent.recording import Imu, Poses
 
+pytestmark = pytest.mark.slow
+
 F = 200.0
 RNG = np.random.default_rng(5)
 X, Y = RNG.uniform(-120, 120, (2, 40))

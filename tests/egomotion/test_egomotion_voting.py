@@ -19,6 +19,8 @@ from jaxevent.egomotion.particle_filter.smoothing import smoothed
 from jaxevent.errors import InputError
 from jaxevent.recording import Events
 
+pytestmark = pytest.mark.slow
+
 CAMERA = PinholeCamera(100.0, 100.0, 59.5, 44.5)
 
 
@@ -46,7 +48,6 @@ def slow(recording, row, radius, per_pixel, youngest, oldest):
     return sorted(found)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("every, batch, pieces, per_pixel", [(1, 7, 3, 3), (3, 16, 64, 8)])
 def test_candidates_are_the_recent_neighbours(every, batch, pieces, per_pixel):
     recording = scattered()
@@ -290,7 +291,6 @@ def test_a_score_is_the_slow_one(likelihood, model):
         np.testing.assert_allclose(told.lag, (0.7 * tau + tau) / 2 / 2)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("searching", [False, True])
 def test_a_step_is_the_slow_one(searching):
     params, kind, c = prepared()
@@ -338,7 +338,6 @@ def test_resampling_carries_the_score():
     np.testing.assert_allclose(jacobian, np.eye(20)[ancestor])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("likelihood", ["soft", "literal"])
 def test_gradient_without_resampling(likelihood, optimised):
     params, kind, c = prepared(likelihood, number=300, resample_below=0.0, r_t=50.0, memory=1e9)
@@ -373,7 +372,6 @@ def relative_error(motion, truth):
 FAST = voting.Params.of({"every": 2, "candidates": 48})
 
 
-@pytest.mark.slow
 def test_planar_motion_is_found():
     truth = np.array([130.0, -70.0])
     recording = moved(lambda at: truth, 0.5, 120, seed=3)
@@ -386,7 +384,6 @@ def test_planar_motion_is_found():
     assert relative_error(voting.estimate(moved(lambda at: truth, 0.4, 120, 4), FAST), truth) < 0.03
 
 
-@pytest.mark.slow
 def test_rotation_is_found():
     truth = np.array([0.5, 1.5, -1.2])
     recording = moved(turning(truth), 0.6, 150, seed=5, camera=CAMERA)
@@ -395,7 +392,6 @@ def test_rotation_is_found():
         assert relative_error(motion, truth) < 0.05
 
 
-@pytest.mark.slow
 def test_single_precision(float32):
     truth = np.array([130.0, -70.0])
     motion = voting.estimate(
@@ -423,7 +419,6 @@ def test_a_motion_that_changes_at_once_is_found_again(before, truth):
     assert (np.linalg.eigvalsh(covariance) > 0).all()
 
 
-@pytest.mark.slow
 def test_seeds_and_parameters_in_one_call():
     params, kind, c = prepared()
     c = jax.tree.map(lambda a: a[:4], c)  # as many as elsewhere: one program
@@ -444,7 +439,6 @@ def test_seeds_and_parameters_in_one_call():
 RUN = eqx.filter_jit(filtering.run)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("likelihood", ["soft", "literal"])
 @pytest.mark.parametrize("model", MODELS)
 def test_odd_streams(model, likelihood):

@@ -89,6 +89,7 @@ def test_the_package_supplies_how_places_move():
     np.testing.assert_allclose(ZoomRoll().arms(xi), [np.sqrt((xi**2).sum(1).mean())] * 2)
 
 
+@pytest.mark.slow
 def test_a_run_is_pure():
     """Prepare, run, read; over seeds and parameters in one program, with a gradient."""
     recording = turning()[0.0:0.1]

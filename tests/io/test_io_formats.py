@@ -22,6 +22,8 @@ from jaxevent.io import aedat2, aedat4, columns, event_stream, prophesee, ros, s
 from jaxevent.recording import Events, Frames, Imu, Recording
 from jaxevent.show import describe
 
+pytestmark = pytest.mark.slow
+
 load: Any = io.load
 SIZE = (40, 30)
 
@@ -139,7 +141,6 @@ def test_sensor_size_is_told_or_asked_for(name, tmp_path):
         load(path, (20, 15))
 
 
-@pytest.mark.slow
 def test_events_left_on_disk_need_no_memory(tmp_path):
     """What a pass holds does not grow with the file, but for the index of its blocks.
 

@@ -12,6 +12,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+pytestmark = pytest.mark.slow
+
 SCRIPT = Path(__file__).parents[2] / "experiments" / "fuzz.py"
 NEEDS = {"evt3": "evt3", "aedat4": "aedat", "bag": "rosbags"}
 

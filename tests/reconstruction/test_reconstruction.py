@@ -269,6 +269,7 @@ def test_order_of_pixels_changes_nothing(recording):
     np.testing.assert_allclose(variance[:, ::-1, ::-1], expected[1], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_without_events_the_filter_tends_to_the_augmented_frame():
     recording = random_recording(2, 1, 6)
     recording = dataclasses.replace(recording, events=Events.empty())

@@ -41,6 +41,8 @@ from jaxevent.runs.scores import score
 from jaxevent.splits import interleave
 from jaxevent.tuning import Settings, begin, optimise
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
@@ -262,7 +264,6 @@ def test_what_cannot_be_fitted(names, search, said):
         optimise(toy, Toy(), ["a"], [])
 
 
-@pytest.mark.slow
 def test_a_run_taken_up_anywhere_ends_the_same():
     settings = Settings(iterations=7, starts=2, every=3, patience=4, batch=1, learning_rate=0.3)
     batches = [ONE, (jnp.ones(()), jnp.asarray(1.1))]
@@ -369,7 +370,6 @@ def test_errors_by_hand(error, clipped):
         assert (slope[counted] != 0).all() and counted.sum() > 10
 
 
-@pytest.mark.slow
 def test_the_loss_bounds_the_evaluated_error():
     """It equals what evaluation says of images within [0, 1], and is more for others."""
     recording = moving()
@@ -403,7 +403,6 @@ def test_windows_use_every_image_once(window):
         assert len(part.recording.events) and set(part.recording.frames.t) <= set(given.frames.t)
 
 
-@pytest.mark.slow
 def test_batches_of_windows_weigh_their_images():
     recording = moving()
     blend = METHODS["blend"]
@@ -473,7 +472,6 @@ def fitted(tmp_path_factory) -> tuple[Path, list[dict]]:
     return folder, rows
 
 
-@pytest.mark.slow
 def test_thresholds_and_clock_are_recovered(fitted):
     folder, _ = fitted
     edi = METHODS["edi"]
@@ -495,7 +493,6 @@ def test_thresholds_and_clock_are_recovered(fitted):
     assert abs(scan[int(np.argmin(losses))] - float(params.clock_offset)) <= 2.5e-4
 
 
-@pytest.mark.slow
 def test_what_a_fit_writes(fitted):
     folder, rows = fitted
     out = folder / "out"
@@ -596,7 +593,6 @@ def interrupted(monkeypatch, after: int) -> None:
     monkeypatch.setattr(jaxevent.runs.fit, "save", dying)
 
 
-@pytest.mark.slow
 def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
     monkeypatch.setattr(jaxevent.runs.fit, "PERIOD", 0.0)
     config, out = write(folder, TWO), folder / "out"
@@ -644,7 +640,6 @@ def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
     fails(capsys, ["fit", other, "--out", folder / "whole", "--resume"], "another run")
 
 
-@pytest.mark.slow
 def test_a_fit_that_is_killed_ends_as_if_it_had_not_been(folder):
     """kill -9 in a search and in a descent."""
     one = TWO[: TWO.rindex("[[")].replace("iterations = 6", "iterations = 150")
@@ -686,7 +681,6 @@ def test_a_fit_that_is_killed_ends_as_if_it_had_not_been(folder):
         assert (out / name).read_bytes() == (folder / "whole" / name).read_bytes()
 
 
-@pytest.mark.slow
 def test_recordings_for_each_split_and_in_place_of_those_named(folder, capsys, monkeypatch):
     for name in ("a", "b", "c"):
         jaxevent.save(moving(), folder / f"{name}.h5")
@@ -818,7 +812,6 @@ def test_bad_ways_to_fit(folder, capsys, monkeypatch):
     assert sorted(folder.rglob("*")) == before
 
 
-@pytest.mark.slow
 def test_relaxed_refractory_bound_finds_the_optimum_of_a_scan():
     """Changes that follow the pixel's last event within 10 ms are ten times less certain."""
     bound, size, stop = 0.01, 16, 800_000

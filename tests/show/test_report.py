@@ -18,6 +18,8 @@ from jaxevent.show.report import (
     write_png,
 )
 
+pytestmark = pytest.mark.slow
+
 TONES = ["linear", "log", "percentile", "clahe"]
 RAMP = np.linspace(-0.2, 1.3, 40 * 60).reshape(40, 60)
 

@@ -10,6 +10,8 @@ from jaxevent import simulate as sim
 from jaxevent.egomotion import from_poses
 from jaxevent.errors import InputError
 
+pytestmark = pytest.mark.slow
+
 SIZE = (64, 48)
 SWINGING = sim.CameraMotion(
     (0.5, -0.3, 0.4, 0.6, -1.0, 0.5),

@@ -12,6 +12,8 @@ from jaxevent import simulate as sim
 from jaxevent.camera import SCurve, UnknownResponse
 from jaxevent.show.report import video_writer
 
+pytestmark = pytest.mark.slow
+
 IDEAL = sim.SENSORS["ideal"]
 DARK = IDEAL.dark_offset
 
