@@ -171,10 +171,16 @@ class Gatherer:
         while not full and not self.done:
             events = self.recording.events[self._row : self._row + READ_ROWS]
             used, full = _gather(
-                events.t, events.x, events.y, events.p, self._row, self.every, self.longest, span,
-                self.xi, self._ring, self._head, self.radius, limits, gate, margin, self._scratch,
-                state, self._clock, self.silence, d, age, xi, room, scale, rate, row, t, history,
-            )  # fmt: skip
+                Stream(events.t, events.x, events.y, events.p, self._row),
+                Rules(self.every, self.longest, span, self.radius, margin, self.silence),
+                Latest(self.xi, self._ring, self._head),
+                limits,
+                gate,
+                Filled(d, age, xi, room, scale, rate, row, t, history),
+                state,
+                self._clock,
+                self._scratch,
+            )
             self._row += used
         begun = state[0] + (state[1] > 0)
         history[begun:] = history[begun - 1] if begun else 0
@@ -202,12 +208,57 @@ class Gatherer:
         return Batches(Candidates(**fields, reach=self.radius), t[:used], row[:used])
 
 
+class Stream(NamedTuple):
+    """Events (n,), and the row of the first of them."""
+
+    t: NDArray
+    x: NDArray
+    y: NDArray
+    p: NDArray
+    row: int
+
+
+class Rules(NamedTuple):
+    """How batches are filled: see `Gatherer`; times in us."""
+
+    every: int
+    longest: int
+    span: int
+    radius: int
+    margin: float
+    silence: int
+
+
+class Latest(NamedTuple):
+    """Where pixels look, and their latest events."""
+
+    position: NDArray  # (height, width, 2) px
+    ring: NDArray  # (2, height, width, kept) us
+    head: NDArray  # (2, height, width), the newest's place in the ring
+
+
+class Filled(NamedTuple):
+    """The arrays of `Candidates` and `Batches`, to be filled."""
+
+    d: NDArray
+    age: NDArray
+    xi: NDArray
+    room: NDArray
+    scale: NDArray
+    rate: NDArray
+    row: NDArray
+    t: NDArray
+    history: NDArray
+
+
 @compiled
-def _gather(
-    t_in, x, y, p, row_in, every, longest, span, position, ring, head, radius, limits,
-    gate, margin, scratch, state, clock, silence, d, age, xi, room, scale, rate, row, t, history,
-):  # fmt: skip
+def _gather(stream, rules, latest, limits, gate, out, state, clock, scratch):
     """Fill batches from events: how many events were used, and whether all batches are full."""
+    # Names of their own: numba reads arrays out of tuples anew in every loop.
+    t_in, x, y, p, row_in = stream
+    every, longest, span, radius, margin, silence = rules
+    position, ring, head = latest
+    d, age, xi, room, scale, rate, row, t, history = out
     batch, fill, first, until = state
     parts_y, parts_x = limits.shape[1:]
     gates_y, gates_x = gate.shape[1:]

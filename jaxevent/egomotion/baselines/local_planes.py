@@ -89,7 +89,7 @@ def normal_flow(
     shape = (2, recording.height, recording.width)
     surface, latest = np.full(shape, NEVER), np.full(shape, NEVER)
     scratch = np.zeros((3, (2 * params.radius + 1) ** 2))
-    end, parts = len(recording.events), []
+    end, parts, rules = len(recording.events), [], Rules.of(params)
     with bar(total=end, unit="event", unit_scale=True, progress=progress) as shown:
         for start in range(0, end, READ_ROWS):
             events = recording.events[start : start + READ_ROWS]
@@ -97,13 +97,8 @@ def normal_flow(
             wanted = row % params.every == 0
             flow, age = np.zeros((len(row), 2)), np.zeros(len(row))
             valid = np.zeros(len(row), bool)
-            _planes(
-                events.t, events.x, events.y, events.p, wanted, xi, surface, latest, scratch,
-                params.burst == "first", round(1e6 * float(params.apart)),
-                round(1e6 * float(params.oldest)), params.radius, params.fewest,
-                params.iterations, float(params.tolerance), float(params.rough),
-                float(params.speed_max), flow, age, valid,
-            )  # fmt: skip
+            stream = events.t, events.x, events.y, events.p
+            _planes(stream, wanted, xi, surface, latest, scratch, rules, (flow, age, valid))
             parts.append((events.t[wanted], row[wanted], flow[wanted], valid[wanted], age[wanted]))
             shown.update(len(row))
     if not parts:
@@ -227,12 +222,41 @@ def held(
     return Motion.of(model, t, np.array(mean), np.array(covariance), valid, contrast)
 
 
+class Rules(NamedTuple):
+    """How planes are fitted: numbers of `Params`, times in us."""
+
+    first: bool
+    apart: int
+    oldest: int
+    radius: int
+    fewest: int
+    iterations: int
+    tolerance: float
+    rough: float
+    speed_max: float
+
+    @classmethod
+    def of(cls, params: Params) -> "Rules":
+        return cls(
+            params.burst == "first",
+            round(1e6 * float(params.apart)),
+            round(1e6 * float(params.oldest)),
+            params.radius,
+            params.fewest,
+            params.iterations,
+            float(params.tolerance),
+            float(params.rough),
+            float(params.speed_max),
+        )
+
+
 @compiled
-def _planes(
-    t, x, y, p, wanted, position, surface, latest, scratch, first, apart, oldest, radius, fewest,
-    iterations, tolerance, rough, speed_max, flow, age, valid,
-):  # fmt: skip
+def _planes(stream, wanted, position, surface, latest, scratch, rules, out):
     """Update the surface event by event, and fit a plane to it about each event."""
+    # Names of their own: numba reads arrays out of tuples anew in every loop.
+    t, x, y, p = stream
+    first, apart, oldest, radius, fewest, iterations, tolerance, rough, speed_max = rules
+    flow, age, valid = out
     height, width = surface.shape[1:]
     for i in range(len(t)):
         now, column, line, sign = t[i], int(x[i]), int(y[i]), int(p[i])
