@@ -9,7 +9,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from jaxevent.egomotion.batch_fit import equations as fit
-from jaxevent.egomotion.batch_fit.gauss_newton import units_of_rows, with_first_rows
+from jaxevent.egomotion.batch_fit.gauss_newton import with_first_rows
 from jaxevent.egomotion.batch_fit.lattice import gather, laplacian, spline, weigh
 from jaxevent.egomotion.batch_fit.path import ROWS, SEGMENTS, Path, Prior
 from jaxevent.egomotion.batch_fit.tracks import Scene, Tracks, placed
@@ -38,16 +38,25 @@ def some_tracks() -> Tracks:
     )  # fmt: skip
 
 
-def some_scene(tracks: Tracks, bent: float) -> Scene:
-    """A motion that changes, before depths that are smooth; those of a plane if not `bent`."""
+def some_scene(tracks: Tracks, log_rho: np.ndarray) -> Scene:
+    """A motion that changes, before some depths at nodes."""
     rng = np.random.default_rng(1)
     rows = 0.3 ** np.arange(ROWS)[:, None] / HALF ** np.arange(ROWS)[:, None]
     O, D = rng.normal(size=(2, ROWS, 3)) * rows * 0.3  # noqa: E741
     D[0] = np.array([0.5, -0.3, 0.6]) / np.linalg.norm([0.5, -0.3, 0.6])
-    i, j = np.meshgrid(*(np.arange(n) for n in tracks.nodes), indexing="ij")
-    log_rho = -0.5 + bent * np.sin(i + 0.7 * j).ravel()
     path = Path(*(jnp.asarray(part) for part in (O, D, log_rho)))
     return Scene(path, jnp.asarray(rng.normal(size=SHAPE)), jnp.asarray(0.05))
+
+
+def smooth(tracks: Tracks) -> np.ndarray:
+    """Log depths at nodes that bend."""
+    i, j = np.meshgrid(*(np.arange(n) for n in tracks.nodes), indexing="ij")
+    return -0.5 + 0.1 * np.sin(i + 0.7 * j).ravel()
+
+
+def rays_of_nodes(tracks: Tracks) -> np.ndarray:
+    x, y = tracks.places
+    return np.stack([x / F, y / F, np.ones(len(x))], 1)
 
 
 @jax.jit
@@ -64,13 +73,14 @@ def look_and_linearise(problem: fit.Problem, scene: Scene) -> tuple[fit.Seen, fi
 
 
 @functools.cache
-def linearised(plane: bool) -> tuple[fit.Seen, fit.Equations]:
-    tracks = some_tracks()
+def linearised(normal: tuple[float, float, float] | None = None) -> tuple[fit.Seen, fit.Equations]:
+    """Before depths that bend, or a plane."""
+    tracks, plane = some_tracks(), normal is not None
+    log_rho = np.log(rays_of_nodes(tracks) @ normal) if plane else smooth(tracks)
     numbers = 1.0, 1.0, 0.3, 0.7, np.full((SEGMENTS, 3), 0.2), 2.0, 0.8, 0.05, 10.0
     prior = Prior(*(jnp.asarray(number) for number in numbers))
     problem = fit.Problem(tracks, prior, jnp.asarray(0.7), jnp.asarray(plane), jnp.asarray(0.5))
-
-    seen, equations = look_and_linearise(problem, some_scene(tracks, 0.0 if plane else 0.1))
+    seen, equations = look_and_linearise(problem, some_scene(tracks, log_rho))
     assert (seen.on == 1).all()
     return seen, equations
 
@@ -103,7 +113,7 @@ def some_directions(size: int) -> np.ndarray:
 
 def test_misfits_change_as_linearised():
     """By every row of the path, the skew, every depth, and some changes of the map."""
-    seen, equations = linearised(False)
+    seen, equations = linearised()
     tracks = equations.problem.tracks
     flat, apart = ravel_pytree(equations.gradient)
     directions = some_directions(len(flat))
@@ -115,27 +125,28 @@ def test_misfits_change_as_linearised():
     np.testing.assert_allclose(found, expected, atol=1e-7)
 
 
-def test_misfits_change_with_a_plane_as_linearised():
-    """A plane that faces the camera: log depths of its tilts are linear between nodes."""
-    seen, equations = linearised(True)
+# Log depths of tilts of a plane that faces the camera are linear between nodes; others' nearly, and
+# there the factors of the plane's normal are not all the same.
+@pytest.mark.parametrize("normal, near", [((0.0, 0.0, 0.6), 1e-7), ((0.2, -0.1, 0.6), 0.02)])
+def test_misfits_change_with_a_plane_as_linearised(normal, near):
+    seen, equations = linearised(normal)
     tracks, scene = equations.problem.tracks, seen.scene
-    x, y = tracks.places
-    rays = jnp.asarray(np.stack([x / F, y / F, np.ones(len(x))], 1))
-    rho = jnp.exp(scene.path.log_rho)
+    rays, rho = rays_of_nodes(tracks), np.exp(scene.path.log_rho)
+    assert np.ptp(rho) > 0.2 or near < 1e-6
 
-    def tilted(change: jax.Array) -> jax.Array:
-        level = jnp.log(rho + jnp.median(rho) * rays @ change)
+    def tilted(change: np.ndarray) -> jax.Array:
+        level = jnp.asarray(np.log(rho + np.median(rho) * rays @ change))
         path = Path(scene.path.O, scene.path.D, level)
         return misfits_before_means(scene._replace(path=path), tracks)
 
-    found = equations.jacobian.by_path[fit.FREE + 1 :]
-    np.testing.assert_allclose(found, slopes(tilted, np.eye(3)), atol=1e-7)
+    found, expected = equations.jacobian.by_path[fit.FREE + 1 :], slopes(tilted, np.eye(3))
+    np.testing.assert_allclose(found, expected, atol=near * abs(expected).max())
     assert (equations.jacobian.by_depth == 0).all()
 
 
 def test_the_gradient_is_that_of_what_is_minimised():
     """Of misfits less their means, the weights held, and the priors."""
-    seen, equations = linearised(False)
+    seen, equations = linearised()
     problem, scene = equations.problem, seen.scene
     prior, (a, b) = problem.prior, problem.pairs
     flat, apart = ravel_pytree(equations.gradient)
@@ -161,26 +172,26 @@ def test_the_gradient_is_that_of_what_is_minimised():
 
 def test_the_matrix_is_that_of_least_squares():
     """J' W J of misfits less their means; what is kept of it are its blocks."""
-    seen, equations = linearised(False)
+    _, equations = linearised()
     flat, apart = ravel_pytree(equations.gradient)
     eye, undamped = jnp.eye(len(flat)), jnp.zeros(())
-    H = jax.vmap(lambda v: ravel_pytree(equations.times_H(undamped, apart(v)))[0])(eye)
+    columns = jax.vmap(lambda v: ravel_pytree(equations.times_H(undamped, apart(v)))[0])(eye)
     J = jax.vmap(lambda v: equations.jacobian.subtract_mean(equations.jacobian.of(apart(v))))(eye)
     n, m = SHAPE[0] * SHAPE[1], SHAPE[0] * SHAPE[1] + UNKNOWNS
-    priors = np.asarray(H - (J * equations.information) @ J.T)
-    np.testing.assert_allclose(priors[n:m, n:m], equations.known + equations.held, atol=1e-6)
+    H = np.asarray(columns)
+    priors = H - np.asarray((J * equations.information) @ J.T)
+    held = np.asarray(equations.known + equations.held)
+    np.testing.assert_allclose(priors[n:m, n:m], held, atol=1e-6)
     np.testing.assert_allclose(priors[m:, n:m], 0, atol=1e-9)
     np.testing.assert_allclose(H, H.T, atol=1e-9 * abs(H).max())
-    np.testing.assert_allclose(equations.upper, H[n:m, n:m], rtol=1e-9, atol=1e-6)
-    np.testing.assert_allclose(equations.mixed, H[m:, n:m], atol=1e-9)
-    units = np.asarray(units_of_rows(seen.scene.path, jnp.asarray(F), jnp.asarray(HALF), ROWS))
-    np.testing.assert_array_equal(equations.unit, units)
+    np.testing.assert_allclose(np.asarray(equations.upper), H[n:m, n:m], rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(equations.mixed), H[m:, n:m], atol=1e-9)
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.5])
 def test_the_preconditioner_is_exact_where_the_matrix_is_of_blocks(damping):
     """A diagonal for the map, and path with depths that do not pull on each other."""
-    _, equations = linearised(False)
+    _, equations = linearised()
     flat, apart = ravel_pytree(equations.gradient)
     ease = fit.precondition(equations, jnp.asarray(damping))
     eased = jax.vmap(lambda v: ravel_pytree(ease(apart(v)))[0])(jnp.eye(len(flat)))
