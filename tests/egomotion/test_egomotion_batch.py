@@ -23,7 +23,7 @@ from jaxevent.egomotion.truth import Twists
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]  # it computes long
 
 WIDTH, HEIGHT, F = 96, 72, 80.0
 CAMERA = PinholeCamera(F, F, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
