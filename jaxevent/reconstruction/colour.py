@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.reconstruction.video import Video
+from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Events, Frames, Recording, Times, microseconds
 
 REC709 = (0.2126, 0.7152, 0.0722)  # luminance of linear red, green and blue; the sum is 1
@@ -86,7 +86,9 @@ def _check_colours(rgb: ArrayLike) -> NDArray[np.floating]:
     return colours
 
 
-def colour_video(video: Video[Any], recording: Recording) -> Callable[..., NDArray[np.floating]]:
+def colour_video(
+    video: ImageSequence[Any], recording: Recording
+) -> Callable[..., NDArray[np.floating]]:
     """A reconstruction in the colours of `recording.extra["rgb"]`: `colour_video(...)(times)`.
 
     `extra["rgb"]`, (frames, H, W, 3) uint8, holds the colours of every one of `recording.frames`,

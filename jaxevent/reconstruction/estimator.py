@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 from jaxevent.estimator import Estimate, Estimator
 from jaxevent.reconstruction.clock import Timing, time_span
 from jaxevent.reconstruction.features import Features, ReadOut
-from jaxevent.reconstruction.video import P, Video
+from jaxevent.reconstruction.video import ImageSequence, P, Video
 from jaxevent.reconstruction.windows import prepare
 from jaxevent.recording import Recording, Times, check_times
 
@@ -23,6 +23,25 @@ class ImageEstimator(Estimator[P]):
 
     family: ClassVar[str] = "reconstruction"
     has_likelihood: ClassVar[bool] = False  # whether it has `log_likelihood` of the frames given
+
+    def check_span(self, recording: Recording, times: Times, params: P) -> None:
+        """Raise `InputError` for times outside the recording, its frames on either clock."""
+        check_times(times, *time_span(recording, params.clock_offset), recording.name)
+
+    @abc.abstractmethod
+    def estimate(
+        self, recording: Recording, params: P | None = None, **options: Any
+    ) -> ImageSequence[P]:
+        """Images of a recording: `image, variance, valid = estimate(recording, params)(times)`.
+
+        Raises `InputError` if the recording lacks what the method needs.
+        """
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class PixelEstimator(ImageEstimator[P]):
+    """A reconstruction method to which every pixel is one of its own, in windows of events."""
+
     options: frozenset[str] = dataclasses.field(
         default=frozenset({"window_events", "devices"}), kw_only=True
     )
@@ -73,8 +92,7 @@ class ImageEstimator(Estimator[P]):
         self.check(recording)
         params = self.Params() if params is None else params
         if not extrapolate:
-            span = time_span(recording, params.clock_offset)
-            check_times(times, *span, recording.name)
+            self.check_span(recording, times, params)
         return prepare(recording, times, Timing.of(params), filtering=self.filters)
 
     def estimate(self, recording: Recording, params: P | None = None, **options: Any) -> Video[P]:

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxevent.estimator import Described, Estimate
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.estimator import ImageEstimator, P
+from jaxevent.reconstruction.estimator import P, PixelEstimator
 from jaxevent.reconstruction.features import (
     Features,
     FrameFeatures,
@@ -108,7 +108,7 @@ def log_intensity(params: FrameParams, state: Any) -> tuple[Array, Array]:
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Filter(ImageEstimator[P]):
+class Filter(PixelEstimator[P]):
     """A causal method, made of pure functions of one pixel.
 
     `observe(params, frames)` makes the window's `Observer`. `initial(params, level)` is the state
@@ -141,7 +141,7 @@ class Filter(ImageEstimator[P]):
     def run(
         self, params: P, features: Features, state: Any = None, future: None = None
     ) -> tuple[Trajectory, Any]:
-        """As `ImageEstimator.run`; the state is (pixels,), after each pixel's last event."""
+        """As `PixelEstimator.run`; the state is (pixels,), after each pixel's last event."""
         features = features.at(params.rho_ref)
         observer = self.observe(params, features.frames)
         if state is None:

@@ -39,7 +39,7 @@ from jaxevent.reconstruction.augment import (
     deblur_frames,
     unclipped,
 )
-from jaxevent.reconstruction.estimator import ImageEstimator
+from jaxevent.reconstruction.estimator import PixelEstimator
 from jaxevent.reconstruction.features import (
     Features,
     FrameFeatures,
@@ -339,7 +339,7 @@ def counts_around(
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Smoother(ImageEstimator[Params]):
+class Smoother(PixelEstimator[Params]):
     """The estimator of this module."""
 
     has_likelihood: ClassVar[bool] = True
@@ -364,7 +364,7 @@ class Smoother(ImageEstimator[Params]):
         state: Gaussian | None = None,
         future: Message | None = None,
     ) -> tuple[Passage, Gaussian]:
-        """As `ImageEstimator.run`; the state is (pixels,), before the next window's first frame."""
+        """As `PixelEstimator.run`; the state is (pixels,), before the next window's first frame."""
         frames = features.at(params.rho_ref).frames
         rows, counts = make_rows(params, frames)
         state = self.start(params, features) if state is None else state

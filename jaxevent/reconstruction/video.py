@@ -1,5 +1,6 @@
 """A reconstruction as a function of time: read images at any times without changing them."""
 
+import abc
 import functools
 import itertools
 import math
@@ -29,18 +30,23 @@ BATCH = 8  # images read per call; 8 x 90,000 pixels stay in the second-level ca
 
 @runtime_checkable
 class ImageMethod(Protocol):
-    """What a video needs of its estimator; see `estimator.ImageEstimator`."""
+    """What a sequence of images needs of its estimator; see `estimator.ImageEstimator`."""
 
     @property
     def name(self) -> str: ...
+
+    def check(self, recording: Recording) -> None: ...
+
+
+@runtime_checkable
+class PixelMethod(ImageMethod, Protocol):
+    """What a video needs of its estimator; see `estimator.PixelEstimator`."""
 
     @property
     def filters(self) -> bool: ...
 
     @property
     def looks_ahead(self) -> bool: ...
-
-    def check(self, recording: Recording) -> None: ...
 
     def start(self, params: Any, features: Features) -> Any: ...
 
@@ -53,17 +59,17 @@ class ImageMethod(Protocol):
 
 # jax.jit returns before the result is there; eqx.filter_jit waits for it.
 @functools.partial(jax.jit, static_argnums=0)
-def _start(estimator: ImageMethod, params, features: Features):
+def _start(estimator: PixelMethod, params, features: Features):
     return estimator.start(params, features)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _run(estimator: ImageMethod, params, features: Features, state, future):
+def _run(estimator: PixelMethod, params, features: Features, state, future):
     return estimator.run(params, features, state, future)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _read(estimator: ImageMethod, params, trajectory, out: ReadOut):
+def _read(estimator: PixelMethod, params, trajectory, out: ReadOut):
     return estimator.read(params, trajectory, out)
 
 
@@ -91,14 +97,11 @@ class FilteredWindow(NamedTuple):
         return (start is None or start <= time) and (stop is None or time < stop)
 
 
-class Video(Generic[P]):
-    """Images of a reconstruction: `image, variance, valid = video(times)`.
+class ImageSequence(abc.ABC, Generic[P]):
+    """Images of a reconstruction: `image, variance, valid = sequence(times)`.
 
-    The recording is filtered in time windows of at most `window_events` events when images in them
-    are asked for; windows before them are filtered first. One window is kept, and the state at
-    every window's start, so memory does not grow with the recording's length. Images do not depend
-    on which other images were asked for, nor on the windows. Given several `devices`, of this
-    process, they share out the pixels.
+    A subclass reads images in `_read`. Images do not depend on which others were asked for. Raises
+    `InputError` if the recording lacks what the estimator needs.
     """
 
     def __init__(
@@ -107,29 +110,30 @@ class Video(Generic[P]):
         recording: Recording,
         params: P,
         *,
-        window_events: int = WINDOW_EVENTS,
         progress: bool | None = None,
-        devices: Sequence[Any] = (),
     ):
         estimator.check(recording)
         self.estimator, self.recording, self.params = estimator, recording, params
-        self.progress, self._devices = progress, devices
-        self._mesh = pixel_mesh(devices)
-        self._windows = WindowedRecording(
-            recording,
-            Timing.of(params),
-            filtering=estimator.filters,
-            events=window_events,
-            reuse=True,
-        )
-        self._begins = [Begin(None, self._windows.initial(), None)]
-        self._open: FilteredWindow | None = None
-        self._future: dict[int | None, Any] | None = None  # by the start of the window
+        self.progress = progress
+
+    @property
+    @abc.abstractmethod
+    def dtype(self) -> np.dtype:
+        """The type of images and variances."""
+
+    @abc.abstractmethod
+    def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
+        """Read a few images after another at sorted times (us): the times and their `Estimate`.
+
+        Its arrays have a row of all pixels, in whichever shape, for each of the times, and may have
+        spare rows behind these.
+        """
 
     def __repr__(self) -> str:
         r = self.recording
         span = f"{r.start * 1e-6:g} to {r.stop * 1e-6:g} s"
-        return f"Video({self.estimator.name} of {r.name}, {r.width}x{r.height}, {span})"
+        kind = type(self).__name__
+        return f"{kind}({self.estimator.name} of {r.name}, {r.width}x{r.height}, {span})"
 
     def __call__(self, times: Times, extrapolate: bool = False) -> Estimate:
         """Images at `times`, integers (us) or floats (s) on the recording's clock, in any order.
@@ -143,7 +147,7 @@ class Video(Generic[P]):
         times = np.atleast_1d(microseconds(times))
         order = np.argsort(times, kind="stable")
         shape = (len(times), self.recording.height, self.recording.width)
-        image, variance = np.empty((2, *shape), self._windows.dtype)
+        image, variance = np.empty((2, *shape), self.dtype)
         whole = Estimate(image, variance, np.empty(shape, bool))
         done = 0
         for batch, part in self.batches(times[order], extrapolate):
@@ -165,23 +169,67 @@ class Video(Generic[P]):
             check_times(times, *span, self.recording.name)
         start, stop = self.recording.start, self.recording.stop
         with bar(total=len(times), unit="image", progress=self.progress) as shown:
-            # One batch is computed while the next one is looked up in the events.
-            ahead = None
-            for following in itertools.chain(self._read(times), [None]):
-                if ahead is not None:
-                    batch, images = ahead
-                    shape = (len(batch), self.recording.height, self.recording.width)
-                    image, variance, valid = (
-                        np.asarray(v)[: len(batch)].reshape(shape) for v in images
-                    )
-                    inside = (start <= batch) & (batch <= stop)
-                    if not inside.all():
-                        valid = valid & inside[:, None, None]
-                    yield batch, Estimate(image, variance, valid)
-                    shown.update(len(batch))
-                ahead = following
+            for batch, images in self._read(times):
+                shape = (len(batch), self.recording.height, self.recording.width)
+                image, variance, valid = (
+                    np.asarray(v)[: len(batch)].reshape(shape) for v in images
+                )
+                inside = (start <= batch) & (batch <= stop)
+                if not inside.all():
+                    valid = valid & inside[:, None, None]
+                yield batch, Estimate(image, variance, valid)
+                shown.update(len(batch))
+
+
+class Video(ImageSequence[P]):
+    """Images of a reconstruction: `image, variance, valid = video(times)`.
+
+    The recording is filtered in time windows of at most `window_events` events when images in them
+    are asked for; windows before them are filtered first. One window is kept, and the state at
+    every window's start, so memory does not grow with the recording's length. Images do not depend
+    on which other images were asked for, nor on the windows. Given several `devices`, of this
+    process, they share out the pixels.
+    """
+
+    estimator: PixelMethod
+
+    def __init__(
+        self,
+        estimator: PixelMethod,
+        recording: Recording,
+        params: P,
+        *,
+        window_events: int = WINDOW_EVENTS,
+        progress: bool | None = None,
+        devices: Sequence[Any] = (),
+    ):
+        super().__init__(estimator, recording, params, progress=progress)
+        self._devices = devices
+        self._mesh = pixel_mesh(devices)
+        self._windows = WindowedRecording(
+            recording,
+            Timing.of(params),
+            filtering=estimator.filters,
+            events=window_events,
+            reuse=True,
+        )
+        self._begins = [Begin(None, self._windows.initial(), None)]
+        self._open: FilteredWindow | None = None
+        self._future: dict[int | None, Any] | None = None  # by the start of the window
+
+    @property
+    def dtype(self) -> np.dtype:
+        return self._windows.dtype
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
+        # One batch is computed while the next one is looked up in the events.
+        ahead = None
+        for following in itertools.chain(self._dispatch(times), [None]):
+            if ahead is not None:
+                yield ahead
+            ahead = following
+
+    def _dispatch(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         """Batches of images on their way on the device."""
         done = 0
         while done < len(times):

@@ -12,7 +12,7 @@ from jaxevent.errors import InputError
 from jaxevent.io.output import complete, complete_hdf5, values_of
 from jaxevent.progress import bar
 from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
-from jaxevent.reconstruction.video import BATCH, Video
+from jaxevent.reconstruction.video import BATCH, ImageSequence
 from jaxevent.recording import Recording
 from jaxevent.show.report import display_limits, tone_map, video_writer, write_png
 
@@ -29,7 +29,7 @@ def evenly(recording: Recording, rate: float | int) -> NDArray[np.int64]:
 
 
 Colours = Callable[[NDArray], NDArray] | None  # what `colour_video` returns; None: grey
-Writer = Callable[[Video, NDArray, Path, str, str, Colours], str]
+Writer = Callable[[ImageSequence, NDArray, Path, str, str, Colours], str]
 
 
 def writer(out: Path) -> Writer:
@@ -52,7 +52,7 @@ def writer(out: Path) -> Writer:
 
 
 def write_hdf5(
-    video: Video, times: NDArray, out: Path, tone: str, name: str, colours: Colours
+    video: ImageSequence, times: NDArray, out: Path, tone: str, name: str, colours: Colours
 ) -> str:
     shape = (len(times), video.recording.height, video.recording.width)
     what = "linear intensity" if colours is None else "linear Rec. 709 red, green, blue"
@@ -83,7 +83,7 @@ def write_hdf5(
 
 
 def _write_video(
-    video: Video, times: NDArray, out: Path, tone: str, name: str, colours: Colours
+    video: ImageSequence, times: NDArray, out: Path, tone: str, name: str, colours: Colours
 ) -> str:
     rate = (len(times) - 1) / ((times[-1] - times[0]) / 1e6) if len(times) > 1 else 25.0
     fps = min(rate, 60.0)
@@ -94,7 +94,7 @@ def _write_video(
 
 
 def _write_images(
-    video: Video, times: NDArray, out: Path, tone: str, name: str, colours: Colours
+    video: ImageSequence, times: NDArray, out: Path, tone: str, name: str, colours: Colours
 ) -> str:
     with complete(out, directory=True) as partial:
         lines = []
@@ -107,7 +107,7 @@ def _write_images(
 
 
 def shown(
-    video: Video, times: NDArray, tone: str, colours: Colours = None
+    video: ImageSequence, times: NDArray, tone: str, colours: Colours = None
 ) -> Iterator[tuple[int, NDArray]]:
     """Each time (us) and its image for the display, of limits common to all.
 
@@ -132,7 +132,7 @@ def shown(
 
 
 def _batches(
-    video: Video, times: NDArray, colours: Colours
+    video: ImageSequence, times: NDArray, colours: Colours
 ) -> Iterator[tuple[NDArray, dict[str, NDArray]]]:
     """A few images after another: their times, and what HDF5 holds of them by name."""
     if colours is None:

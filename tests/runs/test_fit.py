@@ -31,7 +31,7 @@ from jaxevent import cli
 from jaxevent.estimator import Estimate
 from jaxevent.methods import HOMES, METHODS
 from jaxevent.parameters import Number, Parameters, Positive
-from jaxevent.reconstruction.estimator import ImageEstimator
+from jaxevent.reconstruction.estimator import PixelEstimator
 from jaxevent.reconstruction.filtering import Filter
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.runs.fit import fit
@@ -303,7 +303,7 @@ def test_images_are_shared_out_in_a_fixed_pattern():
 
 
 @dataclasses.dataclass(frozen=True)
-class Shown(ImageEstimator):
+class Shown(PixelEstimator):
     """A method whose images are what it is given to read, with the variance 0.3."""
 
     @property
