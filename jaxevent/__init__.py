@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         cf_augmented,
         colour,
         edi,
+        flow,
         high_pass,
         last_frame,
     )
@@ -48,7 +49,7 @@ _HOMES = {
     "jaxevent.parameters": ("Parameters",),
     "jaxevent.reconstruction": (
         *("akf", "aks", "augmented", "blend", "cf", "cf_augmented", "edi", "high_pass"),
-        *("last_frame",),
+        *("flow", "last_frame"),
     ),
     "jaxevent.recording": ("Events", "Frames", "Recording"),
     "jaxevent.runs.evaluate": ("evaluate",),
@@ -84,6 +85,7 @@ __all__ = [
     "egomotion",
     "evaluate",
     "fit",
+    "flow",
     "high_pass",
     "last_frame",
     "load",

@@ -1,4 +1,4 @@
-"""The one kind of error that is the user's to mend: bad input, said in a sentence."""
+"""The errors that are the user's to mend: bad input, said in a sentence."""
 
 import importlib
 from types import ModuleType
@@ -12,11 +12,18 @@ class InputError(ValueError):
     """
 
 
+class MissingExtra(InputError):
+    """A package is not installed that an extra of jaxevent installs.
+
+    Nothing is wrong with what was given: evaluations leave out what needs the package.
+    """
+
+
 def require(module: str, extra: str) -> ModuleType:
-    """Import `module`, or raise `InputError` naming the extra of jaxevent that installs it."""
+    """Import `module`, or raise `MissingExtra` naming the extra of jaxevent that installs it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise InputError(
+        raise MissingExtra(
             f"this needs the package {module.partition('.')[0]!r}: pip install 'jaxevent[{extra}]'"
         ) from error

@@ -19,6 +19,7 @@ HOMES = {
         "high-pass": "jaxevent.reconstruction.complementary:high_pass",
         "edi": "jaxevent.reconstruction.direct:edi",
         "augmented": "jaxevent.reconstruction.direct:augmented",
+        "flow": "jaxevent.reconstruction.optical_flow:flow",
         "blend": "jaxevent.reconstruction.direct:blend",
         "last-frame": "jaxevent.reconstruction.direct:last_frame",
     },

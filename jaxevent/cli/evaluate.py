@@ -13,8 +13,8 @@ def add(commands: Any) -> None:
         run,
         "Compare methods on recordings. It hides frames, reconstructs them and prints a table of "
         "the errors. With --out, what is finished is kept: the same again goes on where it was "
-        "stopped, and computes only what is new. A recording or method that fails is said, and the "
-        "others go on; the exit status is 2 only if all fail.",
+        "stopped, and computes only what is new. A recording or method that fails, or for which an "
+        "extra is missing, is said, and the others go on; the exit status is 2 only if all fail.",
         "configs/slider_depth.toml --out results",
         "mine.toml --out results --workers 8",
         "mine.toml --out results --cluster tcp://10.0.0.1:8786",
@@ -72,6 +72,9 @@ def run(
             files = files.replace("results.parquet, ", "")
             files += "; results.parquet needs pip install 'jaxevent[parquet]'"
         print(f"\nwritten to {out}: {files}")
-    failed = sum("error" in row for row in rows)
+    skipped = [f"{row['method']} is skipped: {row['error']}" for row in rows if "skipped" in row]
+    for sentence in dict.fromkeys(skipped):
+        print(f"jaxevent: {sentence}", file=sys.stderr)
+    failed = sum("error" in row and "skipped" not in row for row in rows)
     if failed:
         print(f"jaxevent: {failed} of {len(rows)} rows failed, see below them", file=sys.stderr)

@@ -26,7 +26,7 @@ def add(commands: Any) -> None:
         "--method",
         metavar="NAME",
         required=True,
-        help="akf, aks, cf, cf-augmented, high-pass, edi, augmented, blend, last-frame, or "
+        help="akf, aks, cf, cf-augmented, high-pass, edi, augmented, flow, blend, last-frame, or "
         "package.module:object of your own",
     )
     when = one.add_mutually_exclusive_group()

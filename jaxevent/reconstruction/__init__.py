@@ -3,6 +3,7 @@
 from jaxevent.reconstruction.complementary import cf, cf_augmented, high_pass
 from jaxevent.reconstruction.direct import augmented, blend, edi, last_frame
 from jaxevent.reconstruction.kalman import akf
+from jaxevent.reconstruction.optical_flow import flow
 from jaxevent.reconstruction.smoother import aks
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "cf",
     "cf_augmented",
     "edi",
+    "flow",
     "high_pass",
     "last_frame",
 ]

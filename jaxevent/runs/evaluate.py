@@ -89,7 +89,8 @@ def evaluate(
 
     The file's layout is in the text of this module. In a row, `recording` is the path as the file
     gives it and `method` is the label. Where a method cannot be run on a recording, the row has
-    only those, `params` and `error`, a sentence. Rows do not depend on where they are computed, but
+    only those, `params` and `error`, a sentence; and `skipped`, true, if only an extra of jaxevent
+    is missing. Rows do not depend on where they are computed, but
     for `seconds`.
 
     Args:
@@ -144,7 +145,8 @@ def _rows(plan: "Plan", outcomes: list[Outcome]) -> list[dict[str, Any]]:
         if outcome.error is None:
             rows.append({**outcome.result["row"], **named})
         else:
-            rows.append({**named, "params": entry.shown(), "error": outcome.error})
+            skipped = {"skipped": True} if outcome.skipped else {}
+            rows.append({**named, "params": entry.shown(), "error": outcome.error, **skipped})
     errors = list(dict.fromkeys(row["error"] for row in rows if "error" in row))
     if all("error" in row for row in rows):
         more = f" (and {len(errors) - 1} further errors)" if len(errors) > 1 else ""

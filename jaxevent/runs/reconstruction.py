@@ -374,6 +374,11 @@ class Reconstruction(Family):
     def goal(
         self, method: ImageEstimator, params: Parameters, settings: Mapping[str, Any]
     ) -> ImageGoal:
+        if not method.differentiable:
+            raise InputError(
+                f"the method {method.name!r} has no gradients and cannot be fitted; fit another, "
+                "or compare its settings by a grid in an evaluation"
+            )
         loss = one_of(settings.get("loss", "held-out"), "loss", [*PROTOCOLS, "likelihood"])
         protocol = loss
         if loss == "likelihood":

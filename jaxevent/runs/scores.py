@@ -364,7 +364,8 @@ def _estimates(
     params: FrameParams,
     progress: bool | None,
 ) -> Estimates:
-    video = method.estimate(given, params, progress=progress, devices=local())
+    options = {"devices": local()} if "devices" in method.options else {}
+    video = method.estimate(given, params, progress=progress, **options)
     first = 0
     for times, told in video.batches(frame_times(hidden, params), extrapolate=True):
         yield first, told.mean, told.covariance

@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxevent.devices import local
-from jaxevent.errors import InputError, require
+from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.progress import bar
 
 CONNECT = 30  # s that a scheduler has to answer
@@ -50,10 +50,14 @@ class Task:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """Either a `result`, as JSON gives it back, computed on `host`; or an `error`, one sentence."""
+    """Either a `result`, as JSON gives it back, computed on `host`; or an `error`, one sentence.
+
+    `skipped` says of an error that only an extra is missing where the task was tried.
+    """
 
     result: Any = None
     error: str | None = None
+    skipped: bool = False
     host: str = ""
 
 
@@ -156,17 +160,24 @@ def run(
             shown.set_postfix_str(task.name)
             shown.update(len(numbers))
     return [
-        Outcome(record.get("result"), record.get("error"), record.get("host", ""))
+        Outcome(
+            record.get("result"),
+            record.get("error"),
+            record.get("skipped", False),
+            record.get("host", ""),
+        )
         for record in (found[number] for number in range(len(tasks)))
     ]
 
 
-# The number of a task and its record: {"result", "host"} or {"error"}.
+# The number of a task and its record: {"result", "host"} or {"error", "skipped"}.
 Records = Generator[tuple[int, dict[str, Any]], None, None]
 
 
 def attempt(function: Callable[..., Any], task: Task, folder: Path | None) -> dict[str, Any]:
-    """Run one task, on whichever machine: {"result", "host"}, or {"error"} of an `InputError`.
+    """Run one task, on whichever machine: {"result", "host"}, or {"error", "skipped"}.
+
+    The error is that of an `InputError`; the task is skipped if that is a `MissingExtra`.
 
     A stored result is read; a new one is stored if this machine sees the folder. Any other
     exception is raised.
@@ -180,7 +191,7 @@ def attempt(function: Callable[..., Any], task: Task, folder: Path | None) -> di
         record = json.loads(json.dumps(record, allow_nan=False))
     except InputError as error:
         _log(folder, task.key, f"cannot be done: {error}")
-        return {"error": str(error)}
+        return {"error": str(error), "skipped": isinstance(error, MissingExtra)}
     except Exception:
         _log(folder, task.key, f"failed\n{traceback.format_exc()}")
         raise

@@ -157,16 +157,17 @@ def _text(text: str) -> str:
 
 
 def _failures(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    failed = [row for row in rows if "error" in row]
-    if not failed:
-        return []
-    lines = "".join(
-        f"<li>{_text(row['recording'])}, {_text(row['method'])}: {_text(row['error'])}</li>"
-        for row in failed
-    )
-    return [
-        f'<div class="failed"><h2>{len(failed)} of {len(rows)} failed</h2><ul>{lines}</ul></div>'
-    ]
+    parts = []
+    for how in ("failed", "skipped"):
+        lines = [
+            f"<li>{_text(row['recording'])}, {_text(row['method'])}: {_text(row['error'])}</li>"
+            for row in rows
+            if "error" in row and ("skipped" in row) == (how == "skipped")
+        ]
+        if lines:
+            title = f"{len(lines)} of {len(rows)} {how}"
+            parts.append(f'<div class="failed"><h2>{title}</h2><ul>{"".join(lines)}</ul></div>')
+    return parts
 
 
 def _html_table(head: Iterable[str], lines: Iterable[Iterable[str]], left: int) -> str:

@@ -330,8 +330,17 @@ def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
     are those of computing. The `error` of rows that have one follows the table, each once.
     """
     rows = list(rows)
-    errors = [" ".join(row["error"].split()) for row in rows if "error" in row]
-    said = "".join(f"\nfailed ({errors.count(one)}): {one}\n" for one in dict.fromkeys(errors))
+    errors = [
+        (
+            "skipped" if "skipped" in row else "failed",
+            f"{row['method']}: " * ("skipped" in row) + " ".join(row["error"].split()),
+        )
+        for row in rows
+        if "error" in row
+    ]
+    said = "".join(
+        f"\n{how} ({errors.count((how, one))}): {one}\n" for how, one in dict.fromkeys(errors)
+    )
     return aligned(rows, columns_of(rows)) + said
 
 

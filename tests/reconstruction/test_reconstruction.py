@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 import jaxevent
 from jaxevent.methods import names
 from jaxevent.reconstruction import video
+from jaxevent.reconstruction.estimator import PixelEstimator
 from jaxevent.reconstruction.filtering import Event, Observation, State
 from jaxevent.recording import Events, Frames, Recording
 
@@ -105,6 +106,7 @@ SLOW = {"akf", "aks", "cf-augmented"}  # they compile most; `cf` goes through th
 METHODS = [
     pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW))
     for name in names("reconstruction")
+    if isinstance(jaxevent.METHODS[name], PixelEstimator)
 ]
 
 

@@ -1,0 +1,257 @@
+"""Interpolation along the optical flow of the frames; no events.
+
+Dense inverse search (Kroeger et al., ECCV 2016; OpenCV's, preset medium) finds the flow from the
+frame before to the frame after, and back. Both frames are warped to the time between them, as if
+what moves kept its velocity, and blended by time. Computed on the host with the extra `vision`.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.camera import Response
+from jaxevent.errors import InputError, require
+from jaxevent.estimator import Described, Estimate
+from jaxevent.reconstruction.augment import FrameParams
+from jaxevent.reconstruction.clock import Clock, Timing
+from jaxevent.reconstruction.estimator import ImageEstimator
+from jaxevent.reconstruction.frames import FrameImages
+from jaxevent.reconstruction.video import BATCH, ImageSequence
+from jaxevent.recording import Recording, Times, microseconds
+
+SMALLEST = 12  # pixels that OpenCV's search needs in width or height
+OUTLIERS = 1e-3  # of the greys of two frames, at either end, that do not set the range
+
+
+class Params(FrameParams):
+    """Parameters of `flow`; of them only `clock_offset` acts."""
+
+
+class FrameSeries(Described):
+    """Frames in time: what `run` is given."""
+
+    mid: NDArray[np.floating]  # (frames,), mid-exposures, us from the recording's start
+    grey: NDArray[np.floating]  # (frames, H, W), in [0, 1]
+    intensity: NDArray[np.floating]  # (frames, H, W)
+    gain: NDArray[np.floating]  # (frames,)
+    response: Response
+
+
+class Moments(NamedTuple):
+    """What `read` is given: the frames before times, and how far these are to the next."""
+
+    frame: NDArray[np.int64]
+    share: NDArray[np.floating]
+
+
+class Pair(NamedTuple):
+    """Two frames that follow each other (H, W), and the flows (H, W, 2) there and back, pixels."""
+
+    before: NDArray[np.floating]
+    after: NDArray[np.floating]
+    there: NDArray[np.float32]
+    back: NDArray[np.float32]
+
+    def at(self, share: float | int) -> NDArray[np.floating]:
+        """The image at that share of the time from one to the other."""
+        s = float(share)
+        if s == 0:
+            return self.before
+        moved = _warp(self.before, s * self.there), _warp(self.after, (1 - s) * self.back)
+        return (1 - s) * moved[0] + s * moved[1]
+
+
+def _warp(image: NDArray[np.floating], flow: NDArray[np.float32]) -> NDArray[np.floating]:
+    """The image with every pixel fetched from where the flow at it comes from."""
+    cv2 = require("cv2", "vision")
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float32)
+    return cv2.remap(
+        image, x - flow[..., 0], y - flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+
+
+def make_pair(frames: FrameSeries, first: int) -> Pair:
+    """The frames `first` and `first + 1`, and the flows between them."""
+    cv2 = require("cv2", "vision")
+    two = slice(first, first + 2)
+    one, other = _levels(frames.grey[two], frames.intensity[two], frames.gain[two], frames.response)
+    search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    there, back = search.calc(one, other, None), search.calc(other, one, None)
+    return Pair(frames.intensity[first], frames.intensity[first + 1], there, back)
+
+
+def _levels(
+    grey: NDArray, intensity: NDArray, gain: NDArray, response: Response
+) -> NDArray[np.uint8]:
+    """Two frames in the 256 levels that the search takes.
+
+    The search weighs gradients against thresholds and a smoothness that are made for levels of a
+    well exposed picture, and 256 levels of which frames use a few tell no motion below a pixel. So
+    the range of the two frames, but for a few outliers such as hot pixels, is spread over all
+    levels; the same for both, since flow follows points of one brightness. The range of the whole
+    recording would be that of its brightest moment, and known only at its end. Frames of different
+    gain are brought to the lower one, at which neither clips anew. Levels are grey values rather
+    than intensities: these would leave few for what is dark.
+    """
+    if gain[0] != gain[1]:
+        grey = np.asarray(response.grey(jnp.asarray(intensity * gain.min())))
+    low, high = np.quantile(grey, [OUTLIERS, 1 - OUTLIERS])
+    spread = 255 / (high - low) if high > low else 0.0
+    return np.rint(((grey - low) * spread).clip(0, 255)).astype(np.uint8)
+
+
+class _Frames:
+    """A recording's frames, read a few at a time."""
+
+    def __init__(self, recording: Recording, clock: Clock):
+        self.recording, self.mid = recording, clock.mid
+        self._images = FrameImages(recording, np.dtype(jnp.result_type(float)))
+
+    def read(self, used: slice) -> FrameSeries:
+        """Frames `used` as a series."""
+        number = used.stop - used.start
+        shape = (number, self.recording.height, self.recording.width)
+        grey, intensity, _, gain = self._images.read(used, number)
+        response = self.recording.response
+        return FrameSeries(
+            self.mid[used], grey.reshape(shape), intensity.reshape(shape), gain, response
+        )
+
+
+class FlowVideo(ImageSequence[Params]):
+    """Images along the optical flow of the frames: `image, variance, valid = video(times)`.
+
+    Two frames and the flows between them are kept, so memory does not grow with the recording's
+    length. Before the first frame and after the last, these are held.
+    """
+
+    def __init__(
+        self,
+        estimator: "Flow",
+        recording: Recording,
+        params: Params,
+        *,
+        progress: bool | None = None,
+    ):
+        super().__init__(estimator, recording, params, progress=progress)
+        self._clock = Clock.of(recording, Timing.of(params))
+        self._frames = _Frames(recording, self._clock)
+        self._dtype = np.dtype(jnp.result_type(float))
+        self._pair: tuple[int, Pair] | None = None  # with the number of its first frame
+
+    @property
+    def dtype(self) -> np.dtype:
+        return self._dtype
+
+    def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
+        moments = _moments(self._clock, times)
+        for first in range(0, len(times), BATCH):
+            batch = slice(first, first + BATCH)
+            places = zip(moments.frame[batch], moments.share[batch], strict=True)
+            images = np.stack([self._image(int(frame), float(share)) for frame, share in places])
+            yield times[batch], _estimate(images)
+
+    def _image(self, frame: int, share: float) -> NDArray[np.floating]:
+        if share == 0:
+            return self._frames.read(slice(frame, frame + 1)).intensity[0]
+        if self._pair is None or self._pair[0] != frame:
+            self._pair = frame, make_pair(self._frames.read(slice(frame, frame + 2)), 0)
+        return self._pair[1].at(share)
+
+
+def _moments(clock: Clock, times: NDArray[np.int64]) -> Moments:
+    _, frame, _, share = clock.locate(times - clock.origin)
+    return Moments(frame, share)
+
+
+def _estimate(images: NDArray[np.floating]) -> Estimate:
+    return Estimate(images, np.full_like(images, np.nan), np.isfinite(images))
+
+
+class Flows(Described):
+    """The trajectory: frames, and the flows (H, W, 2) from each to the next and back, pixels."""
+
+    frames: FrameSeries
+    pairs: list[Pair]
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Flow(ImageEstimator[Params]):
+    """The estimator of this module."""
+
+    def check(self, recording: Recording) -> None:
+        """Raise `InputError` without frames, for tiny ones and where the extra is missing."""
+        super().check(recording)
+        if max(recording.width, recording.height) < SMALLEST:
+            raise InputError(
+                f"{recording.name}: {recording.width}x{recording.height} pixels are too few for "
+                f"optical flow; {SMALLEST} in one direction are needed, or the method 'blend'"
+            )
+        require("cv2", "vision")
+
+    def prepare(
+        self,
+        recording: Recording,
+        times: Times,
+        params: Params | None = None,
+        *,
+        extrapolate: bool = False,
+    ) -> tuple[FrameSeries, Moments]:
+        """All frames of a recording, and where sorted `times` lie among them.
+
+        Raises `InputError` as `check`, and for times outside the recording unless told to
+        `extrapolate`.
+        """
+        self.check(recording)
+        params = self.Params() if params is None else params
+        if not extrapolate:
+            self.check_span(recording, times, params)
+        clock = Clock.of(recording, Timing.of(params))
+        frames = _Frames(recording, clock).read(slice(0, len(clock)))
+        return frames, _moments(clock, np.atleast_1d(microseconds(times)))
+
+    def run(self, params: Params, features: FrameSeries, state: None = None) -> tuple[Flows, None]:
+        """Find the flows between all frames; on the host. Nothing passes from run to run."""
+        pairs = [make_pair(features, first) for first in range(len(features.mid) - 1)]
+        return Flows(features, pairs), None
+
+    def read(self, params: Params, trajectory: Flows, out: Moments) -> Estimate:
+        """The images prepared in `out`, each array (times, pixels); on the host."""
+        images = [
+            trajectory.frames.intensity[frame]
+            if share == 0
+            else trajectory.pairs[frame].at(float(share))
+            for frame, share in zip(out.frame, out.share, strict=True)
+        ]
+        return _estimate(np.stack(images).reshape(len(images), -1))
+
+    def estimate(
+        self,
+        recording: Recording,
+        params: Params | None = None,
+        *,
+        progress: bool | None = None,
+        **options: Any,
+    ) -> FlowVideo:
+        """Images along the frames' flow: `image, variance, valid = estimate(recording)(times)`.
+
+        Takes the option `progress`. Raises `InputError` as `check`.
+        """
+        self.refuse_unknown(options)
+        chosen = self.Params() if params is None else params
+        return FlowVideo(self, recording, chosen, progress=progress)
+
+
+flow = Flow(
+    "flow",
+    Params,
+    needs_frames=True,
+    differentiable=False,
+    has_covariance=False,
+    about="The frames before and after, each moved along the optical flow between them (dense "
+    "inverse search), blended by time; no events. Needs the extra `vision`.",
+)
