@@ -4,6 +4,10 @@
     protocol = "held-out"                           # or "reference", "motion" or "tracks"
     size = [240, 180]                               # only for recordings that do not tell it
     metrics = ["lpips"]                             # of images; further ones, named in MEASURES
+    gap = 4                                         # with "held-out": every 4th frame is given,
+                                                    # the others are hidden; omitted: 2
+    moving = true                                   # with "held-out": the error where something
+                                                    # moves, too
 
     [[method]]
     name = "akf"                                    # a key of jaxevent.METHODS, or of your own:
@@ -21,7 +25,9 @@ are asked for by "held-out" and "reference", described below, the others are des
 A method of the name "external" scores images of another program: `jaxevent.runs.external`. Paths
 are relative to the folder of this file. The protocol "held-out" gives the methods frames 0, 2, 4,
 ... and asks for images where frames 1, 3, 5, ... are, at their time stamps plus the method's
-`clock_offset`. Images are clipped to [0, 1], the range of the truth, before they are scored.
+`clock_offset`; with another `gap` g it gives frames 0, g, 2 g, ... and asks for all others. Images
+are clipped to [0, 1], the range of the truth, before they are scored. Something moves where the
+given frames before and after differ by more than 0.05 of white.
 
 The protocol "reference" gives the whole recording and compares with HDR images that it keeps in
 `Recording.extra`, float linear intensities of which 1 is the frames' white, without clipping:
@@ -70,7 +76,7 @@ from jaxevent.show.report import write_parquet
 
 # Part of the keys of stored results: raised whenever the same recording, method and parameters give
 # other results than before.
-RESULTS_VERSION = 2
+RESULTS_VERSION = 3
 
 _opened = Opened()
 
@@ -318,7 +324,7 @@ def _entries(
         raise InputError('name and label must be text; give name = "akf"')
     own = {key: rest.pop(key) for key in protocol.own if key in rest}
     check(own, protocol.own)
-    ending = protocol.label(own)
+    ending = protocol.label({**options, **own})
     if name in protocol.sources:
         source = protocol.sources[name].of(rest, folder.absolute())
         yield Entry(label + ending, name, source, None, own)

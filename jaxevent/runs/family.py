@@ -56,8 +56,8 @@ class Protocol(abc.ABC):
     ) -> None:
         """Raise `InputError` if the settings ask for what the method cannot do."""
 
-    def label(self, own: Mapping[str, Any]) -> str:
-        """What the label of a method with settings of its own ends in."""
+    def label(self, options: Mapping[str, Any]) -> str:
+        """What the label of a method ends in, of settings of the protocol and of its own."""
         return ""
 
     def files(self, path: Path, options: Mapping[str, Any]) -> list[Path]:

@@ -18,6 +18,7 @@ describes it:
     dark_offset = 0.003                 # of the error "log"
     weights = { dark = 1, bright = 1 }  # of pixels of HDR references outside what frames record
     warm_up = 0.2                       # s that are prepared around a window
+    gap = 2                             # of the protocol "held-out": every gap-th frame is given
 
     [[method]]
     name = "akf"                        # a key of jaxevent.METHODS, or "package.module:object"

@@ -1,8 +1,9 @@
 """What of a recording a method of reconstruction is given, and which images it is asked for.
 
 "held-out" gives frames 0, 2, 4, ... and asks for images where frames 1, 3, 5, ... are, at their
-time stamps plus the method's `clock_offset`. Images are clipped to [0, 1], the range of the truth,
-before they are scored.
+time stamps plus the method's `clock_offset`. With a `gap` g it gives every g-th frame, 0, g, 2 g,
+..., and asks for all others. Images are clipped to [0, 1], the range of the truth, before they are
+scored.
 
 "reference" gives the whole recording and asks for the HDR images that it keeps in
 `Recording.extra`, float linear intensities of which 1 is the frames' white, without clipping:
@@ -25,22 +26,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
+from jaxevent.parameters import nearest
 from jaxevent.recording import Frames, Recording, microseconds
 
+GAP = 2  # every second frame is given
+A_GAP = "a whole number of frames from one that is kept to the next, 2 or more"
 
-def held_out(recording: Recording) -> tuple[Recording, Frames]:
-    """The recording with every second frame, and the frames taken out of it.
 
-    Raises `InputError` for fewer than 3 frames and for no events.
+def is_gap(value: Any) -> bool:
+    return type(value) is int and value >= 2
+
+
+def held_out(recording: Recording, gap: int = GAP) -> tuple[Recording, Frames]:
+    """The recording with every `gap`-th frame, and the frames taken out of it.
+
+    Raises `InputError` for a gap below 2, for fewer than gap + 1 frames and for no events.
     """
+    if not is_gap(gap):
+        raise InputError(f"a gap of {gap!r} hides no frame; give {A_GAP}")
     frames = recording.frames
-    if frames is None or len(frames) < 3:
+    if frames is None or len(frames) <= gap:
+        which = "second one" if gap == 2 else f"one but each {gap}th"
         raise InputError(
             f"{recording.name}: has {0 if frames is None else len(frames)} frames; hiding every "
-            "second one needs at least 3, so choose a recording with more"
+            f"{which} needs at least {gap + 1}, so choose a recording with more"
         )
     _need_events(recording)
-    return recording.with_frames(slice(0, None, 2)), frames[1::2]
+    hidden = slice(1, None, 2) if gap == 2 else np.flatnonzero(np.arange(len(frames)) % gap)
+    return recording.with_frames(slice(0, None, gap)), frames[hidden]
+
+
+def frames_around(given: Frames, row: int, gap: int = GAP) -> tuple[int, int] | None:
+    """Which of the frames given lie before and after the hidden frame `row`; None after the last.
+
+    `given` and the number `row` are those that `held_out` tells.
+    """
+    before = row // (gap - 1)
+    return (before, before + 1) if before + 1 < len(given) else None
 
 
 def _need_events(recording: Recording) -> None:
@@ -120,8 +142,25 @@ def reference(recording: Recording) -> tuple[Recording, Reference]:
     return recording, Reference(t, images, none, what == "hdr", bounds, white)
 
 
-Protocol = Callable[[Recording], tuple[Recording, Frames]]
-PROTOCOLS: dict[str, Protocol] = {"held-out": held_out, "reference": reference}
+PROTOCOLS: dict[str, Callable[..., tuple[Recording, Frames]]] = {
+    "held-out": held_out,
+    "reference": reference,
+}
+
+
+def divide(recording: Recording, protocol: str, gap: int = GAP) -> tuple[Recording, Frames]:
+    """What the protocol of that name gives of a recording, and the images that it asks for.
+
+    Raises `InputError` for recordings that it cannot use, for an unknown protocol, and for a gap
+    of one that hides no frames.
+    """
+    if protocol not in PROTOCOLS:
+        raise InputError(f"there is no protocol {protocol!r}; {nearest(protocol, PROTOCOLS)}")
+    if protocol == "held-out":
+        return held_out(recording, gap)
+    if gap != GAP:
+        raise InputError(f"the protocol {protocol!r} hides no frames; omit gap")
+    return PROTOCOLS[protocol](recording)
 
 
 def frame_times(frames: Frames, clock: Any) -> np.ndarray:

@@ -29,8 +29,8 @@ from jaxevent.reconstruction.features import Numeric, over_pixels, pixel_mesh
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.config import NAME, NOT_NEGATIVE, POSITIVE, is_number, one_of
 from jaxevent.runs.family import Family, Goal, Shares, Sources
-from jaxevent.runs.protocols import PROTOCOLS, Reference, frame_times
-from jaxevent.runs.scores import ImageProtocol, score, subset
+from jaxevent.runs.protocols import A_GAP, GAP, PROTOCOLS, Reference, divide, frame_times, is_gap
+from jaxevent.runs.scores import HeldOut, ImageProtocol, score, subset
 from jaxevent.show.report import markdown_table
 from jaxevent.splits import SPLITS, interleave
 
@@ -170,16 +170,17 @@ def parts(
     split: Sequence[int] = (1, 0, 0),
     window: float | int | None = None,
     warm_up: float | int = 0.2,
+    gap: int = GAP,
 ) -> list[Part]:
     """Cut a recording into windows of `window` seconds (None: one part, the whole).
 
-    The true images are those that the protocol hides (`jaxevent.runs.protocols.PROTOCOLS`), shared
-    out by `interleave`. A window's images are those stamped in it; it is prepared from `warm_up`
+    The true images are those that the protocol hides (`jaxevent.runs.protocols`), shared out by
+    `interleave`. A window's images are those stamped in it; it is prepared from `warm_up`
     seconds more on either side: a filter needs them before to forget its initial state, and the
     augmented frame and the smoother use frames after. Windows without events or frames are left
     out. Raises `InputError` for recordings that the protocol cannot use.
     """
-    given, truth = PROTOCOLS[protocol](recording)
+    given, truth = divide(recording, protocol, gap)
     use = interleave(split, len(truth))
     if window is None:
         return [Part(given, truth, np.arange(len(truth)), use)]
@@ -306,6 +307,7 @@ class ImageGoal(Goal):
     protocol: str
     warm_up: float | int
     weights: Mapping[str, float | int] | None
+    gap: int = GAP
 
     def problem(self, sources: Sources, split: Shares, window: float | int | None) -> Problem:
         cut = functools.partial(
@@ -314,6 +316,7 @@ class ImageGoal(Goal):
             split=split or (1, 0, 0),
             window=window,
             warm_up=self.warm_up,
+            gap=self.gap,
         )
         found: dict[str, list] = {}
         for name in ("fit", "validation"):
@@ -333,7 +336,9 @@ class ImageGoal(Goal):
     ) -> Iterator[dict[str, Any]]:
         for whole in SPLITS:
             for given, recording in sources[whole]:
-                row = score(recording, self.method, params, self.protocol, progress=progress)
+                row = score(
+                    recording, self.method, params, self.protocol, gap=self.gap, progress=progress
+                )
                 row["recording"] = given
                 if split is None:
                     yield {**row, "split": whole}
@@ -352,7 +357,7 @@ class ImageGoal(Goal):
 class Reconstruction(Family):
     """The methods that make images."""
 
-    protocols = {name: ImageProtocol(name) for name in PROTOCOLS}
+    protocols = {"held-out": HeldOut("held-out"), "reference": ImageProtocol("reference")}
 
     fit_settings = {
         "loss": NAME,
@@ -368,6 +373,7 @@ class Reconstruction(Family):
             "a table of numbers named dark, well, bright",
         ),
         "warm_up": NOT_NEGATIVE,
+        "gap": (is_gap, A_GAP),
     }
     own = ("loss", "error")
 
@@ -386,7 +392,9 @@ class Reconstruction(Family):
         elif settings.get("protocol", loss) != loss:
             raise InputError(f"the loss {loss!r} has the protocol of that name; omit protocol")
         error = one_of(settings.get("error", "linear"), "error", ERRORS)
-        weights = settings.get("weights")
+        weights, gap = settings.get("weights"), settings.get("gap", GAP)
+        if "gap" in settings and protocol != "held-out":
+            raise InputError("gap is for frames that are hidden, the protocol 'held-out'; omit it")
         if weights is not None and protocol != "reference":
             raise InputError("weights are for HDR references, the loss 'reference'; omit them")
         objective = Objective(
@@ -395,7 +403,7 @@ class Reconstruction(Family):
             protocol == "held-out",
             settings.get("dark_offset", 0.003),
         )
-        return ImageGoal(method, objective, protocol, settings.get("warm_up", 0.2), weights)
+        return ImageGoal(method, objective, protocol, settings.get("warm_up", 0.2), weights, gap)
 
 
 FAMILY = Reconstruction()

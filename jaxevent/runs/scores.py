@@ -32,7 +32,15 @@ from jaxevent.recording import Frames, Recording
 from jaxevent.runs.config import is_texts
 from jaxevent.runs.external import External, Normalise, check_normalise, fit_brightness
 from jaxevent.runs.family import Protocol
-from jaxevent.runs.protocols import PROTOCOLS, Reference, frame_times
+from jaxevent.runs.protocols import (
+    A_GAP,
+    GAP,
+    Reference,
+    divide,
+    frame_times,
+    frames_around,
+    is_gap,
+)
 
 # Further measures of an image and the truth, each a number per image. They cost more time, and the
 # first two need an extra.
@@ -54,17 +62,63 @@ def check_measures(names: Iterable[str]) -> None:
             require("pycvvdp", "hdr")
 
 
-# The scores of one image; those of its regions are nested under "regions".
-Scores = dict[str, float | dict[str, dict[str, float | int]]]
+MOVING = 0.05  # of white, by which frames differ where something moves
+
+# The scores of one image; those of parts of it are nested under "regions" and "moving".
+Scores = dict[str, Any]
 
 
-def _measures(image: NDArray, truth: NDArray, names: Iterable[str]) -> Scores:
-    """The scores of a hidden frame; intensities are clipped to [0, 1]."""
-    image = np.clip(image, 0, 1)
+def _measures(
+    image: NDArray,
+    variance: NDArray | None,
+    truth: Frames,
+    names: Iterable[str],
+    I0: float,
+    moving: NDArray[np.bool_] | None,
+) -> Scores:
+    """The scores of a hidden frame, a `Frames` of one; intensities are clipped to [0, 1]."""
+    shown, true = np.clip(image, 0, 1), truth.intensity[0]
     measures = {"mse": mse, "ssim": ssim, **{name: MEASURES[name] for name in names}}
-    if not np.isfinite(image).all():
-        return dict.fromkeys(measures, math.nan)
-    return {name: float(measure(image, truth)) for name, measure in measures.items()}
+    broken = not np.isfinite(shown).all()
+    scores: Scores = {
+        name: math.nan if broken else float(measure(shown, true))
+        for name, measure in measures.items()
+    }
+    if variance is not None:
+        # A black or clipped pixel tells a bound of the intensity, not the intensity.
+        grey = np.asarray(truth.images)[0]
+        white = 1 if grey.dtype.kind == "f" else np.iinfo(grey.dtype).max
+        told = (grey > 0) & (grey < white)
+        z2, usable = _standardised(image.astype(np.float64), variance, true.astype(np.float64), I0)
+        for name, mean in (("z2", np.mean), ("z2_median", np.median)):
+            scores[name] = math.nan if broken else _over(z2, told & usable, mean)
+    if moving is not None:
+        scores["moving"] = {
+            "share": float(moving.mean()),
+            "mse": math.nan if broken else float(mse(shown, true, moving)),
+        }
+    return scores
+
+
+def _standardised(
+    image: NDArray[np.float64],
+    variance: NDArray[np.floating],
+    truth: NDArray[np.float64],
+    I0: float,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Squared errors of ln(I + I0) in units of the variance, and where there is one.
+
+    The variance is of the type that the image was computed in.
+    """
+    # L = ln(I + I0) cannot be known better than I is rounded.
+    least = max(float(np.finfo(variance.dtype).eps) * I0, 1e-12)
+    L, true_L = (np.log(np.maximum(part + I0, least)) for part in (image, truth))
+    usable = np.isfinite(variance) & (variance > 0)
+    return (L - true_L) ** 2 / np.where(usable, variance, 1).astype(np.float64), usable
+
+
+def _over(values: NDArray, mask: NDArray[np.bool_], mean: Callable[[NDArray], Any]) -> float:
+    return float(mean(values[mask])) if mask.any() else math.nan
 
 
 def _hdr_measures(
@@ -105,19 +159,11 @@ def _hdr_measures(
         for name, mask in masks.items()
     }
     if variance is not None:
-        # L = ln(I + I0) cannot be known better than I is rounded.
-        least = max(float(np.finfo(image.dtype).eps) * I0, 1e-12)
-        L, true_L = (np.log(np.maximum(part + I0, least)) for part in (shown, covered))
-        usable = np.isfinite(variance) & (variance > 0)
-        z2 = (L - true_L) ** 2 / np.where(usable, variance, 1).astype(np.float64)
-
-        def over(mask: NDArray[np.bool_], mean: Callable[[NDArray], Any]) -> float:
-            values = z2[mask & usable]
-            return float(mean(values)) if len(values) else math.nan
-
-        scores["z2"], scores["z2_median"] = over(known, np.mean), over(known, np.median)
+        z2, usable = _standardised(shown, variance, covered, I0)
+        scores["z2"] = _over(z2, known & usable, np.mean)
+        scores["z2_median"] = _over(z2, known & usable, np.median)
         for name, mask in masks.items():
-            parts[name]["z2"] = over(mask, np.mean)
+            parts[name]["z2"] = _over(z2, mask & usable, np.mean)
     if broken:
         scores = dict.fromkeys(scores, math.nan)
         parts = {
@@ -143,7 +189,7 @@ def _listed(scores: list[Scores]) -> dict[str, Any]:
 def _means(per_frame: Mapping[str, Any]) -> dict[str, Any]:
     """The means over images of what `per_frame` lists; regions' over pixels."""
 
-    def mean(values: list[float | None], weights: list[int] | None = None) -> float | None:
+    def mean(values: list[float | None], weights: list[Any] | None = None) -> float | None:
         numbers = np.array([math.nan if value is None else value for value in values])
         weight = np.ones(len(values)) if weights is None else np.array(weights)
         counted = weight > 0
@@ -161,6 +207,11 @@ def _means(per_frame: Mapping[str, Any]) -> dict[str, Any]:
                     **{k: mean(v, part["pixels"]) for k, v in part.items() if k != "pixels"},
                 }
                 for region, part in values.items()
+            }
+        elif name == "moving":
+            means[name] = {
+                "share": mean(values["share"]),
+                "mse": mean(values["mse"], values["share"]),
             }
         elif name != "t":
             means[name] = mean(values)
@@ -210,6 +261,8 @@ def score(
     *,
     metrics: Iterable[str] = (),
     normalise: Normalise = "none",
+    gap: int = GAP,
+    moving: bool = False,
     progress: bool | None = None,
 ) -> dict[str, Any]:
     """Reconstruct the images that `protocol` asks for, and compare: one row of a table of results.
@@ -220,12 +273,19 @@ def score(
     compilation but without scoring. What is not a number is None. `per_frame` lists t (us, as
     stamped) and every measure of every image.
 
+    With "held-out" every `gap`-th frame is given and all others are hidden; a gap other than 2 is
+    in the row. With `moving` rows have also `moving`: the `share` of pixels where something moves,
+    and the `mse` over these. There the given frames before and after differ by more than 0.05 of
+    white. Nothing is known to move after the last frame given.
+
+    Where the method estimates a variance, `z2` is the mean of (error of ln(I + I0))^2 / variance,
+    over all pixels, 1 for honest variances, and `z2_median` the mean over images of its median,
+    then 0.45 if errors are Gaussian. Black and clipped pixels of hidden frames do not count.
+
     Rows of "reference" have also `log_mse` and `log_ssim`; `clip`, the bounds of the `regions`
     "bright", "dark" and "well"; and of each of those its `share` of all pixels and, over its pixels
-    of all images, `mse` and `log_mse`. Where the method estimates a variance, `z2` is the mean of
-    (error of ln(I + I0))^2 / variance, over all pixels and in each region, 1 for honest variances,
-    and `z2_median` the mean over images of its median, then 0.45 if errors are Gaussian. "lpips" is
-    that of ln(I + 0.003), clipped to the truth's range.
+    of all images, `mse`, `log_mse` and, where there is a variance, `z2`. "lpips" is that of
+    ln(I + 0.003), clipped to the truth's range.
 
     With `normalise` "affine", which is then in the row, the brightness of each image is fitted to
     the truth first (`external.fit_brightness`), and no variance is judged. Of `External` images,
@@ -235,8 +295,25 @@ def score(
     Raises `InputError` for a recording that the protocol or the method cannot use, for unknown
     metrics and for those whose extra is missing.
     """
-    check_normalise(normalise)
-    return score_and_sample(recording, method, params, protocol, metrics, normalise, progress)[0]
+    asked = Asked(protocol, tuple(metrics), normalise, gap, moving)
+    return score_and_sample(recording, method, params, asked, progress)[0]
+
+
+@dataclasses.dataclass(frozen=True)
+class Asked:
+    """What is asked of a method, and how its images are scored; see `score`."""
+
+    protocol: str = "held-out"
+    metrics: tuple[str, ...] = ()
+    normalise: str = "none"
+    gap: int = GAP
+    moving: bool = False
+
+    def __post_init__(self):
+        check_normalise(self.normalise)
+        check_measures(self.metrics)
+        if self.moving and self.protocol != "held-out":
+            raise InputError(f"the protocol {self.protocol!r} gives all frames; omit moving")
 
 
 class ImageProtocol(Protocol):
@@ -254,8 +331,11 @@ class ImageProtocol(Protocol):
     def check(self, options: Mapping[str, Any]) -> None:
         check_measures(options.get("metrics", ()))
 
-    def label(self, own: Mapping[str, Any]) -> str:
-        return "" if own.get("normalise", "none") == "none" else ", brightness fitted"
+    def label(self, options: Mapping[str, Any]) -> str:
+        gap = options.get("gap", GAP)
+        hidden = "" if gap == GAP else f", gap {gap}"
+        fitted = "" if options.get("normalise", "none") == "none" else ", brightness fitted"
+        return hidden + fitted
 
     def score(
         self,
@@ -269,13 +349,27 @@ class ImageProtocol(Protocol):
             recording,
             method,
             params,
-            self.name,
-            options.get("metrics", ()),
-            options.get("normalise", "none"),
+            Asked(
+                self.name,
+                tuple(options.get("metrics", ())),
+                options.get("normalise", "none"),
+                options.get("gap", GAP),
+                options.get("moving", False),
+            ),
             progress,
             _known_as(Path(recording.name)),
         )
         return {**row, "sample": sample}
+
+
+class HeldOut(ImageProtocol):
+    """The protocol that hides frames; `gap` and `moving` as in `score`."""
+
+    settings = {
+        **ImageProtocol.settings,
+        "gap": (is_gap, A_GAP),
+        "moving": (lambda value: isinstance(value, bool), "true or false"),
+    }
 
 
 def _known_as(path: Path) -> str:
@@ -287,18 +381,13 @@ def score_and_sample(
     recording: Recording,
     method: ImageEstimator | External,
     params: FrameParams | None,
-    protocol: str,
-    metrics: Iterable[str],
-    normalise: str,
+    asked: Asked,
     progress: bool | None,
     name: str | None = None,
 ) -> tuple[dict[str, Any], Sample | None]:
     """As `score`, with the middle one of the images; `name` is by which images are found."""
-    if protocol not in PROTOCOLS:
-        raise InputError(f"there is no protocol {protocol!r}; {nearest(protocol, PROTOCOLS)}")
-    names = list(metrics)
-    check_measures(names)
-    given, hidden = PROTOCOLS[protocol](recording)
+    given, hidden = divide(recording, asked.protocol, asked.gap)
+    names, normalise = asked.metrics, asked.normalise
     hdr = hidden if isinstance(hidden, Reference) else None
     clock = time.perf_counter()
     seconds, estimated = 0.0, False  # whether the method estimates a variance
@@ -315,21 +404,18 @@ def score_and_sample(
     sample: Sample | None = None
     for first, images, variances in estimates:
         seconds += time.perf_counter() - clock
-        if hdr is None:
-            truths = hidden[first : first + len(images)].intensity
-        else:
-            truths = np.stack([hdr.truth(row) for row in range(first, first + len(images))])
-            if not scores:
-                estimated = normalise == "none" and not np.isnan(variances).all()
-        for row, (image, variance, truth) in enumerate(
-            zip(images, variances, truths, strict=True), first
-        ):
+        if not scores:
+            estimated = normalise == "none" and not np.isnan(variances).all()
+        for row, (image, variance) in enumerate(zip(images, variances, strict=True), first):
+            frame = hidden[row : row + 1]
+            truth = frame.intensity[0] if hdr is None else hdr.truth(row)
             if normalise == "affine":
                 image = fit_brightness(image, truth)
+            P = variance if estimated else None
             if hdr is None:
-                scores.append(_measures(image, truth, names))
+                moves = _moves(given, row, asked.gap) if asked.moving else None
+                scores.append(_measures(image, P, frame, names, I0, moves))
             else:
-                P = variance if estimated else None
                 scores.append(_hdr_measures(image, P, truth, names, hdr.clip, I0))
             t.append(int(hidden.t[row]))
             if row == len(hidden) // 2:
@@ -347,10 +433,21 @@ def score_and_sample(
         "events": len(recording.events),
         "seconds": None if external else seconds,
         **({} if normalise == "none" else {"normalise": normalise}),
+        **({} if asked.gap == GAP else {"gap": asked.gap}),
         "params": values,
         "per_frame": per_frame,
     }
     return row, sample
+
+
+def _moves(given: Recording, row: int, gap: int) -> NDArray[np.bool_]:
+    """Where the frames given before and after the hidden frame `row` differ."""
+    assert given.frames is not None
+    around = frames_around(given.frames, row, gap)
+    if around is None:
+        return np.zeros((given.height, given.width), bool)
+    before, after = given.frames[around[0] : around[1] + 1].intensity
+    return np.abs(after - before) > MOVING
 
 
 # The number of the first image, and some images with their variances, each (images, height, width).

@@ -290,6 +290,8 @@ COLUMNS: list[Column] = [
     ("bright MSE", "regions.bright.mse", 1, 3),
     ("dark log MSE", "regions.dark.log_mse", 1, 4),
     ("well MSE x 1e-2", "regions.well.mse", 100, 3),
+    ("moving MSE x 1e-2", "moving.mse", 100, 3),
+    ("moving share", "moving.share", 1, 4),
     ("LPIPS", "lpips", 1, 3),
     ("JOD", "hdr_quality", 1, 2),
     ("global SSIM", "global_ssim", 1, 3),
