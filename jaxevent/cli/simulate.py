@@ -15,10 +15,11 @@ def add(commands: Any) -> None:
         commands,
         run,
         "Make a recording whose truth is known, as HDF5. A simulated sensor looks at a drawn scene "
-        "of high dynamic range over which the camera moves, or at a video, of which the frames see "
-        "only the middle levels. Or events alone, of moving blobs. Or a camera that moves in a "
-        "rigid world.",
+        "of high dynamic range over which the camera moves, at objects that move on their own, or "
+        "at a video, of which the frames see only the middle levels. Or events alone, of moving "
+        "blobs. Or a camera that moves in a rigid world.",
         "--scene lake --speed fast --out lake.h5",
+        "--objects --speed 200 --seed 1 --out objects.h5",
         "--blobs lissajous --truth dot.csv --out dot.h5",
         "--motion rotation --change varying --truth spin.csv --out spin.h5",
         "bike.mp4 --cut 50 --speed 0.5 --out bike.h5",
@@ -31,6 +32,9 @@ def add(commands: Any) -> None:
         "--scene",
         metavar="NAME",
         help="room, forest, mountain, lake, night, tunnel, or a number for a variant of one",
+    )
+    source.add_argument(
+        "--objects", action="store_true", help="five textured objects before a moving background"
     )
     source.add_argument(
         "--blobs",
@@ -54,15 +58,15 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--speed",
         metavar="SPEED",
-        help="of the camera over a scene, slow (default) or fast; of a video, 2: twice as fast; of "
-        "--motion, px/s (planar), rad/s (rotation) or m/s",
+        help="of the camera over a scene, slow (default) or fast; of --objects, px/s, default 90; "
+        "of a video, 2: twice as fast; of --motion, px/s (planar), rad/s (rotation) or m/s",
     )
     one.add_argument(
         "--duration",
         metavar="S",
         type=float,
-        help="seconds of a scene, default 1.5, or of --motion, default 0.5; of the video, before "
-        "--speed, or of blobs, default all",
+        help="seconds of a scene, default 1.5, of --objects, default 1, or of --motion, default "
+        "0.5; of the video, before --speed, or of blobs, default all",
     )
     one.add_argument(
         "--truth",
@@ -75,7 +79,8 @@ def add(commands: Any) -> None:
         "--size",
         metavar="W,H",
         type=arguments.size,
-        help="sensor size in pixels; default: 128,96 for a scene, 240,180 for --motion",
+        help="sensor size in pixels; default: 128,96 for a scene, 160,120 for --objects, 240,180 "
+        "for --motion",
     )
     group = one.add_argument_group("only for --motion")
     group.add_argument(
@@ -102,6 +107,7 @@ def add(commands: Any) -> None:
 def run(
     video: Path | None,
     scene: str | None,
+    objects: bool,
     blobs: str | None,
     motion: str | None,
     change: str | None,
@@ -156,10 +162,15 @@ def run(
     given = {name: value for name, value in given.items() if value is not None}
     # Opened first, so that a place that cannot be written is told before the work.
     with complete(out) as partial:
-        if scene is not None:
-            if given:
-                option = next(iter(given)).replace("_", "-")
-                raise InputError(f"--{option} is for a video; leave it out with --scene")
+        if given and (scene is not None or objects):
+            option = next(iter(given)).replace("_", "-")
+            what = "--objects" if objects else "--scene"
+            raise InputError(f"--{option} is for a video; leave it out with {what}")
+        if objects:
+            pace = _pace(speed, "200")
+            moving = sim.Objects(size or (160, 120), duration or 1.0, pace or 90.0, seed=seed)
+            recording = sim.simulate(moving, sim.SENSORS[sensor], seed, "objects")
+        elif scene is not None:
             way: Any = speed or "slow"
             if way not in SPEEDS:
                 raise InputError(f"--speed {way} is not possible for a scene; give slow or fast")
@@ -169,7 +180,9 @@ def run(
         else:
             assert video is not None
             if size is not None:
-                raise InputError("--size is for a scene; scale a video with --max-size")
+                raise InputError(
+                    "--size is for a scene or --objects; scale a video with --max-size"
+                )
             try:
                 factor = float(speed or 1)
             except ValueError:
@@ -207,6 +220,19 @@ def _simulate_blobs(
     print_stored(recording, out)
 
 
+def _pace(speed: str | None, example: str) -> float | None:
+    """The number that --speed gives; raises `InputError` for what is none above 0."""
+    try:
+        pace = None if speed is None else float(speed)
+    except ValueError:
+        pace = math.nan
+    if pace is not None and not 0 < pace < math.inf:
+        raise InputError(
+            f"--speed {speed} is not possible; give a number above 0, such as {example}"
+        )
+    return pace
+
+
 def _simulate_motion(
     name: str,
     truth: Path | None,
@@ -227,12 +253,7 @@ def _simulate_motion(
     from jaxevent.show.motion import write_known
     from jaxevent.simulate import SENSORS, motion_scene
 
-    try:
-        pace = None if speed is None else float(speed)
-    except ValueError:
-        pace = math.nan
-    if pace is not None and not 0 < pace < math.inf:
-        raise InputError(f"--speed {speed} is not possible; give a number above 0, such as 1.5")
+    pace = _pace(speed, "1.5")
     with contextlib.ExitStack() as stack:
         partial = stack.enter_context(complete(out))
         table = None if truth is None else stack.enter_context(complete(truth))

@@ -17,11 +17,11 @@ from jaxevent.camera import Response
 from jaxevent.errors import InputError, require
 from jaxevent.estimator import Described, Estimate
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.clock import Clock, Timing
+from jaxevent.reconstruction.clock import Clock, Timing, time_span
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.reconstruction.video import BATCH, ImageSequence
-from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.recording import Recording, Times, check_times, microseconds
 
 SMALLEST = 12  # pixels that OpenCV's search needs in width or height
 OUTLIERS = 1e-3  # of the greys of two frames, at either end, that do not set the range
@@ -63,6 +63,10 @@ class Pair(NamedTuple):
             return self.before
         moved = _warp(self.before, s * self.there), _warp(self.after, (1 - s) * self.back)
         return (1 - s) * moved[0] + s * moved[1]
+
+    def flow(self, share: float | int) -> NDArray[np.floating]:
+        """The flow (H, W, 2) at that time, pixels from the one frame to the other."""
+        return (1 - share) * self.there - share * self.back
 
 
 def _warp(image: NDArray[np.floating], flow: NDArray[np.float32]) -> NDArray[np.floating]:
@@ -155,12 +159,35 @@ class FlowVideo(ImageSequence[Params]):
             images = np.stack([self._image(int(frame), float(share)) for frame, share in places])
             yield times[batch], _estimate(images)
 
+    def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.floating]:
+        """The flow (T, H, W, 2) in px/s, x before y, at times as images are asked for; any order.
+
+        It is that along which images are made. Outside the frames nothing is known to move: NaN.
+        """
+        times = np.atleast_1d(microseconds(times))
+        if not extrapolate:
+            span = time_span(self.recording, self.params.clock_offset)
+            check_times(times, *span, self.recording.name)
+        moments = _moments(self._clock, times)
+        shape = (len(times), self.recording.height, self.recording.width, 2)
+        flows = np.full(shape, np.nan, self._dtype)
+        since = times - self._clock.origin
+        for row in np.argsort(times, kind="stable"):
+            frame = int(moments.frame[row])
+            if self._clock.mid[0] <= since[row] and frame + 1 < len(self._clock):
+                seconds = float(self._clock.mid[frame + 1] - self._clock.mid[frame]) * 1e-6
+                flows[row] = self._between(frame).flow(float(moments.share[row])) / seconds
+        return flows
+
     def _image(self, frame: int, share: float) -> NDArray[np.floating]:
         if share == 0:
             return self._frames.read(slice(frame, frame + 1)).intensity[0]
+        return self._between(frame).at(share)
+
+    def _between(self, frame: int) -> Pair:
         if self._pair is None or self._pair[0] != frame:
             self._pair = frame, make_pair(self._frames.read(slice(frame, frame + 2)), 0)
-        return self._pair[1].at(share)
+        return self._pair[1]
 
 
 def _moments(clock: Clock, times: NDArray[np.int64]) -> Moments:

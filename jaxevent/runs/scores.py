@@ -68,7 +68,7 @@ MOVING = 0.05  # of white, by which frames differ where something moves
 Scores = dict[str, Any]
 
 
-def _measures(
+def hidden_scores(
     image: NDArray,
     variance: NDArray | None,
     truth: Frames,
@@ -76,7 +76,11 @@ def _measures(
     I0: float,
     moving: NDArray[np.bool_] | None,
 ) -> Scores:
-    """The scores of a hidden frame, a `Frames` of one; intensities are clipped to [0, 1]."""
+    """The scores of an image in the place of a hidden frame, a `Frames` of one; see `score`.
+
+    `names` are those of further measures; `variance` is that of ln(I + I0), None where none is
+    judged; `moving` is where something moves, None where that is not asked.
+    """
     shown, true = np.clip(image, 0, 1), truth.intensity[0]
     measures = {"mse": mse, "ssim": ssim, **{name: MEASURES[name] for name in names}}
     broken = not np.isfinite(shown).all()
@@ -413,8 +417,8 @@ def score_and_sample(
                 image = fit_brightness(image, truth)
             P = variance if estimated else None
             if hdr is None:
-                moves = _moves(given, row, asked.gap) if asked.moving else None
-                scores.append(_measures(image, P, frame, names, I0, moves))
+                where = moves(given, row, asked.gap) if asked.moving else None
+                scores.append(hidden_scores(image, P, frame, names, I0, where))
             else:
                 scores.append(_hdr_measures(image, P, truth, names, hdr.clip, I0))
             t.append(int(hidden.t[row]))
@@ -440,7 +444,7 @@ def score_and_sample(
     return row, sample
 
 
-def _moves(given: Recording, row: int, gap: int) -> NDArray[np.bool_]:
+def moves(given: Recording, row: int, gap: int) -> NDArray[np.bool_]:
     """Where the frames given before and after the hidden frame `row` differ."""
     assert given.frames is not None
     around = frames_around(given.frames, row, gap)

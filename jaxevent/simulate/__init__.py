@@ -4,6 +4,12 @@
     recording = jaxevent.simulate.simulate(jaxevent.simulate.Pan(panorama, speed="fast"))
     recording.extra["hdr"], recording.extra["hdr_t"]  # the truth, and when
 
+Objects that move on their own, with the true optical flow of every pixel:
+
+    objects = jaxevent.simulate.Objects(speed=90, seed=1)
+    recording = jaxevent.simulate.simulate(objects)
+    objects.flow(0.2)  # (height, width, 2), px/s
+
 Moving blobs, discs and lights, events only:
 
     recording, truth = jaxevent.simulate.blob_scene("lissajous")
@@ -42,6 +48,7 @@ from jaxevent.simulate.motion import (
     simulate_motion,
     texture_of,
 )
+from jaxevent.simulate.objects import Objects
 from jaxevent.simulate.scenes import FITTING, SCENES, TESTING, Pan, Source, scene
 from jaxevent.simulate.video import Clip, from_video
 
@@ -60,6 +67,7 @@ __all__ = [
     "Lissajous",
     "Motion",
     "MovingCamera",
+    "Objects",
     "Pan",
     "Patch",
     "RandomWalk",

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import zlib
 from collections.abc import Callable
-from typing import Any, Literal, Protocol, get_args, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -268,7 +268,8 @@ class Pan:
     """A camera that moves over a panorama: a `Source`.
 
     The heading swings by 2 rad about left or right within 1.6 s and the speed by a third, 20 to
-    40 px/s ("slow") or 200 to 400 px/s ("fast"); the camera rolls by 5 degrees and zooms by 4 %.
+    40 px/s ("slow") or 200 to 400 px/s ("fast"), or about a number given in px/s; the camera rolls
+    by 5 degrees and zooms by 4 %.
     Of 64 random places it starts where its way is most evenly bright (I > 1), dark (I < 0.05) and
     between. ln intensity is interpolated by cubic splines; beyond the panorama's edges it is
     repeated sideways and mirrored up and down. Deterministic in `seed`.
@@ -278,14 +279,18 @@ class Pan:
     panorama: NDArray[np.float64]
     size: tuple[int, int] = (128, 96)  # width, height
     duration: float | int = 1.5  # s
-    speed: Speed = "slow"
+    speed: Speed | float | int = "slow"  # or px/s
     seed: int = 0
 
     def __post_init__(self) -> None:
         if self.panorama.ndim != 2 or not (self.panorama > 0).all():
             raise InputError("a panorama needs positive intensities of shape (height, width)")
-        if self.speed not in get_args(Speed):
-            raise InputError(f"there is no speed {self.speed!r}; choose slow or fast")
+        if self.speed not in SPEEDS and not (
+            isinstance(self.speed, float | int) and 0 <= self.speed < np.inf
+        ):
+            raise InputError(
+                f"there is no speed {self.speed!r}; choose slow, fast or a number of px/s"
+            )
 
     def intensity(self, t: float | int) -> NDArray[np.float64]:
         width, height = self.size
@@ -314,7 +319,8 @@ class Pan:
         t = np.linspace(0, self.duration, max(8, int(self.duration * 200)))
         bearing, swing, _, pace = self._phases
         bearing = 0.0 if bearing < np.pi else np.pi
-        speed = SPEEDS[self.speed] * (1 + np.sin(2 * np.pi * t / 1.1 + pace) / 3)
+        mean = SPEEDS[self.speed] if isinstance(self.speed, str) else self.speed
+        speed = mean * (1 + np.sin(2 * np.pi * t / 1.1 + pace) / 3)
         heading = bearing + 2 * np.sin(2 * np.pi * t / 1.6 + swing)
         velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1)
         path = CubicSpline(t, velocity).antiderivative()

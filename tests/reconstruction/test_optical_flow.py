@@ -123,6 +123,18 @@ def test_estimate_is_prepare_run_read(cv2):
     assert "\n" not in repr(features) + repr(trajectory)
 
 
+def test_flow_is_the_velocity(cv2):
+    video = jaxevent.flow.estimate(translated(), jaxevent.flow.Params(clock_offset=0.001))
+    times = np.array([47_000, 1_000, 30_000, 500, 61_000])
+    flow = video.flow(times)
+    assert flow.shape == (5, *SIZE, 2) and np.isnan(flow[3:]).all()
+    expected = np.array([STEP[1], STEP[0]]) / 0.02
+    np.testing.assert_allclose(np.median(flow[:3], axis=(1, 2)), [expected] * 3, atol=5)
+    np.testing.assert_array_equal(video.flow(47_000)[0], flow[0])
+    with pytest.raises(jaxevent.InputError, match="integers are microseconds"):
+        video.flow([64_000])
+
+
 def test_what_cannot_be_used_is_said(cv2):
     with pytest.raises(jaxevent.InputError, match="holds no frames"):
         jaxevent.flow.estimate(dataclasses.replace(small(), frames=None))
