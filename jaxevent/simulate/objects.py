@@ -111,7 +111,7 @@ class Objects:
                 "and at least 32x32 pixels"
             )
 
-    def intensity(self, t: float | int) -> NDArray[np.floating]:
+    def intensity(self, t: float | int) -> NDArray[np.float64]:
         """Linear intensity (height, width) at t seconds."""
         y, x = self._grid
         image: Any = None
