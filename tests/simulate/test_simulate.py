@@ -282,7 +282,15 @@ def test_a_pan_looks_where_it_says():
         np.testing.assert_allclose(np.log(pan.intensity(t)), level(px, py), atol=2e-3)
 
 
-@pytest.mark.parametrize("speed, least, most", [("slow", 20, 40), ("fast", 200, 400)])
+def test_speeds_that_a_pan_cannot_have():
+    for speed in (-1.0, np.inf):
+        with pytest.raises(jaxevent.InputError, match="choose slow, fast or a number of px/s"):
+            sim.Pan(np.ones((80, 120)), (20, 20), speed=speed)
+
+
+@pytest.mark.parametrize(
+    "speed, least, most", [("slow", 20, 40), ("fast", 200, 400), (90.0, 60, 120)]
+)
 def test_pans_keep_their_speed_and_turn(speed, least, most):
     pan = sim.Pan(sim.scene("room", size=(120, 80)), (20, 20), 1.5, speed)
     position = np.array([pan.pose(t)[0] for t in np.linspace(0, 1.5, 1501)])
