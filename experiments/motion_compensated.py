@@ -271,15 +271,18 @@ def objects_at(folder: Path, rate: float, seed: int) -> tuple[Objects, Recording
     return source, recorded(file, source, sensor(rate), seed)
 
 
-def fitted_to_objects(folder: Path, rate: float) -> Path:
-    """The folder of a fit to objects of the seeds for choosing."""
-    out = folder / f"fitted_{rate:g}Hz"
+def fitted_to_objects(folder: Path) -> Path:
+    """The folder of a fit to objects of the seeds for choosing, with few frames.
+
+    One sensor is simulated; its parameters do not depend on how many frames it takes.
+    """
+    out, rate = folder / "fitted_to_objects", RATES[0]
     if not (out / "params.toml").exists():
         names = []
         for seed in CHOOSING:
             objects_at(folder, rate, seed)
             names.append(f'"recordings/objects_{rate:g}Hz_{seed}.h5"')
-        config = folder / f"fit_{rate:g}Hz.toml"
+        config = folder / "fit_to_objects.toml"
         config.write_text(FIT.format(recordings=", ".join(names)))
         fit(config, out, resume=(out / "checkpoint").exists(), progress=sys.stderr.isatty())
     return out
@@ -301,8 +304,8 @@ def halfway(recording: Recording, count: int) -> NDArray[np.int64]:
 
 def objects(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> None:
     """Score images halfway between frames."""
+    methods = fits(fitted_to_objects(folder))
     for rate in RATES:
-        methods = fits(fitted_to_objects(folder, rate))
         for seed in tqdm(SCORING, desc=f"objects, {rate:g} Hz", disable=not sys.stderr.isatty()):
             source, recording = objects_at(folder, rate, seed)
             truth = truth_of(source, halfway(recording, 6))
@@ -317,7 +320,7 @@ def panorama() -> NDArray[np.float64]:
 
 def blur(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> None:
     """Score images at the middles of long exposures, and halfway between frames."""
-    methods = fits(fitted_to_objects(folder, RATES[0]))
+    methods = fits(fitted_to_objects(folder))
     light, seed = panorama(), SCORING[0]
     cells = [(kind, e, v) for kind in ("pan", "objects") for e in BLURS[0] for v in BLURS[1]]
     for kind, exposure, speed in tqdm(cells, desc="blur", disable=not sys.stderr.isatty()):
@@ -350,9 +353,9 @@ def flow_errors(
 
 def dense_flow(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> None:
     """Score flows, in px per frame: halfway between frames, and from each to the next."""
+    methods = fits(fitted_to_objects(folder))
+    methods = {n: (m, p) for n, (m, p) in methods.items() if n in ("flow", "mc")}
     for rate in RATES:
-        methods = fits(fitted_to_objects(folder, rate))
-        methods = {n: (m, p) for n, (m, p) in methods.items() if n in ("flow", "mc")}
         for seed in tqdm(SCORING, desc=f"flow, {rate:g} Hz", disable=not sys.stderr.isatty()):
             source, recording = objects_at(folder, rate, seed)
             score = _flow_scorer(source, recording, halfway(recording, 6), 1 / rate)
