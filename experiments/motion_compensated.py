@@ -41,7 +41,7 @@ from jaxevent.runs.scores import hidden_scores, moves
 from jaxevent.simulate import SENSORS, Objects, Pan, Source, scene, simulate
 
 METHODS = ("blend", "flow", "edi", "akf", "aks", "mc")
-LIKELIHOOD = "aks, likelihood"  # the label of the smoother in a fit's parameters
+LIKELIHOOD = "aks, likelihood"  # the label of the smoother in a fit to slider_depth
 SHARED = ("c_on", "c_off", "I0", "clock_offset", "rho_ref")  # what every method takes from it
 CHOOSING, SCORING = (1, 2, 3), (101, 102, 103)  # seeds
 RATES = (25.0, 100.0)  # Hz
@@ -61,10 +61,11 @@ name = "akf"
 params = {{ c_on = 0.2, c_off = 0.18, rho_ref = 5e-4, I0 = 0.1 }}
 fit = ["c_on", "c_off", "I0", "kappa", "w_min", "sigma_iso", "sigma_proc", "sigma_ref"]
 
+# The likelihood of hidden frames: that of given ones makes sigma_floor 0.05, and the error twice
+# that of the values to start from.
 [[method]]
 name = "aks"
-label = "aks, likelihood"
-loss = "likelihood"
+error = "nll"
 params = {{ c_on = 0.2, c_off = 0.18, rho_ref = 5e-4, I0 = 0.1, w_min = 0.6 }}
 fit = ["c_on", "c_off", "sigma_event", "sigma_bg", "sigma_frame", "sigma_floor", "share"]
 """
@@ -84,12 +85,13 @@ class Compensated:
 def chosen(names: Iterable[str], fitted: Path, compensated: Compensated) -> Chosen:
     """Methods and their parameters, from a fit's folder.
 
-    What it did not fit has the smoother's thresholds, offset and dead time. `mc` has all numbers
-    of the smoother that it knows, and the others of its own file.
+    The smoother is that fitted to the likelihood, if there is one. What the fit does not have has
+    the smoother's thresholds, offset and dead time. `mc` has all numbers of the smoother that it
+    knows, and the others of its own file.
     """
     file = fitted / "params.toml"
     labels = read_toml(file)
-    smoother = jaxevent.aks.Params.load(file, LIKELIHOOD)
+    smoother = jaxevent.aks.Params.load(file, LIKELIHOOD if LIKELIHOOD in labels else "aks")
     values = smoother.values()
     found: dict[str, tuple[Any, Parameters]] = {}
     for name in names:
