@@ -1,7 +1,10 @@
 """How loops over events are compiled for the host."""
 
+import functools
 import inspect
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numba
@@ -10,3 +13,26 @@ import numba
 def compiled(function: Callable) -> Any:
     """Compile with numba, without the argument checks that tests wrap around functions."""
     return numba.njit(cache=True, nogil=True)(inspect.unwrap(function))
+
+
+THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@functools.cache
+def _workers() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(THREADS)
+
+
+def over_rows(kernel: Callable, rows: int, *args: Any) -> None:
+    """Call `kernel(begin, end, *args)` for parts of the rows, each on a thread of its own.
+
+    Kernels release the interpreter's lock. What they compute must not depend on the parts.
+    """
+    parts = min(THREADS, rows)
+    if parts <= 1:
+        kernel(0, rows, *args)
+        return
+    edges = [rows * part // parts for part in range(parts + 1)]
+    jobs = [_workers().submit(kernel, *edges[k : k + 2], *args) for k in range(parts)]
+    for job in jobs:
+        job.result()
