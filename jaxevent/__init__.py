@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         flow,
         high_pass,
         last_frame,
+        mc,
     )
     from jaxevent.recording import Events, Frames, Recording
     from jaxevent.runs.evaluate import evaluate
@@ -49,7 +50,7 @@ _HOMES = {
     "jaxevent.parameters": ("Parameters",),
     "jaxevent.reconstruction": (
         *("akf", "aks", "augmented", "blend", "cf", "cf_augmented", "edi", "high_pass"),
-        *("flow", "last_frame"),
+        *("flow", "last_frame", "mc"),
     ),
     "jaxevent.recording": ("Events", "Frames", "Recording"),
     "jaxevent.runs.evaluate": ("evaluate",),
@@ -89,6 +90,7 @@ __all__ = [
     "high_pass",
     "last_frame",
     "load",
+    "mc",
     "metrics",
     "optimise",
     "register",

@@ -22,6 +22,7 @@ HOMES = {
         "flow": "jaxevent.reconstruction.optical_flow:flow",
         "blend": "jaxevent.reconstruction.direct:blend",
         "last-frame": "jaxevent.reconstruction.direct:last_frame",
+        "mc": "jaxevent.reconstruction.compensated:mc",
     },
     "blob": {
         "moment": "jaxevent.blob:moment",

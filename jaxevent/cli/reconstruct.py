@@ -26,8 +26,8 @@ def add(commands: Any) -> None:
         "--method",
         metavar="NAME",
         required=True,
-        help="akf, aks, cf, cf-augmented, high-pass, edi, augmented, flow, blend, last-frame, or "
-        "package.module:object of your own",
+        help="mc, akf, aks, cf, cf-augmented, high-pass, edi, augmented, flow, blend, last-frame, "
+        "or package.module:object of your own",
     )
     when = one.add_mutually_exclusive_group()
     when.add_argument("--rate", metavar="HZ", type=float, help="images per second, evenly spaced")

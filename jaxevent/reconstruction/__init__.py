@@ -1,5 +1,6 @@
 """Video from events and frames: the asynchronous Kalman filter and its baselines."""
 
+from jaxevent.reconstruction.compensated import mc
 from jaxevent.reconstruction.complementary import cf, cf_augmented, high_pass
 from jaxevent.reconstruction.direct import augmented, blend, edi, last_frame
 from jaxevent.reconstruction.kalman import akf
@@ -17,4 +18,5 @@ __all__ = [
     "flow",
     "high_pass",
     "last_frame",
+    "mc",
 ]

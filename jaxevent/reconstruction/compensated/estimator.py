@@ -1,0 +1,358 @@
+"""The motion-compensated reconstruction: the method `mc` and its video.
+
+Per-pixel estimators ignore that all pixels that see a scene point see the same brightness, and
+interpolation between frames ignores the events. Here both speak: the smoother's images at instants
+around a target time, frames among them, show how the points visible at the target move
+(`trajectories`), and along these paths they are fused (`fusion`).
+"""
+
+import collections
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError
+from jaxevent.estimator import Described, Estimate
+from jaxevent.reconstruction.clock import Clock, Timing, time_span
+from jaxevent.reconstruction.compensated import trajectories
+from jaxevent.reconstruction.compensated.evidence import Evidence
+from jaxevent.reconstruction.compensated.fusion import SOURCES, Fused, Place, fuse
+from jaxevent.reconstruction.compensated.instants import ROOM, Instants, Schedule, speed_of
+from jaxevent.reconstruction.compensated.parameters import Params
+from jaxevent.reconstruction.compensated.warping import Along, warp, warp_purely
+from jaxevent.reconstruction.estimator import ImageEstimator
+from jaxevent.reconstruction.features import Features, Numeric, ReadOut
+from jaxevent.reconstruction.video import ImageSequence, Video
+from jaxevent.reconstruction.windows import WINDOW_EVENTS, prepare
+from jaxevent.recording import Recording, Times, check_times, microseconds
+
+PROBES = 6  # instants at which the speed of the image is measured
+KEPT = 96  # images of instants that a video remembers
+FADE = 0.35  # of variances from one resolution to the half of it
+INFLATE = 3.0  # of the variance of an image that motion is refined with
+
+evidence = Evidence("evidence", Params)  # reads images at single instants
+
+
+class Targets(Described):
+    """Images to be read: where their instants lie, and how their points move."""
+
+    instants: ReadOut  # all instants of all targets, sorted
+    rows: Int[Numeric, "times k"]  # of each target's instants
+    place: Place  # each (times, k) or (times,)
+    p: Float[Numeric, "times rows columns 4"]  # trajectories
+
+    def images(self, rows: NDArray) -> "Targets":
+        """Those of its images, in that order."""
+        chosen = jax.tree.map(lambda leaf: leaf[rows], (self.rows, self.place, self.p))
+        return Targets(self.instants, *chosen)
+
+    def over(self, devices: Sequence[Any]) -> "Targets":
+        """The same: pixels read each other and are not shared out."""
+        return self
+
+
+class Images:
+    """The smoother's images at any instants of a recording, the latest ones remembered."""
+
+    def __init__(self, recording: Recording, params: Params, window_events: int):
+        self._video = Video(
+            evidence, recording, params, window_events=window_events, progress=False
+        )
+        self._kept: collections.OrderedDict[int, Estimate] = collections.OrderedDict()
+
+    @property
+    def dtype(self) -> np.dtype:
+        return self._video.dtype
+
+    def fetch(self, times: NDArray[np.int64]) -> None:
+        """Read those of the sorted times that are not remembered."""
+        missing = np.array([t for t in times.tolist() if t not in self._kept], np.int64)
+        for t in times.tolist():
+            if t in self._kept:
+                self._kept.move_to_end(t)
+        for batch, part in self._video.batches(missing, extrapolate=True):
+            for n, t in enumerate(batch.tolist()):
+                image = Estimate(*(np.array(v[n], np.float32) for v in part))
+                self._kept[t] = image
+        while len(self._kept) > max(KEPT, len(times)):
+            self._kept.popitem(last=False)
+
+    def __call__(self, times: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
+        """L, V and clear, each (times, h, w) float32."""
+        self.fetch(times)
+        chosen = [self._kept[t] for t in times.tolist()]
+        L, V, clear = (np.stack(part) for part in zip(*chosen, strict=True))
+        return L, V, clear
+
+
+def schedule_of(recording: Recording, params: Params, images: Images) -> Schedule:
+    """The schedule for a recording, by the speed of its image."""
+    clock = Clock.of(recording, Timing.of(params))
+    # The first whole microsecond at which a frame is the one before.
+    frames = np.ceil(clock.mid).astype(np.int64) + clock.origin
+    first, last = time_span(recording, params.clock_offset)
+    lag = int(np.median(np.diff(frames)) / 4) if len(frames) > 1 else 5000
+    inner = first + np.linspace(0, max(last - lag - first, 0), PROBES + 2)[1:-1].astype(np.int64)
+
+    def logs(times: NDArray[np.int64]) -> NDArray:
+        order = np.argsort(times, kind="stable")
+        L = images(times[order])[0]
+        return L[np.argsort(order, kind="stable")]
+
+    return Schedule(frames, (first, last), speed_of(logs, inner, max(lag, 400)))
+
+
+def estimate_motion(
+    params: Params,
+    instants: Instants,
+    L: NDArray,
+    V: NDArray,
+    clear: NDArray,
+    start: NDArray | None = None,
+) -> NDArray[np.float32]:
+    """Trajectories (rows, columns, 4) of a target, px at s = 1, from images at its instants.
+
+    `start` is that of a target close by, which a few steps improve.
+    """
+    size = L.shape[1:]
+    s, own = instants.s, instants.own
+    smoothness = trajectories.Smoothness(
+        *(float(v) for v in (params.smooth, params.jump, params.edge, params.straight))
+    )
+    caution, floor, nu = (float(v) for v in (params.caution, params.floor, params.robust))
+    doubted = (V * np.where(clear > 0, 1, caution)).astype(np.float32)
+    settings = (floor, nu, smoothness)
+    pyramid = trajectories.Pyramid(L, doubted, FADE)
+    if start is None:
+        motion = trajectories.follow(
+            pyramid, s, None, trajectories.stages(s, instants.first), *settings
+        )
+    else:
+        plan = [trajectories.Stage(1.0, (1,), 2)]
+        motion = trajectories.follow(pyramid, s, trajectories.Motion(start, 0), plan, *settings)
+    p = motion.at(0, *size).p
+    # The target's own image is the smoother's. What is fused so far is a better one to refine with.
+    fused = fuse_images(params, instants, L, V, clear, p)
+    L, doubted = L.copy(), doubted.copy()
+    L[own] = fused.L
+    doubted[own] = INFLATE * np.asarray(fused.P) + floor
+    packed = trajectories.pack(L, doubted)
+    for _ in range(2):
+        p = trajectories.step(packed, s, p, *settings)
+    return p
+
+
+def place_of(instants: Instants, clear: NDArray, room: int) -> Place:
+    """A target's instants for `fuse`, filled up to a number of `room`."""
+    count = len(instants)
+    framed: NDArray = clear.reshape(count, -1).max(1) > 0
+    framed[[instants.before, instants.after]] |= instants.before != instants.after
+    order = np.argsort(np.abs(instants.s), kind="stable")
+    near = np.zeros(count, bool)
+    near[[k for k in order if k == instants.own or not framed[k]][:5]] = True
+    near[instants.own] = True
+
+    def filled(values: NDArray, rest: float | int) -> NDArray:
+        return np.concatenate([values, np.full(room - count, rest)]).astype(np.float32)
+
+    ones = np.ones(count)
+    return Place(
+        filled(instants.s, 1),
+        filled(ones, 0),
+        filled(framed, 0),
+        filled(near, 0),
+        *(np.asarray(k, np.int32) for k in (instants.own, instants.before, instants.after)),
+    )
+
+
+@jax.jit
+def _fuse(params: Params, L, V, along, place) -> Fused:
+    return fuse(params, L, V, along, place)
+
+
+def filled(images: NDArray, room: int) -> NDArray:
+    """Images (K, ...) filled up with zeros to the number `room`."""
+    rest = np.zeros((room - len(images), *images.shape[1:]), images.dtype)
+    return np.concatenate([images, rest]) if len(rest) else images
+
+
+def gather(
+    instants: Instants, L: NDArray, V: NDArray, clear: NDArray, p: NDArray
+) -> tuple[NDArray, NDArray, Along, Place]:
+    """What `fusion` takes besides params: the images, those along trajectories, their place."""
+    along = warp(L, V, np.asarray(clear, np.float32), instants.s, p)
+    room = -(-len(instants) // ROOM) * ROOM
+    place = place_of(instants, clear, room)
+    whole = Along(*(filled(part, room) for part in along))
+    return filled(L, room), filled(V, room), whole, place
+
+
+def fuse_images(
+    params: Params, instants: Instants, L: NDArray, V: NDArray, clear: NDArray, p: NDArray
+) -> Fused:
+    """The images at a target's instants along trajectories, in one."""
+    return _fuse(params, *gather(instants, L, V, clear, p))
+
+
+class CompensatedVideo(ImageSequence[Params]):
+    """Images of `mc`: `image, variance, valid = video(times)`; also `flow` and `sources`.
+
+    The smoother's images are read as `Video` reads them, in constant memory. Images do not depend
+    on which other images were asked for.
+    """
+
+    def __init__(
+        self,
+        estimator: Any,
+        recording: Recording,
+        params: Params,
+        *,
+        window_events: int = WINDOW_EVENTS,
+        progress: bool | None = None,
+    ):
+        super().__init__(estimator, recording, params, progress=progress)
+        self._images = Images(recording, params, window_events)
+        self._schedule: Schedule | None = None
+
+    @property
+    def dtype(self) -> np.dtype:
+        return self._images.dtype
+
+    @property
+    def schedule(self) -> Schedule:
+        """Which instants are looked at; made when first asked for."""
+        if self._schedule is None:
+            self._schedule = schedule_of(self.recording, self.params, self._images)
+        return self._schedule
+
+    def _target(self, t: int) -> tuple[Instants, NDArray[np.float32], Fused]:
+        instants = self.schedule(t)
+        L, V, clear = self._images(instants.t)
+        p = estimate_motion(self.params, instants, L, V, clear)
+        return instants, p, fuse_images(self.params, instants, L, V, clear, p)
+
+    def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
+        for n, t in enumerate(times.tolist()):
+            _, _, fused = self._target(t)
+            image = np.exp(np.asarray(fused.L)) - np.asarray(self.params.I0)
+            whole = (image.astype(self.dtype), np.asarray(fused.P, self.dtype), np.isfinite(image))
+            yield times[n : n + 1], tuple(v[None] for v in whole)
+
+    def _checked(self, times: Times) -> NDArray[np.int64]:
+        times = np.atleast_1d(microseconds(times))
+        span = time_span(self.recording, self.params.clock_offset)
+        check_times(np.sort(times), *span, self.recording.name)
+        return times
+
+    def flow(self, times: Times) -> NDArray[np.float32]:
+        """Optical flow (T, H, W, 2) at `times`, of x and y in px/s, of the points visible then."""
+        found = []
+        for t in self._checked(times).tolist():
+            instants, p, _ = self._target(t)
+            size = (self.recording.height, self.recording.width)
+            found.append(trajectories.velocity(p, size) / np.float32(instants.unit))
+        return np.stack(found)
+
+    def sources(self, times: Times) -> dict[str, NDArray[np.float32]]:
+        """Where each pixel of the images comes from: shares (T, H, W) whose sum is 1.
+
+        "before" and "after" are frames along trajectories, "events" instants without frame along
+        trajectories, "smoothed" the pixel's own smoother and "blend" the frames blended in place.
+        `visible_before` and `visible_after`, 0 to 1, tell whether the frames next to the target
+        show the point.
+        """
+        found = [self._target(t)[2] for t in self._checked(times).tolist()]
+        shares = {name: [one.sources[k] for one in found] for k, name in enumerate(SOURCES)}
+        shares["visible_before"] = [one.visible[0] for one in found]
+        shares["visible_after"] = [one.visible[1] for one in found]
+        return {name: np.stack(images).astype(np.float32) for name, images in shares.items()}
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class MotionCompensated(ImageEstimator[Params]):
+    """The estimator of this package."""
+
+    options: frozenset[str] = dataclasses.field(default=frozenset({"window_events"}), kw_only=True)
+
+    def prepare(
+        self,
+        recording: Recording,
+        times: Times,
+        params: Params | None = None,
+        *,
+        extrapolate: bool = False,
+    ) -> tuple[Features, Targets]:
+        """As `ImageEstimator.prepare`; motion is estimated here, with the params given."""
+        self.check(recording)
+        params = self.Params() if params is None else params
+        wanted = np.atleast_1d(microseconds(times))
+        if not extrapolate:
+            self.check_span(recording, wanted, params)
+        images = Images(recording, params, WINDOW_EVENTS)
+        schedule = schedule_of(recording, params, images)
+        if not len(wanted):
+            raise InputError(f"{recording.name}: no times to prepare images for; give some")
+        chosen = [schedule(t) for t in wanted.tolist()]
+        room = -(-max(len(one) for one in chosen) // ROOM) * ROOM
+        every = np.unique(np.concatenate([one.t for one in chosen]))
+        features, instants = prepare(recording, every, Timing.of(params), filtering=False)
+        shape = (len(chosen), *trajectories.nodes(recording.height, recording.width, 0), 4)
+        rows, p = np.zeros((len(chosen), room), np.int32), np.zeros(shape, np.float32)
+        places = []
+        for n, one in enumerate(chosen):
+            L, V, clear = images(one.t)
+            p[n] = estimate_motion(params, one, L, V, clear)
+            rows[n, : len(one)] = np.searchsorted(every, one.t)
+            places.append(place_of(one, clear, room))
+        place = jax.tree.map(lambda *leaves: np.stack(leaves), *places)
+        return features, jax.device_put(Targets(instants, rows, place, p))
+
+    def run(self, params: Params, features: Features, state: Any = None) -> tuple[Any, Any]:
+        """Smooth each pixel; pure. `state` is what the window before returned."""
+        return evidence.run(params, features, state)
+
+    def read(self, params: Params, trajectory: Any, out: Targets) -> Estimate:
+        """The images prepared in `out`; the motion is what `prepare` found."""
+        L, V, clear = evidence.read(params, trajectory, out.instants)
+        width = trajectory.passage.frames.width
+        L, V, clear = (v.reshape(len(v), -1, width) for v in (L, V, clear.astype(L.dtype)))
+
+        @jax.checkpoint
+        def one(target: tuple) -> tuple[Array, Array]:
+            rows, place, p = target
+            images = (L[rows], V[rows], clear[rows])
+            along = warp_purely(*images, place.s, p)
+            fused = fuse(params, images[0], images[1], along, place)
+            return fused.L, fused.P
+
+        found, P = jax.lax.map(one, (out.rows, out.place, out.p))
+        image = (jnp.exp(found) - params.I0).reshape(len(found), -1)
+        return Estimate(image, P.reshape(image.shape), jnp.isfinite(image))
+
+    def estimate(
+        self, recording: Recording, params: Params | None = None, **options: Any
+    ) -> CompensatedVideo:
+        """Video of a recording: `image, variance, valid = mc.estimate(recording, params)(times)`.
+
+        `options` are those of `CompensatedVideo`.
+        """
+        self.refuse_unknown({name: v for name, v in options.items() if name != "progress"})
+        chosen = self.Params() if params is None else params
+        return CompensatedVideo(self, recording, chosen, **options)
+
+
+mc = MotionCompensated(
+    "mc",
+    Params,
+    needs_frames=True,
+    about="The motion-compensated reconstruction. It estimates how the scene's points move, from "
+    "frames and events together, and fuses both along their paths; where that fails it falls back "
+    "on the smoother of each pixel and on the frames.",
+)

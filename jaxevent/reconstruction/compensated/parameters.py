@@ -1,0 +1,76 @@
+"""Parameters of the motion-compensated reconstruction."""
+
+from jaxevent.parameters import Number, Positive, Share
+from jaxevent.reconstruction import smoother
+
+# What the decision between the ingredients looks at, see `fusion.Signs`.
+SIGNS = (
+    "fused",
+    "scatter",
+    "smoothed",
+    "from_smoothed",
+    "from_each_other",
+    "seen",
+    "seen_twice",
+    "from_near",
+    "near_from_smoothed",
+    "near_information",
+    "frame_information",
+    "contrast",
+    "change",
+    "from_blend",
+    "near_from_blend",
+    "activity",
+)
+OTHERS = ("smoothed", "blend")  # ingredients beside the mean along trajectories
+
+# Fitted by experiments/compensated_choice.py: a number for every sign and one more, for each of
+# `OTHERS`; and the same for the result's variance.
+# fmt: off
+CHOICE = (
+    0.864, 0.09, -0.186, 0.812, 0.44, -5.523, -2.994, 0.176, -0.132, -0.656, 1.102, 0.116,
+    -0.156, -0.741, -0.076, 0.229, 8.942, 0.245, -0.238, -0.373, 0.145, 0.199, 1.508,
+    -2.626, -0.072, 0.484, 0.442, -0.067, -0.09, -0.424, -0.208, -0.412, -0.102, -8.12,
+)
+DOUBT = (
+    0.428, 0.295, 0.198, 0.028, 0.572, -0.637, -2.831, 0.227, -0.209, -0.048, -0.022,
+    -0.074, 0.018, 0.124, -0.09, -0.013, 7.134,
+)
+# fmt: on
+
+
+class Params(smoother.Params):
+    """Parameters of `mc`; those of the smoother say what the images at single instants are."""
+
+    c_on = Positive(0.2, "ln I", "contrast threshold of ON events")
+    c_off = Positive(0.2, "ln I", "contrast threshold of OFF events")
+    I0 = Positive(0.3, "intensity", "offset inside the logarithm, L = ln(I + I0)")
+    w_min = Positive(0.6, "1", "least certainty w of frames, of dark and saturated pixels")
+    sigma_event = Positive(0.6, "c", "noise of an event's step, as part of its threshold")
+    sigma_bg = Positive(0.05, "ln I / sqrt(s)", "drift without events")
+    sigma_frame = Positive(0.002, "intensity", "noise of frames where the certainty w is 1")
+    share = Positive(0.7, "1", "part of an event's change that belongs to its 8 neighbours")
+
+    sigma_pixel = Positive(0.004, "intensity", "noise of a frame's pixel, along trajectories")
+    floor = Positive(2e-4, "(ln I)^2", "variance of any image at a point between pixels")
+    information = Share(0.15, "1", "of an instant without frame; the errors of instants are akin")
+    sigma_place = Positive(0.15, "px", "error of trajectories where images are fused")
+    sigma_between = Positive(0.01, "ln I", "error of interpolation between pixels")
+    tolerance = Positive(3.0, "1", "standardised squared difference by which a point is hidden")
+    caution = Positive(
+        6.0, "1", "factor on the smoother's variance where motion is estimated", gradient=False
+    )
+    robust = Positive(10.0, "1", "standardised squared residual of motion", gradient=False)
+    smooth = Positive(40.0, "1 / px^2", "weight of differences of motion", gradient=False)
+    jump = Positive(0.04, "px", "difference of motion that counts linearly", gradient=False)
+    edge = Positive(0.1, "ln I / px", "gradient over which motions part", gradient=False)
+    straight = Positive(0.2, "1 / px^2", "weight of acceleration", gradient=False)
+    choice = Number(
+        CHOICE,
+        "1",
+        "how signs choose smoother and blend instead of the mean along trajectories",
+    )
+    doubt = Number(DOUBT, "1", "how signs tell the logarithm of the result's variance")
+    presets = {
+        "hdr": {**smoother.Params.presets["hdr"], "sigma_pixel": 0.006, "sigma_between": 0.02}
+    }

@@ -1,0 +1,571 @@
+"""Trajectories of the scene points that are visible at a target time.
+
+Point x of the target's image lies at x + u(x, s) at the instant s, u = v(x) s + a(x) s^2, s = -1..1
+over the instants. v and a are bilinear between nodes, one for every 2 x 2 pixels. They minimise,
+with the unknown image M of the target,
+
+    sum_k sum_x rho((L_k(x + u(x, s_k)) - M(x))^2 W_k(x + u)) + smoothness,
+    rho(q) = nu log(1 + q / nu),   W_k = 1 / (V_k + floor)
+
+by Gauss-Newton steps in which M is eliminated. Large motion is found from nothing by growing the
+horizon: first only the instants next to the target take part, then those twice as far.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.kernels import compiled, over_rows
+
+CHANNELS = 4  # of packed images: log intensity, its variance, its gradient along x and y
+OUTSIDE = np.float32(1e-6)  # weight of what lies outside the image
+FARTHEST = np.float32(1.5)  # px, at the horizon: the longest step
+
+
+class Smoothness(NamedTuple):
+    """What is asked of trajectories beyond the images."""
+
+    weight: float  # of differences between nodes (px^2 at the horizon)
+    jump: float  # px, between nodes, beyond which differences count linearly
+    edge: float  # ln I / px, the gradient over which nodes part
+    straight: float  # draws the acceleration to 0
+
+
+def pack(L: NDArray, V: NDArray) -> NDArray[np.float32]:
+    """Images and their variances (K, h, w) with gradients: (K, h, w, 4)."""
+    out = np.empty((*L.shape, CHANNELS), np.float32)
+    over_rows(_pack, L.shape[1], np.asarray(L, np.float32), np.asarray(V, np.float32), out)
+    return out
+
+
+@compiled
+def _gradient(image, y, x):
+    """Along x and y; five taps: exact for polynomials of degree 4."""
+    h, w = image.shape
+    up, down, up2, down2 = max(y - 1, 0), min(y + 1, h - 1), max(y - 2, 0), min(y + 2, h - 1)
+    left, right, left2, right2 = max(x - 1, 0), min(x + 1, w - 1), max(x - 2, 0), min(x + 2, w - 1)
+    eight, twelfth = np.float32(8), np.float32(1 / 12)
+    gx = eight * (image[y, right] - image[y, left]) - image[y, right2] + image[y, left2]
+    gy = eight * (image[down, x] - image[up, x]) - image[down2, x] + image[up2, x]
+    return gx * twelfth, gy * twelfth
+
+
+@compiled
+def _pack(begin, end, L, V, out):
+    count, h, w = L.shape
+    for k in range(count):
+        for y in range(begin, end):
+            for x in range(w):
+                out[k, y, x, 0] = L[k, y, x]
+                out[k, y, x, 1] = V[k, y, x]
+                out[k, y, x, 2], out[k, y, x, 3] = _gradient(L[k], y, x)
+
+
+@compiled
+def _halve(begin, end, images, out):
+    """Blur by (1, 4, 6, 4, 1) / 16 along both axes and keep every second: half the size."""
+    count, h, w = images.shape
+    taps = np.array([1, 4, 6, 4, 1], np.float32) / np.float32(16)
+    column = np.empty(w, np.float32)
+    for k in range(count):
+        for y in range(begin, end):
+            for x in range(w):
+                total = np.float32(0)
+                for i in range(5):
+                    total += taps[i] * images[k, min(max(2 * y + i - 2, 0), h - 1), x]
+                column[x] = total
+            for x in range(out.shape[2]):
+                total = np.float32(0)
+                for j in range(5):
+                    total += taps[j] * column[min(max(2 * x + j - 2, 0), w - 1)]
+                out[k, y, x] = total
+
+
+def halve(images: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Images (K, h, w) at half the resolution, rounded up."""
+    count, h, w = images.shape
+    out = np.empty((count, (h + 1) // 2, (w + 1) // 2), np.float32)
+    over_rows(_halve, out.shape[1], images, out)
+    return out
+
+
+@compiled
+def between(values, y, x, out):
+    """Values (rows, columns, 4) of nodes at the pixel y, x, bilinear."""
+    rows, columns, _ = values.shape
+    at_y = min(
+        max(np.float32(y) * np.float32(0.5) - np.float32(0.25), np.float32(0)), np.float32(rows - 1)
+    )
+    at_x = min(
+        max(np.float32(x) * np.float32(0.5) - np.float32(0.25), np.float32(0)),
+        np.float32(columns - 1),
+    )
+    i, j = int(at_y), int(at_x)
+    i1, j1 = min(i + 1, rows - 1), min(j + 1, columns - 1)
+    fy, fx = at_y - np.float32(i), at_x - np.float32(j)
+    for c in range(4):
+        top = values[i, j, c] + fx * (values[i, j1, c] - values[i, j, c])
+        bottom = values[i1, j, c] + fx * (values[i1, j1, c] - values[i1, j, c])
+        out[c] = top + fy * (bottom - top)
+
+
+@compiled
+def _fetch(begin, end, images, s, near, p, floor, nu, points, M):
+    """Images along the trajectories of some rows, (h, w, K, 4): L, weight R, gradient; their mean.
+
+    The near instants decide first what the target looks like; then robustly all of them.
+    """
+    count, h, w, _ = images.shape
+    one, zero = np.float32(1), np.float32(0)
+    at = np.empty(4, np.float32)
+    W = np.empty(count, np.float32)
+    for y in range(begin, end):
+        for x in range(w):
+            between(p, y, x, at)
+            vx, vy, ax, ay = at[0], at[1], at[2], at[3]
+            total, mean = zero, zero
+            for k in range(count):
+                X = np.float32(x) + (vx + ax * s[k]) * s[k]
+                Y = np.float32(y) + (vy + ay * s[k]) * s[k]
+                inside = -0.5 <= X <= w - 0.5 and -0.5 <= Y <= h - 0.5
+                X = min(max(X, zero), np.float32(w - 1))
+                Y = min(max(Y, zero), np.float32(h - 1))
+                x0, y0 = min(int(X), max(w - 2, 0)), min(int(Y), max(h - 2, 0))
+                x1, y1 = min(x0 + 1, w - 1), min(y0 + 1, h - 1)
+                fx, fy = X - np.float32(x0), Y - np.float32(y0)
+                a, b = (one - fy) * (one - fx), (one - fy) * fx
+                c, d = fy * (one - fx), fy * fx
+                for q in range(4):
+                    points[y, x, k, q] = (
+                        a * images[k, y0, x0, q]
+                        + b * images[k, y0, x1, q]
+                        + c * images[k, y1, x0, q]
+                        + d * images[k, y1, x1, q]
+                    )
+                W[k] = one / (points[y, x, k, 1] + floor) if inside else OUTSIDE
+                R = W[k] * near[k]
+                total += R
+                mean += R * points[y, x, k, 0]
+            m = mean / total
+            for _ in range(2):
+                total, mean = zero, zero
+                for k in range(count):
+                    e = points[y, x, k, 0] - m
+                    R = W[k] / (one + e * e * W[k] / nu)
+                    points[y, x, k, 1] = R
+                    total += R
+                    mean += R * points[y, x, k, 0]
+                m = mean / total
+            M[y, x] = m
+
+
+@compiled
+def _linearise(begin, end, points, s, M, N, b, edge):
+    """Normal equations of the nodes of some rows: N (10 entries), b (4); and |grad M|.
+
+    M is eliminated: J_k - sum R J / sum R. Its gradient and that of L_k are both that of the scene;
+    their mean has less noise.
+    """
+    h, w, count, _ = points.shape
+    one, zero = np.float32(1), np.float32(0)
+    for i in range(begin, end):
+        for j in range(N.shape[1]):
+            for c in range(10):
+                N[i, j, c] = zero
+            for c in range(4):
+                b[i, j, c] = zero
+            slope, pixels = zero, 0
+            for y in range(2 * i, min(2 * i + 2, h)):
+                for x in range(2 * j, min(2 * j + 2, w)):
+                    mx, my = _gradient(M, y, x)
+                    m = M[y, x]
+                    total, m0, m1, m2, m3 = zero, zero, zero, zero, zero
+                    for k in range(count):
+                        R = points[y, x, k, 1]
+                        J0 = (points[y, x, k, 2] + mx) * np.float32(0.5) * s[k]
+                        J1 = (points[y, x, k, 3] + my) * np.float32(0.5) * s[k]
+                        total += R
+                        m0 += R * J0
+                        m1 += R * J1
+                        m2 += R * J0 * s[k]
+                        m3 += R * J1 * s[k]
+                    m0, m1, m2, m3 = m0 / total, m1 / total, m2 / total, m3 / total
+                    for k in range(count):
+                        R, e = points[y, x, k, 1], points[y, x, k, 0] - m
+                        J0 = (points[y, x, k, 2] + mx) * np.float32(0.5) * s[k]
+                        J1 = (points[y, x, k, 3] + my) * np.float32(0.5) * s[k]
+                        J2, J3 = J0 * s[k] - m2, J1 * s[k] - m3
+                        J0, J1 = J0 - m0, J1 - m1
+                        r0, r1, r2, r3 = R * J0, R * J1, R * J2, R * J3
+                        N[i, j, 0] += r0 * J0
+                        N[i, j, 1] += r0 * J1
+                        N[i, j, 2] += r0 * J2
+                        N[i, j, 3] += r0 * J3
+                        N[i, j, 4] += r1 * J1
+                        N[i, j, 5] += r1 * J2
+                        N[i, j, 6] += r1 * J3
+                        N[i, j, 7] += r2 * J2
+                        N[i, j, 8] += r2 * J3
+                        N[i, j, 9] += r3 * J3
+                        b[i, j, 0] -= r0 * e
+                        b[i, j, 1] -= r1 * e
+                        b[i, j, 2] -= r2 * e
+                        b[i, j, 3] -= r3 * e
+                    slope += np.sqrt(mx * mx + my * my)
+                    pixels += 1
+            share = one / np.float32(pixels)
+            for c in range(10):
+                N[i, j, c] *= share
+            for c in range(4):
+                b[i, j, c] *= share
+            edge[i, j] = slope * share
+
+
+@compiled
+def _soften(values, out):
+    """Blur nodes (rows, columns, channels) by (1, 6, 1) / 8: a Gaussian of 1 px."""
+    rows, columns, channels = values.shape
+    row = np.empty((columns, channels), np.float32)
+    for i in range(rows):
+        up, down = max(i - 1, 0), min(i + 1, rows - 1)
+        for j in range(columns):
+            for c in range(channels):
+                row[j, c] = (
+                    values[up, j, c] + np.float32(6) * values[i, j, c] + values[down, j, c]
+                ) / np.float32(8)
+        for j in range(columns):
+            left, right = max(j - 1, 0), min(j + 1, columns - 1)
+            for c in range(channels):
+                out[i, j, c] = (
+                    row[left, c] + np.float32(6) * row[j, c] + row[right, c]
+                ) / np.float32(8)
+
+
+@compiled
+def _weigh_differences(p, edge, reach, smoothness, across, down):
+    """Weights of the differences between neighbouring nodes; `reach` is the horizon."""
+    rows, columns, _ = p.shape
+    jump, scale = np.float32(smoothness.jump), np.float32(smoothness.edge)
+    for i in range(rows):
+        for j in range(columns):
+            for turn in range(2):
+                i1, j1 = i + (turn == 1), j + (turn == 0)
+                if i1 >= rows or j1 >= columns:
+                    continue
+                dx, dy = (p[i1, j1, 0] - p[i, j, 0]) * reach, (p[i1, j1, 1] - p[i, j, 1]) * reach
+                weight = jump / np.sqrt(dx * dx + dy * dy + jump * jump)
+                slope = (edge[i, j] + edge[i1, j1]) * np.float32(0.5)
+                weight *= np.float32(0.1) + np.float32(0.9) * np.exp(-slope / scale)
+                if turn == 0:
+                    across[i, j] = weight
+                else:
+                    down[i, j] = weight
+
+
+@compiled
+def _rough(p, across, down, i, j, c):
+    """The weighted graph Laplacian of the channel c at a node."""
+    rows, columns, _ = p.shape
+    here, total = p[i, j, c], np.float32(0)
+    if j > 0:
+        total += across[i, j - 1] * (here - p[i, j - 1, c])
+    if j < columns - 1:
+        total += across[i, j] * (here - p[i, j + 1, c])
+    if i > 0:
+        total += down[i - 1, j] * (here - p[i - 1, j, c])
+    if i < rows - 1:
+        total += down[i, j] * (here - p[i + 1, j, c])
+    return total
+
+
+@compiled
+def _times(N, n0, n1, n2, n3, out):
+    out[0] = N[0] * n0 + N[1] * n1 + N[2] * n2 + N[3] * n3
+    out[1] = N[1] * n0 + N[4] * n1 + N[5] * n2 + N[6] * n3
+    out[2] = N[2] * n0 + N[5] * n1 + N[7] * n2 + N[8] * n3
+    out[3] = N[3] * n0 + N[6] * n1 + N[8] * n2 + N[9] * n3
+
+
+@compiled
+def _invert(N, added, out):
+    """The inverse (10 entries) of a symmetric 4 x 4 matrix with `added` on its diagonal."""
+    # Cholesky, in double precision: nodes without texture are nearly singular.
+    A = np.empty((4, 4))
+    at = 0
+    for i in range(4):
+        for j in range(i, 4):
+            A[i, j] = N[at]
+            A[j, i] = N[at]
+            at += 1
+        A[i, i] += added[i]
+    C = np.zeros((4, 4))
+    for i in range(4):
+        for j in range(i + 1):
+            total = A[i, j]
+            for k in range(j):
+                total -= C[i, k] * C[j, k]
+            C[i, j] = np.sqrt(max(total, 1e-12)) if i == j else total / C[j, j]
+    inverse = np.zeros((4, 4))  # of C
+    for j in range(4):
+        for i in range(j, 4):
+            total = 1.0 if i == j else 0.0
+            for k in range(j, i):
+                total -= C[i, k] * inverse[k, j]
+            inverse[i, j] = total / C[i, i]
+    at = 0
+    for i in range(4):
+        for j in range(i, 4):
+            total = 0.0
+            for k in range(j, 4):
+                total += inverse[k, i] * inverse[k, j]
+            out[at] = total
+            at += 1
+
+
+@compiled
+def _solve(N, b, p, across, down, smooth, ridge, iterations, d):
+    """(N + smooth Laplacian + ridge) d = b - smooth Laplacian p - ridge p, by conjugate gradients.
+
+    The preconditioner are the nodes' own 4 x 4 blocks.
+    """
+    rows, columns, _ = p.shape
+    P = np.empty_like(N)
+    r, z, q, Aq = np.empty_like(p), np.empty_like(p), np.empty_like(p), np.empty_like(p)
+    added = np.empty(4, np.float32)
+    rz = 0.0
+    for i in range(rows):
+        for j in range(columns):
+            degree = np.float32(0)
+            if j > 0:
+                degree += across[i, j - 1]
+            if j < columns - 1:
+                degree += across[i, j]
+            if i > 0:
+                degree += down[i - 1, j]
+            if i < rows - 1:
+                degree += down[i, j]
+            for c in range(4):
+                added[c] = smooth[c] * degree + ridge[c] + np.float32(1e-6)
+                rough = _rough(p, across, down, i, j, c)
+                r[i, j, c] = b[i, j, c] - smooth[c] * rough - ridge[c] * p[i, j, c]
+                d[i, j, c] = 0
+            _invert(N[i, j], added, P[i, j])
+            _times(P[i, j], r[i, j, 0], r[i, j, 1], r[i, j, 2], r[i, j, 3], z[i, j])
+            for c in range(4):
+                q[i, j, c] = z[i, j, c]
+                rz += r[i, j, c] * z[i, j, c]
+    for _ in range(iterations):
+        curvature = 0.0
+        for i in range(rows):
+            for j in range(columns):
+                _times(N[i, j], q[i, j, 0], q[i, j, 1], q[i, j, 2], q[i, j, 3], Aq[i, j])
+                for c in range(4):
+                    Aq[i, j, c] += smooth[c] * _rough(q, across, down, i, j, c)
+                    Aq[i, j, c] += ridge[c] * q[i, j, c]
+                    curvature += q[i, j, c] * Aq[i, j, c]
+        step = np.float32(rz / (curvature + 1e-20))
+        following = 0.0
+        for i in range(rows):
+            for j in range(columns):
+                for c in range(4):
+                    d[i, j, c] += step * q[i, j, c]
+                    r[i, j, c] -= step * Aq[i, j, c]
+                _times(P[i, j], r[i, j, 0], r[i, j, 1], r[i, j, 2], r[i, j, 3], z[i, j])
+                for c in range(4):
+                    following += r[i, j, c] * z[i, j, c]
+        share = np.float32(following / (rz + 1e-20))
+        rz = following
+        for i in range(rows):
+            for j in range(columns):
+                for c in range(4):
+                    q[i, j, c] = z[i, j, c] + share * q[i, j, c]
+
+
+@compiled
+def _move(p, d, reach, out):
+    """p + d, no longer than `FARTHEST` at the horizon, then the median of 3 x 3 nodes."""
+    rows, columns, channels = p.shape
+    moved = np.empty_like(p)
+    for i in range(rows):
+        for j in range(columns):
+            for c in range(channels):
+                scale = reach if c < 2 else reach * reach * np.float32(0.25)
+                far = min(max(d[i, j, c] * scale, -FARTHEST), FARTHEST)
+                moved[i, j, c] = p[i, j, c] + far / scale
+    around = np.empty(9, np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            for c in range(channels):
+                n = 0
+                for k in range(i - 1, i + 2):
+                    for m in range(j - 1, j + 2):
+                        value = moved[min(max(k, 0), rows - 1), min(max(m, 0), columns - 1), c]
+                        place = n
+                        while place > 0 and around[place - 1] > value:
+                            around[place] = around[place - 1]
+                            place -= 1
+                        around[place] = value
+                        n += 1
+                out[i, j, c] = around[4]
+
+
+def step(
+    images: NDArray[np.float32],
+    s: NDArray[np.float32],
+    p: NDArray[np.float32],
+    floor: float,
+    nu: float,
+    smoothness: Smoothness,
+    iterations: int = 12,
+) -> NDArray[np.float32]:
+    """One Gauss-Newton step of p (rows, columns, 4) on packed images (K, h, w, 4) at s (K,)."""
+    shape = p.shape[:2]
+    reach = np.float32(max(float(np.abs(s).max()), 1e-3))
+    near = np.exp(-2 * (s / reach) ** 2).astype(np.float32)
+    N, b = np.empty((*shape, 10), np.float32), np.empty((*shape, 4), np.float32)
+    edge = np.empty(shape, np.float32)
+    count, h, w, _ = images.shape
+    points, M = np.empty((h, w, count, 4), np.float32), np.empty((h, w), np.float32)
+    over_rows(_fetch, h, images, s, near, p, np.float32(floor), np.float32(nu), points, M)
+    over_rows(_linearise, shape[0], points, s, M, N, b, edge)
+    blurred_N, blurred_b = np.empty_like(N), np.empty_like(b)
+    _soften(N, blurred_N)
+    _soften(b, blurred_b)
+    across, down = np.zeros((2, *shape), np.float32)
+    _weigh_differences(p, edge, reach, smoothness, across, down)
+    reach2 = reach * reach
+    smooth = np.float32(smoothness.weight) * reach2 * np.array([1, 1, reach2, reach2], np.float32)
+    bend = np.float32(smoothness.straight) * reach2 * reach2
+    tiny = np.float32(1e-5) * smooth[0]
+    ridge = np.array([tiny, tiny, bend, bend], np.float32)
+    d, out = np.empty_like(p), np.empty_like(p)
+    _solve(blurred_N, blurred_b, p, across, down, smooth, ridge, iterations, d)
+    _move(p, d, reach, out)
+    return out
+
+
+@compiled
+def _resize(p, out, scale):
+    """Nodes at another resolution, bilinear, displacements times `scale`."""
+    rows, columns, channels = p.shape
+    ratio_y, ratio_x = np.float32(1) / scale, np.float32(1) / scale
+    for i in range(out.shape[0]):
+        at_y = (np.float32(i) + np.float32(0.5)) * ratio_y - np.float32(0.5)
+        at_y = min(max(at_y, np.float32(0)), np.float32(rows - 1))
+        i0 = int(at_y)
+        i1, fy = min(i0 + 1, rows - 1), at_y - np.float32(i0)
+        for j in range(out.shape[1]):
+            at_x = (np.float32(j) + np.float32(0.5)) * ratio_x - np.float32(0.5)
+            at_x = min(max(at_x, np.float32(0)), np.float32(columns - 1))
+            j0 = int(at_x)
+            j1, fx = min(j0 + 1, columns - 1), at_x - np.float32(j0)
+            for c in range(channels):
+                top = p[i0, j0, c] + fx * (p[i0, j1, c] - p[i0, j0, c])
+                bottom = p[i1, j0, c] + fx * (p[i1, j1, c] - p[i1, j0, c])
+                out[i, j, c] = scale * (top + fy * (bottom - top))
+
+
+def resize(p: NDArray[np.float32], shape: tuple[int, int], finer: bool) -> NDArray[np.float32]:
+    """Nodes (rows, columns, 4) for images of twice (`finer`) or half the resolution."""
+    out = np.empty((*shape, p.shape[2]), np.float32)
+    _resize(p, out, np.float32(2 if finer else 0.5))
+    return out
+
+
+class Pyramid:
+    """Images and variances at full, half, quarter ... resolution, packed when first asked for."""
+
+    def __init__(self, L: NDArray, V: NDArray, fade: float):
+        self._levels = [(np.asarray(L, np.float32), np.asarray(V, np.float32))]
+        self._packed: list[NDArray[np.float32]] = []
+        self._fade = np.float32(fade)
+
+    def __getitem__(self, level: int) -> NDArray[np.float32]:
+        while len(self._packed) <= level:
+            if len(self._levels) == len(self._packed):
+                L, V = self._levels[-1]
+                self._levels.append((halve(L), halve(V) * self._fade))
+            self._packed.append(pack(*self._levels[len(self._packed)]))
+        return self._packed[level]
+
+
+class Stage(NamedTuple):
+    """Some steps at some resolutions, of the instants within a horizon."""
+
+    horizon: float
+    levels: tuple[int, ...]  # 0: full resolution
+    steps: int
+
+
+def stages(s: NDArray, first: float, coarsest: int = 4) -> list[Stage]:
+    """From nothing: the horizon doubles from `first` to all instants."""
+    whole = float(np.abs(s).max())
+    horizon = min(first, whole)
+    found = [Stage(horizon, tuple(range(coarsest, 1, -1)), 3)]
+    while found[-1].horizon < whole * 0.999:
+        found.append(Stage(min(found[-1].horizon * 2, whole), (2, 1), 2))
+    return [*found, Stage(whole, (1,), 2)]
+
+
+def nodes(height: int, width: int, level: int) -> tuple[int, int]:
+    """Rows and columns of the nodes of images of that size at a level."""
+    return -(-height // 2 ** (level + 1)), -(-width // 2 ** (level + 1))
+
+
+class Motion(NamedTuple):
+    """Trajectories (rows, columns, 4) of images at a resolution, displacements in its pixels."""
+
+    p: NDArray[np.float32]
+    level: int
+
+    def at(self, level: int, height: int, width: int) -> "Motion":
+        """The same at another resolution of images of that full size."""
+        p, now = self
+        while now != level:
+            finer = now > level
+            now += -1 if finer else 1
+            p = resize(p, nodes(height, width, now), finer)
+        return Motion(p, level)
+
+
+def follow(
+    pyramid: Pyramid,
+    s: NDArray[np.float32],
+    start: Motion | None,
+    plan: list[Stage],
+    floor: float,
+    nu: float,
+    smoothness: Smoothness,
+) -> Motion:
+    """The motion after all stages of a plan, from `start` or from none."""
+    _, h, w, _ = pyramid[0].shape
+    first = plan[0].levels[0]
+    motion = start or Motion(np.zeros((*nodes(h, w, first), 4), np.float32), first)
+    for stage in plan:
+        chosen = np.abs(s) <= stage.horizon * 1.001
+        for level in stage.levels:
+            p = motion.at(level, h, w).p
+            images = pyramid[level]
+            if not chosen.all():
+                images = np.ascontiguousarray(images[chosen])
+            for _ in range(stage.steps):
+                p = step(images, s[chosen], p, floor, nu, smoothness)
+            motion = Motion(p, level)
+    return motion
+
+
+@compiled
+def _velocity(begin, end, p, out):
+    at = np.empty(4, np.float32)
+    for y in range(begin, end):
+        for x in range(out.shape[1]):
+            between(p, y, x, at)
+            out[y, x, 0], out[y, x, 1] = at[0], at[1]
+
+
+def velocity(p: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """du/ds at the target for every pixel, (h, w, 2): x and y."""
+    out = np.empty((*size, 2), np.float32)
+    over_rows(_velocity, size[0], p, out)
+    return out

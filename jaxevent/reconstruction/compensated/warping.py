@@ -1,0 +1,139 @@
+"""Images read along trajectories: in loops for images, and as a pure function for derivatives."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from jaxevent.kernels import compiled, over_rows
+from jaxevent.reconstruction.compensated.trajectories import between
+from jaxevent.reconstruction.features import Numeric
+
+CUBIC = -0.75  # slope of the cubic kernel at 1, as OpenCV's; the sharper of the usual two
+
+
+class Along(NamedTuple):
+    """Images at instants, seen at the target's points: each (K, h, w)."""
+
+    L: Float[Numeric, "k h w"]  # bicubic
+    V: Float[Numeric, "k h w"]  # its variance, bilinear
+    clear: Float[Numeric, "k h w"]  # 1 where a frame shows the point, bilinear
+    inside: Float[Numeric, "k h w"]  # 1, or 0 beyond the image's border
+
+
+@compiled
+def _cubic(f, out):
+    a, one, two, three = np.float32(CUBIC), np.float32(1), np.float32(2), np.float32(3)
+    far = one + f
+    out[0] = ((a * far - np.float32(5) * a) * far + np.float32(8) * a) * far - np.float32(4) * a
+    out[1] = ((a + two) * f - (a + three)) * f * f + one
+    rest = one - f
+    out[2] = ((a + two) * rest - (a + three)) * rest * rest + one
+    out[3] = one - out[0] - out[1] - out[2]
+
+
+@compiled
+def _warp(begin, end, L, V, clear, s, p, out_L, out_V, out_clear, inside):
+    count, h, w = L.shape
+    one, zero = np.float32(1), np.float32(0)
+    at = np.empty(4, np.float32)
+    across, down = np.empty(4, np.float32), np.empty(4, np.float32)
+    for y in range(begin, end):
+        for x in range(w):
+            between(p, y, x, at)
+            vx, vy, ax, ay = at[0], at[1], at[2], at[3]
+            for k in range(count):
+                X = np.float32(x) + (vx + ax * s[k]) * s[k]
+                Y = np.float32(y) + (vy + ay * s[k]) * s[k]
+                here = -0.5 <= X <= w - 0.5 and -0.5 <= Y <= h - 0.5
+                inside[k, y, x] = one if here else zero
+                X = min(max(X, zero), np.float32(w - 1))
+                Y = min(max(Y, zero), np.float32(h - 1))
+                x0, y0 = min(int(X), max(w - 2, 0)), min(int(Y), max(h - 2, 0))
+                x1, y1 = min(x0 + 1, w - 1), min(y0 + 1, h - 1)
+                fx, fy = X - np.float32(x0), Y - np.float32(y0)
+                a, b = (one - fy) * (one - fx), (one - fy) * fx
+                c, d = fy * (one - fx), fy * fx
+                out_V[k, y, x] = (
+                    a * V[k, y0, x0] + b * V[k, y0, x1] + c * V[k, y1, x0] + d * V[k, y1, x1]
+                )
+                out_clear[k, y, x] = (
+                    a * clear[k, y0, x0]
+                    + b * clear[k, y0, x1]
+                    + c * clear[k, y1, x0]
+                    + d * clear[k, y1, x1]
+                )
+                _cubic(fx, across)
+                _cubic(fy, down)
+                total = zero
+                for i in range(4):
+                    row = min(max(y0 + i - 1, 0), h - 1)
+                    part = zero
+                    for j in range(4):
+                        part += across[j] * L[k, row, min(max(x0 + j - 1, 0), w - 1)]
+                    total += down[i] * part
+                out_L[k, y, x] = total
+
+
+def warp(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, p: NDArray) -> Along:
+    """Images (K, h, w) float32 at instants s (K,) along trajectories p (rows, columns, 4)."""
+    out = Along(*(np.empty(L.shape, np.float32) for _ in range(4)))
+    over_rows(_warp, L.shape[1], L, V, clear, s, p, *out)
+    return out
+
+
+def places(p: Array, s: Array, height: int, width: int) -> tuple[Array, Array]:
+    """Where points are at instants: y and x, (K, h, w)."""
+    rows, columns, _ = p.shape
+
+    def upsampled(nodes: int, size: int) -> tuple[Array, Array, Array]:
+        at = jnp.clip(jnp.arange(size) / 2 - 0.25, 0, nodes - 1)
+        low = at.astype(int)
+        return low, jnp.minimum(low + 1, nodes - 1), at - low
+
+    i, i1, fy = upsampled(rows, height)
+    j, j1, fx = upsampled(columns, width)
+    fy, fx = fy[:, None, None], fx[None, :, None]
+    top = (1 - fx) * p[i][:, j] + fx * p[i][:, j1]
+    bottom = (1 - fx) * p[i1][:, j] + fx * p[i1][:, j1]
+    full = (1 - fy) * top + fy * bottom
+    s = s[:, None, None]
+    Y = jnp.arange(height)[:, None] + (full[..., 1] + full[..., 3] * s) * s
+    X = jnp.arange(width) + (full[..., 0] + full[..., 2] * s) * s
+    return Y, X
+
+
+def warp_purely(L: Array, V: Array, clear: Array, s: Array, p: Array) -> Along:
+    """The same as `warp`; differentiable."""
+    _, h, w = L.shape
+    Y, X = places(p, s, h, w)
+    inside = (X >= -0.5) & (X <= w - 0.5) & (Y >= -0.5) & (Y <= h - 0.5)
+    Y, X = jnp.clip(Y, 0, h - 1), jnp.clip(X, 0, w - 1)
+    y0 = jnp.minimum(Y.astype(int), max(h - 2, 0))
+    x0 = jnp.minimum(X.astype(int), max(w - 2, 0))
+    fy, fx = Y - y0, X - x0
+    k = jnp.arange(len(s))[:, None, None]
+    row = [jnp.clip(y0 + i, 0, h - 1) for i in range(-1, 3)]
+    column = [jnp.clip(x0 + j, 0, w - 1) for j in range(-1, 3)]
+
+    def taps(images: Array, near: slice) -> Array:
+        """Values around the points: (rows, columns, k, h, w)."""
+        rows, columns = jnp.stack(row[near])[:, None], jnp.stack(column[near])
+        return images[k, rows, columns]
+
+    def linear(images: Array) -> Array:
+        weights = jnp.stack([1 - fy, fy])[:, None] * jnp.stack([1 - fx, fx])
+        return (weights * taps(images, slice(1, 3))).sum((0, 1))
+
+    def cubic(f: Array) -> Array:
+        a = CUBIC
+        far, rest = 1 + f, 1 - f
+        first = ((a * far - 5 * a) * far + 8 * a) * far - 4 * a
+        second = ((a + 2) * f - (a + 3)) * f * f + 1
+        third = ((a + 2) * rest - (a + 3)) * rest * rest + 1
+        return jnp.stack([first, second, third, 1 - first - second - third])
+
+    bicubic = (cubic(fy)[:, None] * cubic(fx) * taps(L, slice(0, 4))).sum((0, 1))
+    return Along(bicubic, linear(V), linear(clear), inside.astype(L.dtype))

@@ -1,0 +1,409 @@
+"""The motion-compensated reconstruction: its parts against slow ones, its images against truth."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+import jaxevent
+from jaxevent.errors import InputError
+from jaxevent.methods import find
+from jaxevent.reconstruction.compensated import fusion, instants, trajectories, warping
+from jaxevent.reconstruction.compensated.parameters import OTHERS, SIGNS, Params
+from jaxevent.recording import Frames
+from jaxevent.simulate import Sensor, simulate
+
+mc = find("mc", "reconstruction")
+fuse = jax.jit(fusion.fuse)
+SMOOTHNESS = trajectories.Smoothness(40.0, 0.04, 0.1, 0.2)
+
+
+def texture(height, width, seed=0):
+    """A texture as a function of continuous y, x: log intensity."""
+    rng = np.random.default_rng(seed)
+    waves = [
+        (*rng.uniform(-0.7, 0.7, 2), rng.uniform(0, 6.28), rng.uniform(0.05, 0.2))
+        for _ in range(12)
+    ]
+
+    def level(y, x):
+        return -1 + sum(a * np.cos(ky * y + kx * x + ph) for ky, kx, ph, a in waves)
+
+    return level
+
+
+def moved(v, a, s, height=40, width=56):
+    """Images (K, h, w) of a texture whose points go by v s + a s^2."""
+    y, x = np.mgrid[:height, :width].astype(float)
+    level = texture(height, width)
+    shifts = [(v[0] * k + a[0] * k**2, v[1] * k + a[1] * k**2) for k in s]
+    return np.stack([level(y - dy, x - dx) for dx, dy in shifts]).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "v, a", [((6.0, -3.0), (0.0, 0.0)), ((-9.0, 4.0), (2.5, -1.5)), ((0.0, 0.0), (0.0, 0.0))]
+)
+def test_motion_is_found_from_nothing(v, a):
+    s = np.array([-1, -0.75, -0.5, -0.25, 0, 0.25, 0.5, 0.75, 1], np.float32)
+    L = moved(v, a, s)
+    pyramid = trajectories.Pyramid(L, np.full_like(L, 1e-3), 0.35)
+    plan = trajectories.stages(s, 0.5)
+    motion = trajectories.follow(pyramid, s, None, plan, 2e-4, 10.0, SMOOTHNESS)
+    assert motion.level == 1
+    p = motion.at(0, 40, 56).p
+    inner = p[6:-6, 6:-6]
+    # The scene's points go by v s + a s^2.
+    np.testing.assert_allclose(inner.mean((0, 1)), [*v, *a], atol=0.15)
+    assert np.abs(inner - inner.mean((0, 1)))[..., :2].max() < 0.6
+    flow = trajectories.velocity(p, (40, 56))
+    np.testing.assert_allclose(flow[12:-12, 12:-12].mean((0, 1)), v, atol=0.15)
+
+
+def test_motion_of_half_the_image_alone():
+    s = np.array([-1, -0.5, 0, 0.5, 1], np.float32)
+    still, moving = moved((0, 0), (0, 0), s), moved((3.0, 0), (0, 0), s)
+    L = np.where(np.arange(56) < 28, still, moving).astype(np.float32)
+    pyramid = trajectories.Pyramid(L, np.full_like(L, 1e-3), 0.35)
+    plan = trajectories.stages(s, 0.5)
+    p = trajectories.follow(pyramid, s, None, plan, 2e-4, 10.0, SMOOTHNESS).p
+    assert np.abs(p[:, :5, :2] * 2).max() < 0.3  # of half resolution
+    np.testing.assert_allclose(p[2:-2, -5:-2, 0] * 2, 3, atol=0.4)
+
+
+def test_equations_are_solved():
+    rng = np.random.default_rng(1)
+    rows, columns = 3, 4
+    J = rng.normal(size=(rows, columns, 6, 4))
+    full = np.einsum("yxki,yxkj->yxij", J, J)
+    N = np.stack([full[..., i, j] for i in range(4) for j in range(i, 4)], -1).astype(np.float32)
+    b, p = rng.normal(size=(2, rows, columns, 4)).astype(np.float32)
+    weights = rng.uniform(0.2, 1, (2, rows, columns)).astype(np.float32)
+    across, down = weights[0], weights[1]
+    smooth = np.array([2, 2, 3, 3], np.float32)
+    ridge = np.array([0.1, 0.1, 0.5, 0.5], np.float32)
+    d = np.empty_like(p)
+    trajectories._solve(N, b, p, across, down, smooth, ridge, 60, d)
+
+    size = rows * columns
+    laplacian = np.zeros((size, size))
+    at = np.arange(size).reshape(rows, columns)
+    pairs = [
+        (at[i, j], at[i, j + 1], across[i, j]) for i in range(rows) for j in range(columns - 1)
+    ]
+    pairs += [(at[i, j], at[i + 1, j], down[i, j]) for i in range(rows - 1) for j in range(columns)]
+    for one, other, w in pairs:
+        laplacian[one, one] += w
+        laplacian[other, other] += w
+        laplacian[one, other] -= w
+        laplacian[other, one] -= w
+    A = np.zeros((size, 4, size, 4))
+    for n in range(size):
+        A[n, :, n] += full.reshape(size, 4, 4)[n] + np.diag(ridge)
+    for c in range(4):
+        A[:, c, :, c] += smooth[c] * laplacian
+    flat = p.reshape(size, 4)
+    right = b.reshape(size, 4) - smooth * (laplacian @ flat) - ridge * flat
+    expected = np.linalg.solve(A.reshape(4 * size, -1), right.ravel())
+    np.testing.assert_allclose(d.ravel(), expected, atol=2e-4)
+
+
+@functools.cache
+def warped_case():
+    rng = np.random.default_rng(2)
+    L = moved((2.0, 1.0), (0, 0), [-1, 0, 1], 18, 23)
+    V = rng.uniform(0.01, 0.1, L.shape).astype(np.float32)
+    clear = (rng.random(L.shape) < 0.5).astype(np.float32)
+    p = rng.uniform(-4, 4, (9, 12, 4)).astype(np.float32)
+    return L, V, clear, np.float32([-1, 0, 1]), p
+
+
+def test_images_along_trajectories():
+    L, V, clear, s, p = warped_case()
+    quick = warping.warp(L, V, clear, s, p)
+    pure = warping.warp_purely(*map(jnp.asarray, (L, V, clear, s, p)))
+    for one, other in zip(quick, pure, strict=True):
+        np.testing.assert_allclose(one, other, atol=2e-5)
+    Y, X = (np.asarray(v) for v in warping.places(jnp.asarray(p), jnp.asarray(s), *L.shape[1:]))
+    for k in range(3):
+        at = [Y[k], X[k]]
+        expected = map_coordinates(V[k], at, order=1, mode="nearest")
+        np.testing.assert_allclose(quick.V[k], expected, atol=1e-5)
+        outside = (Y[k] < -0.5) | (Y[k] > 17.5) | (X[k] < -0.5) | (X[k] > 22.5)
+        np.testing.assert_array_equal(quick.inside[k] == 0, outside)
+    np.testing.assert_array_equal(quick.L[1], L[1])  # the target's own
+
+
+def place(count, own, before, after):
+    s = np.arange(count).astype(np.float32) - own
+    s /= np.abs(s).max()
+    framed = np.zeros(count, np.float32)
+    framed[[before, after]] = 1
+    near = (np.abs(np.arange(count) - own) <= 1).astype(np.float32)
+    return fusion.Place(
+        s, np.ones(count, np.float32), framed, near, *(np.int32(k) for k in (own, before, after))
+    )
+
+
+def still(L, V=0.01):
+    """Images along trajectories that stand still."""
+    ones = np.ones_like(L)
+    return warping.Along(L, np.full_like(L, V), ones, ones)
+
+
+def only(name):
+    """Params that choose one ingredient."""
+    rows = np.zeros((len(OTHERS), len(SIGNS) + 1))
+    rows[:, -1] = [40.0 if name == other else -40.0 for other in OTHERS]
+    return Params(choice=rows.ravel().tolist())
+
+
+def test_what_differs_is_hidden():
+    rng = np.random.default_rng(3)
+    truth = moved((0, 0), (0, 0), [0], 20, 24)[0]
+    L = truth + rng.normal(0, 0.05, (9, 20, 24)).astype(np.float32)
+    L[6:, 3:13, 3:13] += 1.5  # a thing in front, in three instants
+    at = place(9, 4, 0, 8)
+    fused = fuse(only("none"), L, np.full_like(L, 0.0025), still(L, 0.0025), at)
+    error = np.abs(np.asarray(fused.L) - truth)
+    assert error[5:11, 5:11].max() < 0.15
+    assert np.sqrt((error[:, 17:] ** 2).mean()) < 0.05 * 0.45  # of nine images, 0.33
+    visible = np.asarray(fused.visible)
+    assert visible[0, 6:10, 6:10].min() > 0.9 and visible[1, 6:10, 6:10].max() < 0.1
+    np.testing.assert_allclose(np.asarray(fused.sources).sum(0), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_ingredients_can_be_chosen(name):
+    L = moved((3.0, 1.0), (0, 0), np.linspace(-1, 1, 9), 20, 24)
+    at = place(9, 2, 1, 5)
+    fused = fuse(only(name), L, np.full_like(L, 0.01), still(L), at)
+    w = (at.s[2] - at.s[1]) / (at.s[5] - at.s[1])
+    expected = {"smoothed": L[2], "blend": (1 - w) * L[1] + w * L[5]}[name]
+    np.testing.assert_allclose(fused.L, expected, atol=1e-5)
+
+
+def test_instants_that_fill_up_change_nothing():
+    L = moved((3.0, 1.0), (0, 0), np.linspace(-1, 1, 9), 20, 24)
+    at = place(9, 2, 1, 5)
+    params = Params()
+    fused = fuse(params, L, np.full_like(L, 0.01), still(L), at)
+    none = np.zeros(2, np.float32)
+    longer = at._replace(
+        s=np.append(at.s, none + 1),
+        present=np.append(at.present, none),
+        framed=np.append(at.framed, none),
+        near=np.append(at.near, none),
+    )
+    pad = np.zeros((2, 20, 24), np.float32)
+    L2 = np.concatenate([L, pad])
+    V2 = np.concatenate([np.full_like(L, 0.01), pad])
+    along = warping.Along(*(np.concatenate([part, pad]) for part in still(L)))
+    again = fuse(params, L2, V2, along, longer)
+    np.testing.assert_allclose(fused.L, again.L, atol=1e-5)
+    np.testing.assert_allclose(fused.P, again.P, rtol=1e-3)
+
+
+def test_instants():
+    frames = np.arange(10) * 40_000
+    choose = instants.Schedule(frames, (0, 360_000), 100.0)
+    assert choose.step == 6_000 and choose.reach == 60_000
+    one = choose(133_333)
+    assert one.t[one.own] == 133_333 and one.s[one.own] == 0
+    assert (np.diff(one.t) > 0).all() and np.abs(one.s).max() == 1
+    assert one.t[one.before] == 120_000 and one.t[one.after] == 160_000
+    assert set(one.t) >= {80_000, 120_000, 160_000, 200_000} and 40_000 not in one.t
+    between = one.t[(one.t > 120_000) & (one.t < 160_000) & (one.t != 133_333)]
+    assert (between % 6_000 == 0).all() and len(between) >= 2
+    first = choose(0)  # nothing before
+    assert first.own == first.before - 0 or first.t[first.before] > 0
+    assert (first.t >= 0).all()
+
+
+class Slide:
+    """A texture that slides by: a source for the simulated sensor."""
+
+    size, duration = (48, 40), 0.42
+    velocity = (70.0, -30.0)  # px/s
+
+    def __init__(self):
+        self.level = texture(40, 48, 5)
+        self.y, self.x = np.mgrid[:40, :48].astype(float)
+
+    def intensity(self, t):
+        u, v = self.velocity
+        return np.exp(self.level(self.y - v * t, self.x - u * t) * 0.9 - 0.3).clip(0.02, 0.95)
+
+
+@functools.cache
+def slide():
+    """A recording of it, and the true images between its frames."""
+    sensor = Sensor(
+        frame_rate=20.0, exposure=1e-3, background_rate=0.1, hot_fraction=0.0, truth_rate=20.0
+    )
+    return simulate(Slide(), sensor, 3, "slide")
+
+
+def params():
+    return Params(c_on=0.2, c_off=0.18, I0=0.03, rho_ref=5e-4, exposure=1e-3)
+
+
+@functools.cache
+def video():
+    return mc.estimate(slide(), params(), progress=False)
+
+
+@pytest.mark.slow
+def test_images_are_better_than_those_of_pixels_and_frames():
+    recording = slide()
+    t, truth = recording.extra["hdr_t"], recording.extra["hdr"]
+    inner = (t > 60_000) & (t < 340_000)
+    given = {"akf": find("akf"), "aks": find("aks"), "blend": find("blend")}
+
+    def error(method, values):
+        image = method.estimate(recording, values, progress=False)(t[inner]).mean
+        return float(((image - truth[inner]) ** 2).mean())
+
+    ours = error(mc, params())
+    shared = {k: v for k, v in params().values().items()}
+    for name, method in given.items():
+        values = {k: v for k, v in shared.items() if k in method.Params.settings()}
+        assert ours < 0.5 * error(method, method.Params(**values)), name
+
+
+def test_variance_and_flow_are_true():
+    recording, made = slide(), video()
+    t, truth = recording.extra["hdr_t"], recording.extra["hdr"]
+    inner = (t > 60_000) & (t < 340_000)
+    image, P, valid = made(t[inner])
+    assert valid.all() and (P > 0).all()
+    z2 = np.log((image + 0.03) / (truth[inner] + 0.03)) ** 2 / P
+    assert 0.1 < z2.mean() < 4
+    flow = made.flow(t[inner][:2])
+    assert flow.shape == (2, 40, 48, 2)
+    error = np.hypot(*np.moveaxis(flow - Slide.velocity, -1, 0))[:, 6:-6, 6:-6]
+    assert np.median(error) < 4 and error.mean() < 8  # px/s, of 76
+
+
+def test_sources_say_where_pixels_come_from():
+    shares = video().sources(np.array([200_000]))
+    assert shares["before"].shape == (1, 40, 48)
+    total = sum(shares[name] for name in fusion.SOURCES)
+    np.testing.assert_allclose(total, 1, atol=1e-4)
+    assert shares["visible_before"].mean() > 0.5
+
+
+def test_images_do_not_depend_on_others():
+    times = np.array([210_000, 105_000, 206_000])
+    together = video()(times)
+    for row, t in enumerate(times):
+        alone = mc.estimate(slide(), params(), progress=False)(np.array([t]))
+        for one, other in zip(together, alone, strict=True):
+            np.testing.assert_array_equal(one[row], other[0])
+
+
+def test_a_later_clock_changes_nothing():
+    recording = slide()
+    shift = 5_000_000_000_000
+    late = dataclasses.replace(
+        recording,
+        events=dataclasses.replace(recording.events, t=recording.events.t + shift),
+        frames=dataclasses.replace(recording.frames, t=recording.frames.t + shift),
+    )
+    moved_images = mc.estimate(late, params(), progress=False)
+    # The first and last instants of the recording, and its grid, are those of its own clock.
+    t = np.array([205_000])
+    assert moved_images.schedule.step == video().schedule.step
+    one, other = video()(t), moved_images(t + shift)
+    np.testing.assert_array_equal(one.mean, other.mean)
+
+
+@functools.cache
+def prepared():
+    """Prepared images, and what is made of them: a function of raw parameters."""
+    times = np.array([190_000, 212_000])
+    features, out = mc.prepare(slide(), times, params())
+    weights = np.random.default_rng(0).normal(size=(2, 40 * 48)).astype(np.float32)
+
+    @jax.jit
+    @functools.partial(jax.value_and_grad, has_aux=True)
+    def value(raw):
+        p = params().with_raw(raw)
+        estimate = mc.read(p, mc.run(p, features)[0], out)
+        image, P, _ = estimate
+        return (weights * image).sum() + 10 * jnp.log(P).mean(), estimate
+
+    return times, value
+
+
+@pytest.mark.slow
+def test_prepared_images_are_those_of_the_video():
+    times, value = prepared()
+    (_, (image, P, valid)), _ = value(params().raw)
+    whole = video()(times)
+    np.testing.assert_allclose(image.reshape(2, 40, 48), whole.mean, atol=2e-3)
+    np.testing.assert_allclose(P.reshape(2, 40, 48), whole.covariance, rtol=0.1)
+    assert valid.all()
+
+
+@pytest.mark.slow
+def test_derivatives_are_those_of_differences():
+    _, value = prepared()
+
+    names = ("c_on", "sigma_pixel", "information", "sigma_place", "choice", "doubt", "sigma_bg")
+    raw = params().raw
+    _, gradient = value(raw)
+    rng = np.random.default_rng(1)
+    direction = {n: jnp.asarray(rng.normal(size=raw[n].shape) * 0.1, raw[n].dtype) for n in names}
+    slope = sum(float((gradient[n] * direction[n]).sum()) for n in names)
+    h = 2e-2
+    ends = [
+        float(value({**raw, **{n: raw[n] + sign * h * direction[n] for n in names}})[0][0])
+        for sign in (1, -1)
+    ]
+    assert slope == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=0.05)
+    assert all(np.isfinite(v).all() for v in gradient.values())
+    assert all(np.any(gradient[n] != 0) for n in names)
+
+
+def test_bad_input():
+    recording = slide()
+    with pytest.raises(InputError, match="holds no frames"):
+        mc.estimate(jaxevent.recording.Recording("bare", 48, 40, recording.events, None))
+    with pytest.raises(InputError, match="were asked for"):
+        video()(np.array([-5_000_000]))
+    with pytest.raises(InputError, match="no option"):
+        mc.estimate(recording, params(), devices=())
+
+
+@pytest.mark.parametrize("size", [(1, 5), (3, 2), (9, 7)])
+def test_tiny_sensors_and_single_frames(size):
+    width, height = size
+    rng = np.random.default_rng(4)
+    n = 40
+    t = np.sort(rng.integers(0, 50_000, n))
+    events = jaxevent.recording.Events(
+        t,
+        rng.integers(0, width, n).astype(np.uint16),
+        rng.integers(0, height, n).astype(np.uint16),
+        rng.random(n) < 0.5,
+    )
+    for count in (1, 2):
+        frames = Frames(
+            np.arange(count) * 30_000 + 1000,
+            rng.integers(30, 200, (count, height, width)).astype(np.uint8),
+            np.zeros(count, np.int64),
+        )
+        tiny = jaxevent.recording.Recording("tiny", width, height, events, frames)
+        image, P, valid = mc.estimate(tiny, progress=False)(np.array([20_000, 40_000]))
+        assert image.shape == (2, height, width) and np.isfinite(image).all()
+        assert valid.all() and (P > 0).all()
+
+
+def test_blurring_is_scipys():
+    image = np.random.default_rng(5).normal(size=(20, 25)).astype(np.float32)
+    expected = gaussian_filter(image, 1.5, mode="nearest", truncate=3.34)
+    np.testing.assert_allclose(fusion.blur(jnp.asarray(image), 1.5), expected, atol=1e-5)
