@@ -1,0 +1,340 @@
+"""The numbers by which `mc` chooses between its ingredients: fits `choice` and `doubt`.
+
+    python experiments/compensated_choice.py --data $JAXEVENT_DATA --out choice
+
+Every image that is scored here was hidden from the methods: frames of the first half of
+slider_depth, at gaps of 2 to 16 frames, and true images of simulated HDR scenes and of moving
+objects, of the scenes and seeds that are for fitting. Prints the numbers as TOML.
+"""
+
+import argparse
+import dataclasses
+import pickle
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from tqdm import tqdm
+
+import jaxevent
+from jaxevent.metrics import ssim
+from jaxevent.reconstruction.compensated import estimator, fusion
+from jaxevent.reconstruction.compensated.parameters import OTHERS, SIGNS, Params
+from jaxevent.runs.protocols import frame_times
+from jaxevent.simulate import FITTING, SENSORS, TESTING, Objects, Pan, Sensor, scene, simulate
+from jaxevent.simulate.scenes import Speed
+
+GAPS = {2: 12, 4: 12, 8: 12, 16: 8}  # frames from one that is given to the next: images scored
+# What `jaxevent fit` finds with the likelihood of frames: configs/fit_slider_depth.toml, and the
+# same for davis346_street.
+SLIDER: dict[str, Any] = dict(
+    c_on=0.2723,
+    c_off=0.2096,
+    clock_offset=0.009589,
+    sigma_event=0.5469,
+    sigma_bg=0.09179,
+    sigma_frame=0.00159,
+    sigma_floor=0.02932,
+    share=0.8016,
+)
+STREET: dict[str, Any] = dict(
+    c_on=0.177,
+    c_off=0.2014,
+    clock_offset=0.008711,
+    sigma_event=0.6936,
+    sigma_bg=0.008503,
+    sigma_frame=0.002417,
+    sigma_floor=0.009652,
+    share=0.5594,
+)
+
+
+def hidden(path: Path, params: Params, gaps: dict[int, int], half: int | None) -> Iterator[tuple]:
+    """Targets among the frames that are not given: label, video, time, truth."""
+    recording = jaxevent.load(path)
+    assert recording.frames is not None
+    count = len(recording.frames)
+    times = frame_times(recording.frames, params)
+    for gap, number in gaps.items():
+        given = recording.with_frames(np.arange(0, count, gap))
+        video = jaxevent.METHODS["mc"].estimate(given, params, progress=False)
+        rows = [k for k in range((count - 1) // gap * gap) if k % gap]
+        if half is not None:
+            rows = [k for k in rows if (k < count // 2) == (half == 0)]
+        chosen = np.unique(np.linspace(0, len(rows) - 1, number).round().astype(int))
+        for row in chosen:
+            truth = recording.frames[rows[row] : rows[row] + 1].intensity[0]
+            yield (
+                f"{path.stem} {gap} {half}",
+                video,
+                int(times[rows[row]]),
+                np.asarray(truth),
+                False,
+            )
+
+
+def panned(names: tuple[str, ...], seed: int, images: int) -> Iterator[tuple]:
+    """Targets among the true images of HDR scenes."""
+    for name in names:
+        pace: tuple[tuple[Speed, float], ...] = (("fast", 0.5), ("slow", 1.0))
+        for speed, seconds in pace:
+            source = Pan(scene(name), speed=speed, duration=seconds, seed=seed)
+            recording = simulate(source, Sensor(), seed, f"{name}_{speed}")
+            params = Params(preset="hdr", c_on=0.2, c_off=0.18, rho_ref=5e-4)
+            video = jaxevent.METHODS["mc"].estimate(recording, params, progress=False)
+            times, truths = recording.extra["hdr_t"], recording.extra["hdr"]
+            for row in np.unique(np.linspace(2, len(times) - 3, images).round().astype(int)):
+                yield f"hdr {speed}", video, int(times[row]), np.asarray(truths[row]), True
+
+
+class Texture:
+    """A random texture that slides by on an accelerated path, before another one or without."""
+
+    size, duration = (96, 72), 0.6
+
+    def __init__(self, seed: int):
+        self.rng = rng = np.random.default_rng(seed)
+        self.y, self.x = np.mgrid[:72, :96].astype(float)
+        self.speed = float(np.exp(rng.uniform(np.log(15), np.log(300))))
+        self.layers = [self._layer() for _ in range(int(rng.integers(1, 3)))]
+        self.edge = rng.uniform(25, 70)
+
+    def _layer(self) -> tuple:
+        rng, angle = self.rng, self.rng.uniform(0, 6.28)
+        fine = np.exp(rng.uniform(np.log(0.15), np.log(1.2)))
+        waves = np.stack([*rng.normal(0, fine, (2, 25)), rng.uniform(0, 6.28, 25)])
+        v = self.speed * rng.uniform(0.4, 1) * np.array([np.cos(angle), np.sin(angle)])
+        return (
+            waves,
+            rng.uniform(0.1, 0.4),
+            v,
+            rng.uniform(-1, 1, 2) * self.speed,
+            rng.normal(0, 0.4),
+        )
+
+    def _level(self, layer: tuple, t: float) -> np.ndarray:
+        (ky, kx, phase), contrast, v, a, mean = layer
+        dx, dy = v * t + a * t * t / 2
+        at = ky[:, None, None] * (self.y - dy) + kx[:, None, None] * (self.x - dx)
+        return -1.2 + mean + contrast * np.cos(at + phase[:, None, None]).sum(0) / 2
+
+    def intensity(self, t: float | int) -> np.ndarray:
+        level = self._level(self.layers[0], float(t))
+        if len(self.layers) > 1:
+            place = self.edge + self.layers[1][2][0] * (t - 0.3)
+            front = 1 / (1 + np.exp(-(self.x - place) / 0.4))
+            level = front * self._level(self.layers[1], float(t)) + (1 - front) * level
+        return np.exp(level).clip(0.01, 1.5)
+
+
+def textures(seeds: range) -> Iterator[tuple]:
+    """Targets among the true images of sliding textures."""
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        rate = float(np.exp(rng.uniform(np.log(8), np.log(80))))
+        c_on, c_off = rng.uniform(0.1, 0.35, 2)
+        sensor = Sensor(
+            c_on=c_on, c_off=c_off, frame_rate=rate, exposure=1e-3,
+            background_rate=rng.uniform(0, 0.5), read_noise=rng.uniform(0.3, 2), truth_rate=20.0,
+        )  # fmt: skip
+        recording = simulate(Texture(seed), sensor, seed, f"texture {seed}")
+        wrong = np.exp(rng.normal(0, 0.12, 2))
+        params = Params(
+            c_on=c_on * wrong[0], c_off=c_off * wrong[1], I0=float(rng.choice([0.01, 0.05, 0.3])),
+            rho_ref=5e-4, w_min=float(rng.choice([0.05, 0.6])),
+            sigma_event=float(rng.uniform(0.2, 0.7)),
+        )  # fmt: skip
+        video = jaxevent.METHODS["mc"].estimate(recording, params, progress=False)
+        times, truths = recording.extra["hdr_t"], recording.extra["hdr"]
+        for row in np.unique(np.linspace(1, len(times) - 2, 3).round().astype(int)):
+            yield "textures", video, int(times[row]), np.asarray(truths[row]), False
+
+
+def objects(seeds: range) -> Iterator[tuple]:
+    """Targets among the true images of objects that move on their own."""
+    for seed in seeds:
+        for rate in (25.0, 100.0):
+            sensor = dataclasses.replace(SENSORS["davis"], frame_rate=rate, truth_rate=20.0)
+            recording = simulate(Objects(seed=seed), sensor, seed, f"objects {seed}")
+            params = Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4)
+            video = jaxevent.METHODS["mc"].estimate(recording, params, progress=False)
+            times, truths = recording.extra["hdr_t"], recording.extra["hdr"]
+            for row in np.unique(np.linspace(2, len(times) - 3, 5).round().astype(int)):
+                truth = np.asarray(truths[row])
+                yield f"objects {rate:g} Hz", video, int(times[row]), truth, False
+
+
+def compared(targets: Iterator[tuple]) -> Iterator[dict[str, Any]]:
+    compare = jax.jit(fusion.compare)
+    for label, video, t, truth, hdr in targets:
+        instants, p, _ = video._target(t)
+        L, V, clear = video._images(instants.t)
+        L, V, along, place = estimator.gather(instants, L, V, clear, p)
+        told = compare(video.params, L, V, along, place)
+        yield {
+            "label": label,
+            "ingredients": np.asarray(told.ingredients),
+            "signs": np.asarray(told.signs),
+            "truth": truth.astype(np.float32),
+            "I0": float(video.params.I0),
+            "hdr": hdr,
+        }
+
+
+def errors(L: Any, I0: Any, truth: Any, hdr: Any) -> Any:
+    """What is made small: squared differences of intensity, of HDR scenes of its logarithm."""
+    image = jnp.exp(L) - I0
+    linear = jnp.clip(image, 0, 1) - jnp.clip(truth, 0, 1)
+    logs = jnp.log(jnp.maximum(image, 0) + 0.003) - jnp.log(truth + 0.003)
+    return jnp.where(hdr, logs, linear) ** 2
+
+
+def fit(rows: list[dict], sub: int = 7, iterations: int = 400, l2: float = 3e-4) -> tuple:
+    """`choice` (2, signs) and `doubt` (signs)."""
+
+    def column(part) -> jnp.ndarray:
+        return jnp.asarray(np.concatenate([np.asarray(part(r), np.float32) for r in rows]))
+
+    def some(image):
+        return image.reshape(*image.shape[:-2], -1)[..., ::sub]
+
+    X = column(lambda r: some(r["signs"]).T)
+    Y = column(lambda r: some(r["ingredients"]).T)
+    truth = column(lambda r: some(r["truth"]))
+    I0 = column(lambda r: np.full(len(some(r["truth"])), r["I0"]))
+    hdr = column(lambda r: np.full(len(some(r["truth"])), r["hdr"])) > 0
+    # Every image counts by what its ingredients get wrong, so that hard ones do not outweigh.
+    scale = column(
+        lambda r: np.full(
+            len(some(r["truth"])),
+            1
+            / np.sqrt(
+                np.prod(
+                    [
+                        float(errors(r["ingredients"][k], r["I0"], r["truth"], r["hdr"]).mean())
+                        for k in (0, 1)
+                    ]
+                )
+            ),
+        )
+    )
+    mean, spread = X.mean(0).at[-1].set(0), X.std(0).at[-1].set(1)
+    X = (X - mean) / spread
+    level = jnp.log(truth + I0)
+
+    def choose(W):
+        q = jax.nn.softmax(jnp.concatenate([jnp.zeros_like(X[:, :1]), X @ W.T], 1))
+        return (q * Y).sum(1)
+
+    def loss(W):
+        return (scale * errors(choose(W), I0, truth, hdr)).mean() + l2 * (W[:, :-1] ** 2).sum()
+
+    def surprise(w, squares):
+        # Heavy-tailed as a t distribution, so that a few lost pixels do not set all variances.
+        logs = X @ w
+        tail = 10 * jnp.log1p(squares * jnp.exp(-logs) / 10)
+        return 0.5 * (1.1 * tail + logs).mean() + 1e-4 * (w[:-1] ** 2).sum()
+
+    def descend(value: Callable[[Any], Any], start: Any) -> tuple[Any, float]:
+        optimiser = optax.adam(0.05)
+        state, step, found = optimiser.init(start), jax.jit(jax.value_and_grad(value)), 0.0
+        for _ in range(iterations):
+            found, gradient = step(start)
+            change, state = optimiser.update(gradient, state)
+            start = optax.apply_updates(start, change)
+        return start, float(found)
+
+    def plain(W):
+        W = W / spread
+        return W.at[..., -1].add(-(W[..., :-1] * mean[:-1]).sum(-1))
+
+    start = jnp.zeros((len(OTHERS), len(SIGNS) + 1)).at[:, -1].set(jnp.array([-2.0, -3.0]))
+    W, found = descend(loss, start)
+    squares = (choose(W) - level) ** 2
+    start = jnp.zeros(X.shape[1]).at[-1].set(jnp.log(squares.mean()))
+    w, _ = descend(lambda w: surprise(w, squares), start)
+    # Scaled so that the mean squared standardised error is 1, in the geometric mean over images.
+    places = np.cumsum([0, *(len(some(r["truth"])) for r in rows)])
+    z2 = np.asarray(squares * jnp.exp(-(X @ w)))
+    means = [np.log(z2[i:j].mean()) for i, j in zip(places[:-1], places[1:], strict=True)]
+    factor = float(np.exp(np.mean(means)))
+    w = w.at[-1].add(np.log(factor))
+    print(f"loss {found:.4f}, mean squared standardised error before scaling {factor:.2f}")
+    return np.asarray(plain(W)), np.asarray(plain(w))
+
+
+def show(rows: list[dict], params: Params) -> None:
+    """Errors of the ingredients and of the choice, by label."""
+    decide = jax.jit(fusion.decide)
+    table: dict[str, list] = {}
+    for r in rows:
+        told = fusion.Comparison(
+            jnp.asarray(r["ingredients"]),
+            jnp.asarray(r["signs"]),
+            jnp.zeros((3, 1, 1)),
+            jnp.zeros((2, 1, 1)),
+        )
+        fused = decide(params, told)
+        line = []
+        for L in (*r["ingredients"], np.asarray(fused.L)):
+            line.append(float(errors(L, r["I0"], r["truth"], r["hdr"]).mean()) * 100)
+        shown = (np.exp(np.asarray(fused.L)) - r["I0"]).clip(0, 1).astype(np.float32)
+        line.append(float(ssim(shown, r["truth"])) if not r["hdr"] else np.nan)
+        z2 = (np.asarray(fused.L) - np.log(r["truth"] + r["I0"])) ** 2 / np.asarray(fused.P)
+        table.setdefault(r["label"], []).append([*line, z2.mean()])
+    print("| images | along | smoothed | blend | mc | SSIM | z2 |\n|---|---|---|---|---|---|---|")
+    for label, lines in table.items():
+        cells = " | ".join(f"{v:.4f}" for v in np.mean(lines, 0))
+        print(f"| {label} | {cells} |", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    data = given.data / "data"
+
+    def kept(name: str, *targets: Iterator[tuple]) -> list[dict]:
+        path = given.out / f"{name}.pkl"
+        if not path.exists():
+            found = [row for one in targets for row in tqdm(compared(one), desc=name)]
+            path.write_bytes(pickle.dumps(found))
+        return pickle.loads(path.read_bytes())
+
+    slider, street = data / "slider_depth.zip", data / "davis346_street.npz"
+    fitting = [
+        kept("slider", hidden(slider, Params(**SLIDER), GAPS, 0)),
+        kept("slider_plain", hidden(slider, Params(), GAPS, 0)),
+        kept("hdr", panned(FITTING, 11, 5)),
+        kept("textures", textures(range(1000, 1060))),
+        kept("objects", objects(range(1, 4))),
+    ]
+    testing = [
+        kept("slider_test", hidden(slider, Params(**SLIDER), {2: 10, 4: 10, 8: 10, 16: 8}, 1)),
+        kept("slider_plain_test", hidden(slider, Params(), {2: 10, 4: 10, 8: 10, 16: 8}, 1)),
+        kept("street_test", hidden(street, Params(**STREET), {2: 10, 4: 10, 8: 10}, None)),
+        kept("street_plain_test", hidden(street, Params(), {2: 10, 4: 10, 8: 10}, None)),
+        kept("hdr_test", panned(TESTING, 2, 4)),
+        kept("textures_test", textures(range(2000, 2030))),
+        kept("objects_test", objects(range(11, 13))),
+    ]
+    choice, doubt = fit([row for part in fitting for row in part])
+    numbers = Params().replace(
+        choice=[round(float(v), 3) for v in choice.ravel()],
+        doubt=[round(float(v), 3) for v in doubt],
+    )
+    print("choice =", numbers.values()["choice"], "\ndoubt =", numbers.values()["doubt"])
+    for name, parts in (("fitted", fitting), ("not seen", testing)):
+        print(name)
+        for part in parts:
+            show(part, numbers)
+
+
+if __name__ == "__main__":
+    main()
