@@ -26,7 +26,7 @@ from jaxevent.runs.fit import fit
 from jaxevent.runs.reconstruction import Objective, Problem, parts
 from jaxevent.tuning import Settings, optimise
 
-FOUR = "--xla_force_host_platform_device_count=4"
+FOUR = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
 
 # Eight windows, so that each of four devices, or of two processes, has several.
 FIT = """

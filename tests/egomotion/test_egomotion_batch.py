@@ -294,7 +294,7 @@ def test_the_map_is_the_least_squares_one():
     scene = scene_of(fit)._replace(map=jnp.zeros(tracks.shape))
     # All events' weights are 1: sigma is so large that none costs anything beside it, and 4 times
     # as much counts where costs are small.
-    prior = prior._replace(alike=jnp.asarray(4e-6), flat=jnp.asarray(0.02))
+    prior = prior._replace(alike=jnp.zeros(()) + 4e-6, flat=jnp.zeros(()) + 0.02)
     for _ in range(2):
         scene, _ = adjust(tracks, scene, prior, 1e3, 100, 8)
     left = np.asarray(misfits(scene, tracks))
@@ -391,12 +391,16 @@ def test_the_gradient_of_misfits():
     scene = scene_of(fit)._replace(path=given)
 
     @jax.jit
-    def value(O0):
+    @jax.value_and_grad
+    def both(O0):
         path = dataclasses.replace(given, O=given.O.at[0].set(O0))
         return jnp.mean(misfits(scene._replace(path=path), tracks) ** 2)
 
+    def value(O0):
+        return both(O0)[0]
+
     at = given.O[0] + 0.01
-    slope = jax.jit(jax.grad(value))(at)
+    slope = both(at)[1]
     h = 1e-7
     for axis in np.eye(3):
         difference = (value(at + h * axis) - value(at - h * axis)) / (2 * h)
@@ -407,7 +411,7 @@ def test_the_gradient_of_misfits():
 def test_priors_pull():
     windows, fit = fitted()
     tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
-    strong = prior._replace(omega=jnp.asarray(1e9))
+    strong = prior._replace(omega=jnp.zeros(()) + 1e9)
     scene, _ = adjust(tracks, scene_of(fit), strong, 0.1, 0, 8)
     assert np.linalg.norm(scene.path.O[0]) < 0.1 * np.linalg.norm(fit.path.O[0])
     t = np.array([0, 300_000])

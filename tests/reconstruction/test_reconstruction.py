@@ -65,8 +65,11 @@ def followed(params):
 
 @st.composite
 def recordings(draw, fewest_frames=0, most=60):
-    """Small recordings: bursts, equal times, silent and border pixels, odd exposures."""
-    width, height = draw(st.sampled_from([(4, 3), (1, 5)]))
+    """Small recordings: bursts, equal times, silent and border pixels, odd exposures.
+
+    All have as many pixels, so that they share programs.
+    """
+    width, height = draw(st.sampled_from([(4, 3), (1, 12)]))
     count = draw(st.integers(fewest_frames, 4))
     n = draw(st.integers(0 if count else 1, most))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
@@ -200,7 +203,8 @@ def test_many_frames_and_uneven_pixels_in_windows():
     whole = jaxevent.akf.estimate(recording, params, window_events=10**6)
     features, out = jaxevent.akf.prepare(recording, times, extrapolate=True)
     assert set(np.unique(features.tiles.kind)) == {0, 1, 2, 3}
-    image, variance, _ = jaxevent.akf.read(params, jaxevent.akf.run(params, features)[0], out)
+    trajectory = jax.jit(jaxevent.akf.run)(params, features)[0]
+    image, variance, _ = jax.jit(jaxevent.akf.read)(params, trajectory, out)
     expected = look(whole, times)
     assert len(whole._begins) > 1  # cut by frames
     np.testing.assert_allclose(
@@ -407,6 +411,18 @@ def test_step_maps_over_pixels():
         np.testing.assert_allclose([mapped.L[i], mapped.P[i]], [one.L, one.P], rtol=1e-14)
 
 
+def weighted(method, params, features, out, of_image, of_variance):
+    """A loss that all pixels of all images, and what is known of their errors, take part in."""
+    image, variance, _ = method.read(params, method.run(params, features)[0], out)
+    total = (image * of_image).sum()
+    return total + (variance * of_variance).sum() if method.has_covariance else total
+
+
+# Recordings of as many pixels, frames and times share these.
+LOSS = jax.jit(weighted, static_argnums=0)
+SLOPE = jax.jit(jax.grad(weighted, 1), static_argnums=0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name, exposure, values",
@@ -424,18 +440,18 @@ def test_gradients_equal_central_differences(name, exposure, values):
     recording = random_recording(7, 90, 4, exposure=exposure)
     times = recording.frames.t + 1_300
     params = followed(params_of(method, **values))
-    images = chain(method, recording, times, params)
+    features, out = method.prepare(recording, times, params, extrapolate=True)
     weight = jnp.asarray(np.random.default_rng(0).normal(size=(len(times), 12)))
+    given = features, out, weight, weight
 
-    @jax.jit
-    def loss(params):
-        image, variance, _ = images(params)
-        noise = 0.0 if name == "cf-augmented" else (variance * weight).sum()
-        return (image * weight).sum() + noise
-
-    slopes = [jax.jit(jax.grad(loss))(params)]
-    if values is PARAMS:  # the other direction takes as long to compile
-        slopes.append(jax.jit(jax.jacfwd(loss))(params))
+    slope = SLOPE(method, params, *given)
+    if name == "akf" and values is PARAMS:  # forwards too: what goes backwards is made of it
+        ones = jax.tree.map(jnp.ones_like, params)
+        _, along = jax.jit(
+            lambda params: jax.jvp(lambda p: weighted(method, p, *given), (params,), (ones,))
+        )(params)
+        total = sum(np.nansum(leaf) for leaf in jax.tree.leaves(slope))
+        assert float(along) == pytest.approx(float(total), rel=1e-9)
     leaves, tree = jax.tree.flatten(params)
     names = list(jax.tree.leaves(jax.tree_util.tree_map_with_path(lambda p, _: str(p), params)))
     for i, leaf in enumerate(leaves):
@@ -444,19 +460,21 @@ def test_gradients_equal_central_differences(name, exposure, values):
                 continue  # a positive parameter at 0
             h = 1e-5 * max(abs(float(leaf.ravel()[entry])), 1e-2)
             up, down = (
-                loss(
+                LOSS(
+                    method,
                     tree.unflatten(
                         [
                             *leaves[:i],
                             leaf.ravel().at[entry].add(s).reshape(leaf.shape),
                             *leaves[i + 1 :],
                         ]
-                    )
+                    ),
+                    *given,
                 )
                 for s in (h, -h)
             )
             expected = float(up - down) / (2 * h)
-            got = [float(jax.tree.leaves(g)[i].ravel()[entry]) for g in slopes]
+            got = float(jax.tree.leaves(slope)[i].ravel()[entry])
             np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-7, err_msg=names[i])
 
 
@@ -466,8 +484,8 @@ def test_gradients_are_finite_at_corners(name):
     """No events, equal times, black and saturated pixels."""
     method = jaxevent.METHODS[name]
     for recording, values in (
-        (dataclasses.replace(random_recording(8, 1, 3), events=Events.empty()), PARAMS),
-        (random_recording(9, 50, 3, span=24_000), OPTIONS),
+        (dataclasses.replace(random_recording(8, 1, 4), events=Events.empty()), PARAMS),
+        (random_recording(9, 50, 4, span=24_000), OPTIONS),
     ):
         images = np.zeros_like(recording.frames.images)
         images[:, 1] = 255
@@ -476,9 +494,11 @@ def test_gradients_are_finite_at_corners(name):
             frames=dataclasses.replace(recording.frames, images=images),
             events=dataclasses.replace(recording.events, t=recording.events.t // 4_000 * 4_000),
         )
-        params = params_of(method, **values)
-        read = chain(method, recording, recording.frames.t + 1, params)
-        gradient = jax.jit(jax.grad(lambda p: sum(v.sum() for v in read(p))))(params)  # noqa: B023
+        params = followed(params_of(method, **values))
+        times = recording.frames.t + 1
+        features, out = method.prepare(recording, times, params, extrapolate=True)
+        ones = jnp.ones((len(times), 12))
+        gradient = SLOPE(method, params, features, out, ones, ones)
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
@@ -495,13 +515,11 @@ def test_derivative_by_the_dead_time_is_that_of_preparing_anew(name):
         return look(method.estimate(recording, params), times)[0].sum()
 
     params = followed(params_of(method, **{**OPTIONS, "rho_ref": rho}))
-    features, out = method.prepare(recording, times, params)
-
-    def total(params):
-        return method.read(params, method.run(params, features)[0], out).mean.sum()
-
+    features, out = method.prepare(recording, times, params, extrapolate=True)
+    ones = jnp.ones((len(times), 12))
+    slope = SLOPE(method, params, features, out, ones, 0 * ones).raw["rho_ref"]
     expected = (anew(rho + h) - anew(rho - h)) / (2 * h) * rho  # by ln rho
-    np.testing.assert_allclose(jax.jit(jax.grad(total))(params).raw["rho_ref"], expected, rtol=1e-5)
+    np.testing.assert_allclose(slope, expected, rtol=1e-5)
 
 
 LIKELIHOOD = jax.jit(jaxevent.aks.log_likelihood)
