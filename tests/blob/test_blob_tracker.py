@@ -205,8 +205,9 @@ def test_chunks_and_windows_do_not_matter(pair):
     assert whole.birth[1] == 31_234 and not whole(31_233).valid[0, 1]
     expected = parts(whole(times, extrapolate=True))
     other = follow(rec, params, seeds, steps=3, chunks=5)
-    same(parts(other(times, extrapolate=True)), expected)
-    same(parts(other(times[::-1], extrapolate=True)), [v[::-1] for v in expected])
+    # Not to the last bit: compilers round one size of a loop's arrays otherwise than another.
+    same(parts(other(times, extrapolate=True)), expected, exact=False)
+    same(parts(other(times[::-1], extrapolate=True)), [v[::-1] for v in expected], exact=False)
     assert np.array_equal(other.death, whole.death) and len(other._begins) > 10
 
 

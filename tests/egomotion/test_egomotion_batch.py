@@ -158,12 +158,13 @@ def test_the_motion_of_a_window_is_found():
 
 def test_the_motion_before_a_wall_is_found():
     """The homography has two, the true one costs less with a plane's depths."""
-    more = batch.Params.of({**GIVEN, "events": 20_000})
-    windows = batch.Windows(seen(ROOF[:1], 5.0), more, CAMERA)
+    recording = seen(ROOF[:1], 5.0)
+    few = batch.Windows(recording, PARAMS, CAMERA)
+    windows = batch.Windows(recording, batch.Params.of({**GIVEN, "events": 15_000}), CAMERA)
     normal = np.array(ROOF[0][0]) / ROOF[0][1]
     exact = np.cross(np.eye(3), OMEGA) + np.outer(T, normal)
     exact -= np.trace(exact) / 3 * np.eye(3)
-    M = starts.homography(windows.cut(150_000, 0.05, 20_000), windows.rotation(150_000))
+    M = starts.homography(few.cut(150_000, 0.05, batch.COARSE), few.rotation(150_000))
     assert np.linalg.norm(M - exact) < 0.5 * np.linalg.norm(exact)
 
     near = exact + 0.05 * np.linalg.norm(exact) * np.diag([0.5, -0.7, 0.5])
@@ -174,7 +175,7 @@ def test_the_motion_before_a_wall_is_found():
     assert np.degrees(np.arccos(heading[0] @ T / np.linalg.norm(T))) < 1
     assert np.linalg.norm(turn[0] - OMEGA) < 0.02 * np.linalg.norm(OMEGA)
     # Depths are the plane's; smaller than LEAST some were not.
-    (x, y), rho = windows.tracks(150_000, 0.15, 20_000).places, np.exp(found[0][0].path.log_rho)
+    (x, y), rho = windows.tracks(150_000, 0.15, batch.TRIED).places, np.exp(found[0][0].path.log_rho)
     rays = np.stack([x / F, y / F, np.ones(len(x))], 1)
     ahead = rays @ normal > 0.3
     n = np.linalg.lstsq(rays[ahead], rho[ahead])[0]
@@ -429,8 +430,9 @@ def test_priors_pull():
 
 def test_a_recording_from_end_to_end(monkeypatch):
     """With fewer steps than `fitted`, which are enough to come near."""
-    monkeypatch.setattr(batch, "ROUNDS", (batch.Stage(0.3, 6),))
-    monkeypatch.setattr(batch, "FINAL", (batch.Stage(0.1, 4),))
+    monkeypatch.setattr(batch, "ROUNDS", (batch.Stage(0.3, 4),))
+    monkeypatch.setattr(batch, "FINAL", (batch.Stage(0.1, 3),))
+    monkeypatch.setattr(batch, "GROWING", ())
     motion = batch.batch.estimate(seen(), PARAMS)
     mean, covariance, valid = motion(motion.t[len(motion) // 2 :][:1])
     assert valid[0] and covariance.shape == (1, 6, 6)

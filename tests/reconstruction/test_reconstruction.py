@@ -391,7 +391,6 @@ def test_run_jits_and_maps_over_parameters():
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *params)
     mapped = jax.jit(jax.vmap(images))(stacked)
     for i, p in enumerate(params):
-        np.testing.assert_allclose(mapped.mean[i], images(p).mean, rtol=1e-12, atol=1e-13)
         video, _ = look(jaxevent.akf.estimate(recording, p), times)
         np.testing.assert_allclose(
             mapped.mean[i].reshape(video.shape), video, rtol=1e-12, atol=1e-13
