@@ -1,11 +1,14 @@
 """Every command and example of the README works, in the order printed."""
 
+import json
 import os
 import re
 from pathlib import Path
 
 import pytest
+from commands import decoded
 from pages import run_page
+from PIL import Image
 
 from jaxevent.methods import names
 
@@ -13,7 +16,7 @@ README = (Path(__file__).parents[1] / "README.md").read_text()
 
 
 @pytest.mark.slow
-def test_examples_run_in_order(tmp_path, monkeypatch, float32):
+def test_examples_run_in_order(tmp_path, monkeypatch, capsys, float32):
     pytest.importorskip("matplotlib").use("Agg")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "environ", os.environ.copy())
@@ -23,6 +26,23 @@ def test_examples_run_in_order(tmp_path, monkeypatch, float32):
     assert scope["gradient"].raw["c_on"] != 0
     for name in ("jaxevent-demo", "slider.mp4", "dot", "moved", "fitted/params.toml"):
         assert (tmp_path / name).exists()
+    check_demo(tmp_path / "jaxevent-demo", capsys.readouterr().out)
+
+
+def check_demo(out: Path, said: str) -> None:
+    """What `jaxevent demo` writes and prints."""
+    assert (out / "results.md").read_text() in said and f"Written to {out.name}" in said
+    rows = json.loads((out / "results.json").read_text())["rows"]
+    errors = {row["method"]: row["mse"] for row in rows}
+    known = names("reconstruction")
+    assert list(errors)[: len(known)] == known
+    assert len(errors) == len(known) + 2
+    by_hand = errors["akf, thresholds and clock set by hand"]
+    assert by_hand < errors["akf"] < errors["cf"] < errors["last-frame"]
+    with Image.open(out / "comparison.png") as figure:
+        assert figure.width > 1000
+    images, about = decoded(out / "video.mp4", 360, 480)
+    assert len(images) == 180 and " 30 fps" in about
 
 
 def test_the_fit_sees_no_frame_that_the_filter_was_given():

@@ -385,31 +385,35 @@ def test_gradient_and_vmap(pair):
     truth[3, 1] = np.nan
     batch = blob.prepare_positions(rec, params, seeds, times, truth)
 
-    value = jax.jit(likelihood)(params, features)
-    assert value == pytest.approx(float(oracle(rec, params, seeds, tracker)[2]), rel=1e-9)
+    def losses(raw):
+        """Both losses and their slopes: one backwards, the other one along all numbers at once."""
 
-    def losses(raw, batch):
-        p = params.with_raw(raw)
-        nll = likelihood(p, batch.features, "all")
-        return jnp.stack([nll, blob.position_error(tracker, p, batch)])
+        def nll(raw):
+            return likelihood(params.with_raw(raw), batch.features, "all")
+
+        def error(raw):
+            return blob.position_error(tracker, params.with_raw(raw), batch)
+
+        ones = jax.tree.map(jnp.ones_like, raw)
+        held = likelihood(params.with_raw(raw), features)
+        return held, jax.value_and_grad(nll)(raw), jax.jvp(error, (raw,), (ones,))
 
     names, h = ("Q_v", "Q_p", "P0_v", "P0_p", "outliers", "clutter"), 1e-5
     raw = {name: params.raw[name] for name in names}
     steps = {name: np.zeros(13) for name in names}
     for k, name in enumerate(names):
         steps[name][2 * k : 2 * k + 2] = h, -h
-    values = jax.jit(jax.vmap(losses, (0, None)))(
-        {name: raw[name] + steps[name] for name in names}, batch
+    # Compiling a gradient takes seconds: one program tells all.
+    held, (nll, slopes), (errors, along) = jax.tree.map(
+        np.asarray, jax.jit(jax.vmap(losses))({name: raw[name] + steps[name] for name in names})
     )
-    values = np.asarray(values)
+    expected = float(oracle(rec, params, seeds, tracker)[2])
+    assert held[12] == pytest.approx(expected, rel=1e-9)
+    values = np.stack([nll, errors], 1)
     expected = (values[:12:2] - values[1:12:2]) / (2 * h)
     assert abs(expected[:, 0]).min() > 1e-7
-    # Compiling a gradient takes seconds: one loss backwards, the other one forwards.
-    slopes = jax.jit(jax.grad(lambda raw, batch: losses(raw, batch)[0]))(raw, batch)
-    np.testing.assert_allclose([slopes[name] for name in names], expected[:, 0], rtol=3e-4)
-    ones = jax.tree.map(jnp.ones_like, raw)
-    slope = jax.jit(lambda raw: jax.jvp(lambda r: losses(r, batch)[1], (raw,), (ones,))[1])(raw)
-    assert float(slope) == pytest.approx(expected[:, 1].sum(), rel=3e-4)
+    np.testing.assert_allclose([slopes[name][12] for name in names], expected[:, 0], rtol=3e-4)
+    assert along[12] == pytest.approx(expected[:, 1].sum(), rel=3e-4)
 
     d2 = ((follow(rec, params, seeds, tracker=tracker)(times).mean[:, :, :2] - truth) ** 2).sum(-1)
     error = np.nanmean(200 * (np.sqrt(1 + d2 / 100) - 1))

@@ -621,21 +621,3 @@ def test_evaluate(folder, capsys):
     assert said.startswith((folder / "results" / "results.md").read_text())
     assert str(folder / "results") in said
     assert "| small.h5  | blend" in said
-
-
-def test_demo(tmp_path, capsys, float32):
-    out = tmp_path / "demo"
-    assert cli.main(["demo", "--out", str(out)]) == 0
-    said = capsys.readouterr().out
-    assert said.startswith((out / "results.md").read_text()) and str(out) in said
-    rows = json.loads((out / "results.json").read_text())["rows"]
-    errors = {row["method"]: row["mse"] for row in rows}
-    known = names("reconstruction")
-    assert list(errors)[: len(known)] == known
-    assert len(errors) == len(known) + 2
-    by_hand = errors["akf, thresholds and clock set by hand"]
-    assert by_hand < errors["akf"] < errors["cf"] < errors["last-frame"]
-    with Image.open(out / "comparison.png") as figure:
-        assert figure.width > 1000
-    images, about = decoded(out / "video.mp4", 360, 480)
-    assert len(images) == 180 and " 30 fps" in about

@@ -175,7 +175,10 @@ def test_the_motion_before_a_wall_is_found():
     assert np.degrees(np.arccos(heading[0] @ T / np.linalg.norm(T))) < 1
     assert np.linalg.norm(turn[0] - OMEGA) < 0.02 * np.linalg.norm(OMEGA)
     # Depths are the plane's; smaller than LEAST some were not.
-    (x, y), rho = windows.tracks(150_000, 0.15, batch.TRIED).places, np.exp(found[0][0].path.log_rho)
+    (x, y), rho = (
+        windows.tracks(150_000, 0.15, batch.TRIED).places,
+        np.exp(found[0][0].path.log_rho),
+    )
     rays = np.stack([x / F, y / F, np.ones(len(x))], 1)
     ahead = rays @ normal > 0.3
     n = np.linalg.lstsq(rays[ahead], rho[ahead])[0]
