@@ -8,13 +8,13 @@ demo: .venv/demo.stamp
 	$(bin)/jaxevent demo
 
 test: lint
-	$(bin)/python -m pytest -n auto --dist loadfile
+	$(bin)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 # For the edit loop: no types, and none of the tests that take long.
 quick: .venv/test.stamp
 	$(bin)/ruff check
 	$(bin)/ruff format --check
-	$(bin)/python -m pytest -n auto --dist loadfile -m "not slow"
+	$(bin)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "not slow"
 
 lint: .venv/test.stamp
 	$(bin)/ruff check

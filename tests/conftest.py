@@ -24,6 +24,25 @@ jax.config.update("jax_enable_x64", True)
 
 hypothesis.settings.register_profile("tests", deadline=None, derandomize=True, max_examples=25)
 hypothesis.settings.load_profile("tests")
+# For experiments/mutations.py, which asks whether a test fails, not where it fails most simply.
+hypothesis.settings.register_profile(
+    "any", hypothesis.settings.get_profile("tests"), phases=(hypothesis.Phase.generate,)
+)
+
+# They take longest. Begun first, they leave no worker waiting for another at the end.
+LONGEST = (
+    "test_egomotion_batch.py",
+    "test_reconstruction.py",
+    "test_devices.py",
+    "test_fit.py",
+    "test_blob_tracker.py",
+    "test_readme.py",
+    "test_docs.py",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.path.name not in LONGEST)
 
 
 @pytest.fixture

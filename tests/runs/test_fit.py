@@ -244,6 +244,19 @@ def test_steps_that_are_not_finite_are_left_out():
         optimise(loss, Toy(b=0.5), ["b"], [ONE], settings=QUICK)
 
 
+def test_a_start_that_is_not_finite_is_not_chosen():
+    several = dataclasses.replace(QUICK, starts=3, spread=1.0)
+    bad = begin(Toy(), ["b"], several).position.raw["b"][1]
+
+    def loss(params, batch):
+        return jnp.where(jnp.abs(params.b - bad) < 1e-6, jnp.nan, (params.b - 1) ** 2)
+
+    fitted = optimise(loss, Toy(), ["b"], [ONE], settings=several)
+    losses = [loss for start, *_, loss, _ in fitted.history if start == 1 and loss is not None]
+    assert losses and not np.isfinite(losses).any()
+    close(fitted.params, b=1.0)
+
+
 @pytest.mark.parametrize(
     ("names", "search", "said"),
     [
