@@ -113,6 +113,7 @@ def test_a_run_is_pure():
         voting.prepare(recording, np.array([2_000_000]), params, model=MODEL)
 
 
+@pytest.mark.slow
 def test_it_is_evaluated(folder, capsys):
     settings = ", ".join(f"{k} = {v}" for k, v in SMALL.items())
     config = folder / "run.toml"

@@ -92,6 +92,7 @@ def folder(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_it_is_evaluated(folder, capsys):
     config = folder / "run.toml"
     config.write_text(

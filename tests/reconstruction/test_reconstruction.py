@@ -105,7 +105,8 @@ def times_of(recording):
     return np.sort(recording.start + rng.integers(-3, span + span // 3, 7))
 
 
-SLOW = {"akf", "aks", "cf-augmented"}  # they compile most; `cf` goes through the same scan
+# They compile most; `cf` goes through the same scan, and `edi` looks at frames as they do.
+SLOW = {"akf", "aks", "cf-augmented", "augmented", "high-pass"}
 METHODS = [
     pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW))
     for name in names("reconstruction")

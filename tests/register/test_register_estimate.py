@@ -51,6 +51,7 @@ def test_all_is_found_of_a_far_scene(far, tmp_path, capsys):
         assert np.isfinite(np.array(file["image"])).all()
 
 
+@pytest.mark.slow
 def test_the_clock_of_a_calibrated_rig_is_found(near):
     _, _, recording, other, rig, offset = near
     size, seen = (recording.width, recording.height), (other.width, other.height)

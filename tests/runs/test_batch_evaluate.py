@@ -132,6 +132,7 @@ def test_only_what_changed_is_computed(tmp_path, monkeypatch):
     assert json.loads(text)["rows"][0]["mse"] == score(jaxevent.load(path), METHODS["blend"])["mse"]
 
 
+@pytest.mark.slow
 def test_folders_are_known_by_all_their_files(tmp_path):
     folder = tmp_path / "folder"
     (folder / "images").mkdir(parents=True)

@@ -105,6 +105,7 @@ def test_one_file_of_all_images(folder):
     }
 
 
+@pytest.mark.slow
 def test_what_reconstruct_writes_scores_as_the_method_itself(folder, float32):
     """As HDF5, exactly; as PNG images of 8 bits, almost."""
     jaxevent.save(small().with_frames(slice(0, None, 2)), folder / "given.h5")
@@ -168,6 +169,7 @@ def test_an_hdr_reference_is_compared_as_it_is(folder):
     assert score(hdr_recording(), external(folder, white=2), protocol="reference")["mse"] > 0.1
 
 
+@pytest.mark.slow
 def test_external_results_are_kept_until_their_files_change(folder):
     write_images(folder, bytes_of(grey()))
     write_times(folder, STAMPS)
