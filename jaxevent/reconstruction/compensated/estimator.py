@@ -245,30 +245,35 @@ class CompensatedVideo(ImageSequence[Params]):
             whole = (image.astype(self.dtype), np.asarray(fused.P, self.dtype), np.isfinite(image))
             yield times[n : n + 1], tuple(v[None] for v in whole)
 
-    def _checked(self, times: Times) -> NDArray[np.int64]:
-        times = np.atleast_1d(microseconds(times))
-        span = time_span(self.recording, self.params.clock_offset)
-        check_times(np.sort(times), *span, self.recording.name)
-        return times
+    def _targets(self, times: Times, extrapolate: bool) -> Iterator[tuple]:
+        wanted = np.atleast_1d(microseconds(times))
+        if not extrapolate:
+            span = time_span(self.recording, self.params.clock_offset)
+            check_times(np.sort(wanted), *span, self.recording.name)
+        for t in wanted.tolist():
+            yield self._target(t)
 
-    def flow(self, times: Times) -> NDArray[np.float32]:
-        """Optical flow (T, H, W, 2) at `times`, of x and y in px/s, of the points visible then."""
-        found = []
-        for t in self._checked(times).tolist():
-            instants, p, _ = self._target(t)
-            size = (self.recording.height, self.recording.width)
-            found.append(trajectories.velocity(p, size) / np.float32(instants.unit))
+    def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.float32]:
+        """Optical flow (T, H, W, 2) at `times`, of x and y in px/s, of the points visible then.
+
+        Times are as those of images.
+        """
+        size = (self.recording.height, self.recording.width)
+        found = [
+            trajectories.velocity(p, size) / np.float32(instants.unit)
+            for instants, p, _ in self._targets(times, extrapolate)
+        ]
         return np.stack(found)
 
-    def sources(self, times: Times) -> dict[str, NDArray[np.float32]]:
+    def sources(self, times: Times, extrapolate: bool = False) -> dict[str, NDArray[np.float32]]:
         """Where each pixel of the images comes from: shares (T, H, W) whose sum is 1.
 
         "before" and "after" are frames along trajectories, "events" instants without frame along
         trajectories, "smoothed" the pixel's own smoother and "blend" the frames blended in place.
         `visible_before` and `visible_after`, 0 to 1, tell whether the frames next to the target
-        show the point.
+        show the point. Times are as those of images.
         """
-        found = [self._target(t)[2] for t in self._checked(times).tolist()]
+        found = [fused for _, _, fused in self._targets(times, extrapolate)]
         shares = {name: [one.sources[k] for one in found] for k, name in enumerate(SOURCES)}
         shares["visible_before"] = [one.visible[0] for one in found]
         shares["visible_after"] = [one.visible[1] for one in found]
