@@ -4,10 +4,11 @@
 
 Simulates the recordings (an S-shaped response that crops, mismatched thresholds, dead time, noise,
 hot pixels; a slow and a fast pan of each scene), fits every tunable method by
-configs/fit_ahdr.toml, and scores all on the test scenes against the true HDR images. Errors are
-geometric means over test recordings; after +- is the standard deviation over the seeds of such a
-mean, in per cent. Done parts are kept in the folder and not repeated. Where ColorVideoVDP is
-installed (pip install '.[hdr]'), the last table has its quality Q too, of every sixth image.
+configs/fit_ahdr.toml, gives the smoother's numbers to mc, and scores all on the test scenes against
+the true HDR images. Errors are geometric means over test recordings; after +- is the standard
+deviation over the seeds of such a mean, in per cent. Done parts are kept in the folder and not
+repeated. Where ColorVideoVDP is installed (pip install '.[hdr]'), the last table has its quality Q
+too, of every sixth image.
 """
 
 import argparse
@@ -78,6 +79,10 @@ def rows_of(paths: list[Path], fitted: Path, out: Path) -> list[dict]:
     ):
         method = jaxevent.METHODS[name]
         methods.append((label, method, method.Params.load(fitted, label)))
+    # mc is not fitted: it has the smoother's numbers.
+    smoother, known = methods[-1][2].values(), jaxevent.mc.Params.settings()
+    shared = {name: value for name, value in smoother.items() if name in known}
+    methods.append(("mc", jaxevent.mc, jaxevent.mc.Params(preset="hdr").replace(**shared)))
     rows = []
     for path in tqdm(paths, desc="scoring"):
         recording = jaxevent.load(path)

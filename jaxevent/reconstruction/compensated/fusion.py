@@ -21,6 +21,7 @@ from jaxevent.reconstruction.compensated.warping import Along
 from jaxevent.reconstruction.features import Numeric
 
 TINY = 1e-4  # (ln I)^2, below which signs do not tell differences
+PLAIN = 3.0  # the misfit of an instant that scatter hardly counts
 OUTSIDE = 1e6  # variance beyond the image's border
 
 
@@ -117,9 +118,10 @@ def compare(params: Params, L: Numeric, V: Numeric, along: Along, place: Place) 
     R = W * seen
     total = R.sum(0)
     M = (R * along.L).sum(0) / total
-    present = place.present[:, None, None]
-    excess = (seen / variance * present * ((along.L - M) ** 2 - 0.6 * variance)).sum(0)
-    scatter = jnp.maximum(blur(excess, 2.0) / blur(total, 2.0), 0)
+    # Of all instants but the plainly hidden ones, whatever the tolerance.
+    plain = place.present[:, None, None] / variance / (1 + (misfit / PLAIN) ** 2)
+    excess = (plain * ((along.L - M) ** 2 - 0.6 * variance)).sum(0)
+    scatter = jnp.maximum(blur(excess, 2.0) / blur((plain * eta).sum(0), 2.0), 0)
 
     smoothed = L[own]
     a, b = place.before, place.after
@@ -154,8 +156,8 @@ def compare(params: Params, L: Numeric, V: Numeric, along: Along, place: Place) 
         "near_from_blend": apartness(near, blend),
         "activity": blur(((L[1:] - L[:-1]) ** 2 * between).sum(0), 1.5),
     }
-    plain = ("seen", "seen_twice")
-    X = [signs[n] if n in plain else jnp.log(signs[n] + TINY) for n in SIGNS]
+    as_they_are = ("seen", "seen_twice")
+    X = [signs[n] if n in as_they_are else jnp.log(signs[n] + TINY) for n in SIGNS]
     X = jnp.stack([*X, jnp.ones_like(M)])
     share = R / total
     framed = place.framed[:, None, None]

@@ -54,8 +54,8 @@ class Params(smoother.Params):
     sigma_pixel = Positive(0.004, "intensity", "noise of a frame's pixel, along trajectories")
     floor = Positive(2e-4, "(ln I)^2", "variance of any image at a point between pixels")
     information = Share(0.15, "1", "of an instant without frame; the errors of instants are akin")
-    sigma_place = Positive(0.15, "px", "error of trajectories where images are fused")
-    sigma_between = Positive(0.01, "ln I", "error of interpolation between pixels")
+    sigma_place = Positive(0.1, "px", "error of trajectories where images are fused")
+    sigma_between = Positive(0.003, "ln I", "error of interpolation between pixels")
     tolerance = Positive(3.0, "1", "standardised squared difference by which a point is hidden")
     caution = Positive(
         6.0, "1", "factor on the smoother's variance where motion is estimated", gradient=False
