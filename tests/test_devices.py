@@ -273,6 +273,7 @@ def test_an_error_of_one_process_is_one_of_all(monkeypatch):
     assert devices.shared_out([10, 11, 12]) == [devices.ELSEWHERE, 11, devices.ELSEWHERE]
 
 
+@pytest.mark.slow
 def test_each_process_prepares_its_own_windows(monkeypatch):
     from texture import moving
 

@@ -153,6 +153,7 @@ def test_it_is_fitted(folder, capsys):
     fails(capsys, ["fit", config, "--out", folder / "no"], "r_t does nothing with likelihood")
 
 
+@pytest.mark.slow
 def test_it_is_on_the_command_line(folder, capsys):
     (folder / "mine.toml").write_text("".join(f"{k} = {v}\n" for k, v in SMALL.items()))
     argv = ["motion", folder / "turning.h5", "--model", MODEL, "--method", "voting", "--params",

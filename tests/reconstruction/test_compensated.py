@@ -274,6 +274,7 @@ def test_images_are_better_than_those_of_pixels_and_frames():
         assert ours < 0.5 * error(method, method.Params(**values)), name
 
 
+@pytest.mark.slow
 def test_variance_and_flow_are_true():
     recording, made = slide(), video()
     t, truth = recording.extra["hdr_t"], recording.extra["hdr"]
@@ -288,6 +289,7 @@ def test_variance_and_flow_are_true():
     assert np.median(error) < 4 and error.mean() < 8  # px/s, of 76
 
 
+@pytest.mark.slow
 def test_sources_say_where_pixels_come_from():
     shares = video().sources(np.array([200_000]))
     assert shares["before"].shape == (1, 40, 48)
@@ -296,6 +298,7 @@ def test_sources_say_where_pixels_come_from():
     assert shares["visible_before"].mean() > 0.5
 
 
+@pytest.mark.slow
 def test_images_do_not_depend_on_others():
     times = np.array([210_000, 105_000, 206_000])
     together = video()(times)
@@ -305,6 +308,7 @@ def test_images_do_not_depend_on_others():
             np.testing.assert_array_equal(one[row], other[0])
 
 
+@pytest.mark.slow
 def test_a_later_clock_changes_nothing():
     recording = slide()
     shift = 5_000_000_000_000
@@ -379,6 +383,7 @@ def test_bad_input():
         mc.estimate(recording, params(), devices=())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(1, 5), (3, 2), (9, 7)])
 def test_tiny_sensors_and_single_frames(size):
     width, height = size

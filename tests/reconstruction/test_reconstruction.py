@@ -106,7 +106,7 @@ def times_of(recording):
 
 
 # They compile most; `cf` goes through the same scan, and `edi` looks at frames as they do.
-SLOW = {"akf", "aks", "cf-augmented", "augmented", "high-pass"}
+SLOW = {"akf", "aks", "cf-augmented", "augmented", "high-pass", "cf"}
 METHODS = [
     pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW))
     for name in names("reconstruction")

@@ -95,6 +95,7 @@ def test_a_dead_worker_loses_nothing_and_blames_only_its_task(tmp_path):
     assert calls(tmp_path) == {"a": 1, "b": 2, "c": 1, "d": 2, "e": 1}
 
 
+@pytest.mark.slow
 def test_workers_end_with_the_process_that_started_them(tmp_path):
     code = f"""
 import sys
