@@ -221,6 +221,7 @@ def test_nothing_found_is_an_empty_table(tmp_path, capsys):
         assert figure.width > 800
 
 
+@pytest.mark.slow
 def test_bad_ways_to_track(folder, capsys):
     path, out = folder / "two.h5", folder / "out"
     bare = folder / "bare.h5"

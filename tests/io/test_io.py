@@ -806,6 +806,7 @@ def test_changed_bytes_are_refused_or_harmless(tmp_path, format):
             load(path)
 
 
+@pytest.mark.slow
 def test_importing_is_cheap():
     code = (
         "import sys, jaxevent.io; "

@@ -121,6 +121,7 @@ def warped_case():
     return L, V, clear, np.float32([-1, 0, 1]), p
 
 
+@pytest.mark.slow
 def test_images_along_trajectories():
     L, V, clear, s, p = warped_case()
     quick = warping.warp(L, V, clear, s, p)
