@@ -17,11 +17,11 @@ from jaxevent.camera import Response
 from jaxevent.errors import InputError, require
 from jaxevent.estimator import Described, Estimate
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.clock import Clock, Timing, time_span
+from jaxevent.reconstruction.clock import Clock, Timing
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.reconstruction.video import BATCH, ImageSequence
-from jaxevent.recording import Recording, Times, check_times, microseconds
+from jaxevent.recording import Recording, Times, microseconds
 
 SMALLEST = 12  # pixels that OpenCV's search needs in width or height
 OUTLIERS = 1e-3  # of the greys of two frames, at either end, that do not set the range
@@ -166,8 +166,7 @@ class FlowVideo(ImageSequence[Params]):
         """
         times = np.atleast_1d(microseconds(times))
         if not extrapolate:
-            span = time_span(self.recording, self.params.clock_offset)
-            check_times(times, *span, self.recording.name)
+            self.estimator.check_span(self.recording, times, self.params)
         moments = _moments(self._clock, times)
         shape = (len(times), self.recording.height, self.recording.width, 2)
         flows = np.full(shape, np.nan, self._dtype)

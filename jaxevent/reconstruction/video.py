@@ -15,12 +15,12 @@ from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.clock import Timing, time_span
+from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.features import Features, ReadOut, over_pixels, pixel_mesh
 from jaxevent.reconstruction.reading import Reader
 from jaxevent.reconstruction.stream import StreamState
 from jaxevent.reconstruction.windows import WINDOW_EVENTS, EventWindow, WindowedRecording
-from jaxevent.recording import Recording, Times, check_times, microseconds
+from jaxevent.recording import Recording, Times, microseconds
 
 P = TypeVar("P", bound=FrameParams)
 
@@ -36,6 +36,8 @@ class ImageMethod(Protocol):
     def name(self) -> str: ...
 
     def check(self, recording: Recording) -> None: ...
+
+    def check_span(self, recording: Recording, times: Times, params: Any) -> None: ...
 
 
 @runtime_checkable
@@ -165,8 +167,7 @@ class ImageSequence(abc.ABC, Generic[P]):
         if (times[1:] < times[:-1]).any():
             raise InputError("times must be sorted to be read in batches; sort them")
         if not extrapolate:
-            span = time_span(self.recording, self.params.clock_offset)
-            check_times(times, *span, self.recording.name)
+            self.estimator.check_span(self.recording, times, self.params)
         start, stop = self.recording.start, self.recording.stop
         with bar(total=len(times), unit="image", progress=self.progress) as shown:
             for batch, images in self._read(times):

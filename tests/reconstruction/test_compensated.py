@@ -52,7 +52,7 @@ def test_motion_is_found_from_nothing(v, a):
     L = moved(v, a, s)
     pyramid = trajectories.Pyramid(L, np.full_like(L, 1e-3), 0.35)
     plan = trajectories.stages(s, 0.5)
-    motion = trajectories.follow(pyramid, s, None, plan, 2e-4, 10.0, SMOOTHNESS)
+    motion = trajectories.follow(pyramid, s, plan, 2e-4, 10.0, SMOOTHNESS)
     assert motion.level == 1
     p = motion.at(0, 40, 56).p
     inner = p[6:-6, 6:-6]
@@ -69,7 +69,7 @@ def test_motion_of_half_the_image_alone():
     L = np.where(np.arange(56) < 28, still, moving).astype(np.float32)
     pyramid = trajectories.Pyramid(L, np.full_like(L, 1e-3), 0.35)
     plan = trajectories.stages(s, 0.5)
-    p = trajectories.follow(pyramid, s, None, plan, 2e-4, 10.0, SMOOTHNESS).p
+    p = trajectories.follow(pyramid, s, plan, 2e-4, 10.0, SMOOTHNESS).p
     assert np.abs(p[:, :5, :2] * 2).max() < 0.3  # of half resolution
     np.testing.assert_allclose(p[2:-2, -5:-2, 0] * 2, 3, atol=0.4)
 

@@ -30,7 +30,7 @@ from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.features import Features, Numeric, ReadOut
 from jaxevent.reconstruction.video import ImageSequence, Video
 from jaxevent.reconstruction.windows import WINDOW_EVENTS, prepare
-from jaxevent.recording import Recording, Times, check_times, microseconds
+from jaxevent.recording import Recording, Times, microseconds
 
 PROBES = 6  # instants at which the speed of the image is measured
 KEPT = 96  # images of instants that a video remembers
@@ -110,18 +110,9 @@ def schedule_of(recording: Recording, params: Params, images: Images) -> Schedul
 
 
 def estimate_motion(
-    params: Params,
-    instants: Instants,
-    L: NDArray,
-    V: NDArray,
-    clear: NDArray,
-    start: NDArray | None = None,
+    params: Params, instants: Instants, L: NDArray, V: NDArray, clear: NDArray
 ) -> NDArray[np.float32]:
-    """Trajectories (rows, columns, 4) of a target, px at s = 1, from images at its instants.
-
-    `start` is that of a target close by, which a few steps improve.
-    """
-    size = L.shape[1:]
+    """Trajectories (rows, columns, 4) of a target, px at s = 1, from images at its instants."""
     s, own = instants.s, instants.own
     smoothness = trajectories.Smoothness(
         *(float(v) for v in (params.smooth, params.jump, params.edge, params.straight))
@@ -130,14 +121,9 @@ def estimate_motion(
     doubted = (V * np.where(clear > 0, 1, caution)).astype(np.float32)
     settings = (floor, nu, smoothness)
     pyramid = trajectories.Pyramid(L, doubted, FADE)
-    if start is None:
-        motion = trajectories.follow(
-            pyramid, s, None, trajectories.stages(s, instants.first), *settings
-        )
-    else:
-        plan = [trajectories.Stage(1.0, (1,), 2)]
-        motion = trajectories.follow(pyramid, s, trajectories.Motion(start, 0), plan, *settings)
-    p = motion.at(0, *size).p
+    plan = trajectories.stages(s, instants.first)
+    motion = trajectories.follow(pyramid, s, plan, *settings)
+    p = motion.at(0, *L.shape[1:]).p
     # The target's own image is the smoother's. What is fused so far is a better one to refine with.
     fused = fuse_images(params, instants, L, V, clear, p)
     L, doubted = L.copy(), doubted.copy()
@@ -149,6 +135,17 @@ def estimate_motion(
     return p
 
 
+def filled(values: NDArray, room: int, rest: float | int = 0) -> NDArray:
+    """Values (K, ...) of instants, filled up to the number `room`."""
+    more = np.full((room - len(values), *values.shape[1:]), rest, values.dtype)
+    return np.concatenate([values, more]) if len(more) else values
+
+
+def room_for(number: int) -> int:
+    """The number up to which instants are filled."""
+    return -(-number // ROOM) * ROOM
+
+
 def place_of(instants: Instants, clear: NDArray, room: int) -> Place:
     """A target's instants for `fuse`, filled up to a number of `room`."""
     count = len(instants)
@@ -158,16 +155,11 @@ def place_of(instants: Instants, clear: NDArray, room: int) -> Place:
     near = np.zeros(count, bool)
     near[[k for k in order if k == instants.own or not framed[k]][:5]] = True
     near[instants.own] = True
-
-    def filled(values: NDArray, rest: float | int) -> NDArray:
-        return np.concatenate([values, np.full(room - count, rest)]).astype(np.float32)
-
-    ones = np.ones(count)
     return Place(
-        filled(instants.s, 1),
-        filled(ones, 0),
-        filled(framed, 0),
-        filled(near, 0),
+        filled(instants.s, room, 1),
+        filled(np.ones(count, np.float32), room),
+        filled(framed.astype(np.float32), room),
+        filled(near.astype(np.float32), room),
         *(np.asarray(k, np.int32) for k in (instants.own, instants.before, instants.after)),
     )
 
@@ -177,18 +169,12 @@ def _fuse(params: Params, L, V, along, place) -> Fused:
     return fuse(params, L, V, along, place)
 
 
-def filled(images: NDArray, room: int) -> NDArray:
-    """Images (K, ...) filled up with zeros to the number `room`."""
-    rest = np.zeros((room - len(images), *images.shape[1:]), images.dtype)
-    return np.concatenate([images, rest]) if len(rest) else images
-
-
 def gather(
     instants: Instants, L: NDArray, V: NDArray, clear: NDArray, p: NDArray
 ) -> tuple[NDArray, NDArray, Along, Place]:
     """What `fusion` takes besides params: the images, those along trajectories, their place."""
     along = warp(L, V, np.asarray(clear, np.float32), instants.s, p)
-    room = -(-len(instants) // ROOM) * ROOM
+    room = room_for(len(instants))
     place = place_of(instants, clear, room)
     whole = Along(*(filled(part, room) for part in along))
     return filled(L, room), filled(V, room), whole, place
@@ -248,8 +234,7 @@ class CompensatedVideo(ImageSequence[Params]):
     def _targets(self, times: Times, extrapolate: bool) -> Iterator[tuple]:
         wanted = np.atleast_1d(microseconds(times))
         if not extrapolate:
-            span = time_span(self.recording, self.params.clock_offset)
-            check_times(np.sort(wanted), *span, self.recording.name)
+            self.estimator.check_span(self.recording, wanted, self.params)
         for t in wanted.tolist():
             yield self._target(t)
 
@@ -300,12 +285,12 @@ class MotionCompensated(ImageEstimator[Params]):
         wanted = np.atleast_1d(microseconds(times))
         if not extrapolate:
             self.check_span(recording, wanted, params)
-        images = Images(recording, params, WINDOW_EVENTS)
-        schedule = schedule_of(recording, params, images)
         if not len(wanted):
             raise InputError(f"{recording.name}: no times to prepare images for; give some")
+        images = Images(recording, params, WINDOW_EVENTS)
+        schedule = schedule_of(recording, params, images)
         chosen = [schedule(t) for t in wanted.tolist()]
-        room = -(-max(len(one) for one in chosen) // ROOM) * ROOM
+        room = room_for(max(len(one) for one in chosen))
         every = np.unique(np.concatenate([one.t for one in chosen]))
         features, instants = prepare(recording, every, Timing.of(params), filtering=False)
         shape = (len(chosen), *trajectories.nodes(recording.height, recording.width, 0), 4)

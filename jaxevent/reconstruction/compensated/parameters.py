@@ -3,7 +3,7 @@
 from jaxevent.parameters import Number, Positive, Share
 from jaxevent.reconstruction import smoother
 
-# What the decision between the ingredients looks at, see `fusion.Signs`.
+# What the choice between the ingredients looks at; `fusion.compare` computes them.
 SIGNS = (
     "fused",
     "scatter",

@@ -111,6 +111,21 @@ def between(values, y, x, out):
 
 
 @compiled
+def around(X, Y, h, w):
+    """Whether a point lies in an image, the pixels around it (or its border) and its place there.
+
+    inside, x0, y0, x1, y1, fx, fy.
+    """
+    zero = np.float32(0)
+    inside = -0.5 <= X <= w - 0.5 and -0.5 <= Y <= h - 0.5
+    X = min(max(X, zero), np.float32(w - 1))
+    Y = min(max(Y, zero), np.float32(h - 1))
+    x0, y0 = min(int(X), max(w - 2, 0)), min(int(Y), max(h - 2, 0))
+    x1, y1 = min(x0 + 1, w - 1), min(y0 + 1, h - 1)
+    return inside, x0, y0, x1, y1, X - np.float32(x0), Y - np.float32(y0)
+
+
+@compiled
 def _fetch(begin, end, images, s, near, p, floor, nu, points, M):
     """Images along the trajectories of some rows, (h, w, K, 4): L, weight R, gradient; their mean.
 
@@ -128,12 +143,7 @@ def _fetch(begin, end, images, s, near, p, floor, nu, points, M):
             for k in range(count):
                 X = np.float32(x) + (vx + ax * s[k]) * s[k]
                 Y = np.float32(y) + (vy + ay * s[k]) * s[k]
-                inside = -0.5 <= X <= w - 0.5 and -0.5 <= Y <= h - 0.5
-                X = min(max(X, zero), np.float32(w - 1))
-                Y = min(max(Y, zero), np.float32(h - 1))
-                x0, y0 = min(int(X), max(w - 2, 0)), min(int(Y), max(h - 2, 0))
-                x1, y1 = min(x0 + 1, w - 1), min(y0 + 1, h - 1)
-                fx, fy = X - np.float32(x0), Y - np.float32(y0)
+                inside, x0, y0, x1, y1, fx, fy = around(X, Y, h, w)
                 a, b = (one - fy) * (one - fx), (one - fy) * fx
                 c, d = fy * (one - fx), fy * fx
                 for q in range(4):
@@ -393,7 +403,7 @@ def _move(p, d, reach, out):
                 scale = reach if c < 2 else reach * reach * np.float32(0.25)
                 far = min(max(d[i, j, c] * scale, -FARTHEST), FARTHEST)
                 moved[i, j, c] = p[i, j, c] + far / scale
-    around = np.empty(9, np.float32)
+    window = np.empty(9, np.float32)
     for i in range(rows):
         for j in range(columns):
             for c in range(channels):
@@ -402,12 +412,12 @@ def _move(p, d, reach, out):
                     for m in range(j - 1, j + 2):
                         value = moved[min(max(k, 0), rows - 1), min(max(m, 0), columns - 1), c]
                         place = n
-                        while place > 0 and around[place - 1] > value:
-                            around[place] = around[place - 1]
+                        while place > 0 and window[place - 1] > value:
+                            window[place] = window[place - 1]
                             place -= 1
-                        around[place] = value
+                        window[place] = value
                         n += 1
-                out[i, j, c] = around[4]
+                out[i, j, c] = window[4]
 
 
 def step(
@@ -449,14 +459,14 @@ def step(
 def _resize(p, out, scale):
     """Nodes at another resolution, bilinear, displacements times `scale`."""
     rows, columns, channels = p.shape
-    ratio_y, ratio_x = np.float32(1) / scale, np.float32(1) / scale
+    ratio = np.float32(1) / scale
     for i in range(out.shape[0]):
-        at_y = (np.float32(i) + np.float32(0.5)) * ratio_y - np.float32(0.5)
+        at_y = (np.float32(i) + np.float32(0.5)) * ratio - np.float32(0.5)
         at_y = min(max(at_y, np.float32(0)), np.float32(rows - 1))
         i0 = int(at_y)
         i1, fy = min(i0 + 1, rows - 1), at_y - np.float32(i0)
         for j in range(out.shape[1]):
-            at_x = (np.float32(j) + np.float32(0.5)) * ratio_x - np.float32(0.5)
+            at_x = (np.float32(j) + np.float32(0.5)) * ratio - np.float32(0.5)
             at_x = min(max(at_x, np.float32(0)), np.float32(columns - 1))
             j0 = int(at_x)
             j1, fx = min(j0 + 1, columns - 1), at_x - np.float32(j0)
@@ -532,16 +542,15 @@ class Motion(NamedTuple):
 def follow(
     pyramid: Pyramid,
     s: NDArray[np.float32],
-    start: Motion | None,
     plan: list[Stage],
     floor: float,
     nu: float,
     smoothness: Smoothness,
 ) -> Motion:
-    """The motion after all stages of a plan, from `start` or from none."""
+    """The motion after all stages of a plan, from none."""
     _, h, w, _ = pyramid[0].shape
     first = plan[0].levels[0]
-    motion = start or Motion(np.zeros((*nodes(h, w, first), 4), np.float32), first)
+    motion = Motion(np.zeros((*nodes(h, w, first), 4), np.float32), first)
     for stage in plan:
         chosen = np.abs(s) <= stage.horizon * 1.001
         for level in stage.levels:

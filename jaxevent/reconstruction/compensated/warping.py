@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.kernels import compiled, over_rows
-from jaxevent.reconstruction.compensated.trajectories import between
+from jaxevent.reconstruction.compensated.trajectories import around, between
 from jaxevent.reconstruction.features import Numeric
 
 CUBIC = -0.75  # slope of the cubic kernel at 1, as OpenCV's; the sharper of the usual two
@@ -47,13 +47,8 @@ def _warp(begin, end, L, V, clear, s, p, out_L, out_V, out_clear, inside):
             for k in range(count):
                 X = np.float32(x) + (vx + ax * s[k]) * s[k]
                 Y = np.float32(y) + (vy + ay * s[k]) * s[k]
-                here = -0.5 <= X <= w - 0.5 and -0.5 <= Y <= h - 0.5
+                here, x0, y0, x1, y1, fx, fy = around(X, Y, h, w)
                 inside[k, y, x] = one if here else zero
-                X = min(max(X, zero), np.float32(w - 1))
-                Y = min(max(Y, zero), np.float32(h - 1))
-                x0, y0 = min(int(X), max(w - 2, 0)), min(int(Y), max(h - 2, 0))
-                x1, y1 = min(x0 + 1, w - 1), min(y0 + 1, h - 1)
-                fx, fy = X - np.float32(x0), Y - np.float32(y0)
                 a, b = (one - fy) * (one - fx), (one - fy) * fx
                 c, d = fy * (one - fx), fy * fx
                 out_V[k, y, x] = (
