@@ -1,6 +1,6 @@
 """Tracking of blobs: bright spots and other compact sources of events.
 
-    tracks = blob.moment.estimate(recording, blob.moment.Params(events_per_step=32))
+    tracks = blob.moment.estimate(recording)    # targets and parameters are found
     mean, covariance, valid = tracks(times)
 
 Every method here is used in this way, each with its own `Params`.
@@ -10,6 +10,7 @@ from jaxevent.blob.filters.chi2 import chi2, chi2_split
 from jaxevent.blob.filters.constant_velocity import constant_velocity
 from jaxevent.blob.filters.moment import moment
 from jaxevent.blob.filters.moving_moments import moving_moments
+from jaxevent.blob.finding import Found, find
 from jaxevent.blob.losses import negative_log_likelihood, position_error, prepare_positions
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.states import TrackStates
@@ -19,6 +20,7 @@ from jaxevent.blob.tracks import Tracks
 
 __all__ = [
     "Filter",
+    "Found",
     "TrackStates",
     "Tracker",
     "TrackerParams",
@@ -26,6 +28,7 @@ __all__ = [
     "chi2",
     "chi2_split",
     "constant_velocity",
+    "find",
     "moment",
     "moving_moments",
     "negative_log_likelihood",

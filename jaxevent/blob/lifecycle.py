@@ -12,11 +12,20 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxevent.blob.association import largest_eigenvalue
+from jaxevent.blob.association import Expected, largest_eigenvalue
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import LONGEST, Features
 from jaxevent.blob.steps import Filter, choose
-from jaxevent.blob.targets import Slots, begin_slots, seconds, shift_slots, silence_limits
+from jaxevent.blob.targets import (
+    Slots,
+    begin_slots,
+    own_params,
+    predict,
+    seconds,
+    shift_slots,
+    silence_limits,
+    start_states,
+)
 
 ENDS = ("end", "idle", "unconfirmed", "left", "size", "uncertain", "merged", "not finite")
 
@@ -49,11 +58,13 @@ class Log(eqx.Module):
 def begin(filter: Filter, params: TrackerParams, features: Features) -> State:
     """No track yet."""
     real = features.xi.dtype
-    number = len(features.seed) + (params.max_targets if features.detect else 0)
+    number = max(len(features.seed) + (params.max_targets if features.detect else 0), 1)
+    own = {} if not len(features.seed) else jax.tree.map(jnp.asarray, features.own)
     none = jnp.zeros(number, jnp.int32)
     size = jnp.broadcast_to(params.lambda0, number).astype(real)
-    state = jax.vmap(filter.start, (None, 0, 0))(params, jnp.zeros((number, 2), real), size)
-    slots = Slots(state, size, 0 * size, none, none, none, none, none - 1, jnp.zeros(number, bool))
+    state = start_states(filter, params, own, jnp.zeros((number, 2), real), size)
+    free = jnp.zeros(number, bool)
+    slots = Slots(state, size, 0 * size, none, none, none, none, none - 1, free, own)
     grid = None
     if features.detect:
         grid = Grid(jnp.zeros((3, *features.cells), real), jnp.zeros((), jnp.int32))
@@ -155,9 +166,12 @@ def _judge(
     alive = slots.id >= 0
     dt = jnp.where(alive, seconds(jnp.maximum(stop - slots.last, 0), slots.gate), 0)
     state = lax.stop_gradient(slots.state)
-    now = jax.vmap(filter.expected, (None, 0))(
-        params, jax.vmap(filter.predict, (None, 0, 0))(params, state, dt)
-    )
+
+    def expect(own: dict[str, Array], state: Any, dt: Array) -> Expected:
+        mine = own_params(params, own)
+        return filter.expected(mine, predict(filter, mine, state, dt))
+
+    now = jax.vmap(expect)(slots.own, state, dt)
     age = seconds(stop - slots.born, slots.gate)
     enough = (slots.hits >= params.n_confirm) & (age >= params.t_confirm)
 
@@ -211,7 +225,7 @@ def end_cycle(
     real = slots.gate.dtype
     size = jnp.broadcast_to(params.lambda0, len(dead)).astype(real)
     nowhere = jnp.zeros((len(dead), 2), real)
-    empty = jax.vmap(filter.start, (None, 0, 0))(params, nowhere, size)
+    empty = start_states(filter, params, slots.own, nowhere, size)
     slots = eqx.tree_at(lambda s: s.state, slots, jax.vmap(choose)(dead, empty, slots.state))
     state = State(slots, state.grid, state.next_id)
     if state.grid is not None:

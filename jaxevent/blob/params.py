@@ -87,6 +87,12 @@ class TrackerParams(Parameters):
     t_coast = Positive(
         0.1, "s", "confirmed tracks end after this time without events", gradient=False
     )
+    t_still = Positive(
+        0.0,
+        "s",
+        "a target without events for this time stands still, for events need motion; 0: it goes on",
+        gradient=False,
+    )
     t_merge = Positive(
         0.1,
         "s",

@@ -16,8 +16,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
+from jaxevent.blob.finding.paths import ANYBODY, NOBODY, candidates, join
+from jaxevent.blob.finding.found import Found
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.seeds import read_seeds
+from jaxevent.blob.seeds import read_seeds, span_of
 from jaxevent.errors import InputError
 from jaxevent.estimator import Described
 from jaxevent.kernels import compiled
@@ -26,6 +28,7 @@ from jaxevent.recording import Recording, Times, check_times, microseconds
 STEPS = (4, 8, 16, 32, 64, 128, 256)  # per chunk
 STRETCH_STEPS = 8192
 READ_ROWS = 65536  # events read from a file at a time
+NEAR = 3.5  # standard deviations from a found path within which events may be the target's
 LONGEST = 2**29  # us between boundaries; two of them fit into int32
 
 Numeric = Array | np.ndarray
@@ -44,6 +47,8 @@ class Features(Described):
     seed: Int[Numeric, " seeds"]  # the chunk at whose start each seed begins; -1: not in these
     seed_xi: Float[Numeric, "seeds 2"]  # px
     seed_size: Float[Numeric, " seeds"]  # px; 0: lambda0
+    owner: Int[Numeric, "chunks steps M"] | None  # see `Found`: a seed, or ANYBODY; None: anybody
+    own: dict[str, Float[Numeric, " seeds"]]  # numbers (`raw`) that are a seed's own
     frame: Float[Numeric, " 2"]  # width and height, px
     detect: bool = eqx.field(static=True)
     cells: tuple[int, int] = eqx.field(static=True)  # rows and columns of the grid of births
@@ -57,6 +62,7 @@ class ReadOut(Described):
     time: Int[Numeric, " times"]  # us since the chunk's start
     inside: Bool[Numeric, " times"]  # whether it is tracked then
     given: Int[Numeric, " seeds"]  # the place of each seed, by time, among those given
+    ended: Bool[Numeric, "times seeds"]  # whether what was found has ended by then
 
 
 class Mark(NamedTuple):
@@ -89,6 +95,7 @@ class Packing:
         start: Integers are us, floats s; None: the first event.
         stop: The first time that is left out; None: after the last event.
         detect: Whether tracks are born where events belong to none; None: only without seeds.
+        found: Targets that were found: they are the seeds and say whose events may be.
         steps: Of a chunk; None: as suits the recording.
         chunks: Of a stretch; None: as suits the steps.
 
@@ -105,12 +112,29 @@ class Packing:
         stop: int | float | None = None,
         detect: bool | None = None,
         *,
+        found: Found | None = None,
         steps: int | None = None,
         chunks: int | None = None,
     ):
-        begin, end = _span(recording, start, stop)
+        begin, end = span_of(recording, start, stop)
+        if found is not None:
+            if seeds is not None or detect:
+                raise InputError(
+                    f"{recording.name}: targets that were found take no seeds and no detection; "
+                    "leave these out"
+                )
+            seeds, detect = found.seeds(begin, end), False
         detect = seeds is None if detect is None else detect
         self.recording, self.start, self.stop = recording, begin, end
+        self.joined = self.ends = None
+        self.own: dict[str, NDArray] = {}
+        if found is not None and len(found):
+            self.joined = join(found.paths)
+            # What is seen to the last but one window goes on to the end.
+            self.ends = np.array(
+                [end if p.end >= end - p.window else p.end for p in found.paths], np.int64
+            )
+            self.own = found.own(params)
         self.seeds = read_seeds(recording, seeds, begin, end)
         # Without births and tentative tracks less is to be decided.
         self.period = max(1, round((1 if detect else 10) * 1e6 * float(params.cycle)))
@@ -143,6 +167,7 @@ class Packing:
             np.zeros(self.chunks, np.int32),
             np.zeros(self.chunks, bool),
             np.full(len(self.seeds.t), -1, np.int32),
+            np.full(shape, ANYBODY, np.int32),
         )
         bounds = _Bounds(self.start, self.stop, self.period, self.seeds.t)
         place = _Place(0, 0, 0, mark.previous, mark.start, 0, mark.seed)
@@ -150,14 +175,18 @@ class Packing:
         while not done:
             upto = min(at + READ_ROWS, self.rows[1])
             events = self.recording.events[at:upto]
-            kept = self._kept(events, at)
-            given = _Given(events.t, events.x, events.y, events.p, kept)
+            kept, owner = self._kept(events, at), np.full(len(events), ANYBODY, np.int32)
+            if self.joined is not None and len(events):
+                owner = candidates(events, self.joined, NEAR)
+                kept &= owner != NOBODY
+            given = _Given(events.t, events.x, events.y, events.p, kept, owner)
             done, used, place = _pack(given, at, upto == self.rows[1], bounds, place, out)
             at += used
         out.start[place.chunk :] = np.iinfo(np.int64).max
         features = Features(
             out.t, out.xi, out.polarity, out.row >= 0, out.elapsed, out.stop, out.cycle, out.seed,
             self.seeds.xi.astype(real), self.seeds.size.astype(real),
+            out.owner if self.joined is not None else None, self.own,
             np.array([self.recording.width, self.recording.height], real),
             self.detect, self.cells,
         )  # fmt: skip
@@ -174,7 +203,8 @@ class Packing:
         used = sum(int((w.start < np.iinfo(np.int64).max).sum()) for w in stretches)
         used = -(-used // 32) * 32  # so that few shapes occur
         fields = {}
-        for name in ("t", "xi", "polarity", "valid", "elapsed", "stop", "cycle"):
+        names = ("t", "xi", "polarity", "valid", "elapsed", "stop", "cycle")
+        for name in (*names, "owner") if self.joined is not None else names:
             fields[name] = np.concatenate([getattr(w.features, name) for w in stretches])[:used]
         at = np.stack([w.features.seed for w in stretches])
         place = np.argmax(at >= 0, axis=0)
@@ -192,7 +222,10 @@ class Packing:
         chunk = np.searchsorted(begins, us, "right") - 1
         step = count_steps(features, chunk, us - begins[chunk])
         time = (us - begins[chunk]).astype(np.int32)
-        return ReadOut(chunk, step, time, inside, self.seeds.given)
+        ended = np.zeros((len(us), len(self.seeds.t)), bool)
+        if self.ends is not None:
+            ended = us[:, None] >= self.ends
+        return ReadOut(chunk, step, time, inside, self.seeds.given, ended)
 
     def check_times(self, times: Times) -> None:
         """Raise `InputError` for times outside the recording and outside what is tracked."""
@@ -222,27 +255,6 @@ def packing_key(params: TrackerParams) -> tuple[Any, ...]:
     """The numbers that act when events are packed; equal ones pack alike."""
     names = ("events_per_step", "cycle", "cell", "prefilter", "prefilter_neighbours")
     return *(float(getattr(params, name)) for name in names), float(params.prefilter_time)
-
-
-def _span(
-    recording: Recording, start: int | float | None, stop: int | float | None
-) -> tuple[int, int]:
-    """From when to when events are used (us)."""
-    if not len(recording.events):
-        first, last = 0, 1
-        if recording.frames is not None:
-            first, last = int(recording.frames.t[0]), int(recording.frames.t[-1]) + 1
-    else:
-        first, last = int(recording.events[:1].t[0]), len(recording.events)
-        last = int(recording.events[last - 1 : last].t[0]) + 1
-    begin = first if start is None else int(microseconds(start, "the start"))
-    end = last if stop is None else int(microseconds(stop, "the stop"))
-    if end <= begin:
-        raise InputError(
-            f"{recording.name}: nothing to track from {begin} us to {end} us; the events reach "
-            f"from {first} to {last - 1} us, integers are microseconds, floats seconds"
-        )
-    return begin, end
 
 
 def count_steps(features: Features, chunk: NDArray, time: NDArray) -> NDArray[np.int32]:
@@ -276,6 +288,7 @@ class _Given(NamedTuple):
     y: NDArray
     p: NDArray
     kept: NDArray  # by the prefilter
+    owner: NDArray
 
 
 class _Bounds(NamedTuple):
@@ -311,6 +324,7 @@ class _Chunks(NamedTuple):
     stop: NDArray
     cycle: NDArray
     seed: NDArray
+    owner: NDArray
 
 
 @compiled
@@ -358,6 +372,7 @@ def _pack(given, first_row, final, bounds, place, out):
         out.xi[chunk, step, slot, 1] = given.y[i]
         out.polarity[chunk, step, slot] = 1 if given.p[i] else -1
         out.row[chunk, step, slot] = first_row + i
+        out.owner[chunk, step, slot] = given.owner[i]
         fill += 1
         i += 1
     return False, i, _Place(chunk, opened, fill, previous, begin, end, following)

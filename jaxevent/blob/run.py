@@ -53,7 +53,7 @@ def run(
         state = begin(filter, params, features)
     parts = (
         jnp.arange(len(features.t), dtype=jnp.int32), features.t, features.xi, features.polarity,
-        features.valid, features.elapsed, features.stop, features.cycle,
+        features.valid, features.owner, features.elapsed, features.stop, features.cycle,
     )  # fmt: skip
     chunk = functools.partial(_run_chunk, filter, params, features, wanted or "")
     return lax.scan(jax.checkpoint(chunk), state, parts)
@@ -67,10 +67,10 @@ def _run_chunk(
     state: State,
     part: Any,
 ) -> tuple[State, Told]:
-    number, t, xi, polarity, valid, elapsed, stop, cycle = part
+    number, t, xi, polarity, valid, owner, elapsed, stop, cycle = part
     state = shift(state, elapsed)
     before = sow(filter, params, features, features.seed == number, state.slots)
-    events = t, xi, polarity, valid
+    events = t, xi, polarity, valid, owner
     slots, steps = scan_steps(filter, params, wanted, features.frame, before, events)
     grid = state.grid
     if grid is not None:

@@ -1,4 +1,4 @@
-"""Where the user says that targets are."""
+"""Where the user says that targets are, and from when to when they are tracked."""
 
 import dataclasses
 import math
@@ -61,3 +61,24 @@ def read_seeds(
     return Seeds(
         np.array(times, np.int64)[given], xi[given], np.array(sizes, np.float64)[given], given
     )
+
+
+def span_of(
+    recording: Recording, start: int | float | None, stop: int | float | None
+) -> tuple[int, int]:
+    """From when to when events are used (us)."""
+    if not len(recording.events):
+        first, last = 0, 1
+        if recording.frames is not None:
+            first, last = int(recording.frames.t[0]), int(recording.frames.t[-1]) + 1
+    else:
+        first, last = int(recording.events[:1].t[0]), len(recording.events)
+        last = int(recording.events[last - 1 : last].t[0]) + 1
+    begin = first if start is None else int(microseconds(start, "the start"))
+    end = last if stop is None else int(microseconds(stop, "the stop"))
+    if end <= begin:
+        raise InputError(
+            f"{recording.name}: nothing to track from {begin} us to {end} us; the events reach "
+            f"from {first} to {last - 1} us, integers are microseconds, floats seconds"
+        )
+    return begin, end

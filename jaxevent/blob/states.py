@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.steps import Filter
-from jaxevent.blob.targets import Slots, seconds
+from jaxevent.blob.targets import Slots, own_params, predict, seconds
 from jaxevent.estimator import Estimate
 
 THETA_RATIO = 1.15  # lambda1 / lambda2 from which theta means something
@@ -56,7 +56,8 @@ def tell(
     filter: Filter, params: TrackerParams, slot: Slots, time: Array
 ) -> tuple[Array, Array, Array]:
     """Mean, covariance and seconds without events of one target at a time (us, in its chunk)."""
+    params = own_params(params, slot.own)
     dt = seconds(jnp.maximum(time - slot.last, 0), slot.gate)
-    state = filter.predict(params, slot.state, dt)
+    state = predict(filter, params, slot.state, dt)
     mean, covariance = canonical(*filter.moments(params, state))
     return mean, covariance, seconds(time - slot.heard, slot.gate)

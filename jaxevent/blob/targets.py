@@ -7,7 +7,7 @@ target and are mapped over all of them here.
 
 import functools
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -16,9 +16,13 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxevent.blob.association import gate_radius
+from jaxevent.blob.finding.paths import ANYBODY
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import LONGEST
 from jaxevent.blob.steps import Batch, Filter, choose
+
+
+P = TypeVar("P", bound=TrackerParams)
 
 
 class Slots(eqx.Module):
@@ -33,6 +37,7 @@ class Slots(eqx.Module):
     apart: Int[Array, "*targets"]  # last found more than a lambda from all older tracks
     id: Int[Array, "*targets"]  # serial number; -1: free
     confirmed: Bool[Array, "*targets"]
+    own: dict[str, Float[Array, "*targets"]]  # numbers (`raw`) that are a target's own, see `Found`
 
 
 class Step(eqx.Module):
@@ -63,6 +68,13 @@ def seconds(us: Any, like: Array) -> Array:
     return us.astype(like.dtype) * 1e-6
 
 
+def own_params(params: P, own: dict[str, Array]) -> P:
+    """The parameters of one target: those of all, but for its own numbers."""
+    if not own:
+        return params
+    return eqx.tree_at(lambda one: one.raw, params, {**params.raw, **own})
+
+
 def begin_slots(
     filter: Filter,
     params: TrackerParams,
@@ -75,13 +87,25 @@ def begin_slots(
     confirmed: bool,
 ) -> Slots:
     """Tracks begin in some slots, `which` (targets,), at rest at the positions given."""
-    state = jax.vmap(filter.start, (None, 0, 0))(params, xi, size)
+    state = start_states(filter, params, slots.own, xi, size)
     gate = jnp.clip(params.gate * size, params.gate_min, params.gate_max).astype(xi.dtype)
     at = jnp.broadcast_to(time, which.shape)
     new = Slots(
-        state, gate, jnp.zeros_like(gate), at, at, at, at, ids, jnp.full_like(which, confirmed)
-    )
+        state, gate, jnp.zeros_like(gate), at, at, at, at, ids, jnp.full_like(which, confirmed),
+        slots.own,
+    )  # fmt: skip
     return jax.vmap(choose)(which, new, slots)
+
+
+def start_states(
+    filter: Filter, params: TrackerParams, own: dict[str, Array], xi: Array, size: Array
+) -> Any:
+    """States of targets (targets, ...) at rest at the positions given."""
+
+    def start(own: dict[str, Array], xi: Array, size: Array) -> Any:
+        return filter.start(own_params(params, own), xi, size)
+
+    return jax.vmap(start)(own, xi, size)
 
 
 def shift_slots(slots: Slots, elapsed: Array) -> Slots:
@@ -101,9 +125,16 @@ def silence_limits(params: TrackerParams, slots: Slots) -> Int[Array, " targets"
     return jnp.where(slots.id >= 0, us, -4 * LONGEST)
 
 
+def predict(filter: Filter, params: TrackerParams, state: Any, dt: Array) -> Any:
+    """One target's state dt (s) later, without events; after `t_still` it stands still."""
+    still = (params.t_still > 0) & (dt > params.t_still)
+    return filter.predict(params, choose(still, filter.halt(state), state), dt)
+
+
 def place(filter: Filter, params: TrackerParams, slots: Slots) -> tuple[Array, Array, Array]:
     """Position, velocity and time of the last update of all targets."""
-    now = jax.vmap(filter.expected, (None, 0))(params, slots.state)
+    of_one = lambda slot: filter.expected(own_params(params, slot.own), slot.state)  # noqa: E731
+    now = jax.vmap(of_one)(slots)
     return now.p, now.v, slots.last
 
 
@@ -115,11 +146,13 @@ def _look_ahead(
     time: Array,
     batch: Batch,
     valid: Array,
+    owner: Array | None,
 ) -> _Ahead:
     """One target and what it expects of the events; `limit`: us of silence that end its track."""
+    params = own_params(params, slot.own)
     alive = time - slot.heard <= limit
     dt = jnp.where(alive, seconds(jnp.maximum(time - slot.last, 0), batch.xi), 0)
-    state = filter.predict(params, slot.state, dt)
+    state = predict(filter, params, slot.state, dt)
     expected = filter.expected(params, state)
     e = batch.xi - (expected.p - expected.v * batch.age[:, None])
     density = jax.vmap(filter.log_likelihood, (None, None, 0))(params, expected, e)
@@ -128,7 +161,10 @@ def _look_ahead(
     fixed, now, residual = lax.stop_gradient((params, expected, e))
     radius = gate_radius(fixed, slot.gate, now.size.max(), dt)
     gates = jax.vmap(filter.gate, (None, None, None, 0))
-    inside = gates(fixed, now, radius, residual) & alive & valid
+    inside = gates(fixed, now, radius, residual)
+    if owner is not None:
+        inside = jnp.where(owner == ANYBODY, inside, owner == slot.id)
+    inside &= alive & valid
     near = gates(fixed, now, jnp.maximum(fixed.surround, 1) * radius, residual) & alive
     return _Ahead(state, alive, radius, inside, near, density)
 
@@ -143,6 +179,7 @@ def _update_slot(
     weight: Array,
 ) -> Slots:
     """One target after its events."""
+    params = own_params(params, slot.own)
     touched = (weight > 0).any()
     number = lax.stop_gradient(weight).sum()
     state = choose(touched, filter.update(params, ahead.state, batch, weight), slot.state)
@@ -156,6 +193,7 @@ def _update_slot(
         slot.apart,
         slot.id,
         slot.confirmed,
+        slot.own,
     )
 
 
@@ -169,13 +207,15 @@ def step(
     events: Any,
 ) -> tuple[Slots, Step]:
     """One step: predict, gate, share out, update. `limit`: us of silence that end a track."""
-    times, xi, polarity, valid = events
+    times, xi, polarity, valid, owner = events
     time = times[-1]
     # A single event's is 0 for the compiler too, which leaves out what it would multiply.
     age = seconds(time - times, xi) if len(times) > 1 else jnp.zeros_like(xi[:, 0])
     batch = Batch(xi, age, polarity)
     look = functools.partial(_look_ahead, filter, params)
-    ahead = jax.vmap(look, (0, 0, None, None, None))(slots, limit, time, batch, valid)
+    ahead = jax.vmap(look, (0, 0, None, None, None, None))(
+        slots, limit, time, batch, valid, owner
+    )
     shares = jax.vmap(functools.partial(filter.share, params), 1, 1)
     weight = shares(ahead.inside, ahead.density)
     update = functools.partial(_update_slot, filter, params)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxevent.blob.finding import Found, find
 from jaxevent.blob.lifecycle import State, shift
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Packing, ReadOut
@@ -35,7 +36,7 @@ class Tracker(Estimator[P]):
     filter: Filter
     family: ClassVar[str] = "blob"
     options: frozenset[str] = dataclasses.field(
-        default=frozenset({"seeds", "start", "stop", "detect"}), kw_only=True
+        default=frozenset({"seeds", "start", "stop", "detect", "found"}), kw_only=True
     )
 
     def prepare(
@@ -48,6 +49,7 @@ class Tracker(Estimator[P]):
         start: int | float | None = None,
         stop: int | float | None = None,
         detect: bool | None = None,
+        found: Found | None = None,
         extrapolate: bool = False,
     ) -> tuple[Features, ReadOut]:
         """All events of a recording, or of a part of it, for `run`, and `times` for `read`.
@@ -58,7 +60,7 @@ class Tracker(Estimator[P]):
         """
         self.check(recording)
         params = self.Params() if params is None else params
-        packing = Packing(recording, params, seeds, start, stop, detect)
+        packing = Packing(recording, params, seeds, start, stop, detect, found=found)
         us = np.atleast_1d(microseconds(times))
         if not extrapolate:
             packing.check_times(us)
@@ -91,6 +93,7 @@ class Tracker(Estimator[P]):
         valid = (slots.id >= 0) & slots.confirmed & (time[:, None] - slots.heard < limits)
         valid &= jnp.asarray(out.inside)[:, None]
         seeds = len(out.given)
+        valid = valid.at[:, :seeds].set(valid[:, :seeds] & ~jnp.asarray(out.ended))
         id = slots.id
         if seeds:
             given = jnp.asarray(out.given)
@@ -116,27 +119,35 @@ class Tracker(Estimator[P]):
         start: int | float | None = None,
         stop: int | float | None = None,
         detect: bool | None = None,
+        found: Found | None = None,
         progress: bool | None = None,
     ) -> Tracks:
         """Track the blobs of a recording.
 
+        Without parameters and seeds the targets and what suits them are found first, see `find`.
+
         Args:
             recording: Events; frames are not needed.
-            params: See `Params`.
+            params: See `Params`; None: those of what is found, or the defaults.
             seeds: Where targets are, one (x, y, size) or (x, y, size, t) for each: the pixel, about
                 twice the standard deviation of its events in px, and when the track begins (int us
                 or float s on the recording's clock; by default at `start`). They are confirmed at
                 once.
             start: Tracking begins there, by default at the first event.
             stop: And ends before this, by default after the last event.
-            detect: Whether tracks are born where events belong to none; by default only without
-                seeds.
+            detect: Whether tracks are born where events belong to none; by default only with
+                parameters and without seeds.
+            found: Targets found before, by `find`. Tracks begin and end with them, and take events
+                that are near them only.
             progress: Whether a bar is shown; None: where somebody looks on.
 
         Raises:
             InputError: A seed is outside the sensor or the time, or there is no time to track.
         """
         self.check(recording)
-        params = self.Params() if params is None else params
-        packing = Packing(recording, params, seeds, start, stop, detect)
+        if params is None and seeds is None and detect is None and found is None:
+            found = find(recording, start, stop, progress=progress)
+        if params is None:
+            params = self.Params(**found.settings()) if found is not None else self.Params()
+        packing = Packing(recording, params, seeds, start, stop, detect, found=found)
         return Tracks(self.filter, packing, params, progress)

@@ -47,6 +47,7 @@ def _read(
     f = features
     before = jax.tree.map(lambda a: a[chunk], begins)
     events = f.t[chunk], f.xi[chunk], f.polarity[chunk], f.valid[chunk]
+    events = *events, None if f.owner is None else f.owner[chunk]
     _, steps = scan_steps(filter, params, "states", f.frame, before, events)
     path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), before, steps.slots)
     slots = jax.tree.map(lambda a: a[step[:, None], slot], path)
@@ -345,6 +346,9 @@ class Tracks:
         self.birth = np.array([history.birth[k] for k in self._serial], np.int64)
         self.confirmed = np.array([history.confirmed[k] for k in self._serial], np.int64)
         ends = [history.death.get(int(k), (self.stop, 0)) for k in self._serial]
+        if self._packing.ends is not None:
+            found = [(int(end), 1) for end in self._packing.ends]
+            ends = [min(e, f) if f[0] < self.stop else e for e, f in zip(ends, found, strict=True)]
         self.death = np.array([when for when, _ in ends], np.int64)
         self.ended = tuple(ENDS[why] for _, why in ends)
         self._id_of = np.full(max([-1, *history.birth]) + 2, -1)  # its last serves the serial -1

@@ -329,6 +329,13 @@ def expected(params: WindowParams, state: State) -> Expected:
     return Expected(x[:2], x[2:4], spread(x[6], size), state.P[:2, :2], size)
 
 
+def halt(state: State) -> State:
+    goes_on = np.ones(len(state.x))
+    goes_on[[2, 3, 7]] = 0  # velocity and turn rate
+    keep = jnp.asarray(goes_on, state.x.dtype)
+    return dataclasses.replace(state, x=keep * state.x, P=state.P * keep[:, None] * keep)
+
+
 def moments(params: WindowParams, state: State) -> tuple[Array, Array]:
     x, P = state.x[:8], state.P[:8, :8]
     if state.logarithmic:
@@ -373,7 +380,7 @@ def _update_split(params: WindowParams, state: State, batch: Batch, weight: Arra
 chi2 = Tracker(
     "chi2",
     Params,
-    Filter(start, predict, update, expected, moments),
+    Filter(start, predict, update, expected, moments, halt),
     about="The asynchronous event-blob tracker (Wang et al. 2023), equations corrected.",
 )
 chi2_split = Tracker(
@@ -385,6 +392,7 @@ chi2_split = Tracker(
         _update_split,
         expected,
         moments,
+        halt,
     ),
     about="The asynchronous event-blob tracker with one sum of squares per axis of the blob.",
 )

@@ -41,6 +41,10 @@ def expected(params: TrackerParams, state: State) -> Expected:
     return expected_of(state.motion, 0 * state.size, state.size * jnp.ones_like(state.motion.x[0]))
 
 
+def halt(state: State) -> State:
+    return State(state.motion.halt(), state.size)
+
+
 def moments(params: TrackerParams, state: State) -> tuple[Array, Array]:
     two = jnp.ones_like(state.motion.x[0])
     return moments_of(state.motion, state.size * two, 0 * two, 0 * two, jnp.zeros(4, two.dtype))
@@ -49,6 +53,6 @@ def moments(params: TrackerParams, state: State) -> tuple[Array, Array]:
 constant_velocity = Tracker(
     "constant_velocity",
     Params,
-    Filter(start, predict, update, expected, moments),
+    Filter(start, predict, update, expected, moments, halt),
     about="A Kalman filter of position and velocity of round blobs; a baseline.",
 )

@@ -149,6 +149,12 @@ def expected(params: TrackerParams, state: State) -> Expected:
     return expected_of(state.motion, state.turn[0], jnp.exp(state.log_size))
 
 
+def halt(state: State) -> State:
+    still = jnp.array([1.0, 0.0], state.turn.dtype)
+    P_turn = state.P_turn * jnp.array([1.0, 0.0, 0.0], state.P_turn.dtype)
+    return State(state.motion.halt(), state.log_size, state.P_size, still * state.turn, P_turn)
+
+
 def moments(params: TrackerParams, state: State) -> tuple[Array, Array]:
     size = jnp.exp(state.log_size)
     tt, tq, qq = state.P_turn
@@ -160,6 +166,6 @@ def moments(params: TrackerParams, state: State) -> tuple[Array, Array]:
 moment = Tracker(
     "moment",
     Params,
-    Filter(start, predict, update, expected, moments),
+    Filter(start, predict, update, expected, moments, halt),
     about="Tracking of blobs by second moments of the events' residuals; the default.",
 )

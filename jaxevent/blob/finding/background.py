@@ -1,0 +1,127 @@
+"""Events that are of no target: hot pixels, and the rate of the others in place and time.
+
+The rate is that of cells of the sensor, from the quieter quarter of the recording's slices: targets
+only add events, and one that comes back (swings, circles) fills many slices. One factor tells how
+active the whole sensor is in each slice.
+"""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.blob.finding.stream import Stream
+
+SLICES = 64  # of the recording's time
+CELL = 16  # px
+FEWEST = 50  # events per slice in the calm cells from which the sensor's activity is told
+MOST_WINDOWS = 400  # in which the dispersion is measured
+FULL = 5.0  # counts in a cell whose dispersion is measured
+
+
+@dataclasses.dataclass(frozen=True)
+class Background:
+    """The rate of events that are of no target.
+
+    Attributes:
+        rate: (rows, columns) 1/(px s), of cells of 16 px.
+        calm: (slices, rows, columns) where no target seems to be.
+        activity: (slices,) factors of the rate, at least 1.
+        duration: s.
+    """
+
+    rate: NDArray[np.float64]
+    calm: NDArray[np.bool_]
+    activity: NDArray[np.float64]
+    duration: float
+
+    def slice(self, t: float | NDArray) -> NDArray[np.int64]:
+        """Which slices hold times (s)."""
+        part = np.asarray(t) / self.duration * SLICES
+        return np.clip(part, 0, SLICES - 1).astype(np.int64)
+
+    def at(self, x: NDArray, y: NDArray, t: float) -> NDArray[np.float64]:
+        """Rates, 1/(px s), at some pixels at a time (s)."""
+        rows, columns = self.rate.shape
+        row = np.clip(np.asarray(y).astype(np.int64) // CELL, 0, rows - 1)
+        column = np.clip(np.asarray(x).astype(np.int64) // CELL, 0, columns - 1)
+        return self.rate[row, column] * self.activity[self.slice(t)]
+
+
+def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Pixels that fire far more often than all of their eight neighbours.
+
+    `counts` (rows, columns) are their events. A pixel is hot if it has four times the events of its
+    strongest neighbour, and more than chance gives to one of all pixels in a thousand recordings.
+    """
+    rows, columns = counts.shape
+    around = np.pad(counts.astype(np.float64), 1, mode="edge")
+    shifts = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+    most = np.max([around[i : i + rows, j : j + columns] for i, j in shifts], axis=0)
+    mu = np.maximum(most, 1.0)
+    evidence = counts * np.log(np.maximum(counts, 1) / mu) - counts + mu
+    return (counts > 4 * mu) & (evidence > np.log(counts.size) + 7)
+
+
+def measure_background(stream: Stream) -> Background:
+    """The background of a stream; hot pixels are marked in the stream."""
+    rows, columns = -(-stream.height // CELL), -(-stream.width // CELL)
+    pixels = np.zeros(stream.height * stream.width, np.int64)
+    cells = np.zeros(SLICES * rows * columns, np.int64)
+    kinds = Background(np.zeros((rows, columns)), np.zeros(0, bool), np.zeros(0), stream.duration)
+    hot = np.zeros((stream.height, stream.width), bool)
+    for counting in (pixels, cells):  # hot pixels are known before cells are counted
+        for part in stream.batches():
+            if counting is pixels:
+                place = part.y * stream.width + part.x
+            else:
+                where = (kinds.slice(part.t) * rows + part.y // CELL) * columns + part.x // CELL
+                place = where
+            counting += np.bincount(place, minlength=len(counting))
+        if counting is pixels:
+            hot = find_hot_pixels(pixels.reshape(stream.height, stream.width))
+            stream.hot = hot
+    return _of_counts(cells.reshape(SLICES, rows, columns).astype(float), stream.duration)
+
+
+def _of_counts(N: NDArray[np.float64], duration: float) -> Background:
+    """Of the counts of all cells in all slices."""
+    quarter, empty = np.quantile(N, 0.25, axis=0), (N == 0).mean(0)
+    # The mean of a Poisson number from its lower quartile; from the share of zeros where it is small.
+    few = np.minimum(-np.log(np.clip(empty, 0.5 / SLICES, 1)), 5.0)
+    m = np.where(quarter >= 3, quarter + 0.674 * np.sqrt(quarter + 0.5), few)
+    m = np.maximum(m, max(float(np.median(m)), 0.02))
+    ratio = N / m
+    low = ratio <= np.quantile(ratio, 0.7, axis=(1, 2), keepdims=True)
+    counted, expected = (N * low).sum((1, 2)), (m * low).sum((1, 2))
+    activity = np.ones(SLICES)
+    usual = float(np.median(counted / expected))
+    if usual > 0 and counted.mean() >= FEWEST:
+        activity = np.maximum(1, counted / expected / usual)
+    calm = N <= np.maximum(np.median(N, 0), 1)
+    return Background(m / (CELL**2 * duration / SLICES), calm, activity, duration)
+
+
+def measure_dispersion(stream: Stream, background: Background, window: float) -> float:
+    """Variance over mean of the background's counts in windows (s); at least 1.
+
+    The median over the sensor's cells: targets in a minority of them do not change it.
+    """
+    number = int(min(MOST_WINDOWS, stream.duration / window))
+    rows, columns = background.rate.shape
+    middles = (np.arange(number) + 0.5) / number * stream.duration
+    slices = background.slice(middles)
+    calm = background.calm[slices]
+    activity = background.activity[slices][:, None, None]
+    N = np.zeros((number, rows, columns))
+    for k, middle in enumerate(middles):
+        part = stream.window(middle - window / 2, middle + window / 2)
+        place = part.y // CELL * columns + part.x // CELL
+        N[k] = np.bincount(place, minlength=rows * columns).reshape(rows, columns)
+    mean = (N * calm).sum(0) / np.maximum((activity * calm).sum(0), 1)
+    squares = (calm * (N - mean * activity) ** 2).sum(0)
+    expected = (calm * mean * activity).sum(0)
+    full = expected >= FULL
+    if full.mean() < 0.5:
+        return 1.0
+    return max(1.0, float(np.median(squares[full] / expected[full])))

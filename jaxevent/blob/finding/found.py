@@ -1,0 +1,151 @@
+"""What was found of a recording: paths of targets, scales, and the parameters that follow."""
+
+import dataclasses
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.blob.finding.paths import Path
+from jaxevent.blob.finding.scale import Choice
+from jaxevent.blob.params import TrackerParams
+from jaxevent.recording import Recording
+
+P = TypeVar("P", bound=TrackerParams)
+
+STILL = 2  # windows of silence after which a target stands still
+FOREVER = 1e3  # s; what was found tells when targets end
+
+
+@dataclasses.dataclass(frozen=True)
+class Pass:
+    """What one pass over the recording chose and found."""
+
+    choice: Choice
+    targets: int
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Found:
+    """Targets of a recording, found by `find`.
+
+    Attributes:
+        paths: Where targets were, by their beginning.
+        passes: The scales chosen, and how many targets were found with each.
+        hot_pixels: How many were left out.
+        background: Events of no target, per s, of the whole sensor.
+        recording: Whose events these are.
+    """
+
+    paths: tuple[Path, ...]
+    passes: tuple[Pass, ...]
+    hot_pixels: int
+    background: float
+    recording: Recording
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __repr__(self) -> str:
+        return f"<{self.summary()}>"
+
+    def summary(self) -> str:
+        """One line of what was found."""
+        count = f"{len(self)} target{'s' * (len(self) != 1)}"
+        text = f"{count}, background of {self.background:,.0f} events/s"
+        if self.hot_pixels:
+            text += f", {self.hot_pixels} hot pixel{'s' * (self.hot_pixels != 1)} left out"
+        if not len(self):
+            return text
+        size, speed, rate = (self._typical(values) for values in self._numbers())
+        windows = [f"{p.choice.scale.window * 1e3:g}" for p in self.passes if p.targets]
+        return (
+            f"{text}; size {size:.3g} px, speed {speed:.3g} px/s, {rate:,.0f} events/s each; "
+            f"seen in windows of {' and '.join(windows)} ms"
+        )
+
+    def seeds(self, start: int, stop: int) -> list[tuple[float, float, float, int]]:
+        """One (x, y, size, us) for each target, where it is first seen; size is the largest."""
+        width, height = self.recording.width, self.recording.height
+        out = []
+        for path in self.paths:
+            x, y = path.p[0]
+            at = int(np.clip(path.begin, start, stop - 1))
+            x, y = np.clip(x, -0.5, width - 0.5), np.clip(y, -0.5, height - 0.5)
+            out.append((float(x), float(y), float(2 * np.median(path.size[:, 0])), at))
+        return out
+
+    def settings(self) -> dict[str, Any]:
+        """Values of parameters that suit what was found: scales of length, time and rate.
+
+        Of what differs between targets these are the median ones, weighted by events.
+        """
+        if not len(self):
+            return {}
+        sizes, _, rates = self._numbers()
+        windows = np.array([path.window * 1e-6 for path in self.paths])
+        most, least = self._typical(sizes, 0.95), self._typical(sizes, 0.05)
+        W = self._typical(windows)
+        steps = self._typical(rates) * self._together() * W / 32
+        return {name: self._typical(values) for name, values in self._each().items()} | {
+            "events_per_step": int(2 ** np.clip(np.round(np.log2(max(steps, 1e-9))), 0, 5)),
+            "lambda_min": min(0.5, least / 3),
+            "lambda_max": 6 * most,
+            "t_coast": FOREVER,
+            "t_merge": FOREVER,
+            "aspect_max": 1e3,
+            "sigma_max": float(np.hypot(self.recording.width, self.recording.height)),
+            "cycle": W,
+        }
+
+    def own(self, params: TrackerParams) -> dict[str, NDArray]:
+        """What of `params` differs between targets, as it is stored; not what the user has set."""
+        usual, told = self.settings(), {}
+        for name, values in self._each().items():
+            if np.isclose(float(getattr(params, name)), usual[name], rtol=1e-5):
+                stored = getattr(type(params), name).unconstrained(values)
+                told[name] = np.asarray(stored, params.raw[name].dtype)
+        return told
+
+    def _each(self) -> dict[str, NDArray[np.float64]]:
+        """Values of parameters for each target."""
+        L, v, _ = self._numbers()
+        W = np.array([path.window * 1e-6 for path in self.paths])
+        return {
+            "Q_p": 1e-4 * L**2 / W,
+            "Q_v": np.array([path.agility for path in self.paths]),
+            "Q_lambda": (0.05 * L) ** 2 / W,
+            "Q_theta": 0.01 / W,
+            "Q_q": 0.01 / W**3,
+            "P0_p": L**2 / 4,
+            "P0_v": 4 * v**2 + (L / W) ** 2,
+            "P0_lambda": L**2,
+            "P0_q": (0.1 / W) ** 2,
+            "lambda0": 2 * L,
+            "gate_decay": 1 / W,
+            "gate_min": np.maximum(2.0, 3 * L / 2),
+            "gate_max": 24 * L,
+            "t_still": STILL * W,
+        }
+
+    def _numbers(self) -> tuple[NDArray, NDArray, NDArray]:
+        """Of each target: size of the longer axis (px), speed (px/s), rate (events/s)."""
+        paths = self.paths
+        return (
+            np.array([np.median(path.size[:, 0]) for path in paths]),
+            np.array([np.median(np.hypot(*path.v.T)) for path in paths]),
+            np.array([np.median(path.n) / (path.window * 1e-6) for path in paths]),
+        )
+
+    def _typical(self, values: NDArray, part: float = 0.5) -> float:
+        """The quantile of values of targets, weighted by their events."""
+        events = np.array([path.n.sum() for path in self.paths])
+        order = np.argsort(values)
+        total = np.cumsum(events[order])
+        return float(values[order][np.searchsorted(total, part * total[-1])])
+
+    def _together(self) -> int:
+        """Most targets at a time."""
+        times = np.sort([path.begin for path in self.paths])
+        ends = np.sort([path.end for path in self.paths])
+        return int((np.arange(1, len(times) + 1) - np.searchsorted(ends, times, "right")).max())

@@ -1,0 +1,397 @@
+"""Targets followed from window to window: predicted, gated, updated, begun, joined and ended.
+
+Each is a Kalman filter of constant velocity in windows of one length. Its size follows that of its
+events. Silence is information: where no more events come than the background gives, size and
+position hold, and a target that has been silent for two windows stands still, for events need
+motion.
+"""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.blob.finding.background import Background
+from jaxevent.blob.finding.detection import FALSE_ALARMS, Scale, detect, evidence, measure_blobs
+from jaxevent.blob.finding.agility import fit_agility
+from jaxevent.blob.finding.paths import Path
+from jaxevent.blob.finding.scale import CONTACT
+from jaxevent.blob.finding.stream import Part, Stream
+from jaxevent.progress import bar
+
+GATE = 3.0  # standard deviations
+BORN, FILL = 4, 0.5  # windows, and share of its windows, in which a confirmed target was seen
+HOLD, HOLD_NEW = 24, 2  # windows that silent targets are held: confirmed ones, others
+STILL = 2  # windows of silence after which a target stands still
+SEEN, SEEN_NEW = 1e-3, 1e-5  # false alarms of a look where a target is known to be
+FAINT = 0.02  # of its own rate: a target with fewer events is silent
+GAIN = 0.2  # of size and rate
+YOUNG = 3  # windows: what is in contact then may be a part, what comes in contact later is not
+PARTS = 5  # windows of common motion in contact that make two targets one
+FREE = 0.7  # share of a blob's events that are nobody's, where a target begins
+CLAIMED, OWNS = 0.3, 0.1  # shares of a blob that is claimed, and of those who own the rest of it
+JITTER = 0.05  # of the size: error of a window's mean, for events of an edge are not independent
+
+
+@dataclasses.dataclass
+class Live:
+    """The targets of one moment; arrays begin with the number of targets."""
+
+    id: NDArray[np.int64]
+    t: NDArray[np.float64]  # s, of the last window seen
+    p: NDArray[np.float64]  # (n, 2) px
+    v: NDArray[np.float64]  # (n, 2) px/s
+    P: NDArray[np.float64]  # (n, 3): variance of p, covariance, variance of v; of each axis alike
+    C: NDArray[np.float64]  # (n, 2, 2) px^2, covariance of events
+    n: NDArray[np.float64]  # events per window
+    top: NDArray[np.float64]  # and most of them, slowly forgotten
+    q: NDArray[np.float64]  # px^2/s^3
+    nis: NDArray[np.float64]  # mean square of standardised innovations
+    born: NDArray[np.float64]  # s
+    hits: NDArray[np.int64]  # windows seen
+    miss: NDArray[np.int64]  # windows of silence
+    path: NDArray[np.float64]  # px
+    nats: NDArray[np.float64]  # against background
+    confirmed: NDArray[np.bool_]
+    part: NDArray[np.bool_]  # of another one
+
+    def keep(self, which: NDArray) -> "Live":
+        return Live(*(value[which] for value in vars(self).values()))
+
+    def add(self, other: "Live") -> "Live":
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Live(*(np.concatenate(pair) for pair in pairs))
+
+    @property
+    def size(self) -> NDArray[np.float64]:
+        """(n,) px, standard deviation along the longer axis."""
+        return np.sqrt(_larger(self.C))
+
+    @property
+    def agility(self) -> NDArray[np.float64]:
+        """Noise of the velocity, px^2/s^3."""
+        return self.q * np.clip(self.nis, 0.05, 50)
+
+    def predict(self, t: float) -> tuple[NDArray, NDArray]:
+        """Positions (n, 2) and P (n, 3) at t."""
+        dt, (a, b, c), q = t - self.t, self.P.T, self.agility
+        P = [a + 2 * b * dt + c * dt**2 + q * dt**3 / 3, b + c * dt + q * dt**2 / 2, c + q * dt]
+        return self.p + self.v * dt[:, None], np.stack(P, 1)
+
+
+def _begin(ids: NDArray, t: float, p: NDArray, C: NDArray, n: NDArray, window: float) -> Live:
+    number, square = len(ids), _larger(C)
+    zero, none = np.zeros(number), np.zeros(number, np.int64)
+    P = np.stack(
+        [square / np.maximum(n, 1) + JITTER * square, zero, 9 * (square + 1) / window**2], 1
+    )
+    # An error of 0.3 sizes after one window.
+    q = 0.3**2 * (square + 0.5) * 3 / window**3
+    return Live(
+        ids, zero + t, p, np.zeros((number, 2)), P, C, n, n, q, zero + 1, zero + t, none + 1, none,
+        zero, zero, np.zeros(number, bool), np.zeros(number, bool),
+    )  # fmt: skip
+
+
+def _larger(C: NDArray) -> NDArray[np.float64]:
+    """Larger eigenvalues of (..., 2, 2)."""
+    half = (C[..., 0, 0] - C[..., 1, 1]) / 2
+    return (C[..., 0, 0] + C[..., 1, 1]) / 2 + np.hypot(half, C[..., 0, 1])
+
+
+def touching(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> NDArray[np.float64]:
+    """Distances over the sum of both ellipses' reach along the line between them."""
+    d = pb - pa
+    length = np.hypot(d[..., 0], d[..., 1])
+    u = d / np.maximum(length, 1e-9)[..., None]
+    reach = [np.sqrt(np.einsum("...i,...ij,...j", u, C, u)) for C in (Ca, Cb)]
+    return length / np.maximum(reach[0] + reach[1], 1e-9)
+
+
+@dataclasses.dataclass
+class _Row:
+    """What is kept of a window: of the targets seen."""
+
+    t: float
+    id: NDArray
+    p: NDArray
+    v: NDArray
+    C: NDArray
+    n: NDArray
+    m: NDArray  # (n, 2) px, means of the window's events
+    R: NDArray  # (n,) px^2, their variance
+
+
+class Links:
+    """Targets followed through a stream: `Links(stream, background, scale).follow()`."""
+
+    def __init__(self, stream: Stream, background: Background, scale: Scale):
+        self.stream, self.background, self.scale = stream, background, scale
+        self.size = stream.height, stream.width
+        none, no_C = np.zeros((0, 2)), np.zeros((0, 2, 2))
+        self.live = _begin(np.zeros(0, np.int64), 0.0, none, no_C, np.zeros(0), scale.window)
+        self.next_id = 0
+        self.rows: list[_Row] = []
+        self.contacts: dict[tuple[int, int], tuple[float, NDArray, float]] = {}
+        self.confirmed: set[int] = set()
+        self.parts: set[int] = set()
+        tests = stream.width * stream.height * stream.duration / scale.window
+        self.enough = np.log(tests / FALSE_ALARMS)
+
+    def follow(self, stage: str, progress: bool | None = None) -> list[Path]:
+        """The paths of all targets that were confirmed and are no part of another.
+
+        `stage` is shown before the bar of `progress`.
+        """
+        w = self.scale.window
+        windows = int(self.stream.duration / w)
+        with bar(total=windows, unit="window", desc=stage, progress=progress) as shown:
+            for k in range(windows):
+                self._step(k * w)
+                shown.update(1)
+        self._end(np.ones(len(self.live.id), bool))
+        ids = np.concatenate([row.id for row in self.rows] or [np.zeros(0, np.int64)])
+        if not len(ids):
+            return []
+        t = np.concatenate([np.full(len(row.id), row.t) for row in self.rows])
+        us = self.stream.start + np.rint(t * 1e6).astype(np.int64)
+        joined = [np.concatenate([getattr(row, name) for row in self.rows]) for name in "pvCnmR"]
+        paths = []
+        for one in sorted(self.confirmed - self.parts):
+            at = np.flatnonzero(ids == one)
+            p, v, C, n, m, R = (values[at] for values in joined)
+            agility = fit_agility(t[at], m, R, np.median(_larger(C)) / w**3)
+            paths.append(Path(us[at], p, v, C, n, round(1e6 * w), agility))
+        return paths
+
+    def _step(self, begin: float) -> None:
+        w = self.scale.window
+        t = begin + w / 2
+        part = self.stream.window(begin, begin + w)
+        labels, blobs = detect(part, self.background, self.scale, self.size, t)
+        owner = np.full(len(part), -1)
+        if len(self.live.id):
+            seen = _Look(self.live, part, t)
+            owner = seen.share_out(labels, blobs)
+            self._update(seen, owner, labels > 0)
+            self._join_parts(t)
+            self._end(self._over())
+        self._begin_targets(part, t, owner, labels, blobs)
+
+    def _update(self, seen: "_Look", owner: NDArray, in_blob: NDArray) -> None:
+        """All targets after a window's events."""
+        live, t = self.live, seen.t
+        n, z, D = seen.moments(owner, in_blob)
+        # One place to look at, no search: fewer events tell. They move the target, not its size.
+        weak = n < 2
+        if weak.any():
+            spread = np.linalg.det(live.C + (seen.P[:, 0] + 0.1)[:, None, None] * np.eye(2))
+            all_n, all_z, all_D = seen.moments(owner, np.ones(len(owner), bool))
+            told = evidence(all_n, self._expected(seen.p, t, spread), self.scale.dispersion)
+            asked = -np.log(np.where(live.confirmed, SEEN, SEEN_NEW))
+            there = weak & (all_n >= 2) & (told >= asked)
+            n = np.where(weak, np.where(there, all_n, 0), n)
+            z = np.where(there[:, None], all_z, z)
+            D = np.where(there[:, None, None], all_D, D)
+        live.top = np.where(n >= 2, np.maximum(0.99 * live.top, n), live.top)
+        heard = (n >= 2) & (n >= FAINT * live.top)
+        live.miss = np.where(heard, 0, live.miss + 1)
+        still = live.miss == STILL
+        live.v[still], live.P[still, 1] = 0, 0
+
+        square = _larger(D)
+        R = square / 2 / np.maximum(n, 1) + square * JITTER**2 + 1e-3
+        total = seen.P[:, 0] + R
+        free = heard & ~seen.soft
+        nis = np.clip((z**2).sum(1) / 2 / total, 0, 30)
+        live.nis = np.where(free, live.nis + 0.15 * (nis - live.nis), live.nis)
+        K = seen.P[:, :2] / total[:, None]
+        p = seen.p + K[:, :1] * z
+        P = np.stack(
+            [(1 - K[:, 0]) * seen.P[:, 0], (1 - K[:, 0]) * seen.P[:, 1],
+             seen.P[:, 2] - K[:, 1] * seen.P[:, 1]], 1,
+        )  # fmt: skip
+        live.path += np.where(heard, np.hypot(*(p - live.p).T), 0)
+        live.p = np.where(heard[:, None], p, live.p)
+        live.v = np.where(heard[:, None], live.v + K[:, 1:] * z, live.v)
+        live.P = np.where(heard[:, None], P, live.P)
+        live.t = np.where(heard, t, live.t)
+        newer = 1 / (live.hits + 1)
+        a = np.maximum(GAIN * np.minimum(1, n / live.n), newer)
+        sized = free & ~weak
+        live.C = np.where(sized[:, None, None], live.C + a[:, None, None] * (D - live.C), live.C)
+        a = np.maximum(GAIN, newer)
+        live.n = np.where(heard, live.n + a * (n - live.n), live.n)
+        live.hits = live.hits + heard
+        mu = self._expected(live.p, t, np.linalg.det(live.C))
+        told = evidence(n, mu, self.scale.dispersion)
+        live.nats = live.nats + np.where(heard, told, 0)
+        self._confirm(heard, t)
+        some = live.keep(heard)
+        m, R = (seen.p + z)[heard], (square / 2 / np.maximum(n, 1))[heard]
+        self.rows.append(_Row(t, some.id, some.p, some.v, some.C, n[heard], m, R))
+
+    def _expected(self, p: NDArray, t: float, determinant: NDArray) -> NDArray[np.float64]:
+        """Events of the background in gates."""
+        rate = self.background.at(p[:, 0], p[:, 1], t)
+        area = np.pi * GATE**2 * np.sqrt(np.maximum(determinant, 0))
+        return np.maximum(rate * area * self.scale.window, 1e-3)
+
+    def _confirm(self, heard: NDArray, t: float) -> None:
+        live = self.live
+        age = np.rint((t - live.born) / self.scale.window) + 1
+        apart = ~np.isin(live.id, [newer for newer, _ in self.contacts])
+        enough = (live.hits >= BORN) & (live.hits >= FILL * age) & (live.nats > self.enough)
+        live.confirmed = live.confirmed | (heard & enough & apart)
+
+    def _join_parts(self, t: float) -> None:
+        """Make one of two targets that touch and move together."""
+        live, w = self.live, self.scale.window
+        size = live.size
+        reach = size[:, None] + size
+        apart = live.p[:, None] - live.p
+        near = np.hypot(apart[..., 0], apart[..., 1]) < CONTACT * reach
+        heard = (live.miss == 0) & ~live.part
+        now: dict[tuple[int, int], tuple[float, NDArray, float]] = {}
+        young = t - live.born < (YOUNG - 0.5) * w
+        for newer, older in zip(*np.nonzero(np.tril(near, -1)), strict=True):
+            key = int(live.id[newer]), int(live.id[older])
+            shorter = min(live.path[newer], live.path[older])
+            if key not in self.contacts and not young[newer]:
+                continue  # they came from apart
+            if not (heard[newer] and heard[older]):
+                if key in self.contacts:
+                    now[key] = self.contacts[key]
+                continue
+            since, then, path = self.contacts.get(key, (t, apart[newer, older], shorter))
+            changed = abs(np.hypot(*apart[newer, older]) - np.hypot(*then))
+            if changed >= 0.5 * reach[newer, older]:
+                since, then, path = t, apart[newer, older], shorter
+            now[key] = since, then, path
+            long = (t - since) / w >= PARTS - 0.5
+            # Slow neighbours look rigid for a few windows; those that went their own size do not.
+            if long and shorter - path > 2 * reach[newer, older]:
+                self._join(int(newer), int(older))
+                heard = heard & ~live.part
+        self.contacts = now
+
+    def _join(self, one: int, other: int) -> None:
+        live = self.live
+
+        def weight(i: int) -> tuple[bool, float]:
+            return bool(live.confirmed[i]), float(live.n[i] * live.hits[i])
+
+        big, small = (one, other) if weight(one) >= weight(other) else (other, one)
+        share = live.n[big] / (live.n[big] + live.n[small])
+        p = share * live.p[big] + (1 - share) * live.p[small]
+        C = np.zeros((2, 2))
+        for i, part in ((big, share), (small, 1 - share)):
+            C += part * (live.C[i] + np.outer(live.p[i] - p, live.p[i] - p))
+        live.p[big], live.C[big] = p, C
+        live.n[big] += live.n[small]
+        live.hits[big] = max(live.hits[big], live.hits[small])
+        live.part[small] = True
+
+    def _over(self) -> NDArray[np.bool_]:
+        """Which targets end."""
+        live, (rows, columns) = self.live, self.size
+        x, y = live.p.T
+        outside = (x <= -1) | (x >= columns) | (y <= -1) | (y >= rows)
+        return live.part | outside | (live.miss > np.where(live.confirmed, HOLD, HOLD_NEW))
+
+    def _end(self, which: NDArray) -> None:
+        over = self.live.keep(which)
+        self.confirmed |= set(over.id[over.confirmed].tolist())
+        self.parts |= set(over.id[over.part].tolist())
+        self.live = self.live.keep(~which)
+
+    def _begin_targets(
+        self, part: Part, t: float, owner: NDArray, labels: NDArray, blobs: int
+    ) -> None:
+        """Targets begin at blobs of which most events are nobody's."""
+        if not blobs:
+            return
+        free = owner < 0
+        counts = np.bincount(labels, minlength=blobs + 1)
+        found = measure_blobs(
+            Part(part.t[free], part.x[free], part.y[free]), labels[free], blobs
+        )
+        new = (found.n >= 3) & (found.n >= FREE * counts[1:])
+        number = int(new.sum())
+        ids = np.arange(self.next_id, self.next_id + number)
+        self.next_id += number
+        p, C, n = found.p[new], found.C[new], found.n[new]
+        self.live = self.live.add(_begin(ids, t, p, C, n, self.scale.window))
+        self.rows.append(_Row(t, ids, p, np.zeros_like(p), C, n, p, _larger(C) / 2 / n))
+
+
+class _Look:
+    """What targets see of a window: residuals of its events, and in whose gates they are."""
+
+    def __init__(self, live: Live, part: Part, t: float):
+        self.live, self.t = live, t
+        self.p, self.P = live.predict(t)
+        S = live.C * (1 + 2 / live.n)[:, None, None]
+        S = S + (self.P[:, 0] + 0.1)[:, None, None] * np.eye(2)
+        a, b, c = S[:, 0, 0, None], S[:, 0, 1, None], S[:, 1, 1, None]
+        late = part.t - t
+        self.ex = part.x - self.p[:, :1] - live.v[:, :1] * late
+        self.ey = part.y - self.p[:, 1:] - live.v[:, 1:] * late
+        determinant = a * c - b * b
+        squared = (c * self.ex**2 - 2 * b * self.ex * self.ey + a * self.ey**2) / determinant
+        self.distance = squared + np.log(determinant) + np.where(live.confirmed, 0, 2)[:, None]
+        self.inside = squared < GATE**2
+        self.soft = self._in_contact()
+
+    def _in_contact(self) -> NDArray[np.bool_]:
+        """Confirmed targets that touch another one: events between them are shared."""
+        live = self.live
+        near = touching(self.p[:, None], live.C[:, None], self.p, live.C) < CONTACT
+        np.fill_diagonal(near, False)
+        return (near & live.confirmed & live.confirmed[:, None]).any(1)
+
+    def share_out(self, labels: NDArray, blobs: int) -> NDArray[np.int64]:
+        """Whose each event is; -1: nobody's."""
+        distance = np.where(self.inside, self.distance, np.inf)
+        owner = np.where(self.inside.any(0), distance.argmin(0), -1)
+        number = len(self.live.id)
+        at = (labels > 0) & (owner >= 0)
+        table = np.bincount(labels[at] * number + owner[at], minlength=(blobs + 1) * number)
+        table = table.reshape(blobs + 1, number)
+        counts = np.maximum(np.bincount(labels, minlength=blobs + 1), 1)
+        share = table / counts[:, None]
+        # The rest of a blob goes with its owners: targets may grow at once, or be larger than gates.
+        for one in range(1, blobs + 1):
+            if share[one].sum() < CLAIMED:
+                continue
+            own = np.flatnonzero((share[one] >= min(OWNS, share[one].max())) & (share[one] > 0))
+            rest = np.flatnonzero((labels == one) & ~np.isin(owner, own))
+            if len(rest):
+                owner[rest] = own[self.distance[own][:, rest].argmin(0)]
+        return owner
+
+    def moments(self, owner: NDArray, which: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Number (n,), mean (n, 2) and covariance (n, 2, 2) of residuals of some events."""
+        number = len(self.live.id)
+        shared = (self.inside & self.soft[:, None]).sum(0) > 1
+        i = np.flatnonzero((owner >= 0) & which & ~shared)
+        k, weight = owner[i], np.ones(len(i))
+        if shared.any():
+            both = np.flatnonzero(shared & which)
+            inside = self.inside[:, both] & self.soft[:, None]
+            density = np.where(inside, -0.5 * self.distance[:, both], -np.inf)
+            density = np.exp(density - density.max(0)) * self.live.n[:, None]
+            of, event = np.nonzero(inside)
+            weight = np.concatenate([weight, (density / density.sum(0))[of, event]])
+            i, k = np.concatenate([i, both[event]]), np.concatenate([k, of])
+
+        def total(values: NDArray) -> NDArray[np.float64]:
+            return np.bincount(k, weight * values, number)
+
+        n = total(np.ones(len(i)))
+        ex, ey, over = self.ex[k, i], self.ey[k, i], 1 / np.maximum(n, 1e-9)
+        x, y = total(ex) * over, total(ey) * over
+        xy = total(ex * ey) * over - x * y
+        xx, yy = total(ex**2) * over - x**2, total(ey**2) * over - y**2
+        C = np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2) + np.eye(2) / 12
+        return n, np.stack([x, y], 1), C

@@ -1,0 +1,118 @@
+"""Paths of targets through windows of events, and which events are near them."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.kernels import compiled
+from jaxevent.recording import Events
+
+NOBODY, ANYBODY = -1, -2  # whose an event is: of no path, of one of several
+
+
+@dataclasses.dataclass(frozen=True)
+class Path:
+    """Where a target was in the windows in which it was seen.
+
+    Attributes:
+        t: (rows,) us, the middle of each window.
+        p: (rows, 2) px.
+        v: (rows, 2) px/s.
+        C: (rows, 2, 2) px^2, covariance of the target's events.
+        n: (rows,) events in the window, smoothed.
+        window: us.
+        agility: px^2/s^3, noise of its velocity.
+    """
+
+    t: NDArray[np.int64]
+    p: NDArray[np.float64]
+    v: NDArray[np.float64]
+    C: NDArray[np.float64]
+    n: NDArray[np.float64]
+    window: int
+    agility: float
+
+    @property
+    def begin(self) -> int:
+        """us."""
+        return int(self.t[0]) - self.window // 2
+
+    @property
+    def end(self) -> int:
+        """us; the first moment that is no more of it."""
+        return int(self.t[-1]) + self.window // 2
+
+    @property
+    def size(self) -> NDArray[np.float64]:
+        """(rows, 2) px, standard deviations along the axes, the larger first."""
+        return np.sqrt(np.maximum(np.linalg.eigvalsh(self.C)[:, ::-1], 0))
+
+    def at(self, t: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Positions (times, 2) at some times, on straight lines between rows."""
+        return np.stack([np.interp(t, self.t, self.p[:, i]) for i in range(2)], 1)
+
+    def seen(self, t: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether a window in which it was seen holds the times."""
+        after = np.clip(np.searchsorted(self.t, t), 0, len(self.t) - 1)
+        before = np.maximum(after - 1, 0)
+        return np.minimum(abs(self.t[after] - t), abs(self.t[before] - t)) <= self.window / 2
+
+
+class Joined(NamedTuple):
+    """Rows of several paths, one after another: those of path k from first[k] to first[k + 1]."""
+
+    first: NDArray[np.int64]
+    window: NDArray[np.int64]
+    t: NDArray[np.int64]
+    p: NDArray[np.float64]
+    S: NDArray[np.float64]  # (rows, 3): of events about p, xx, xy, yy
+
+
+def join(paths: Sequence[Path]) -> Joined:
+    """The paths' rows."""
+    S = [path.C * (1 + 2 / np.maximum(path.n, 1))[:, None, None] + 0.1 * np.eye(2) for path in paths]
+    S = np.concatenate(S)
+    return Joined(
+        np.cumsum([0, *(len(path.t) for path in paths)]),
+        np.array([path.window for path in paths]),
+        np.concatenate([path.t for path in paths]),
+        np.concatenate([path.p for path in paths]),
+        np.stack([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]], 1),
+    )
+
+
+def candidates(events: Events, joined: Joined, sigmas: float) -> NDArray[np.int32]:
+    """Of which path each event may be: its number, `NOBODY` or, of several, `ANYBODY`.
+
+    Of a path are events within `sigmas` standard deviations while it is seen.
+    """
+    return _candidates(events.t, events.x, events.y, joined, float(sigmas) ** 2)
+
+
+@compiled
+def _candidates(t: Any, x: Any, y: Any, joined: Any, limit: float) -> Any:
+    whose = np.full(len(t), -1, np.int32)
+    for k in range(len(joined.window)):
+        first, last, w = joined.first[k], joined.first[k + 1] - 1, joined.window[k]
+        begin, end = joined.t[first] - w // 2, joined.t[last] + w // 2
+        row = first
+        for i in range(np.searchsorted(t, begin), np.searchsorted(t, end)):
+            while row < last and joined.t[row + 1] <= t[i]:
+                row += 1
+            following = min(row + 1, last)
+            span = joined.t[following] - joined.t[row]
+            part = min(max((t[i] - joined.t[row]) / span, 0.0), 1.0) if span > 0 else 0.0
+            if span > w + w // 2 and min(part, 1 - part) * span > w / 2:
+                continue  # not seen
+            px = joined.p[row, 0] + part * (joined.p[following, 0] - joined.p[row, 0])
+            py = joined.p[row, 1] + part * (joined.p[following, 1] - joined.p[row, 1])
+            a = joined.S[row, 0] + part * (joined.S[following, 0] - joined.S[row, 0])
+            b = joined.S[row, 1] + part * (joined.S[following, 1] - joined.S[row, 1])
+            c = joined.S[row, 2] + part * (joined.S[following, 2] - joined.S[row, 2])
+            ex, ey = x[i] - px, y[i] - py
+            if c * ex * ex - 2 * b * ex * ey + a * ey * ey <= limit * (a * c - b * b):
+                whose[i] = k if whose[i] == -1 else -2
+    return whose

@@ -1,0 +1,174 @@
+"""Targets of a recording, found without settings.
+
+The background is measured, then the scale at which blobs predict the next events best is chosen and
+targets are followed at that scale. What is near them is taken away, and all is done again for what
+remains, so that slow and fast targets are found in one recording.
+"""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.blob.finding.background import CELL, Background, measure_background
+from jaxevent.blob.finding.detection import Scale, evidence
+from jaxevent.blob.finding.found import Found, Pass
+from jaxevent.blob.finding.links import FAINT, GATE, HOLD, SEEN, Links, touching
+from jaxevent.blob.finding.paths import Path
+from jaxevent.blob.finding.scale import CONTACT, choose_scale
+from jaxevent.blob.finding.stream import Stream
+from jaxevent.blob.seeds import span_of
+from jaxevent.recording import Recording
+
+PASSES = 4
+WORTH = 0.05  # nats per event from which a pass is worth it
+FEWEST = 100  # events of a recording that is looked at
+ONE_PIXEL = 0.5  # px: what is smaller is a pixel, no blob
+FILL = 0.5  # share of its windows in which a target was seen
+JOINS = 1.5  # ellipses' distances, as `touching`, of a target's end and its new beginning
+PAUSE = 4 * HOLD  # windows between them at most; or, at rest,
+REST = 2.0  # times the life of the shorter of both
+EDGE = 2.0  # sizes from the sensor's edge, where others come and go
+SAME = 0.5  # share of a target's life near one of an earlier pass that makes it a part of that
+
+
+def find(
+    recording: Recording,
+    start: int | float | None = None,
+    stop: int | float | None = None,
+    *,
+    progress: bool | None = None,
+) -> Found:
+    """Find the targets of a recording, without settings.
+
+    Args:
+        recording: Events; frames are not needed.
+        start: Events are used from there, by default all. Integers are us, floats s.
+        stop: And before this.
+        progress: Whether a bar is shown; None: where somebody looks on.
+
+    Raises:
+        InputError: There is no time between `start` and `stop`.
+    """
+    stream = Stream(recording, *span_of(recording, start, stop))
+    if len(stream) < FEWEST:
+        return Found((), (), 0, 0.0, recording)
+    background = measure_background(stream)
+    found: list[Path] = []
+    near: list[Path] = []
+    passes: list[Pass] = []
+    for number in range(PASSES):
+        choice = choose_scale(stream, background)
+        if choice is None or choice.score < WORTH:
+            break
+        confirmed = Links(stream, background, choice.scale).follow(f"find, pass {number + 1}", progress)
+        if not confirmed:
+            passes.append(Pass(choice, 0))
+            break
+        near += confirmed
+        rest = stream.without(near, GATE)
+        new = [
+            _look_back(path, rest, background, choice.scale) for path in confirmed if _lasting(path)
+        ]
+        new = [path for path in _stitch(new, (stream.width, stream.height)) if not _left_over(path, found)]
+        passes.append(Pass(choice, len(new)))
+        found += new
+        near += new
+        stream = stream.without(near, 2 * GATE)
+    rate = float((background.rate * CELL**2).sum())
+    found.sort(key=lambda path: (path.begin, path.p[0].tolist()))
+    return Found(tuple(found), tuple(passes), int(stream.hot.sum()), rate, recording)
+
+
+def _lasting(path: Path) -> bool:
+    """Whether it is larger than a pixel and was seen in enough of its windows."""
+    windows = (path.t[-1] - path.t[0]) / path.window + 1
+    size = np.median(np.trace(path.C, axis1=1, axis2=2))
+    return bool(size > 2 * ONE_PIXEL**2 and len(path.t) >= FILL * windows)
+
+
+def _look_back(path: Path, rest: Stream, background: Background, scale: Scale) -> Path:
+    """The path with what was before its beginning: the same look at one place, backwards in time.
+
+    `rest` are the events that belong to nobody.
+    """
+    first = min(8, len(path.t))
+    if first < 3:
+        return path
+    w, times = scale.window, (path.t[:first] - rest.start) * 1e-6
+    v, p = np.polyfit(times - times[0], path.p[:first], 1)
+    C, usual = path.C[:first].mean(0), float(np.median(path.n[:first]))
+    spread = C + np.eye(2) * (0.1 + np.trace(C) / 2 / max(usual, 1))
+    t, silent, rows = float(times[0]), 0, []
+    while silent < HOLD and t - 1.5 * w > 0:
+        t, p = t - w, p - v * w
+        if not (0 <= p[0] < rest.width and 0 <= p[1] < rest.height):
+            break
+        part = rest.window(t - w / 2, t + w / 2)
+        e = np.stack([part.x - p[0], part.y - p[1]], 1) - v * (part.t - t)[:, None]
+        S = spread * (1 + 0.2 * silent)
+        near = np.einsum("ni,ij,nj->n", e, np.linalg.inv(S), e) < GATE**2
+        n = int(near.sum())
+        area = np.pi * GATE**2 * np.sqrt(np.linalg.det(S))
+        mu = max(float(background.at(p[0], p[1], t)) * w * area, 1e-3)
+        if n < 2 or n < FAINT * usual or evidence(n, mu, scale.dispersion) < -np.log(SEEN):
+            silent += 1
+            continue
+        z = e[near].mean(0)
+        p, v, silent = p + 0.5 * z, v - 0.15 * z / w / (1 + silent), 0
+        rows.append((t, p, v, n))
+    if not rows:
+        return path
+    t, p, v, n = (np.array(values) for values in zip(*rows[::-1], strict=True))
+    us = rest.start + np.rint(t * 1e6).astype(np.int64)
+    C = np.broadcast_to(C, (len(rows), 2, 2))
+    before = dataclasses.replace(path, t=us, p=p, v=v, C=C, n=n.astype(float))
+    return _after(before, path)
+
+
+def _after(one: Path, other: Path) -> Path:
+    """Two paths, one after the other, as one."""
+    pairs = {name: (getattr(one, name), getattr(other, name)) for name in ("t", "p", "v", "C", "n")}
+    return dataclasses.replace(one, **{name: np.concatenate(pair) for name, pair in pairs.items()})
+
+
+def _stitch(paths: list[Path], size: tuple[int, int]) -> list[Path]:
+    """Join a path to a later one that begins where it ended: at rest or carried on."""
+    paths, done = sorted(paths, key=lambda path: path.begin), []
+    while paths:
+        one = paths.pop(0)
+        while True:
+            following = [(_gap(one, other, size), k) for k, other in enumerate(paths)]
+            distance, k = min(following, default=(np.inf, -1))
+            if distance >= JOINS:
+                break
+            one = _after(one, paths.pop(k))
+        done.append(one)
+    return done
+
+
+def _gap(one: Path, other: Path, size: tuple[int, int]) -> float:
+    """How far a path's beginning is from another's end, as `touching`; inf: too late or too soon."""
+    pause = int(other.t[0] - one.t[-1])
+    shorter = min(one.end - one.begin, other.end - other.begin)
+    if not 0 < pause <= max(min(PAUSE * one.window, 2 * REST * shorter), REST * shorter):
+        return np.inf
+    margin = EDGE * max(one.size[-1, 0], other.size[0, 0])
+    at_edge = (one.p[-1] < margin) | (one.p[-1] > np.array(size) - 1 - margin)
+    if at_edge.any() and pause > 2 * one.window:
+        return np.inf
+    ends = [one.p[-1]]
+    if pause <= PAUSE * one.window:
+        ends.append(one.p[-1] + one.v[-1] * pause * 1e-6)
+    return min(float(touching(end, one.C[-1], other.p[0], other.C[0])) for end in ends)
+
+
+def _left_over(path: Path, found: list[Path]) -> bool:
+    """Whether it was for long near a target of an earlier pass."""
+    for other in found:
+        inside = (path.t > other.begin - 2 * other.window) & (path.t < other.end + 2 * other.window)
+        row = np.clip(np.searchsorted(other.t, path.t), 0, len(other.t) - 1)
+        apart = touching(path.p, path.C, other.at(path.t), other.C[row])
+        if (inside & (apart < 1.5 * CONTACT)).mean() >= SAME:
+            return True
+    return False

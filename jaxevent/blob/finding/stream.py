@@ -1,0 +1,81 @@
+"""The events that the search for targets looks at, window by window."""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.blob.finding.paths import Path, candidates, join
+from jaxevent.recording import Recording
+
+BATCH = 1 << 20  # events read at a time
+
+
+class Part(NamedTuple):
+    """Consecutive events: t in s since the stream's start, x and y in px."""
+
+    t: NDArray[np.float64]
+    x: NDArray[np.int64]
+    y: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+
+class Stream:
+    """Events of a recording from `start` to before `stop` (us), without those that are left out.
+
+    Left out are `hot` pixels, once they are known, and what is within `sigmas` standard deviations
+    of the paths given to `without`. Nothing is copied: events are read where they are needed.
+    """
+
+    def __init__(self, recording: Recording, start: int, stop: int):
+        self.recording, self.start, self.stop = recording, start, stop
+        self.width, self.height = recording.width, recording.height
+        self.hot = np.zeros((recording.height, recording.width), bool)
+        self._out: Sequence[Path] = ()
+        self._sigmas = 0.0
+
+    @property
+    def duration(self) -> float:
+        """s."""
+        return (self.stop - self.start) * 1e-6
+
+    def __len__(self) -> int:
+        """Events in all, those left out included."""
+        events = self.recording.events
+        return events.index(self.stop) - events.index(self.start)
+
+    def without(self, paths: Sequence[Path], sigmas: float) -> "Stream":
+        """The same without events near some paths."""
+        stream = Stream(self.recording, self.start, self.stop)
+        stream.hot, stream._out, stream._sigmas = self.hot, paths, sigmas
+        return stream
+
+    def window(self, begin: float, end: float) -> Part:
+        """The events of begin <= t < end (s since the start)."""
+        us = [self.start + round(1e6 * t) for t in (begin, end)]
+        first, last = (self.recording.events.index(min(t, self.stop)) for t in us)
+        return self._rows(first, last)
+
+    def batches(self) -> Iterator[Part]:
+        """All events, one batch after another."""
+        first, last = (self.recording.events.index(t) for t in (self.start, self.stop))
+        for row in range(first, last, BATCH):
+            yield self._rows(row, min(row + BATCH, last))
+
+    def times(self, number: int) -> NDArray[np.float64]:
+        """Times (s) of some events that are equally many events apart."""
+        first, last = (self.recording.events.index(t) for t in (self.start, self.stop))
+        rows = first + ((np.arange(number) + 0.5) / number * (last - first)).astype(np.int64)
+        us = [int(self.recording.events[row : row + 1].t[0]) for row in rows]
+        return (np.array(us) - self.start) * 1e-6
+
+    def _rows(self, first: int, last: int) -> Part:
+        events = self.recording.events[first:last]
+        kept = ~self.hot[events.y, events.x]
+        if len(self._out) and len(events):
+            kept &= candidates(events, join(self._out), self._sigmas) == -1
+        t = (events.t[kept] - self.start) * 1e-6
+        return Part(t, events.x[kept].astype(np.int64), events.y[kept].astype(np.int64))
