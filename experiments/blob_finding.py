@@ -8,11 +8,11 @@ nearest of the image before; and `kalman`, a tracker of constant velocity on the
 optimal assignment, births after three and deaths after five images, as norfair and motpy do it.
 Both baselines get the window and cell that `find` chose. Makes table.md and results.json.
 
-Scores are taken at 200 times: a track and a target are one where they are nearer than 2 sizes and 3
-px. `idf1` is that of Ristani et al. 2016 (identities assigned once for the whole recording), `mota`
-that of the CLEAR metrics. A target is found if one track has it for half its time. `false` tracks
-are near no target for half of their time. `cover`: share of the targets' time that is matched; `rms`:
-px, of the matched.
+Scores are taken at 200 times: a track and a target are one where they are nearer than 2 sizes and
+3 px. `idf1` is that of Ristani et al. 2016 (identities assigned once for the whole recording),
+`mota` that of the CLEAR metrics. A target is found if one track has it for half its time. `false`
+tracks are near no target for half of their time. `cover` is the share of the targets' time that is
+matched, `rms` the distance in px where it is.
 """
 
 import argparse
@@ -28,11 +28,18 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from jaxevent.blob import Found, find, moment
-from jaxevent.blob.finding.detection import detect, measure_blobs
 from jaxevent.blob.finding.background import measure_background
+from jaxevent.blob.finding.detection import detect, measure_blobs
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.recording import Recording
-from jaxevent.simulate.blobs import Circle, Line, Lissajous, Target, Truth, blob_scene, simulate_blobs
+from jaxevent.simulate.blobs import (
+    Circle,
+    Line,
+    Target,
+    Truth,
+    blob_scene,
+    simulate_blobs,
+)
 
 VGA = (640, 480)
 TIMES = 200
@@ -45,7 +52,13 @@ class Answer(NamedTuple):
 
 
 def _drifting(
-    count: int, rate: float, speed: float, size: float, duration: float, noise: float, seed: int,
+    count: int,
+    rate: float,
+    speed: float,
+    size: float,
+    duration: float,
+    noise: float,
+    seed: int,
     shape: str = "gaussian",
 ) -> tuple[Recording, Truth]:
     """Targets that circle with random phases, so that they stay on the sensor."""
@@ -83,7 +96,11 @@ def _passing_discs(seed: int) -> tuple[Recording, Truth]:
     rng = np.random.default_rng([seed, 5])
     shift = rng.uniform(-20, 20)
     targets = [
-        Target(Line((320 - s * 120 + shift, 240 - s * 12.5), (s * 240.0, s * 10.0), size=(9.8, 9.8)), 3e4, "disc")
+        Target(
+            Line((320 - s * 120 + shift, 240 - s * 12.5), (s * 240.0, s * 10.0), size=(9.8, 9.8)),
+            3e4,
+            "disc",
+        )
         for s in (1, -1)
     ]
     return simulate_blobs(targets, VGA, 1.0, 5e3, seed)
@@ -243,7 +260,9 @@ def kalman(recording: Recording, found: Found, times: NDArray[np.int64]) -> Answ
         rows, columns = np.zeros(0, int), np.zeros(0, int)
         apart = np.zeros((len(live), len(p)))
         if live and len(p):
-            apart = np.hypot(*(np.array([one["x"] for one in live])[:, None] - p).transpose(2, 0, 1))
+            apart = np.hypot(
+                *(np.array([one["x"] for one in live])[:, None] - p).transpose(2, 0, 1)
+            )
             rows, columns = linear_sum_assignment(np.minimum(apart, 1e3))
         hit = {int(i): int(j) for i, j in zip(rows, columns, strict=True) if apart[i, j] < 30}
         for i, one in enumerate(live):
@@ -300,7 +319,9 @@ def score(answer: Answer, truth: Truth, times: NDArray[np.int64], size: tuple[in
                 errors.append(d[k, target, one])
                 switches += last[target] not in (-1, one)
                 last[target] = one
-    false = np.isfinite(tracks[..., 0]).any(0) & (same.any(1).sum(0) + hidden.sum(0) < 0.5 * np.isfinite(tracks[..., 0]).sum(0))
+    false = np.isfinite(tracks[..., 0]).any(0) & (
+        same.any(1).sum(0) + hidden.sum(0) < 0.5 * np.isfinite(tracks[..., 0]).sum(0)
+    )
     most = shared.max(1, initial=0) if shared.size else np.zeros(len(wanted))
     misses = there.sum() - matched
     return {
@@ -316,7 +337,9 @@ def score(answer: Answer, truth: Truth, times: NDArray[np.int64], size: tuple[in
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--scenes", nargs="+", default=list(SCENES))
     parser.add_argument("--seeds", type=int, default=2)

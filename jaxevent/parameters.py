@@ -321,19 +321,28 @@ class Parameters(_Module):
         return {name: NO_GRADIENT for name, number in self.numbers.items() if not number.gradient}
 
     @classmethod
-    def of(cls: type[T], table: Mapping[str, Any]) -> T:
-        """Params from `name = value` settings; raises `InputError` naming the setting."""
+    def of(cls: type[T], table: Mapping[str, Any], rest: Mapping[str, Any] | None = None) -> T:
+        """Params from `name = value` settings; raises `InputError` naming the setting.
+
+        `rest` are values of numbers that neither the table nor its preset sets.
+        """
         preset = table.get("preset")
         if preset is not None and not isinstance(preset, str):
             raise InputError(f"the preset is {preset!r}; give the name of one")
-        return cls(**table)
+        return cls(**{**(rest or {}), **cls.presets.get(preset or "", {}), **table})
 
     @classmethod
-    def load(cls: type[T], path: str | Path, method: str | None = None) -> T:
+    def load(
+        cls: type[T],
+        path: str | Path,
+        method: str | None = None,
+        rest: Mapping[str, Any] | None = None,
+    ) -> T:
         """Params from a TOML file; raises `InputError` naming file and key.
 
         The file holds `name = value` settings, or one table of them for each of several methods
         (as `jaxevent fit` writes); then `method` is the name of the table to take.
+        `rest` are values of numbers that the file does not set; omitted, the defaults.
         """
         table = read_toml(path)
         try:
@@ -344,7 +353,7 @@ class Parameters(_Module):
                         "those methods or give another file"
                     )
                 table = table[method]
-            return cls.of(table)
+            return cls.of(table, rest)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
 

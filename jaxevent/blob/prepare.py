@@ -16,14 +16,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
-from jaxevent.blob.finding.paths import ANYBODY, NOBODY, candidates, join
 from jaxevent.blob.finding.found import Found
+from jaxevent.blob.finding.paths import ANYBODY, NOBODY, candidates, join
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.seeds import read_seeds, span_of
 from jaxevent.errors import InputError
 from jaxevent.estimator import Described
 from jaxevent.kernels import compiled
-from jaxevent.recording import Recording, Times, check_times, microseconds
+from jaxevent.recording import Recording, Times, check_times
 
 STEPS = (4, 8, 16, 32, 64, 128, 256)  # per chunk
 STRETCH_STEPS = 8192
@@ -127,14 +127,14 @@ class Packing:
         detect = seeds is None if detect is None else detect
         self.recording, self.start, self.stop = recording, begin, end
         self.joined = self.ends = None
-        self.own: dict[str, NDArray] = {}
+        self.own: dict[str, Numeric] = {}
         if found is not None and len(found):
             self.joined = join(found.paths)
             # What is seen to the last but one window goes on to the end.
             self.ends = np.array(
                 [end if p.end >= end - p.window else p.end for p in found.paths], np.int64
             )
-            self.own = found.own(params)
+            self.own |= found.own(params)
         self.seeds = read_seeds(recording, seeds, begin, end)
         # Without births and tentative tracks less is to be decided.
         self.period = max(1, round((1 if detect else 10) * 1e6 * float(params.cycle)))

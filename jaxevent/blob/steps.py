@@ -30,7 +30,7 @@ class Batch(eqx.Module):
     polarity: Float[Array, " M"]  # +1 or -1
 
 
-def _go_on(state: T) -> T:
+def _go_on(params: Any, state: T, known: bool) -> T:
     return state
 
 
@@ -53,8 +53,9 @@ class Filter:
             time.
         moments: `moments(params, state)` is the mean (8,) and the covariance (8, 8) of (px, py, vx,
             vy, lambda1, lambda2, theta, q), lambda in px.
-        halt: `halt(state)` is the state of the target when it stands still: its velocity is 0 and
-            known, its position that of the last event. By default the state as it is.
+        halt: `halt(params, state, known)` is the state of a target that stands still: its velocity
+            is 0, and is either known or as uncertain as at the start. By default the state as it
+            is.
         gate: `gate(params, expected, radius, e)` says whether a residual (2,) is a possible event
             of the target.
         log_likelihood: `log_likelihood(params, expected, e)` is ln(2 pi p) of that residual.
@@ -67,7 +68,7 @@ class Filter:
     update: Callable[[Any, Any, Batch, Array], Any]
     expected: Callable[[Any, Any], Expected]
     moments: Callable[[Any, Any], tuple[Array, Array]]
-    halt: Callable[[Any], Any] = _go_on
+    halt: Callable[[Any, Any, bool], Any] = _go_on
     gate: Callable[[Any, Expected, Array, Array], Array] = association.gate
     log_likelihood: Callable[[Any, Expected, Array], Array] = association.log_likelihood
     share: Callable[[Any, Array, Array], Array] = association.share

@@ -21,7 +21,6 @@ from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import LONGEST
 from jaxevent.blob.steps import Batch, Filter, choose
 
-
 P = TypeVar("P", bound=TrackerParams)
 
 
@@ -126,9 +125,14 @@ def silence_limits(params: TrackerParams, slots: Slots) -> Int[Array, " targets"
 
 
 def predict(filter: Filter, params: TrackerParams, state: Any, dt: Array) -> Any:
-    """One target's state dt (s) later, without events; after `t_still` it stands still."""
+    """One target's state dt (s) later, without events.
+
+    After `t_still` it stands still, and when it goes on its velocity is as unknown as at the start.
+    """
     still = (params.t_still > 0) & (dt > params.t_still)
-    return filter.predict(params, choose(still, filter.halt(state), state), dt)
+    state = choose(still, filter.halt(params, state, True), state)
+    state = filter.predict(params, state, dt)
+    return choose(still, filter.halt(params, state, False), state)
 
 
 def place(filter: Filter, params: TrackerParams, slots: Slots) -> tuple[Array, Array, Array]:
@@ -213,9 +217,7 @@ def step(
     age = seconds(time - times, xi) if len(times) > 1 else jnp.zeros_like(xi[:, 0])
     batch = Batch(xi, age, polarity)
     look = functools.partial(_look_ahead, filter, params)
-    ahead = jax.vmap(look, (0, 0, None, None, None, None))(
-        slots, limit, time, batch, valid, owner
-    )
+    ahead = jax.vmap(look, (0, 0, None, None, None, None))(slots, limit, time, batch, valid, owner)
     shares = jax.vmap(functools.partial(filter.share, params), 1, 1)
     weight = shares(ahead.inside, ahead.density)
     update = functools.partial(_update_slot, filter, params)

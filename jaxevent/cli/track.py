@@ -14,10 +14,12 @@ def add(commands: Any) -> None:
     one = command(
         commands,
         run,
-        "Track blobs: bright spots and other compact sources of events. Without suffix the output "
-        "is a folder of tracks.csv, tracks.h5, tracks.mp4 and tracks.png; with one it is the file "
-        "of that kind. Tables have a row for each track and time.",
-        "stars.h5 --params slow.toml --out stars",
+        "Track blobs: bright spots and other compact sources of events. Targets, their scales and "
+        "the parameters that suit them are found in the recording; what is given in --params or "
+        "with --seed wins. Without suffix the output is a folder of tracks.csv, tracks.h5, "
+        "tracks.mp4, tracks.png and params.toml; with one it is the file of that kind. Tables have "
+        "a row for each track and time.",
+        "stars.h5 --out stars",
         "dot.h5 --seed 320,240,20 --rate 2000 --out dot.csv",
         "car.h5 --seed 400,300,15 --seed 460,300,15 --pair 0,1 --out car",
     )
@@ -43,10 +45,13 @@ def add(commands: Any) -> None:
         type=arguments.seed,
         action="append",
         help="where a blob is (px), how large (standard deviation of its events, px) and from when "
-        "(s, default: the start); may be repeated. Without, blobs are found",
+        "(s, default: the start); may be repeated. Without, targets are found",
     )
     one.add_argument(
-        "--detect", action="store_true", help="find further blobs where there are seeds"
+        "--detect",
+        action="store_true",
+        help="tracks begin where events are many on a grid, as --params says, instead of the "
+        "search through the whole recording; with seeds: further ones",
     )
     when = one.add_mutually_exclusive_group()
     when.add_argument(
@@ -100,12 +105,14 @@ def run(
     size_factor: float | int | None,
     out: Path,
 ) -> None:
+    from jaxevent import methods
+    from jaxevent.blob import find
     from jaxevent.io import load
-    from jaxevent.methods import find
+    from jaxevent.runs import toml
     from jaxevent.show.tracks import Output
 
-    tracker = find(method, "blob")
-    values = tracker.Params() if params is None else tracker.Params.load(params, method)
+    tracker = methods.find(method, "blob")
+    given = None if params is None else tracker.Params.load(params, method)  # told before the work
     each = None if at == "events" else rate
     output = Output(out, each, background, pair, extent, focal, size_factor)
     recording = load(path, size, in_memory=False, progress=show_progress())
@@ -114,20 +121,24 @@ def run(
         raise InputError(f"{path}: holds no events to track; choose another recording")
     span: dict[str, Any] = {"start": start, "stop": stop}
     clock = time.perf_counter()
-    found = detect or seeds is None
-    tracks = tracker.estimate(
-        recording, values, seeds=seeds, **span, detect=found, progress=show_progress()
-    )
+    options: dict[str, Any] = {"seeds": seeds, "detect": detect, **span}
+    if seeds is None and not detect:
+        found = find(recording, **span, progress=show_progress())
+        print(found.summary())
+        settings = found.settings()
+        given = tracker.Params(**settings)
+        if params is not None:
+            given = tracker.Params.load(params, method, settings)
+        options = {"found": found, **span}
+    tracks = tracker.estimate(recording, given, **options, progress=show_progress())
     seconds = time.perf_counter() - clock
-    written = output.write(tracks, show_progress())
+    texts = {"params.toml": toml.parameters(tracks.params) + "\n"}
+    written = output.write(tracks, show_progress(), texts)
     count = recording.events.index(tracks.stop) - recording.events.index(tracks.start)
     if len(tracks):
         print("\n".join(written.summary()))
     else:
-        print(
-            "no blob was found; say where one is with --seed X,Y,SIZE, or try --params with "
-            'preset = "slow" or "fast"'
-        )
+        print("no blob was found; say where one is with --seed X,Y,SIZE, or try --detect")
     how = ", ".join(written.files) + f" in {out}" if not out.suffix else str(out)
     slow = "" if written.slow is None else f"; the video plays at {written.slow:.3g} of real time"
     print(

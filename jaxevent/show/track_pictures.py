@@ -87,9 +87,9 @@ def draw_frames(
             while way[0][0] < first:
                 way.pop(0)
             _line(draw, np.stack([place for _, place in way]), colours[i], scale, 1)
-            outline = _ellipse(mean[i], sigmas)
-            _line(draw, outline, colours[i], scale, 2)
-            x, y = _large(np.array([outline[:, 0].max(), outline[:, 1].min()]), scale)
+            ellipse = outline(mean[i], sigmas)
+            _line(draw, ellipse, colours[i], scale, 2)
+            x, y = _large(np.array([ellipse[:, 0].max(), ellipse[:, 1].min()]), scale)
             draw.text((x, y), str(number[i]), fill=colours[i], font=font, anchor="ls")
         yield np.asarray(large)
 
@@ -138,8 +138,8 @@ def _event_images(
         yield image
 
 
-def _ellipse(state: NDArray, sigmas: float | int) -> NDArray[np.float64]:
-    """Points (49, 2) of a closed outline, px."""
+def outline(state: NDArray, sigmas: float | int) -> NDArray[np.float64]:
+    """Points (49, 2) of the closed ellipse of `sigmas` standard deviations of a state (8,), px."""
     angle = np.linspace(0, 2 * np.pi, 49)
     u, v = sigmas * state[4] * np.cos(angle), sigmas * state[5] * np.sin(angle)
     c, s = np.cos(state[6]), np.sin(state[6])

@@ -1,9 +1,10 @@
-"""Size, time to contact and range of tracks drawn over time.
+"""Paths of tracks in the image, and their size, time to contact and range over time.
 
 Arrays as in `jaxevent.show.track_tables`.
 """
 
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +14,22 @@ from numpy.typing import ArrayLike, NDArray
 from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_range
 from jaxevent.errors import InputError, require
 from jaxevent.io.output import complete
-from jaxevent.recording import Times
-from jaxevent.show.track_pictures import track_colour
+from jaxevent.recording import Recording, Times
+from jaxevent.show.track_pictures import outline, track_colour
 from jaxevent.show.track_tables import check_tracks
+
+_BEHIND = 1_000_000  # most events behind the paths
+_ELLIPSES = 6  # along a path
+_TELLS, _OFTEN = (
+    3.0,
+    0.2,
+)  # standard deviations from 0 of a growth, and share of its times, to be told
+_LEGEND = 16  # most tracks that a legend lists
 
 
 def plot_tracks(
     path: str | Path,
+    recording: Recording,
     times: Times,
     ids: ArrayLike,
     mean: ArrayLike,
@@ -33,12 +43,14 @@ def plot_tracks(
     Q: float | int = 0.01,
     Q_lambda: float | int | None = None,
 ) -> None:
-    """Draw size and inverse time to contact over time, with bands of two standard deviations.
+    """Draw where tracks went and, over time, their size, with bands of two standard deviations.
 
-    1 / TTC is that of each track's growth (`quantities.growth`, smoothed, with Q and Q_lambda) and,
-    given the ids of a `pair`, that of the two blobs. Range is drawn where `extent` (m) and `focal`
-    (px) are given. The suffix of `path` chooses the format (PNG, PDF, SVG). Raises `InputError`
-    without the extra "plot", for unknown ids and suffixes and for arrays that do not fit.
+    Paths are drawn over the events, coloured by time, with ellipses of two standard deviations at
+    intervals. 1 / TTC is that of each track's growth (`quantities.growth`, smoothed, with Q and
+    Q_lambda), where it differs from 0, and, given the ids of a `pair`, that of the two blobs. Range
+    is drawn where `extent` (m) and `focal` (px) are given. Time counts from the recording's start.
+    The suffix of `path` chooses the format (PNG, PDF, SVG). Raises `InputError` without the extra
+    "plot", for unknown ids and suffixes and for arrays that do not fit.
     """
     require("matplotlib", "plot")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -50,28 +62,6 @@ def plot_tracks(
         raise InputError(f"{path}: the pair {pair} is not two of the tracks {known}")
     if (extent is None) != (focal is None):
         raise InputError(f"{path}: range needs both the extent (m) and the focal length (px)")
-    names = ["lambda (px)", "1 / TTC (1/s)"] + ["range (m)"] * (extent is not None)
-    figure = Figure(figsize=(8, 2.6 * len(names)), layout="constrained")
-    suffix = Path(path).suffix.lstrip(".").lower()
-    if suffix not in FigureCanvasAgg(figure).get_supported_filetypes():
-        raise InputError(
-            f"{path}: a figure cannot be stored as {suffix or 'a file without suffix'}; "
-            "end the name in .png, .pdf or .svg"
-        )
-    axes = dict(zip(names, figure.subplots(len(names), 1, sharex=True), strict=True))
-    seconds, bounds, faint = t * 1e-6, [], min(0.2, 0.5 / max(len(known), 1))
-
-    def band(name: str, value, variance, seen: NDArray, colour: str, **line) -> None:
-        deviation = np.sqrt(np.maximum(np.asarray(variance, np.float64), 0))
-        value = np.where(seen & np.isfinite(deviation), np.asarray(value, np.float64), np.nan)
-        axes[name].plot(seconds, value, color=colour, lw=1.3, **line)
-        low, high = value - 2 * deviation, value + 2 * deviation
-        axes[name].fill_between(seconds, low, high, color=colour, alpha=faint, lw=0)
-        if name == names[1] and np.isfinite(value).any():
-            # Before anything has been measured a band reaches beyond every scale.
-            clear = np.isfinite(value) & (deviation <= 3 * np.nanmedian(deviation[seen]))
-            bounds.extend([np.nanmin(low[clear]), np.nanmax(high[clear])])
-
     filled = np.where(valid[..., None], mean, 1.0)
     filled_P = np.where(valid[..., None, None], covariance, np.eye(8))
     m, P = jnp.asarray(filled), jnp.asarray(filled_P)
@@ -79,6 +69,41 @@ def plot_tracks(
     grown, spread = jax.vmap(
         lambda m, P, seen: growth(since, m, P, seen, Q=Q, Q_lambda=Q_lambda), in_axes=1, out_axes=1
     )(m, P, jnp.asarray(valid))
+    grown, spread = np.asarray(grown, np.float64), np.asarray(spread, np.float64)
+    clear = valid & (np.abs(grown) > _TELLS * np.sqrt(np.maximum(spread, 0)))
+    grows = clear.sum(0) > _OFTEN * np.maximum(valid.sum(0), 1)
+
+    names = ["lambda (px)"]
+    names += ["1 / TTC (1/s)"] * bool(grows.any() or pair is not None)
+    names += ["range (m)"] * (extent is not None)
+    high = 7.0 * min(recording.height / recording.width, 1.2)
+    figure = Figure(figsize=(8, high + 2.2 * len(names)), layout="constrained")
+    suffix = Path(path).suffix.lstrip(".").lower()
+    if suffix not in FigureCanvasAgg(figure).get_supported_filetypes():
+        raise InputError(
+            f"{path}: a figure cannot be stored as {suffix or 'a file without suffix'}; "
+            "end the name in .png, .pdf or .svg"
+        )
+    grid = figure.add_gridspec(1 + len(names), 1, height_ratios=[high, *([2.2] * len(names))])
+    seconds = (t - recording.start) * 1e-6
+    _draw_paths(figure, figure.add_subplot(grid[0]), recording, t, seconds, known, mean, valid)
+    first = figure.add_subplot(grid[1])
+    axes = {names[0]: first}
+    for row, name in enumerate(names[1:], 2):
+        axes[name] = figure.add_subplot(grid[row], sharex=first)
+    bounds, faint = [], min(0.2, 0.5 / max(len(known), 1))
+
+    def band(name: str, value, variance, seen: NDArray, colour: str, **line) -> None:
+        deviation = np.sqrt(np.maximum(np.asarray(variance, np.float64), 0))
+        value = np.where(seen & np.isfinite(deviation), np.asarray(value, np.float64), np.nan)
+        axes[name].plot(seconds, value, color=colour, lw=1.3, **line)
+        low, high = value - 2 * deviation, value + 2 * deviation
+        axes[name].fill_between(seconds, low, high, color=colour, alpha=faint, lw=0)
+        if name == "1 / TTC (1/s)" and np.isfinite(value).any():
+            # Before anything has been measured a band reaches beyond every scale.
+            clear = np.isfinite(value) & (deviation <= 3 * np.nanmedian(deviation[seen]))
+            bounds.extend([np.nanmin(low[clear]), np.nanmax(high[clear])])
+
     ranges = None
     if extent is not None and focal is not None:
         ranges = jax.jit(size_range)(m, P, extent, focal, size_factor)
@@ -88,10 +113,12 @@ def plot_tracks(
             label = f"{one}" if axis == 4 else None
             variance = filled_P[:, i, axis, axis]
             band(names[0], filled[:, i, axis], variance, valid[:, i], colour, ls=style, label=label)
-        band(names[1], grown[:, i], spread[:, i], valid[:, i], colour, label=f"{one}, growth")
+        if grows[i]:
+            seen = valid[:, i]
+            band(names[1], grown[:, i], spread[:, i], seen, colour, label=f"{one}, growth")
         if ranges is not None:
             value, variance = ranges
-            band(names[2], value[:, i], variance[:, i], valid[:, i], colour, label=f"{one}")
+            band(names[-1], value[:, i], variance[:, i], valid[:, i], colour, label=f"{one}")
     if pair is not None:
         a, b = (known.index(one) for one in pair)
         value, variance = jax.jit(inverse_ttc)(m[:, a], P[:, a], m[:, b], P[:, b])
@@ -100,13 +127,59 @@ def plot_tracks(
     for name, axis in axes.items():
         axis.set_ylabel(name)
         axis.spines[["top", "right"]].set_visible(False)
-        if 0 < len(known) <= 8:
+        if 0 < len(known) <= _LEGEND:
             axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
     if bounds:
         axes[names[1]].set_ylim(min(bounds), max(bounds) + 1e-9)
     axes[names[0]].set_title(
         "lambda1 solid, lambda2 dashed; bands: 2 standard deviations", fontsize=9
     )
-    axes[names[-1]].set_xlabel("t (s)")
+    axes[names[-1]].set_xlabel("t (s) from the recording's start")
     with complete(Path(path)) as temporary:
         figure.savefig(temporary, format=suffix, dpi=150)
+
+
+def _draw_paths(
+    figure: Any,
+    axis: Any,
+    recording: Recording,
+    t: NDArray[np.int64],
+    seconds: NDArray[np.float64],
+    known: list[int],
+    mean: NDArray,
+    valid: NDArray[np.bool_],
+) -> None:
+    """Paths in the image plane over the number of events of each pixel; time is colour."""
+    from matplotlib.collections import LineCollection
+
+    first, last = (recording.events.index(int(at)) for at in (t[0], t[-1] + 1))
+    middle = max(first, (first + last - _BEHIND) // 2)
+    events = recording.events[middle : min(last, middle + _BEHIND)]
+    counts = np.zeros((recording.height, recording.width))
+    np.add.at(counts, (events.y, events.x), 1)
+    behind = np.log1p(counts)
+    axis.imshow(behind, "Greys", vmin=0, vmax=2 * max(float(np.percentile(behind, 99.9)), 0.5))
+    lines = None
+    for i, one in enumerate(known):
+        seen = np.flatnonzero(valid[:, i] & np.isfinite(mean[:, i]).all(1))
+        if not len(seen):
+            continue
+        places = mean[seen, i, :2]
+        parts = np.stack([places[:-1], places[1:]], 1)[np.diff(seen) == 1]
+        lines = LineCollection(list(parts), lw=1.5, cmap="viridis")
+        lines.set_array(seconds[seen[:-1]][np.diff(seen) == 1])
+        lines.set_clim(seconds[0], max(float(seconds[-1]), float(seconds[0]) + 1e-9))
+        axis.add_collection(lines)
+        for k in np.unique(np.linspace(0, len(seen) - 1, _ELLIPSES).astype(np.int64)):
+            colour = lines.to_rgba(seconds[seen[k]])
+            axis.plot(*outline(mean[seen[k], i], 2.0).T, color=colour, lw=0.8)
+        dark = "#{:02x}{:02x}{:02x}".format(*track_colour(one, dark=True))
+        axis.annotate(
+            str(one), places[-1], (4, 4), textcoords="offset points", color=dark, fontsize=9,
+            weight="bold",
+        )  # fmt: skip
+    if lines is not None:
+        figure.colorbar(lines, ax=axis, fraction=0.03, pad=0.01, label="t (s)")
+    axis.set(xlim=(-0.5, recording.width - 0.5), ylim=(recording.height - 0.5, -0.5))
+    axis.set(xlabel="x (px)", ylabel="y (px)")
+    axis.set_title("paths, ellipses of 2 standard deviations, numbers where they end", fontsize=9)

@@ -99,8 +99,13 @@ class Output:
         with contextlib.suppress(_Tried), complete(path, directory=not suffix):
             raise _Tried
 
-    def write(self, tracks: Tracks, progress: bool | None = None) -> "Written":
-        """Write everything, complete or not at all; raises `InputError` for an unknown pair."""
+    def write(
+        self, tracks: Tracks, progress: bool | None = None, texts: Mapping[str, str] | None = None
+    ) -> "Written":
+        """Write everything, complete or not at all; raises `InputError` for an unknown pair.
+
+        `texts` are further files of a folder, by name.
+        """
         known = tracks.id.tolist()
         if self.pair is not None and not set(self.pair) <= set(known):
             raise InputError(
@@ -113,6 +118,8 @@ class Output:
             places = {kind: folder / f"tracks{kind}" for kind in (".csv", ".h5", ".mp4", ".png")}
             if self.pair is not None or self.extent is not None:
                 places["quantities"] = folder / "quantities.csv"
+            for name, text in (texts or {}).items():
+                (folder / name).write_text(text, encoding="utf-8")
             return self._all(tracks, places, progress)
 
     def _all(self, tracks: Tracks, places: Mapping[str, Path], progress: bool | None) -> "Written":
@@ -165,8 +172,8 @@ class Output:
         for kind in set(places) & set(_PLOTS):
             chosen = rows.longest(_PLOTTED, self.pair or ())
             plot_tracks(
-                places[kind], coarse, tracks.id[chosen], *rows.dense(chosen), pair=self.pair,
-                extent=self.extent, focal=self.focal, size_factor=self._factor(),
+                places[kind], tracks.recording, coarse, tracks.id[chosen], *rows.dense(chosen),
+                pair=self.pair, extent=self.extent, focal=self.focal, size_factor=self._factor(),
                 Q_lambda=float(tracks.params.Q_lambda),
             )  # fmt: skip
         slow = min(often, _FPS) / often if ".mp4" in places else None

@@ -389,11 +389,11 @@ def test_tracks_that_cannot_be_written_are_named(tmp_path):
     with pytest.raises(InputError, match="do not fit"):
         write_tracks(tmp_path / "tracks.csv", times, ids * 1.0, mean, P, valid)
     with pytest.raises(InputError, match="not two of the tracks"):
-        plot_tracks(tmp_path / "a.png", times, ids, mean, P, valid, pair=(3, 4))
+        plot_tracks(tmp_path / "a.png", still(), times, ids, mean, P, valid, pair=(3, 4))
     with pytest.raises(InputError, match="both the extent"):
-        plot_tracks(tmp_path / "a.png", times, ids, mean, P, valid, extent=1.0)
+        plot_tracks(tmp_path / "a.png", still(), times, ids, mean, P, valid, extent=1.0)
     with pytest.raises(InputError, match="file without suffix"):
-        plot_tracks(tmp_path / "a", times, ids, mean, P, valid)
+        plot_tracks(tmp_path / "a", still(), times, ids, mean, P, valid)
     with pytest.raises(InputError, match="not sorted"):
         list(pictures.track_frames(still(), times[::-1], ids, mean, valid))
     with pytest.raises(InputError, match="image 0 of 12 .* shape"):
@@ -491,13 +491,14 @@ def test_small_sensors_are_enlarged_in_a_video(tmp_path):
 def test_plots_are_written(tmp_path):
     pytest.importorskip("matplotlib")
     times, ids, mean, P, valid = tracks(T=12)
-    plot_tracks(
-        tmp_path / "both.png", times, ids, mean, P, valid, pair=(3, 17), extent=0.2, focal=500.0
-    )
-    # None is valid, and no range is asked for.
-    plot_tracks(tmp_path / "none.png", times, ids, mean, P, np.zeros_like(valid))
+    given = still(), times, ids, mean, P
+    plot_tracks(tmp_path / "both.png", *given, valid, pair=(3, 17), extent=0.2, focal=500.0)
+    # None is valid, and neither time to contact nor range is asked for.
+    plot_tracks(tmp_path / "none.png", *given, np.zeros_like(valid))
     sizes = []
     for name in ("both.png", "none.png"):
         with Image.open(tmp_path / name) as image:
             sizes.append(image.size)
-    assert sizes[0][0] == sizes[1][0] and sizes[0][1] * 2 == sizes[1][1] * 3
+    assert (
+        sizes[0][0] == sizes[1][0] and sizes[0][1] - sizes[1][1] == 2 * 330
+    )  # panels of 2.2 inches

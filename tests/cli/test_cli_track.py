@@ -77,7 +77,7 @@ def test_a_folder_of_everything(folder, capsys):
     ]
     assert cli.main([*map(str, argv), *seeded()]) == 0
     said = capsys.readouterr().out
-    names = ["quantities.csv", "tracks.csv", "tracks.h5", "tracks.mp4", "tracks.png"]
+    names = ["params.toml", "quantities.csv", "tracks.csv", "tracks.h5", "tracks.mp4", "tracks.png"]
     assert sorted(path.name for path in out.iterdir()) == names
     assert all(name in said for name in names) and f"{out}: 2 tracks" in said
 

@@ -329,11 +329,15 @@ def expected(params: WindowParams, state: State) -> Expected:
     return Expected(x[:2], x[2:4], spread(x[6], size), state.P[:2, :2], size)
 
 
-def halt(state: State) -> State:
-    goes_on = np.ones(len(state.x))
-    goes_on[[2, 3, 7]] = 0  # velocity and turn rate
-    keep = jnp.asarray(goes_on, state.x.dtype)
-    return dataclasses.replace(state, x=keep * state.x, P=state.P * keep[:, None] * keep)
+def halt(params: WindowParams, state: State, known: bool) -> State:
+    moving = np.zeros(len(state.x))
+    moving[[2, 3, 7]] = 1  # velocity and turn rate
+    keep = jnp.asarray(1 - moving, state.x.dtype)
+    P = state.P * keep[:, None] * keep
+    if not known:
+        start = jnp.stack([params.P0_v, params.P0_v, params.P0_q])
+        P = P + jnp.zeros_like(P).at[(2, 3, 7), (2, 3, 7)].set(start)
+    return dataclasses.replace(state, x=keep * state.x, P=P)
 
 
 def moments(params: WindowParams, state: State) -> tuple[Array, Array]:

@@ -41,8 +41,8 @@ def expected(params: TrackerParams, state: State) -> Expected:
     return expected_of(state.motion, 0 * state.size, state.size * jnp.ones_like(state.motion.x[0]))
 
 
-def halt(state: State) -> State:
-    return State(state.motion.halt(), state.size)
+def halt(params: TrackerParams, state: State, known: bool) -> State:
+    return State(state.motion.halt(params, known), state.size)
 
 
 def moments(params: TrackerParams, state: State) -> tuple[Array, Array]:

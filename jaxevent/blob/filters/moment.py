@@ -149,10 +149,12 @@ def expected(params: TrackerParams, state: State) -> Expected:
     return expected_of(state.motion, state.turn[0], jnp.exp(state.log_size))
 
 
-def halt(state: State) -> State:
-    still = jnp.array([1.0, 0.0], state.turn.dtype)
-    P_turn = state.P_turn * jnp.array([1.0, 0.0, 0.0], state.P_turn.dtype)
-    return State(state.motion.halt(), state.log_size, state.P_size, still * state.turn, P_turn)
+def halt(params: TrackerParams, state: State, known: bool) -> State:
+    theta, q = state.turn
+    tt, tq, qq = state.P_turn
+    P_turn = jnp.stack([tt, 0 * tq, 0 * qq if known else params.P0_q + 0 * qq])
+    motion = state.motion.halt(params, known)
+    return State(motion, state.log_size, state.P_size, jnp.stack([theta, 0 * q]), P_turn)
 
 
 def moments(params: TrackerParams, state: State) -> tuple[Array, Array]:

@@ -66,13 +66,15 @@ class Motion(eqx.Module):
             rest = [pd + dt * vd, vd, dd + params.Q_d * dt * eye]
         return Motion((p + dt * v, v, *offset), (pp, pv, vv, *rest))
 
-    def halt(self) -> "Motion":
-        """The same at rest: the velocity is 0, and known."""
+    def halt(self, params: TrackerParams, known: bool) -> "Motion":
+        """The same at rest: the velocity is 0, and known or as uncertain as at the start."""
         p, v, *offset = self.x
         pp, pv, vv, *rest = self.P
         if rest:
             rest[1] = 0 * rest[1]
-        return Motion((p, 0 * v, *offset), (pp, 0 * pv, 0 * vv, *rest))
+        variance = 0 if known else params.P0_v
+        vv = variance * jnp.eye(2, dtype=vv.dtype)
+        return Motion((p, 0 * v, *offset), (pp, 0 * pv, vv, *rest))
 
     def residuals(self, batch: Batch, weight: Array) -> tuple[Array, Array, list[Array | float]]:
         """Of each event (M, 2), their weighted mean, and the factors of x in what it measures."""

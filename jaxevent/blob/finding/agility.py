@@ -12,7 +12,7 @@ FAR = 16.0  # squared standardised innovations count no more than this
 FEWEST = 4  # windows
 
 
-def fit_agility(t: NDArray, m: NDArray, R: NDArray, unit: float) -> float:
+def fit_agility(t: NDArray, m: NDArray, R: NDArray, unit: float | int) -> float:
     """Noise of the velocity, px^2/s^3, of constant velocity filters that are tried on a grid.
 
     t (windows,) in s, means of events m (windows, 2) in px and their variances R (windows,) in
@@ -26,7 +26,7 @@ def fit_agility(t: NDArray, m: NDArray, R: NDArray, unit: float) -> float:
 
 
 @compiled
-def _log_likelihood(t: Any, m: Any, R: Any, q: float) -> float:
+def _log_likelihood(t: Any, m: Any, R: Any, q: float | int) -> float:
     total = 0.0
     for axis in range(2):
         dt = t[1] - t[0]

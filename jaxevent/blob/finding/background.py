@@ -6,9 +6,10 @@ active the whole sensor is in each slice.
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.blob.finding.stream import Stream
 
@@ -35,12 +36,12 @@ class Background:
     activity: NDArray[np.float64]
     duration: float
 
-    def slice(self, t: float | NDArray) -> NDArray[np.int64]:
+    def slice(self, t: ArrayLike | float | int) -> Any:
         """Which slices hold times (s)."""
         part = np.asarray(t) / self.duration * SLICES
         return np.clip(part, 0, SLICES - 1).astype(np.int64)
 
-    def at(self, x: NDArray, y: NDArray, t: float) -> NDArray[np.float64]:
+    def at(self, x: ArrayLike | float | int, y: ArrayLike | float | int, t: float | int) -> Any:
         """Rates, 1/(px s), at some pixels at a time (s)."""
         rows, columns = self.rate.shape
         row = np.clip(np.asarray(y).astype(np.int64) // CELL, 0, rows - 1)
@@ -65,29 +66,23 @@ def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
 
 def measure_background(stream: Stream) -> Background:
     """The background of a stream; hot pixels are marked in the stream."""
-    rows, columns = -(-stream.height // CELL), -(-stream.width // CELL)
     pixels = np.zeros(stream.height * stream.width, np.int64)
+    for part in stream.batches():
+        pixels += np.bincount(part.y * stream.width + part.x, minlength=len(pixels))
+    stream.hot = find_hot_pixels(pixels.reshape(stream.height, stream.width))
+    rows, columns = -(-stream.height // CELL), -(-stream.width // CELL)
     cells = np.zeros(SLICES * rows * columns, np.int64)
-    kinds = Background(np.zeros((rows, columns)), np.zeros(0, bool), np.zeros(0), stream.duration)
-    hot = np.zeros((stream.height, stream.width), bool)
-    for counting in (pixels, cells):  # hot pixels are known before cells are counted
-        for part in stream.batches():
-            if counting is pixels:
-                place = part.y * stream.width + part.x
-            else:
-                where = (kinds.slice(part.t) * rows + part.y // CELL) * columns + part.x // CELL
-                place = where
-            counting += np.bincount(place, minlength=len(counting))
-        if counting is pixels:
-            hot = find_hot_pixels(pixels.reshape(stream.height, stream.width))
-            stream.hot = hot
+    for part in stream.batches():
+        slices = np.minimum(part.t / stream.duration * SLICES, SLICES - 1).astype(np.int64)
+        place = (slices * rows + part.y // CELL) * columns + part.x // CELL
+        cells += np.bincount(place, minlength=len(cells))
     return _of_counts(cells.reshape(SLICES, rows, columns).astype(float), stream.duration)
 
 
 def _of_counts(N: NDArray[np.float64], duration: float) -> Background:
     """Of the counts of all cells in all slices."""
     quarter, empty = np.quantile(N, 0.25, axis=0), (N == 0).mean(0)
-    # The mean of a Poisson number from its lower quartile; from the share of zeros where it is small.
+    # The mean of a Poisson number from its lower quartile, or from the share of zeros if small.
     few = np.minimum(-np.log(np.clip(empty, 0.5 / SLICES, 1)), 5.0)
     m = np.where(quarter >= 3, quarter + 0.674 * np.sqrt(quarter + 0.5), few)
     m = np.maximum(m, max(float(np.median(m)), 0.02))
@@ -102,7 +97,7 @@ def _of_counts(N: NDArray[np.float64], duration: float) -> Background:
     return Background(m / (CELL**2 * duration / SLICES), calm, activity, duration)
 
 
-def measure_dispersion(stream: Stream, background: Background, window: float) -> float:
+def measure_dispersion(stream: Stream, background: Background, window: float | int) -> float:
     """Variance over mean of the background's counts in windows (s); at least 1.
 
     The median over the sensor's cells: targets in a minority of them do not change it.

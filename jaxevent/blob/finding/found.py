@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any, TypeVar
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +14,7 @@ from jaxevent.recording import Recording
 
 P = TypeVar("P", bound=TrackerParams)
 
+FIRST = 4  # windows that tell the size at the start
 STILL = 2  # windows of silence after which a target stands still
 FOREVER = 1e3  # s; what was found tells when targets end
 
@@ -65,14 +67,15 @@ class Found:
         )
 
     def seeds(self, start: int, stop: int) -> list[tuple[float, float, float, int]]:
-        """One (x, y, size, us) for each target, where it is first seen; size is the largest."""
+        """One (x, y, size, us) for each target, where it is first seen."""
         width, height = self.recording.width, self.recording.height
         out = []
         for path in self.paths:
             x, y = path.p[0]
             at = int(np.clip(path.begin, start, stop - 1))
             x, y = np.clip(x, -0.5, width - 0.5), np.clip(y, -0.5, height - 0.5)
-            out.append((float(x), float(y), float(2 * np.median(path.size[:, 0])), at))
+            size = np.median(path.size[:FIRST].mean(1))
+            out.append((float(x), float(y), float(size), at))
         return out
 
     def settings(self) -> dict[str, Any]:
@@ -103,8 +106,8 @@ class Found:
         usual, told = self.settings(), {}
         for name, values in self._each().items():
             if np.isclose(float(getattr(params, name)), usual[name], rtol=1e-5):
-                stored = getattr(type(params), name).unconstrained(values)
-                told[name] = np.asarray(stored, params.raw[name].dtype)
+                stored = jnp.asarray(values, params.raw[name].dtype)
+                told[name] = np.asarray(getattr(type(params), name).unconstrained(stored))
         return told
 
     def _each(self) -> dict[str, NDArray[np.float64]]:
@@ -119,9 +122,9 @@ class Found:
             "Q_q": 0.01 / W**3,
             "P0_p": L**2 / 4,
             "P0_v": 4 * v**2 + (L / W) ** 2,
-            "P0_lambda": L**2,
+            "P0_lambda": (0.5 * L) ** 2,
             "P0_q": (0.1 / W) ** 2,
-            "lambda0": 2 * L,
+            "lambda0": L,
             "gate_decay": 1 / W,
             "gate_min": np.maximum(2.0, 3 * L / 2),
             "gate_max": 24 * L,
@@ -137,7 +140,7 @@ class Found:
             np.array([np.median(path.n) / (path.window * 1e-6) for path in paths]),
         )
 
-    def _typical(self, values: NDArray, part: float = 0.5) -> float:
+    def _typical(self, values: NDArray, part: float | int = 0.5) -> float:
         """The quantile of values of targets, weighted by their events."""
         events = np.array([path.n.sum() for path in self.paths])
         order = np.argsort(values)

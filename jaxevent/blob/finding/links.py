@@ -7,13 +7,14 @@ motion.
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.blob.finding.agility import fit_agility
 from jaxevent.blob.finding.background import Background
 from jaxevent.blob.finding.detection import FALSE_ALARMS, Scale, detect, evidence, measure_blobs
-from jaxevent.blob.finding.agility import fit_agility
 from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.scale import CONTACT
 from jaxevent.blob.finding.stream import Part, Stream
@@ -21,13 +22,17 @@ from jaxevent.progress import bar
 
 GATE = 3.0  # standard deviations
 BORN, FILL = 4, 0.5  # windows, and share of its windows, in which a confirmed target was seen
-HOLD, HOLD_NEW = 24, 2  # windows that silent targets are held: confirmed ones, others
+HOLD, HOLD_NEW = (
+    24,
+    2,
+)  # windows that silent targets are held: confirmed ones (and twice those seen), others
 STILL = 2  # windows of silence after which a target stands still
 SEEN, SEEN_NEW = 1e-3, 1e-5  # false alarms of a look where a target is known to be
 FAINT = 0.02  # of its own rate: a target with fewer events is silent
 GAIN = 0.2  # of size and rate
 YOUNG = 3  # windows: what is in contact then may be a part, what comes in contact later is not
 PARTS = 5  # windows of common motion in contact that make two targets one
+LONGISH, APART = 3.0, 0.25  # aspect of a target, and share of its events in the smaller of two
 FREE = 0.7  # share of a blob's events that are nobody's, where a target begins
 CLAIMED, OWNS = 0.3, 0.1  # shares of a blob that is claimed, and of those who own the rest of it
 JITTER = 0.05  # of the size: error of a window's mean, for events of an edge are not independent
@@ -72,14 +77,16 @@ class Live:
         """Noise of the velocity, px^2/s^3."""
         return self.q * np.clip(self.nis, 0.05, 50)
 
-    def predict(self, t: float) -> tuple[NDArray, NDArray]:
+    def predict(self, t: float | int) -> tuple[NDArray, NDArray]:
         """Positions (n, 2) and P (n, 3) at t."""
         dt, (a, b, c), q = t - self.t, self.P.T, self.agility
         P = [a + 2 * b * dt + c * dt**2 + q * dt**3 / 3, b + c * dt + q * dt**2 / 2, c + q * dt]
         return self.p + self.v * dt[:, None], np.stack(P, 1)
 
 
-def _begin(ids: NDArray, t: float, p: NDArray, C: NDArray, n: NDArray, window: float) -> Live:
+def _begin(
+    ids: NDArray, t: float | int, p: NDArray, C: NDArray, n: NDArray, window: float | int
+) -> Live:
     number, square = len(ids), _larger(C)
     zero, none = np.zeros(number), np.zeros(number, np.int64)
     P = np.stack(
@@ -99,7 +106,7 @@ def _larger(C: NDArray) -> NDArray[np.float64]:
     return (C[..., 0, 0] + C[..., 1, 1]) / 2 + np.hypot(half, C[..., 0, 1])
 
 
-def touching(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> NDArray[np.float64]:
+def touching(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> Any:
     """Distances over the sum of both ellipses' reach along the line between them."""
     d = pb - pa
     length = np.hypot(d[..., 0], d[..., 1])
@@ -112,7 +119,7 @@ def touching(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> NDArray[np.f
 class _Row:
     """What is kept of a window: of the targets seen."""
 
-    t: float
+    t: float | int
     id: NDArray
     p: NDArray
     v: NDArray
@@ -133,6 +140,7 @@ class Links:
         self.next_id = 0
         self.rows: list[_Row] = []
         self.contacts: dict[tuple[int, int], tuple[float, NDArray, float]] = {}
+        self.pairs: dict[int, tuple[float, int]] = {}
         self.confirmed: set[int] = set()
         self.parts: set[int] = set()
         tests = stream.width * stream.height * stream.duration / scale.window
@@ -164,7 +172,7 @@ class Links:
             paths.append(Path(us[at], p, v, C, n, round(1e6 * w), agility))
         return paths
 
-    def _step(self, begin: float) -> None:
+    def _step(self, begin: float | int) -> None:
         w = self.scale.window
         t = begin + w / 2
         part = self.stream.window(begin, begin + w)
@@ -174,6 +182,7 @@ class Links:
             seen = _Look(self.live, part, t)
             owner = seen.share_out(labels, blobs)
             self._update(seen, owner, labels > 0)
+            self._part(part, owner, labels, blobs)
             self._join_parts(t)
             self._end(self._over())
         self._begin_targets(part, t, owner, labels, blobs)
@@ -231,20 +240,44 @@ class Links:
         m, R = (seen.p + z)[heard], (square / 2 / np.maximum(n, 1))[heard]
         self.rows.append(_Row(t, some.id, some.p, some.v, some.C, n[heard], m, R))
 
-    def _expected(self, p: NDArray, t: float, determinant: NDArray) -> NDArray[np.float64]:
+    def _expected(self, p: NDArray, t: float | int, determinant: NDArray) -> NDArray[np.float64]:
         """Events of the background in gates."""
         rate = self.background.at(p[:, 0], p[:, 1], t)
         area = np.pi * GATE**2 * np.sqrt(np.maximum(determinant, 0))
         return np.maximum(rate * area * self.scale.window, 1e-3)
 
-    def _confirm(self, heard: NDArray, t: float) -> None:
+    def _confirm(self, heard: NDArray, t: float | int) -> None:
         live = self.live
         age = np.rint((t - live.born) / self.scale.window) + 1
         apart = ~np.isin(live.id, [newer for newer, _ in self.contacts])
         enough = (live.hits >= BORN) & (live.hits >= FILL * age) & (live.nats > self.enough)
         live.confirmed = live.confirmed | (heard & enough & apart)
 
-    def _join_parts(self, t: float) -> None:
+    def _part(self, part: Part, owner: NDArray, labels: NDArray, blobs: int) -> None:
+        """Leave a target the larger of two blobs whose distance changes: the other is another one.
+
+        Parts of one object, such as both sides of an outline, keep their distance.
+        """
+        live = self.live
+        longish = _larger(live.C) > LONGISH**2 * np.linalg.det(live.C) / _larger(live.C)
+        before, self.pairs = self.pairs, {}
+        for i in np.flatnonzero(longish & live.confirmed & (live.miss == 0)):
+            at = (owner == i) & (labels > 0)
+            two = measure_blobs(Part(part.t[at], part.x[at], part.y[at]), labels[at], blobs)
+            a, b = np.argsort(-two.n, kind="stable")[:2] if blobs > 1 else (0, 0)
+            if a == b or two.n[b] < APART * at.sum():
+                continue
+            if touching(two.p[a], two.C[a], two.p[b], two.C[b]) < CONTACT:
+                continue
+            distance = float(np.hypot(*(two.p[a] - two.p[b])))
+            first, windows = before.get(int(live.id[i]), (distance, 0))
+            size = np.sqrt(_larger(two.C[[a, b]])).sum()
+            if windows >= PARTS and abs(distance - first) > size:
+                live.p[i], live.C[i], live.n[i] = two.p[a], two.C[a], two.n[a]
+                continue
+            self.pairs[int(live.id[i])] = first, windows + 1
+
+    def _join_parts(self, t: float | int) -> None:
         """Make one of two targets that touch and move together."""
         live, w = self.live, self.scale.window
         size = live.size
@@ -256,7 +289,7 @@ class Links:
         young = t - live.born < (YOUNG - 0.5) * w
         for newer, older in zip(*np.nonzero(np.tril(near, -1)), strict=True):
             key = int(live.id[newer]), int(live.id[older])
-            shorter = min(live.path[newer], live.path[older])
+            shorter = float(min(live.path[newer], live.path[older]))
             if key not in self.contacts and not young[newer]:
                 continue  # they came from apart
             if not (heard[newer] and heard[older]):
@@ -297,7 +330,8 @@ class Links:
         live, (rows, columns) = self.live, self.size
         x, y = live.p.T
         outside = (x <= -1) | (x >= columns) | (y <= -1) | (y >= rows)
-        return live.part | outside | (live.miss > np.where(live.confirmed, HOLD, HOLD_NEW))
+        hold = np.where(live.confirmed, np.minimum(HOLD, 2 * live.hits), HOLD_NEW)
+        return live.part | outside | (live.miss > hold)
 
     def _end(self, which: NDArray) -> None:
         over = self.live.keep(which)
@@ -306,16 +340,14 @@ class Links:
         self.live = self.live.keep(~which)
 
     def _begin_targets(
-        self, part: Part, t: float, owner: NDArray, labels: NDArray, blobs: int
+        self, part: Part, t: float | int, owner: NDArray, labels: NDArray, blobs: int
     ) -> None:
         """Targets begin at blobs of which most events are nobody's."""
         if not blobs:
             return
         free = owner < 0
         counts = np.bincount(labels, minlength=blobs + 1)
-        found = measure_blobs(
-            Part(part.t[free], part.x[free], part.y[free]), labels[free], blobs
-        )
+        found = measure_blobs(Part(part.t[free], part.x[free], part.y[free]), labels[free], blobs)
         new = (found.n >= 3) & (found.n >= FREE * counts[1:])
         number = int(new.sum())
         ids = np.arange(self.next_id, self.next_id + number)
@@ -328,7 +360,7 @@ class Links:
 class _Look:
     """What targets see of a window: residuals of its events, and in whose gates they are."""
 
-    def __init__(self, live: Live, part: Part, t: float):
+    def __init__(self, live: Live, part: Part, t: float | int):
         self.live, self.t = live, t
         self.p, self.P = live.predict(t)
         S = live.C * (1 + 2 / live.n)[:, None, None]
@@ -343,12 +375,13 @@ class _Look:
         self.inside = squared < GATE**2
         self.soft = self._in_contact()
 
-    def _in_contact(self) -> NDArray[np.bool_]:
+    def _in_contact(self) -> NDArray:
         """Confirmed targets that touch another one: events between them are shared."""
         live = self.live
         near = touching(self.p[:, None], live.C[:, None], self.p, live.C) < CONTACT
         np.fill_diagonal(near, False)
-        return (near & live.confirmed & live.confirmed[:, None]).any(1)
+        near &= live.confirmed & live.confirmed[:, None]
+        return np.asarray(near.any(1))
 
     def share_out(self, labels: NDArray, blobs: int) -> NDArray[np.int64]:
         """Whose each event is; -1: nobody's."""
@@ -360,7 +393,7 @@ class _Look:
         table = table.reshape(blobs + 1, number)
         counts = np.maximum(np.bincount(labels, minlength=blobs + 1), 1)
         share = table / counts[:, None]
-        # The rest of a blob goes with its owners: targets may grow at once, or be larger than gates.
+        # The rest of a blob goes with its owners: targets may grow at once or pass their gates.
         for one in range(1, blobs + 1):
             if share[one].sum() < CLAIMED:
                 continue
@@ -385,7 +418,7 @@ class _Look:
             weight = np.concatenate([weight, (density / density.sum(0))[of, event]])
             i, k = np.concatenate([i, both[event]]), np.concatenate([k, of])
 
-        def total(values: NDArray) -> NDArray[np.float64]:
+        def total(values: NDArray) -> NDArray:
             return np.bincount(k, weight * values, number)
 
         n = total(np.ones(len(i)))

@@ -73,7 +73,9 @@ class Joined(NamedTuple):
 
 def join(paths: Sequence[Path]) -> Joined:
     """The paths' rows."""
-    S = [path.C * (1 + 2 / np.maximum(path.n, 1))[:, None, None] + 0.1 * np.eye(2) for path in paths]
+    S = [
+        path.C * (1 + 2 / np.maximum(path.n, 1))[:, None, None] + 0.1 * np.eye(2) for path in paths
+    ]
     S = np.concatenate(S)
     return Joined(
         np.cumsum([0, *(len(path.t) for path in paths)]),
@@ -84,7 +86,7 @@ def join(paths: Sequence[Path]) -> Joined:
     )
 
 
-def candidates(events: Events, joined: Joined, sigmas: float) -> NDArray[np.int32]:
+def candidates(events: Events, joined: Joined, sigmas: float | int) -> NDArray[np.int32]:
     """Of which path each event may be: its number, `NOBODY` or, of several, `ANYBODY`.
 
     Of a path are events within `sigmas` standard deviations while it is seen.
@@ -93,7 +95,7 @@ def candidates(events: Events, joined: Joined, sigmas: float) -> NDArray[np.int3
 
 
 @compiled
-def _candidates(t: Any, x: Any, y: Any, joined: Any, limit: float) -> Any:
+def _candidates(t: Any, x: Any, y: Any, joined: Any, limit: float | int) -> Any:
     whose = np.full(len(t), -1, np.int32)
     for k in range(len(joined.window)):
         first, last, w = joined.first[k], joined.first[k + 1] - 1, joined.window[k]

@@ -42,10 +42,15 @@ def choose_scale(stream: Stream, background: Background) -> Choice | None:
     for i, w in enumerate(windows):
         dispersions.append(measure_dispersion(stream, background, w))
         begins = np.clip(stream.times(STRETCHES), 2 * w, stream.duration - w)
-        windows_of = [[stream.window(t + k * w, t + (k + 1) * w) for k in (-2, -1, 0)] for t in begins]
+        windows_of = [
+            [stream.window(t + k * w, t + (k + 1) * w) for k in (-2, -1, 0)] for t in begins
+        ]
         for j, g in enumerate(CELLS):
             scale = Scale(float(w), g, dispersions[i])
-            told = [_predict(parts, t, stream, background, scale) for parts, t in zip(windows_of, begins, strict=True)]
+            told = [
+                _predict(parts, t, stream, background, scale)
+                for parts, t in zip(windows_of, begins, strict=True)
+            ]
             nats, events, touching, found = np.sum(told, axis=0)
             score = nats / max(events, 1)
             scores[i, j] = score - SPLIT * abs(score) * touching / max(found, 1e-9)
@@ -59,7 +64,7 @@ def choose_scale(stream: Stream, background: Background) -> Choice | None:
 
 
 def _predict(
-    parts: list[Part], t: float, stream: Stream, background: Background, scale: Scale
+    parts: list[Part], t: float | int, stream: Stream, background: Background, scale: Scale
 ) -> NDArray[np.float64]:
     """Nats and events of the third window; events in touching blobs, and in all, of the second."""
     size, w = (stream.height, stream.width), scale.window

@@ -8,7 +8,6 @@ remains, so that slow and fast targets are found in one recording.
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxevent.blob.finding.background import CELL, Background, measure_background
 from jaxevent.blob.finding.detection import Scale, evidence
@@ -61,7 +60,9 @@ def find(
         choice = choose_scale(stream, background)
         if choice is None or choice.score < WORTH:
             break
-        confirmed = Links(stream, background, choice.scale).follow(f"find, pass {number + 1}", progress)
+        confirmed = Links(stream, background, choice.scale).follow(
+            f"find, pass {number + 1}", progress
+        )
         if not confirmed:
             passes.append(Pass(choice, 0))
             break
@@ -70,7 +71,11 @@ def find(
         new = [
             _look_back(path, rest, background, choice.scale) for path in confirmed if _lasting(path)
         ]
-        new = [path for path in _stitch(new, (stream.width, stream.height)) if not _left_over(path, found)]
+        new = [
+            path
+            for path in _stitch(new, (stream.width, stream.height))
+            if not _left_over(path, found)
+        ]
         passes.append(Pass(choice, len(new)))
         found += new
         near += new
@@ -148,7 +153,7 @@ def _stitch(paths: list[Path], size: tuple[int, int]) -> list[Path]:
 
 
 def _gap(one: Path, other: Path, size: tuple[int, int]) -> float:
-    """How far a path's beginning is from another's end, as `touching`; inf: too late or too soon."""
+    """How far a path's beginning is from another's end, as `touching`; inf: not in time."""
     pause = int(other.t[0] - one.t[-1])
     shorter = min(one.end - one.begin, other.end - other.begin)
     if not 0 < pause <= max(min(PAUSE * one.window, 2 * REST * shorter), REST * shorter):

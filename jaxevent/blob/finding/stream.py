@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.finding.paths import Path, candidates, join
+from jaxevent.blob.finding.paths import NOBODY, Joined, Path, candidates, join
 from jaxevent.recording import Recording
 
 BATCH = 1 << 20  # events read at a time
@@ -34,7 +34,7 @@ class Stream:
         self.recording, self.start, self.stop = recording, start, stop
         self.width, self.height = recording.width, recording.height
         self.hot = np.zeros((recording.height, recording.width), bool)
-        self._out: Sequence[Path] = ()
+        self._out: Joined | None = None
         self._sigmas = 0.0
 
     @property
@@ -47,13 +47,13 @@ class Stream:
         events = self.recording.events
         return events.index(self.stop) - events.index(self.start)
 
-    def without(self, paths: Sequence[Path], sigmas: float) -> "Stream":
+    def without(self, paths: Sequence[Path], sigmas: float | int) -> "Stream":
         """The same without events near some paths."""
         stream = Stream(self.recording, self.start, self.stop)
-        stream.hot, stream._out, stream._sigmas = self.hot, paths, sigmas
+        stream.hot, stream._out, stream._sigmas = self.hot, join(paths), sigmas
         return stream
 
-    def window(self, begin: float, end: float) -> Part:
+    def window(self, begin: float | int, end: float | int) -> Part:
         """The events of begin <= t < end (s since the start)."""
         us = [self.start + round(1e6 * t) for t in (begin, end)]
         first, last = (self.recording.events.index(min(t, self.stop)) for t in us)
@@ -75,7 +75,7 @@ class Stream:
     def _rows(self, first: int, last: int) -> Part:
         events = self.recording.events[first:last]
         kept = ~self.hot[events.y, events.x]
-        if len(self._out) and len(events):
-            kept &= candidates(events, join(self._out), self._sigmas) == -1
-        t = (events.t[kept] - self.start) * 1e-6
+        if self._out is not None and len(events):
+            kept &= candidates(events, self._out, self._sigmas) == NOBODY
+        t = np.asarray((events.t[kept] - self.start) * 1e-6, np.float64)
         return Part(t, events.x[kept].astype(np.int64), events.y[kept].astype(np.int64))

@@ -1,0 +1,242 @@
+"""Targets found without settings, on small sensors and against slow, obvious computations."""
+
+import dataclasses
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from jaxevent import blob
+from jaxevent.blob.finding.agility import GRID, _log_likelihood, fit_agility
+from jaxevent.blob.finding.background import find_hot_pixels, measure_background
+from jaxevent.blob.finding.detection import evidence
+from jaxevent.blob.finding.paths import ANYBODY, NOBODY, candidates, join
+from jaxevent.blob.finding.paths import Path as TargetPath
+from jaxevent.blob.finding.stream import Stream
+from jaxevent.errors import InputError
+from jaxevent.io import load
+from jaxevent.recording import Events, Recording
+from jaxevent.simulate.blobs import Circle, Line, Target, simulate_blobs
+
+SMALL = (128, 96)
+
+
+def scene(targets, duration=0.4, noise=2e3, seed=0):
+    return simulate_blobs(targets, SMALL, duration, noise, seed)
+
+
+def crossing():
+    """Two that pass through each other, and their paths."""
+    targets = [
+        Target(Line((64 - s * 40, 48.0), (s * 200.0, 0.0), size=(4.0, 3.0)), 2e4) for s in (1, -1)
+    ]
+    return scene(targets)
+
+
+@pytest.fixture(scope="module")
+def crossed():
+    recording, truth = crossing()
+    return recording, truth, blob.find(recording, progress=False)
+
+
+def test_two_that_cross_keep_their_identities(crossed):
+    recording, truth, found = crossed
+    assert len(found) == 2 and found.summary().startswith("2 targets")
+    tracks = blob.moment.estimate(recording, progress=False)
+    times = np.arange(20_000, 390_000, 5000)
+    states, true = tracks(times), truth(times)
+    assert len(tracks) == 2 and states.valid.all()
+    apart = np.linalg.norm(states.mean[:, :, None, :2] - true[:, None, :, :2], axis=-1)
+    straight = apart[:, [0, 1], [0, 1]], apart[:, [0, 1], [1, 0]]
+    assert min(np.sqrt((d**2).mean()) for d in straight) < 0.7
+    # What is prepared and run by hand is the same.
+    params = blob.moment.Params(**found.settings())
+    features, out = blob.moment.prepare(recording, times, params, found=found)
+    again = blob.moment.read(params, blob.moment.run(params, features)[0], out)
+    np.testing.assert_allclose(again.mean, states.mean, rtol=1e-4, atol=1e-3)
+
+
+def test_what_the_user_sets_wins_over_what_is_found(crossed):
+    _, _, found = crossed
+    settings = found.settings()
+    params = blob.moment.Params(**settings)
+    assert set(found.own(params)) == set(settings) & set(found.own(params)) != set()
+    assert "Q_v" in found.own(params)
+    assert "Q_v" not in found.own(params.replace(Q_v=12.0))
+    with pytest.raises(InputError, match="take no seeds"):
+        blob.moment.estimate(crossed[0], found=found, seeds=[(10.0, 10.0, 3.0)])
+
+
+def test_noise_and_hot_pixels_are_no_targets():
+    hot = [Target(Line((x, 40.0), size=(0.01, 0.01)), 2e3) for x in (20.0, 90.0)]
+    recording, _ = scene(hot, noise=2e4, seed=3)
+    found = blob.find(recording, progress=False)
+    assert len(found) == 0 and found.hot_pixels == 2
+    assert 0.8 * 2e4 < found.background < 1.4 * 2e4
+    tracks = blob.moment.estimate(recording, found=found, progress=False)
+    assert len(tracks) == 0 and tracks([0.1]).mean.shape == (1, 0, 8)
+
+
+@pytest.mark.parametrize("count", [0, 1, 99])
+def test_recordings_of_few_events_have_no_targets(count):
+    t = np.arange(count, dtype=np.int64)
+    none = np.zeros(count, np.uint16)
+    recording = Recording("few", *SMALL, Events(t, none, none, none.astype(bool)))
+    assert len(blob.find(recording, progress=False)) == 0
+    assert len(blob.moment.estimate(recording, progress=False)) == 0
+
+
+class Stopping:
+    """At rest and without events from 0.3 to 0.6 s, then back."""
+
+    def state(self, t):
+        out = np.zeros((len(t), 8))
+        out[:, 0] = 30 + 150 * np.minimum(t, 0.3) - 100 * np.maximum(t - 0.6, 0)
+        out[:, 1], out[:, 4:6] = 50, (4.0, 3.0)
+        return out
+
+
+@pytest.fixture(scope="module")
+def stopped():
+    recording, truth = scene([Target(Stopping(), 1e4, dropouts=((0.3, 0.6),))], 0.9)
+    return recording, truth, blob.find(recording, progress=False)
+
+
+@pytest.mark.parametrize("method", ["moment", "chi2", "constant_velocity"])
+def test_a_silent_target_stands_still(method, stopped):
+    recording, truth, found = stopped
+    assert len(found) == 1
+    tracker = getattr(blob, method)
+    tracks = tracker.estimate(
+        recording, tracker.Params(**found.settings()), found=found, progress=False
+    )
+    times = np.array([0.2, 0.35, 0.45, 0.58, 0.75])
+    states, true = tracks(times), truth(times)[:, 0]
+    assert states.valid.all()
+    assert np.abs(states.mean[:, 0, :2] - true[:, :2]).max() < 1.5
+    np.testing.assert_array_equal(states.mean[1:4, 0, 2:4], 0)
+    sizes = states.mean[1:4, 0, 4:6]
+    np.testing.assert_allclose(sizes, np.broadcast_to(sizes[0], sizes.shape), rtol=1e-6)
+    spread = states.covariance[:, 0, 0, 0]
+    assert spread[1] < spread[2] < spread[3] and spread[4] < spread[3]
+
+
+def test_evidence_bounds_the_tail_of_poisson():
+    n, mu = np.meshgrid(np.arange(1, 60), [0.01, 0.3, 2.0, 20.0])
+    bound = np.exp(-evidence(n, mu, 1.0))
+    assert (bound * (1 + 1e-9) >= stats.poisson.sf(n - 1, mu)).all()
+    assert (evidence(n, mu, 2.0) * 2 == evidence(n, mu, 1.0)).all()
+    assert (evidence(n, mu, 1.0)[n <= mu] == 0).all()
+
+
+def test_hot_pixels_stand_alone():
+    rng = np.random.default_rng(0)
+    counts = rng.poisson(3.0, (40, 50))
+    counts[10, 20] = 200
+    counts[30:33, 30:33] = 300  # something that rests
+    expected = np.zeros(counts.shape, bool)
+    expected[10, 20] = True
+    np.testing.assert_array_equal(find_hot_pixels(counts), expected)
+
+
+def test_background_is_that_without_the_targets():
+    swinging = Target(Circle((64, 48), 25, 12.0, size=(3.0, 3.0)), 2e4)
+    recording, _ = scene([swinging], 1.0, noise=2e4)
+    stream = Stream(recording, 0, 1_000_000)
+    rate = measure_background(stream).rate
+    assert rate.shape == (6, 8)
+    true = 2e4 / (SMALL[0] * SMALL[1])
+    assert 0.8 * true < np.median(rate) < 1.3 * true
+    assert rate.max() < 4 * true  # the target alone makes 20 times as many where it passes
+
+
+def test_candidates_are_those_of_a_slow_loop():
+    rng = np.random.default_rng(1)
+    paths = []
+    for k in range(3):
+        t = np.sort(rng.choice(np.arange(5, 95), 20, replace=False)) * 1000
+        C = np.stack([np.diag(rng.uniform(2, 9, 2)) + 1.0 for _ in t])
+        n = rng.uniform(5, 50, len(t))
+        p = np.stack([30 + 0.5e-3 * t, np.full(len(t), 40.0 + 4 * k)], 1)
+        paths.append(TargetPath(t, p, np.zeros_like(p), C, n, 1000, 1.0))
+    t = np.sort(rng.integers(0, 100_000, 3000))
+    x, y = rng.integers(20, 90, 3000), rng.integers(25, 65, 3000)
+    events = Events(t, x.astype(np.uint16), y.astype(np.uint16), np.zeros(3000, bool))
+    told = candidates(events, join(paths), 3.0)
+
+    def near(path, i):
+        if not path.seen(t[i : i + 1])[0]:
+            return False
+        S = path.C * (1 + 2 / path.n)[:, None, None] + 0.1 * np.eye(2)
+        S = np.array([[np.interp(t[i], path.t, S[:, a, b]) for b in (0, 1)] for a in (0, 1)])
+        e = np.array([x[i], y[i]]) - path.at(t[i : i + 1])[0]
+        return e @ np.linalg.solve(S, e) <= 9
+
+    for i in range(3000):
+        mine = [k for k, path in enumerate(paths) if near(path, i)]
+        assert told[i] == (NOBODY if not mine else mine[0] if len(mine) == 1 else ANYBODY)
+
+
+def test_agility_is_the_most_likely():
+    rng = np.random.default_rng(2)
+    dt, q, R = 0.01, 3e4, 0.5
+    Q = q * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+    steps = rng.multivariate_normal([0, 0], Q, (400, 2))
+    state, m = np.zeros((2, 2)), []
+    for step in steps:
+        state = np.stack([state[:, 0] + dt * state[:, 1], state[:, 1]], 1) + step
+        m.append(state[:, 0] + rng.normal(0, np.sqrt(R), 2))
+    m, t = np.array(m), dt * np.arange(400)
+    found = fit_agility(t, m, np.full(400, R), 1e6)
+    assert q / 2.5 < found < 2.5 * q and np.isclose(GRID * 1e6, found).any()
+
+    # The density of 12 means, given the first two, written out.
+    n = 12
+    F = np.array([[1, dt], [0, 1]])
+    P = np.array([[R, R / dt], [R / dt, 2 * R / dt**2 + q * dt]])
+    S = np.zeros((n - 2, n - 2))
+    blocks = []
+    for _ in range(n - 2):
+        P = F @ P @ F.T + Q
+        blocks.append(P)
+    for i in range(n - 2):
+        for j in range(n - 2):
+            low, high = min(i, j), max(i, j)
+            S[i, j] = (np.linalg.matrix_power(F, high - low) @ blocks[low])[0, 0] + R * (i == j)
+    total = 0.0
+    for axis in range(2):
+        v = (m[1, axis] - m[0, axis]) / dt
+        mean = m[1, axis] + v * dt * np.arange(1, n - 1)
+        total += stats.multivariate_normal(mean, S).logpdf(m[2:n, axis])
+    constant = (n - 2) * np.log(2 * np.pi)
+    ours = _log_likelihood(t[:n], m[:n], np.full(n, R), q)
+    assert ours == pytest.approx(total + constant, rel=1e-9)
+
+
+def test_targets_do_not_depend_on_the_clock(crossed):
+    recording, _, found = crossed
+    events = recording.events[:]
+    late = dataclasses.replace(events, t=events.t + 7_000_000_000)
+    again = blob.find(dataclasses.replace(recording, events=late), progress=False)
+    for one, other in zip(found.paths, again.paths, strict=True):
+        np.testing.assert_array_equal(other.t - one.t, 7_000_000_000)
+        np.testing.assert_allclose(other.p, one.p, atol=1e-4)
+
+
+@pytest.mark.skipif("JAXEVENT_DATA" not in os.environ, reason="JAXEVENT_DATA is not set")
+@pytest.mark.slow
+def test_cars_on_a_street_and_a_spinning_dot_are_found():
+    data = Path(os.environ["JAXEVENT_DATA"]) / "data"
+    street = blob.find(load(data / "davis346_street.npz"), progress=False)
+    lives = [(path.end - path.begin) * 1e-6 for path in street.paths]
+    assert sum(life > 1.5 for life in lives) == 3 and all(x < 0.2 for x in lives if x < 1.5)
+    dot = load(data / "spinning_dot.npz")
+    tracks = blob.moment.estimate(dot, progress=False)
+    assert len(tracks) == 1 and tracks.death[0] - tracks.birth[0] > 0.9 * 50_000
+    t = np.linspace(0.003, 0.0495, 400)
+    states = tracks(t).mean[:, 0]
+    radius = np.hypot(states[:, 0] - 314.29, states[:, 1] - 202.35)
+    speed = np.hypot(states[:, 2], states[:, 3])
+    assert abs(radius.mean() - 107.66) < 1.5 and abs(np.median(speed) / 13117 - 1) < 0.03
