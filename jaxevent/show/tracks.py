@@ -120,7 +120,8 @@ class Output:
                 places["quantities"] = folder / "quantities.csv"
             for name, text in (texts or {}).items():
                 (folder / name).write_text(text, encoding="utf-8")
-            return self._all(tracks, places, progress)
+            written = self._all(tracks, places, progress)
+            return dataclasses.replace(written, files=[*written.files, *(texts or {})])
 
     def _all(self, tracks: Tracks, places: Mapping[str, Path], progress: bool | None) -> "Written":
         duration = (tracks.stop - tracks.start) * 1e-6

@@ -36,7 +36,7 @@ def evidence(
 
     Chernoff's bound of the Poisson distribution's tail, over the dispersion.
     """
-    n, mu = np.asarray(n, np.float64), np.maximum(mu, 1e-300)
+    n, mu = np.asarray(n, np.float64), np.maximum(np.asarray(mu, np.float64), 1e-300)
     told = n * np.log(np.maximum(n / mu, 1)) - n + mu
     return np.where(n > mu, told, 0) / dispersion
 
