@@ -1,10 +1,15 @@
 """Progress bars: shown by default where somebody looks on, in a terminal or a notebook."""
 
 import sys
+import threading
 from collections.abc import Iterable
 from typing import Any
 
 from tqdm.auto import tqdm
+
+# By default tqdm makes a lock for processes too: a semaphore, of which Python warns that it leaks
+# when a process is killed. No two processes share a bar here.
+tqdm.set_lock(threading.RLock())
 
 
 def watched() -> bool:

@@ -6,9 +6,13 @@ command that needs them, so that help appears at once.
 
 import argparse
 import contextlib
+import io
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import jaxevent
 from jaxevent.cli import (
@@ -23,6 +27,7 @@ from jaxevent.cli import (
     simulate,
     track,
 )
+from jaxevent.cli.arguments import guarded
 from jaxevent.errors import InputError
 
 # In the order of `jaxevent --help`.
@@ -34,25 +39,100 @@ COMMANDS = (
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line (default: the process's arguments); returns the exit status.
 
-    0: done; 1: the output was not read to its end; 2: bad input or arguments (argparse exits with
-    2 by itself); 130: interrupted.
+    0: done; 2: bad input or arguments (argparse exits with 2 by itself), or what was to be printed
+    could not be; 130, 143, 129: interrupted, terminated, hung up; 141: nobody read the output to
+    its end. The last are the numbers that a shell gives a tool which the signal killed, so that
+    pipelines (`set -o pipefail`) take it as they take others.
     """
-    arguments = vars(_parser().parse_args(argv))
-    command = arguments.pop("command")
+    _mend_streams()
     try:
-        command(**arguments)
-        sys.stdout.flush()
+        with _terminable():
+            try:
+                arguments = vars(_parser().parse_args(argv))
+            finally:
+                sys.stdout.flush()  # help
+            command = arguments.pop("command")
+            with guarded(arguments) as options:
+                command(**options)
+            sys.stdout.flush()
     except InputError as error:
-        print(f"jaxevent: {' '.join(str(error).split())}", file=sys.stderr)
+        _say(str(error))
         return 2
+    except _Signal as signalled:
+        return 128 + signalled.number
     except KeyboardInterrupt:
-        return 130
+        return 128 + signal.SIGINT
     except BrokenPipeError:
-        # Python flushes stdout once more at exit, which must not fail again.
-        with contextlib.suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+        _silence()
+        return 128 + signal.SIGPIPE if hasattr(signal, "SIGPIPE") else 1
+    except OSError as error:
+        # Files' errors are `InputError`s by now: what remains is that of printing.
+        if error.filename is not None:
+            raise
+        _silence()
+        _say(f"what was to be printed cannot be written ({error.strerror or error})")
+        return 2
     return 0
+
+
+class _Signal(BaseException):
+    """A signal to end, which unwinds as an interrupt does."""
+
+    def __init__(self, number: int):
+        self.number = number
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP unwind the block, so that nothing incomplete is left behind."""
+
+    def leave(number: int, frame: Any) -> None:
+        for other in before:
+            signal.signal(other, signal.SIG_IGN)  # once is enough
+        raise _Signal(number)
+
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in numbers:
+            if signal.getsignal(number) != signal.SIG_IGN:  # of nohup
+                before[number] = signal.signal(number, leave)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _mend_streams() -> None:
+    """Make stdout and stderr take any text, and fail where they are closed, not crash.
+
+    A file that is opened next would get the number of a closed one, and what libraries say there.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDONLY)
+    if sys.stdout is None:
+        sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _say(sentence: str) -> None:
+    """Say on stderr why the command ends; silently where nobody can be told."""
+    with contextlib.suppress(OSError, ValueError):
+        print(f"jaxevent: {' '.join(sentence.split())}", file=sys.stderr, flush=True)
+
+
+def _silence() -> None:
+    """Have Python's last flush of stdout, at exit, not fail again."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -1,9 +1,10 @@
-"""What the commands share: their parsers, values of options, progress, what was stored."""
+"""What the commands share: their parsers, values of options, outputs, progress, what was stored."""
 
 import argparse
+import contextlib
 import sys
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -42,12 +43,71 @@ def add_stream(one: argparse.ArgumentParser) -> None:
     )
 
 
+def add_output(
+    one: argparse.ArgumentParser, *names: str, shared: bool = False, **more: Any
+) -> None:
+    """Add an option for a file or folder to write, and --force; `guarded` knows it by this.
+
+    A `shared` folder may hold other files. `run` then takes `force` and sees to its files itself,
+    by `jaxevent.runs.results.check_folder`, which knows their names.
+    """
+    outputs = one.get_default("outputs") or {}
+    if not outputs:
+        one.add_argument(
+            "--force",
+            action="store_true",
+            help="replace existing files; others in a folder stay",
+        )
+    added = one.add_argument(*names, type=Path, **more)
+    one.set_defaults(outputs={**outputs, added.dest: shared})
+
+
+@contextlib.contextmanager
+def guarded(options: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """The options that a command's `run` takes, once its outputs are known to cost nothing.
+
+    All paths among the options that are no outputs are inputs. Raises `InputError` as
+    `jaxevent.io.places.check` does.
+    """
+    outputs = options.get("outputs", {})
+    force = options.get("force", False)
+    taken = {name: value for name, value in options.items() if name not in ("outputs", "force")}
+    if any(outputs.values()):
+        yield {**taken, "force": force}
+    elif outputs:
+        from jaxevent.io.output import into_folders
+        from jaxevent.io.places import check
+
+        named = [path for name in outputs if (path := taken[name]) is not None]
+        inputs = [
+            value
+            for name, value in taken.items()
+            if isinstance(value, Path) and name not in outputs
+        ]
+        check(named, inputs, force=force)
+        with into_folders(force):
+            yield taken
+    else:
+        yield taken
+
+
 def size(text: str) -> tuple[int, int]:
     try:
         width, height = (int(number) for number in text.split(","))
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not W,H, for example 240,180") from None
     return width, height
+
+
+def number_or_path(text: str) -> float | Path:
+    try:
+        return float(text)
+    except ValueError:
+        return Path(text)
+
+
+def path_or_auto(text: str) -> Path | str:
+    return text if text == "auto" else Path(text)
 
 
 def seed(text: str) -> tuple[float, ...]:

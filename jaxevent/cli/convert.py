@@ -17,7 +17,7 @@ def add(commands: Any) -> None:
         "slider_depth.zip small.h5 --compression gzip",
     )
     one.add_argument("source", metavar="SRC", type=Path, help="a recording")
-    one.add_argument("target", metavar="DST", type=Path, help="the HDF5 file to write")
+    arguments.add_output(one, "target", metavar="DST", help="the HDF5 file to write")
     one.add_argument("--compression", choices=["gzip"], help="smaller, but slower to read")
     arguments.add_size(one)
     arguments.add_stream(one)

@@ -3,7 +3,10 @@
 from pathlib import Path
 from typing import Any
 
+from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command, show_progress
+
+OWN = Path("jaxevent-demo")
 
 
 def add(commands: Any) -> None:
@@ -15,16 +18,17 @@ def add(commands: Any) -> None:
         "",
         "--out my-demo",
     )
-    one.add_argument(
+    arguments.add_output(
+        one,
         "--out",
+        shared=True,
         metavar="DIR",
-        type=Path,
-        default=Path("jaxevent-demo"),
-        help="default: %(default)s",
+        default=OWN,
+        help="default: %(default)s, whose files are replaced without --force",
     )
 
 
-def run(out: Path) -> None:
+def run(out: Path, force: bool) -> None:
     from jaxevent.runs.demo import demo
 
-    demo(out, progress=show_progress())
+    demo(out, progress=show_progress(), replace=force or out == OWN)

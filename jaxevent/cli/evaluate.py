@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command, show_progress
 
 
@@ -20,8 +21,12 @@ def add(commands: Any) -> None:
         "mine.toml --out results --cluster tcp://10.0.0.1:8786",
     )
     one.add_argument("config", metavar="CONFIG.toml", type=Path, help="recordings and methods")
-    one.add_argument(
-        "--out", metavar="DIR", type=Path, help="folder for report.html, results.json and others"
+    arguments.add_output(
+        one,
+        "--out",
+        shared=True,
+        metavar="DIR",
+        help="folder for report.html, results.json and others",
     )
     where = one.add_mutually_exclusive_group()
     where.add_argument(
@@ -52,6 +57,7 @@ def run(
     cluster: str | None,
     scheduler_file: Path | None,
     retries: int,
+    force: bool,
 ) -> None:
     from jaxevent.runs.evaluate import evaluate
     from jaxevent.show.report import markdown_table
@@ -64,6 +70,7 @@ def run(
         cluster=cluster,
         scheduler_file=scheduler_file,
         retries=retries,
+        replace=force,
     )
     print(markdown_table(rows), end="")
     if out is not None:

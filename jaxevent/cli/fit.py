@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command, show_progress
 from jaxevent.errors import InputError
 
@@ -20,8 +21,13 @@ def add(commands: Any) -> None:
         "mine.toml --out fitted --coordinator host1:4321 --processes 2 --process 0",
     )
     one.add_argument("config", metavar="CONFIG.toml", type=Path, help="what to fit, and to what")
-    one.add_argument(
-        "--out", metavar="DIR", type=Path, required=True, help="folder for params.toml, results.md"
+    arguments.add_output(
+        one,
+        "--out",
+        shared=True,
+        metavar="DIR",
+        required=True,
+        help="folder for params.toml, results.md",
     )
     one.add_argument(
         "--recording",
@@ -52,6 +58,7 @@ def run(
     processes: int | None,
     process: int | None,
     distributed: bool,
+    force: bool,
 ) -> None:
     from jaxevent import devices
 
@@ -63,11 +70,10 @@ def run(
     if distributed or parts != (None, None, None):
         devices.join(*parts)
 
-    from jaxevent.runs.fit import fit
+    from jaxevent.runs.fit import FILES, fit
 
-    fit(config, out, recordings, resume, show_progress())
+    fit(config, out, recordings, resume, show_progress(), replace=force)
     if not devices.first():
         return
-    print((out / "results.md").read_text(), end="")
-    files = "params.toml, results.json, results.md, loss.csv, loss.png, config.toml"
-    print(f"\nwritten to {out}: {files}")
+    print((out / "results.md").read_text(encoding="utf-8"), end="")
+    print(f"\nwritten to {out}: {', '.join(FILES)}")

@@ -49,6 +49,7 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--truth",
         metavar="CSV",
+        type=arguments.path_or_auto,
         nargs="?",
         const="auto",
         help="compare with a table with columns as in motion.csv, or without a name with the "
@@ -88,7 +89,7 @@ def add(commands: Any) -> None:
         help="focal length, for a recording without calibration; the centre is the sensor's",
     )
     arguments.add_size(one)
-    one.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
+    arguments.add_output(one, "--out", metavar="DIR", required=True, help="folder to write")
 
 
 def run(
@@ -97,7 +98,7 @@ def run(
     method: str | None,
     params: Path | None,
     seed: int,
-    truth: str | None,
+    truth: Path | str | None,
     gyro: bool,
     still: tuple[float, float] | None,
     rate: float | int,

@@ -49,8 +49,8 @@ def add(commands: Any) -> None:
         help="in the colours of the frames, for a recording that holds extra/rgb; in .h5 images "
         "of red, green, blue without variance",
     )
-    one.add_argument(
-        "--out", metavar="DIR_or_FILE", type=Path, required=True, help="name in .h5, .mp4 or none"
+    arguments.add_output(
+        one, "--out", metavar="DIR_or_FILE", required=True, help="name in .h5, .mp4 or none"
     )
     arguments.add_size(one)
 

@@ -49,6 +49,7 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--depth",
         metavar="M_or_NPY",
+        type=arguments.number_or_path,
         help="of the scene in m, one number or a map of the event camera's pixels; default: far",
     )
     one.add_argument(
@@ -77,9 +78,7 @@ def add(commands: Any) -> None:
     )
     arguments.add_size(one)
     arguments.add_stream(one)
-    one.add_argument(
-        "--out", metavar="FILE", type=Path, required=True, help="the HDF5 file to write"
-    )
+    arguments.add_output(one, "--out", metavar="FILE", required=True, help="the HDF5 file to write")
 
 
 def run(
@@ -88,7 +87,7 @@ def run(
     reference: Path | None,
     homography: Path | None,
     calibration: Path | None,
-    depth: str | None,
+    depth: float | Path | None,
     plane: tuple[float, float, float, float] | None,
     offset: float | int | None,
     search: float | int | None,

@@ -46,9 +46,7 @@ def add(commands: Any) -> None:
         metavar="NAME",
         help="of the camera: planar, rotation, or general before a wall, shapes or texture",
     )
-    one.add_argument(
-        "--out", metavar="FILE", type=Path, required=True, help="the HDF5 file to write"
-    )
+    arguments.add_output(one, "--out", metavar="FILE", required=True, help="the HDF5 file to write")
     one.add_argument(
         "--sensor",
         metavar="NAME",
@@ -68,10 +66,10 @@ def add(commands: Any) -> None:
         help="seconds of a scene, default 1.5, of --objects, default 1, or of --motion, default "
         "0.5; of the video, before --speed, or of blobs, default all",
     )
-    one.add_argument(
+    arguments.add_output(
+        one,
         "--truth",
         metavar="CSV",
-        type=Path,
         help="a table at 1000 Hz: of blobs their states, as that of `jaxevent track`, of --motion "
         "the motion, as that of `jaxevent motion`",
     )

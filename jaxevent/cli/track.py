@@ -84,7 +84,7 @@ def add(commands: Any) -> None:
         type=float,
         help="lambda over the diameter in the image; default: 0.354, of an even rim",
     )
-    one.add_argument("--out", metavar="DIR_or_FILE", type=Path, required=True, help="what to write")
+    arguments.add_output(one, "--out", metavar="DIR_or_FILE", required=True, help="what to write")
 
 
 def run(

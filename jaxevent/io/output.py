@@ -1,10 +1,11 @@
 """Output that appears complete or not at all."""
 
 import contextlib
+import contextvars
 import io
 import math
+import re
 import shutil
-import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,10 +13,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxevent.errors import InputError
+from jaxevent.io.places import abandoned, locked, partial_of
 from jaxevent.parameters import Parameters
 
 if TYPE_CHECKING:
     import h5py
+
+
+_into_folders = contextvars.ContextVar("into_folders", default=False)
+
+
+@contextlib.contextmanager
+def into_folders(allowed: bool) -> Iterator[None]:
+    """Within the block, whether `complete` writes into folders that are not empty.
+
+    Files of the same names are replaced then, and numbered ones of the same kind removed, as those
+    of a longer series of images. All others stay.
+    """
+    token = _into_folders.set(allowed)
+    try:
+        yield
+    finally:
+        _into_folders.reset(token)
 
 
 @contextlib.contextmanager
@@ -24,27 +43,34 @@ def complete(path: Path, directory: bool = False) -> Iterator[Path]:
 
     The sibling is an empty file, or an empty directory where `directory` is True. If the block
     raises, the sibling is removed and `path` is left as it was. An existing file is replaced; an
-    existing directory must be empty.
+    existing directory must be empty, but see `into_folders`. Siblings that a killed process left
+    are removed.
 
     Raises:
         InputError: `path` is of the other kind, a directory that is not empty, or cannot be
             written; also instead of an OSError raised in the block.
     """
     path = Path(path)
-    name = path.absolute().name
-    if not name:
+    if not path.absolute().name:
         raise InputError(f"{path}: is a folder; give the name of something to write in it")
-    partial = path.absolute().with_name(f".{name}.{uuid.uuid4().hex[:12]}.part")
+    partial = partial_of(path.absolute())
+    # It has its name once it is locked: nobody shall take it for abandoned.
+    unlocked = partial.with_suffix(".new")
     try:
         _refuse(path, directory)
+        for remains in abandoned(path):
+            _remove(remains)
         if directory:
-            partial.mkdir()
+            unlocked.mkdir()
         else:
-            partial.touch(exist_ok=False)
-        yield partial
-        if directory and path.exists():
-            path.rmdir()
-        partial.replace(path)
+            unlocked.touch(exist_ok=False)
+        with locked(unlocked):
+            unlocked.replace(partial)
+            yield partial
+            if directory and path.exists():
+                _move_files(partial, path)
+            else:
+                partial.replace(path)
     except InputError as error:  # of a file in a folder that has its final name only now
         if str(partial) in str(error):
             raise InputError(str(error).replace(str(partial), str(path))) from error
@@ -55,11 +81,32 @@ def complete(path: Path, directory: bool = False) -> Iterator[Path]:
             f"{path}: cannot be written ({reason}); choose a writable place with enough room"
         ) from error
     finally:
-        if directory:
-            shutil.rmtree(partial, ignore_errors=True)
-        else:
-            with contextlib.suppress(OSError):
-                partial.unlink()
+        _remove(unlocked)
+        _remove(partial)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink()
+
+
+def _move_files(new: Path, folder: Path) -> None:
+    """Move the files of a folder into another one, in place of those of the same kind there."""
+    if not folder.is_symlink() and not any(folder.iterdir()):
+        folder.rmdir()
+        new.replace(folder)
+        return
+    names = {file.name for file in new.iterdir()}
+    number = re.compile(r"\d{6,}")
+    series = {number.sub("0", name) for name in names if number.search(name)}
+    for file in folder.iterdir():
+        if file.name not in names and number.sub("0", file.name) in series and file.is_file():
+            file.unlink()
+    for name in names:
+        (new / name).replace(folder / name)
 
 
 @contextlib.contextmanager
@@ -121,7 +168,7 @@ def _refuse(path: Path, directory: bool) -> None:
     if not path.parent.is_dir():
         raise InputError(f"{path}: the folder {path.parent} does not exist; create it first")
     if directory and path.is_dir():
-        if any(path.iterdir()):
+        if not _into_folders.get() and any(path.iterdir()):
             raise InputError(f"{path}: the folder is not empty; choose another or empty it")
     elif path.is_dir():
         raise InputError(f"{path}: is a folder; give the name of a file to write")

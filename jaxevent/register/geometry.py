@@ -56,21 +56,19 @@ def read_homography(path: str | Path) -> NDArray[np.float64]:
         raise InputError(f"{path}: {why}; give three lines of three numbers") from None
 
 
-def read_depth(text: str, size: tuple[int, int]) -> NDArray[np.float64]:
-    """Depth in m: a number, or the name of an .npy file of (height, width), `size` transposed.
+def read_depth(given: float | int | Path, size: tuple[int, int]) -> NDArray[np.float64]:
+    """Depth in m: a number, or the path of an .npy file of (height, width), `size` transposed.
 
     Raises `InputError` for anything else.
     """
 
-    try:
-        return np.array(float(text))
-    except ValueError:
-        pass
-    with reading(text):
-        depth = np.load(text, allow_pickle=False)
+    if not isinstance(given, Path):
+        return np.array(float(given))
+    with reading(str(given)):
+        depth = np.load(given, allow_pickle=False)
     if depth.shape != size[::-1] or depth.dtype.kind not in "iuf":
         raise InputError(
-            f"{text}: is {depth.dtype} of shape {depth.shape}; give metres of shape {size[::-1]}"
+            f"{given}: is {depth.dtype} of shape {depth.shape}; give metres of shape {size[::-1]}"
         )
     return depth.astype(np.float64)
 

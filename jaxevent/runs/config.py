@@ -1,5 +1,6 @@
 """What configurations of `evaluate` and `fit` share: recordings, methods, parameters, checks."""
 
+import contextlib
 import glob
 import math
 import os
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from jaxevent.errors import InputError
-from jaxevent.parameters import Parameters, nearest
+from jaxevent.parameters import Parameters, nearest, read_toml
 
 P = TypeVar("P", bound=Parameters)
 
@@ -83,6 +84,23 @@ def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path]]:
         for match in matches:
             found.setdefault(folder / match, match)
     return [(text, path) for path, text in found.items()]
+
+
+def named_files(config: Path) -> list[Path]:
+    """The existing files that a configuration names, in whichever setting."""
+    found: list[Path] = []
+
+    def look(value: Any) -> None:
+        if isinstance(value, str):
+            with contextlib.suppress(OSError, ValueError):  # text that can be no name
+                path = config.parent / os.path.expanduser(os.path.expandvars(value))
+                found.extend([path] if path.is_file() else [])
+        elif isinstance(value, dict | list):
+            for part in value.values() if isinstance(value, dict) else value:
+                look(part)
+
+    look(read_toml(config))
+    return found
 
 
 def read_params(kind: type[P], name: str, given: Any, folder: Path) -> P:

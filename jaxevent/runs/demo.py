@@ -11,7 +11,7 @@ from jaxevent.io import load
 from jaxevent.methods import find, names
 from jaxevent.recording import Recording
 from jaxevent.runs.protocols import frame_times, held_out
-from jaxevent.runs.results import results, write_rows
+from jaxevent.runs.results import check_folder, results, write_rows
 from jaxevent.runs.scores import score
 from jaxevent.show.export import evenly, shown
 from jaxevent.show.report import comparison_figure, markdown_table, video_writer
@@ -20,11 +20,16 @@ from jaxevent.show.report import comparison_figure, markdown_table, video_writer
 BY_HAND = {"c_on": 0.083, "c_off": 0.059, "clock_offset": 0.0075}
 
 
-def demo(out: Path, progress: bool | None = None) -> None:
+FILES = ("comparison.png", "video.mp4", "results.md", "results.json")
+
+
+def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
     """Score every method on the packaged recording; prints the table, writes all to a folder.
 
-    Raises `InputError` if the folder cannot be written or an extra is missing.
+    Raises `InputError` if the folder cannot be written, holds files of these names and `replace` is
+    False, or an extra is missing.
     """
+    check_folder(out, FILES, replace=replace)
     with resources.as_file(resources.files("jaxevent") / "data/slider_depth_crop.h5") as path:
         recording = load(path)
     by_hand = {name: find(name).Params.of(BY_HAND) for name in ("akf", "augmented")}
@@ -54,10 +59,8 @@ def demo(out: Path, progress: bool | None = None) -> None:
         _figure(recording, by_hand, out / "comparison.png")
         slower = _video(recording, by_hand["akf"], out / "video.mp4", progress)
         write_rows(rows, write)
-    print(
-        f"Written to {out}: comparison.png, video.mp4 ({slower:.0f} times slower than real time), "
-        "results.md, results.json"
-    )
+    how = {"video.mp4": f" ({slower:.0f} times slower than real time)"}
+    print(f"Written to {out}: " + ", ".join(name + how.get(name, "") for name in FILES))
 
 
 def _figure(recording: Recording, params: dict[str, Any], path: Path) -> None:

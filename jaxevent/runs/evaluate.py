@@ -66,17 +66,18 @@ from jaxevent.estimator import Estimator
 from jaxevent.io.output import values_of
 from jaxevent.methods import find
 from jaxevent.parameters import Parameters, read_toml
-from jaxevent.runs.config import NAME, SIZE, Check, check, find_recordings, read_params
+from jaxevent.runs.config import NAME, SIZE, Check, check, find_recordings, named_files, read_params
 from jaxevent.runs.contents import Contents, Opened
 from jaxevent.runs.families import find_protocol
 from jaxevent.runs.family import Protocol, Source
-from jaxevent.runs.results import results, write_rows
+from jaxevent.runs.results import check_folder, results, write_rows
 from jaxevent.runs.tasks import Outcome, Place, Task, run
 from jaxevent.show.report import write_parquet
 
 # Part of the keys of stored results: raised whenever the same recording, method and parameters give
 # other results than before.
 RESULTS_VERSION = 3
+FILES = ("report.html", "results.json", "results.md", "results.parquet", "config.toml")
 
 _opened = Opened()
 
@@ -90,6 +91,7 @@ def evaluate(
     cluster: str | None = None,
     scheduler_file: str | Path | None = None,
     retries: int = 2,
+    replace: bool = True,
 ) -> list[dict[str, Any]]:
     """Run an evaluation that a TOML file describes: a row per recording and method, as of `score`.
 
@@ -114,12 +116,16 @@ def evaluate(
         scheduler_file: The same, of the scheduler that wrote this file.
         retries: How often a task is tried again whose process dies or that fails for another reason
             than bad input.
+        replace: Whether files in `out` may be replaced that are not of an evaluation.
 
     Raises:
-        InputError: The file or a parameter cannot be used, `out` not be written, the cluster not be
-            reached; or not a single row could be computed.
+        InputError: The file or a parameter cannot be used, `out` not be written or only over other
+            files, the cluster not be reached; or not a single row could be computed.
     """
     plan = read_plan(Path(config))
+    if out is not None:
+        own = (Path(out) / "tasks").is_dir()
+        check_folder(Path(out), FILES, plan.inputs(Path(config)), replace=replace, own=own)
     place = Place(workers, cluster, None if scheduler_file is None else Path(scheduler_file))
     with contextlib.ExitStack() as stack:
         text = Path(config).read_bytes()
@@ -248,6 +254,19 @@ class Plan:
     protocol: Protocol
     options: dict[str, Any]
     size: tuple[int, int] | None
+
+    def inputs(self, config: Path) -> list[Path]:
+        """All files that are read, and can be."""
+        found = [config, *named_files(config)]
+        for _, path in self.recordings:
+            found.append(path)
+            with contextlib.suppress(OSError, InputError):
+                found += self.protocol.files(path, self.options)
+            for entry in self.methods:
+                if isinstance(entry.method, Source):
+                    with contextlib.suppress(OSError, InputError):
+                        found += entry.method.files(_name(path))
+        return found
 
 
 @dataclasses.dataclass(frozen=True)

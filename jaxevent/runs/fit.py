@@ -56,11 +56,12 @@ from jaxevent.runs import toml
 from jaxevent.runs.checkpoint import finished_rows, restore, save
 from jaxevent.runs.family import Sources
 from jaxevent.runs.fit_config import Plan, Task, read_plan
-from jaxevent.runs.results import results, write_rows
+from jaxevent.runs.results import alone, check_folder, results, write_rows
 from jaxevent.splits import SPLITS
 from jaxevent.tuning import Fitted, Run, optimise
 
 CHECKPOINT = "checkpoint"  # the name of the file in the folder
+FILES = ("params.toml", "results.json", "results.md", "loss.csv", "loss.png", "config.toml")
 PERIOD = 2.0  # s between checkpoints
 
 
@@ -70,6 +71,7 @@ def fit(
     recordings: Sequence[str | Path] | None = None,
     resume: bool = False,
     progress: bool | None = None,
+    replace: bool = True,
 ) -> list[dict[str, Any]]:
     """Run a fit that a TOML file describes; its layout is in the text of this module.
 
@@ -87,6 +89,7 @@ def fit(
         resume: Go on from the checkpoint in `out`. Where the run had not got to the first one, it
             starts; where it had ended, its rows are returned.
         progress: Whether bars are shown; None: where somebody looks on.
+        replace: Whether files in `out` may be replaced that are not of the fit that goes on.
 
     Returns:
         Rows as `evaluate.score` gives them, of the recordings and images of each split: `split` is
@@ -94,24 +97,28 @@ def fit(
         Those of the tracker are described in `jaxevent.runs.blob`.
 
     Raises:
-        InputError: The file, a recording or a parameter cannot be used, `out` cannot be written or
-            holds another run's checkpoint, or matplotlib is missing (extra "plot").
+        InputError: The file, a recording or a parameter cannot be used, `out` cannot be written,
+            holds another run's checkpoint or is written by another process, or matplotlib is
+            missing (extra "plot").
     """
     devices.in_step(lambda: require("matplotlib", "plot"))
     out = Path(out)
     plan = devices.in_step(lambda: read_plan(Path(config), recordings))
     progress = progress if devices.first() else False
-    rows = devices.by_first(lambda: _ended_before(out, plan, resume))
-    if rows is not None:
-        return rows
-    sources, digest = devices.in_step(lambda: (_sources(plan, progress), plan.digest()))
-    if len(set(devices.gathered(digest))) > 1:
-        raise InputError(
-            f"{config}: the processes see different configurations or recordings; give all the same"
-        )
-    done, write = _fit_tasks(plan, sources, digest, out, progress)
-    rows = _score(plan, done, sources, progress)
-    if devices.first():
+    with contextlib.ExitStack() as held:
+        rows = devices.by_first(lambda: _ended_before(out, plan, resume, replace, held))
+        if rows is not None:
+            return rows
+        sources, digest = devices.in_step(lambda: (_sources(plan, progress), plan.digest()))
+        if len(set(devices.gathered(digest))) > 1:
+            raise InputError(
+                f"{config}: the processes see different configurations or recordings; give all the "
+                "same"
+            )
+        done, write = _fit_tasks(plan, sources, digest, out, progress, held)
+        rows = _score(plan, done, sources, progress)
+        if not devices.first():
+            return rows
         write("config.toml", plan.text)
         write("loss.csv", _losses(plan.tasks, done).encode())
         write("loss.png", _curves(plan.tasks, done))
@@ -121,8 +128,15 @@ def fit(
     return rows
 
 
-def _ended_before(out: Path, plan: Plan, resume: bool) -> list[dict[str, Any]] | None:
-    """The rows of a run that had ended, if it is to go on; raises `InputError` if it had not."""
+def _ended_before(
+    out: Path, plan: Plan, resume: bool, replace: bool, held: contextlib.ExitStack
+) -> list[dict[str, Any]] | None:
+    """The rows of a run that had ended, if it is to go on; raises `InputError` if it had not.
+
+    A folder that exists is held until the stack is closed.
+    """
+    if out.is_dir():
+        held.enter_context(alone(out))
     checkpoint = out / CHECKPOINT
     if checkpoint.exists() and not resume:
         raise InputError(
@@ -131,15 +145,22 @@ def _ended_before(out: Path, plan: Plan, resume: bool) -> list[dict[str, Any]] |
         )
     if resume and not checkpoint.exists() and (out / "results.json").exists():
         return finished_rows(out, plan)
+    check_folder(out, FILES, plan.inputs(), replace=replace, own=checkpoint.exists())
     return None
 
 
 def _fit_tasks(
-    plan: Plan, sources: Sources, digest: str, out: Path, progress: bool | None
+    plan: Plan,
+    sources: Sources,
+    digest: str,
+    out: Path,
+    progress: bool | None,
+    held: contextlib.ExitStack,
 ) -> tuple[list[Fitted], Any]:
     """Fit all methods, from the checkpoint in the folder on; and the function that writes there.
 
-    The folder is made if missing. Raises `InputError` naming the method.
+    The folder is made if missing, and then held until the stack is closed. Raises `InputError`
+    naming the method.
     """
     checkpoint, saved = out / CHECKPOINT, -math.inf
     done: list[Fitted] = []
@@ -152,7 +173,10 @@ def _fit_tasks(
             nonlocal write
             # `results` removes a folder that it made if the block raises. At the first checkpoint
             # the block ends: from then on the folder stays.
+            missing = not out.exists()
             write = new.enter_context(results(out))
+            if missing:
+                held.enter_context(alone(out))
             content = checkpoint.read_bytes() if checkpoint.exists() else None
             for remains in out.glob(".*.part"):  # of a write during which the run was killed
                 remains.unlink(missing_ok=True)

@@ -1,5 +1,6 @@
 """The configuration of a fit, read and checked; `jaxevent.runs.fit` says what it may hold."""
 
+import contextlib
 import dataclasses
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -25,6 +26,7 @@ from jaxevent.runs.config import (
     find_recordings,
     is_number,
     is_texts,
+    named_files,
     read_params,
 )
 from jaxevent.runs.contents import fingerprint
@@ -58,6 +60,17 @@ class Plan:
     size: tuple[int, int] | None
     split: Shares
     window: float | int | None
+
+    def inputs(self) -> list[Path]:
+        """All files that are read, and can be."""
+        found = [self.config, *named_files(self.config)]
+        for split in SPLITS:
+            for _, path in self.recordings[split]:
+                found.append(path)
+                for task in self.tasks:
+                    with contextlib.suppress(OSError, InputError):
+                        found += task.goal.files(path)
+        return found
 
     def digest(self) -> str:
         """A number that changes with the configuration, the recordings and the precision."""

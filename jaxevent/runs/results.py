@@ -4,15 +4,33 @@ import contextlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from jaxevent.errors import InputError
 from jaxevent.io.output import complete
+from jaxevent.io.places import check, locked
 from jaxevent.show.report import markdown_table
 
 Write = Callable[[str, bytes], None]
+
+
+def check_folder(
+    folder: Path,
+    names: Sequence[str],
+    inputs: Sequence[Path] = (),
+    *,
+    replace: bool,
+    own: bool = False,
+) -> None:
+    """Raise `InputError` if writing files of these names into a folder would cost something.
+
+    Inputs are never written over, existing files only if they are to be replaced or the folder is
+    of a run that goes on: the caller's own. See `jaxevent.io.places.check`.
+    """
+    files = [folder / name for name in names]
+    check(files, inputs, force=replace, inside=files if own else ())
 
 
 def write_rows(
@@ -25,6 +43,19 @@ def write_rows(
     text = json.dumps({"rows": rows}, indent=1, allow_nan=False) + "\n"
     write("results.json", text.encode())
     write("results.md", table(rows).encode())
+
+
+@contextlib.contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Keep others from an existing folder; raises `InputError` where one keeps it already."""
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(locked(folder))
+        except BlockingIOError:
+            raise InputError(
+                f"{folder}: another process writes there; wait for it, or choose another folder"
+            ) from None
+        yield
 
 
 @contextlib.contextmanager

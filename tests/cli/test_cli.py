@@ -173,7 +173,7 @@ def test_bad_ways_to_reconstruct(folder, capsys):
     for name in ("out.avi", "out.h5.gz"):
         fails(capsys, ["reconstruct", path, *blend[:2], "--out", folder / name], folder / name)
     fails(capsys, ["reconstruct", path, *blend[:2], "--out", "."])
-    fails(capsys, ["reconstruct", path, *blend[:2], "--out", folder], folder, "not empty")
+    fails(capsys, ["reconstruct", path, *blend[:2], "--out", folder], folder, "holds the input")
     assert sorted(folder.rglob("*")) == before
 
 
@@ -236,7 +236,7 @@ def test_as_a_process(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt, 130), (BrokenPipeError, 1)])
+@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt, 130), (BrokenPipeError, 141)])
 def test_interrupted_and_broken_pipe(error, status, monkeypatch, capsys):
     def load(*arguments, **options):
         raise error

@@ -1,0 +1,185 @@
+"""Where commands write: never onto an input, never unasked onto a file; what signals leave."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from commands import fails
+from noise import ONE, small, write_config
+
+import jaxevent
+from jaxevent import cli
+from jaxevent.io import output, places
+
+RECONSTRUCT = "reconstruct {source} --method blend --rate 5 --out {out}"
+COMMANDS = {
+    "convert": "convert {source} {out}",
+    "reconstruct": RECONSTRUCT,
+    "track": "track {source} --out {out}",
+    "motion": "motion {source} --model planar --out {out}",
+    "motion's truth": "motion other.h5 --model planar --truth {source} --out {out}",
+    "params": "reconstruct other.h5 --method blend --params {source} --out {out}",
+    "simulate": "simulate {source} --out {out}",
+    "register": "register {source} --frames other.h5 --out {out}",
+    "frames": "register other.h5 --frames {source} --out {out}",
+    "homography": "register other.h5 --frames other.h5 --homography {source} --out {out}",
+    "calibration": "register other.h5 --frames other.h5 --calibration {source} --out {out}",
+    "depth": "register other.h5 --frames other.h5 --depth {source} --out {out}",
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch) -> Path:
+    jaxevent.save(small(), tmp_path / "source.h5")
+    os.symlink("source.h5", tmp_path / "symbolic.h5")
+    os.link(tmp_path / "source.h5", tmp_path / "hard.h5")
+    (tmp_path / "sub").mkdir()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def state(folder: Path) -> dict[Path, bytes | None]:
+    """All that is in a folder, to the byte."""
+    return {
+        path: path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))
+    }
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_no_command_writes_onto_its_input(name, folder, capsys):
+    before = state(folder)
+    for out in ("source.h5", "sub/../source.h5", "symbolic.h5", "hard.h5", folder / "source.h5"):
+        for more in ([], ["--force"]):
+            argv = [word.format(source="source.h5", out=out) for word in COMMANDS[name].split()]
+            fails(capsys, [*argv, *more], out, "is an input too")
+    assert state(folder) == before
+
+
+@pytest.mark.parametrize("name", ["reconstruct", "track", "motion"])
+def test_no_folder_is_written_that_holds_an_input_or_is_a_part_of_it(name, folder, capsys):
+    (folder / "sub" / "rec").mkdir()
+    for file in ("images.txt", "events.txt"):
+        (folder / "sub" / "rec" / file).write_text("0.1 3 4 1\n")
+    before = state(folder)
+    for source, out, said in (
+        (folder / "source.h5", folder, "holds the input"),
+        ("sub/rec/events.txt", "sub", "holds the input"),
+        ("sub", "sub/rec", "is a part of the input"),
+        ("sub", "sub", "is an input too"),
+    ):
+        argv = [word.format(source=source, out=out) for word in COMMANDS[name].split()]
+        fails(capsys, [*argv, "--force"], out, said)
+    fails(capsys, ["convert", "sub/rec", "sub/rec/events.txt", "--force"], "is a part of the input")
+    assert state(folder) == before
+
+
+def test_two_outputs_have_two_names(folder, capsys):
+    before = state(folder)
+    for table in ("z.h5", "sub/../z.h5"):
+        words = f"simulate --blobs lissajous --duration 0.01 --truth {table} --out z.h5"
+        fails(capsys, words.split(), "two outputs")
+        words = f"simulate --motion planar --duration 0.01 --truth {table} --out z.h5 --force"
+        fails(capsys, words.split(), "two outputs")
+    assert state(folder) == before
+
+
+def test_files_are_replaced_only_with_force(folder, capsys):
+    for out in ("kept.h5", "kept.mp4"):
+        (folder / out).write_text("mine")
+        argv = RECONSTRUCT.format(source="source.h5", out=out).split()
+        fails(capsys, argv, out, "--force")
+        assert (folder / out).read_text() == "mine"
+    fails(capsys, ["convert", "source.h5", "kept.h5"], "--force")
+    (folder / "t.csv").write_text("mine")
+    fails(capsys, "simulate --blobs disc --truth t.csv --out new.h5".split(), "t.csv", "--force")
+    assert not (folder / "new.h5").exists() and (folder / "t.csv").read_text() == "mine"
+    assert cli.main(["convert", "source.h5", "kept.h5", "--force"]) == 0
+    assert len(jaxevent.load(folder / "kept.h5").events) == len(small().events)
+
+
+@pytest.mark.slow
+def test_in_a_folder_others_stay(folder, capsys):
+    argv = ["reconstruct", "source.h5", "--method", "blend", "--out", "pictures", "--rate"]
+    (folder / "pictures").mkdir()
+    assert cli.main([*argv, "300"]) == 0  # an empty folder is one to write into
+    (folder / "pictures" / "notes.txt").write_text("mine")
+    (folder / "pictures" / "frame_1.png").write_text("mine too")
+    many = len(list((folder / "pictures").glob("frame_*")))
+    before = state(folder)
+    capsys.readouterr()
+    fails(capsys, [*argv, "100"], "pictures", "not empty", "--force")
+    assert state(folder) == before
+    assert cli.main([*argv, "100", "--force"]) == 0
+    lines = (folder / "pictures" / "images.txt").read_text().splitlines()
+    named = {line.split()[1] for line in lines}
+    assert len(named) < many - 1
+    there = {path.name for path in (folder / "pictures").iterdir()}
+    assert there == named | {"images.txt", "notes.txt", "frame_1.png"}
+
+
+@pytest.mark.slow
+def test_folders_of_results(folder, capsys):
+    """An evaluation goes on in its own folder, and replaces nobody's files."""
+    config = write_config(folder, ONE.replace("small.h5", "source.h5"))
+    evaluate = ["evaluate", config.name, "--out", "results"]
+    (folder / "results").mkdir()
+    (folder / "results" / "config.toml").write_text("mine")
+    fails(capsys, evaluate, "results/config.toml", "--force")
+    assert (folder / "results" / "config.toml").read_text() == "mine"
+    assert cli.main([*evaluate, "--force"]) == 0
+    assert cli.main(evaluate) == 0
+    capsys.readouterr()
+    fails(capsys, ["demo", "--out", "results"], "results/results.md", "--force")
+    fit = ["fit", config.name, "--out", "results"]
+    config.write_text(ONE.replace("small.h5", "source.h5") + 'fit = ["I0"]\n')
+    fails(capsys, fit, "results/results.json", "--force")
+
+
+@pytest.mark.parametrize("command", ["fit", "evaluate"])
+def test_results_are_not_written_onto_what_the_configuration_names(command, folder, capsys):
+    (folder / "results.json").write_text("I0 = 0.2\n")
+    text = ONE.replace("small.h5", "source.h5") + 'params = "results.json"\n'
+    more = 'fit = ["I0"]\n' if command == "fit" else ""
+    config = write_config(folder, text + more)
+    before = state(folder)
+    fails(capsys, [command, config, "--out", folder, "--force"], "results.json", "an input too")
+    (folder / "results.json").rename(folder / "start.toml")
+    config.write_text(config.read_text().replace("results.json", "start.toml"))
+    config.rename(folder / "config.toml")
+    before = state(folder)
+    argv = [command, "config.toml", "--out", ".", "--force"]
+    fails(capsys, argv, "config.toml", "an input too")
+    assert state(folder) == before
+
+
+def test_what_a_killed_process_left_is_removed(folder):
+    code = """
+import os, signal
+from pathlib import Path
+from jaxevent.io.output import complete
+with complete(Path("a.h5")) as a, complete(Path("b"), directory=True) as b:
+    (b / "x").touch()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    subprocess.run([sys.executable, "-c", code], cwd=folder)
+    left = sorted(folder.glob(".*.part"))
+    assert len(left) == 2
+    other = folder / ".a.h5.notes.part"  # not of ours
+    other.touch()
+    with output.complete(folder / "a.h5") as partial:
+        assert not left[0].exists() and partial.exists() and left[1].exists()
+        with output.complete(folder / "a.h5") as another:  # what is at work is left alone
+            assert partial.exists() and another.exists()
+    with output.complete(folder / "b", directory=True):
+        assert not left[1].exists()
+    assert sorted(folder.glob(".*")) == [other]
+
+
+def test_what_another_process_writes_is_refused(folder, capsys):
+    before = state(folder)
+    with output.complete(folder / "a.h5"):
+        fails(capsys, ["convert", "source.h5", "a.h5", "--force"], "another process")
+    assert state(folder).keys() == before.keys() | {folder / "a.h5"}
+    assert not places.partials(folder / "a.h5")
