@@ -19,11 +19,18 @@ prepares and computes its windows, number p, p + N, p + 2 N, ... of N processes,
 at least as many windows as processes (`window` in the configuration). Losses and gradients of all
 windows are exchanged and added in the order of the windows by every process: the parameters are
 those of one process, to the bit where the devices are alike. Process 0 writes.
+
+The channel between processes protects nothing: no password, no encryption. Whoever reaches its
+ports can read what is said, say something else, or end the fit, so use it in a network that you
+trust. What comes is read as JSON and arrays, never run. The coordinator listens at the HOST that is
+given, no other address of the machine (--distributed: where JAX has it listen, on all). On CPUs
+each process listens at the address of its host's name, too, for the exchange itself.
 """
 
 import contextlib
+import io
+import json
 import math
-import pickle
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -123,7 +130,10 @@ def join(
             )
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     try:
-        jax.distributed.initialize(*given, initialization_timeout=START)
+        # By default the coordinator would listen on all interfaces.
+        jax.distributed.initialize(
+            *given, initialization_timeout=START, coordinator_bind_address=coordinator
+        )
     except (RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(
@@ -139,17 +149,70 @@ def shared_out(batches: Sequence[T]) -> list[T | Elsewhere]:
 
 
 def gathered(said: Any) -> list[Any]:
-    """What every process says, in their order; all of them must ask. Pickled, so to the bit."""
+    """What every process says, in their order; all of them must ask. Arrays are kept to the bit.
+
+    Raises `InputError` if one says what none of ours would; see `packed` for what can be said.
+    """
     if jax.process_count() == 1:
         return [said]
     from jax.experimental.multihost_utils import process_allgather
 
-    text = np.frombuffer(pickle.dumps(said), np.uint8)
+    text = np.frombuffer(packed(said), np.uint8)
     lengths = np.asarray(process_allgather(np.array([len(text)], np.int32))).ravel()
     # A ladder of sizes: each one is compiled.
     room = 1 << max(10, (int(lengths.max()) - 1).bit_length())
     texts = np.asarray(process_allgather(np.pad(text, (0, room - len(text)))))
-    return [pickle.loads(row[:n].tobytes()) for row, n in zip(texts, lengths, strict=True)]
+    return [unpacked(row[:n].tobytes()) for row, n in zip(texts, lengths, strict=True)]
+
+
+def packed(said: Any) -> bytes:
+    """Numbers, text, bytes, arrays, None, and lists, tuples and dictionaries of them, as bytes.
+
+    A line of JSON, then the arrays as .npy. Reading it runs nothing, as unpickling would.
+    """
+    arrays = io.BytesIO()
+
+    def node(value: Any) -> Any:
+        if isinstance(value, bytes):
+            np.save(arrays, np.frombuffer(value, np.uint8), allow_pickle=False)
+            return {"bytes": None}
+        if isinstance(value, np.ndarray | np.generic | jax.Array):
+            np.save(arrays, np.asarray(value), allow_pickle=False)
+            return {"array": None}
+        if isinstance(value, dict):
+            return {"dict": [[node(key), node(one)] for key, one in value.items()]}
+        if isinstance(value, list | tuple):
+            kind = "list" if isinstance(value, list) else "tuple"
+            return {kind: [node(one) for one in value]}
+        return value
+
+    return json.dumps(node(said)).encode() + b"\n" + arrays.getvalue()
+
+
+def unpacked(text: bytes) -> Any:
+    """What `packed` was given; raises `InputError` for bytes that it would not make."""
+    arrays = io.BytesIO(text)
+    made: dict[str, Callable[[Any], Any]] = {
+        "bytes": lambda _: np.load(arrays, allow_pickle=False).tobytes(),
+        "array": lambda _: np.load(arrays, allow_pickle=False),
+        "dict": lambda items: {value(key): value(one) for key, one in items},
+        "list": lambda items: [value(one) for one in items],
+        "tuple": lambda items: tuple(value(one) for one in items),
+    }
+
+    def value(node: Any) -> Any:
+        if not isinstance(node, dict):
+            return node
+        ((kind, content),) = node.items()
+        return made[kind](content)
+
+    try:
+        return value(json.loads(arrays.readline()))
+    except (ValueError, KeyError, TypeError, EOFError, RecursionError) as error:
+        raise InputError(
+            "another process said what cannot be read; start all with the same version of "
+            "jaxevent, and see that no other program uses the coordinator's port"
+        ) from error
 
 
 def by_first(compute: Callable[[], T]) -> T:

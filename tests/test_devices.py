@@ -273,6 +273,67 @@ def test_an_error_of_one_process_is_one_of_all(monkeypatch):
     assert devices.shared_out([10, 11, 12]) == [devices.ELSEWHERE, 11, devices.ELSEWHERE]
 
 
+class Trap:
+    """Unpickling it would raise."""
+
+    def __reduce__(self):
+        return exec, ("raise SystemExit('unpickled')",)
+
+
+def test_what_processes_say_is_kept_to_the_bit_and_never_run(monkeypatch):
+    from jax.experimental import multihost_utils
+
+    rng = np.random.default_rng(0)
+    said: Any = {
+        "3": (2.0, [rng.random(3), np.float32(0.1), {"c_on": np.zeros((0, 2), np.int64)}]),
+        "rows": [{"mse": 1 / 3, "lost": float("nan"), "name": "\u00b5\n", "ok": True, "no": None}],
+        "checkpoint": bytes(range(256)),
+    }
+    got = devices.unpacked(devices.packed(said))
+    jax.tree.map(np.testing.assert_array_equal, got, said)
+    assert jax.tree.structure(got) == jax.tree.structure(said) and list(got) == list(said)
+    assert devices.unpacked(devices.packed({3: "a", "3": "b"})) == {3: "a", "3": "b"}
+    assert got["3"][1][1].dtype == np.float32
+
+    # Of two processes, a stranger in place of the other.
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    for strange in (
+        pickle.dumps(Trap()),
+        b"",
+        b"{}\n",
+        b'{"run": 1}\n',
+        b'{"array": null}\n',
+        b'{"array": null}\n' + pickle.dumps(Trap()),
+        b"[" * 100_000,
+    ):
+        messages = [devices.packed("mine"), strange]
+        room = max(1024, 1 << (max(map(len, messages)) - 1).bit_length())
+        rows = [np.frombuffer(one.ljust(room, b"\0"), np.uint8) for one in messages]
+        answers = iter([np.array([len(one) for one in messages]), np.stack(rows)])
+        monkeypatch.setattr(multihost_utils, "process_allgather", lambda _: next(answers))  # noqa: B023
+        with pytest.raises(InputError, match="cannot be read"):
+            devices.gathered("mine")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="looks into /proc")
+def test_the_coordinator_listens_where_it_is_told(tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    program = f"""
+from pathlib import Path
+from jaxevent import devices
+devices.join("127.0.0.1:{port}", 1, 0)
+for table in ("tcp", "tcp6"):
+    for _, at, _, state, *_ in map(str.split, Path("/proc/net", table).read_text().splitlines()):
+        if at.endswith(":{port:04X}") and state == "0A":
+            print(at[-13:])
+"""
+    (said,) = ended([started(["-c", program])])
+    assert said == f"0100007F:{port:04X}\n"  # the bytes of 127.0.0.1 backwards
+
+
 @pytest.mark.slow
 def test_each_process_prepares_its_own_windows(monkeypatch):
     from texture import moving
