@@ -19,6 +19,7 @@ from jaxevent.errors import InputError
 T = TypeVar("T", bound="Parameters")
 S = TypeVar("S", bound="Setting")
 
+LARGEST = 1e15  # a value must be smaller, so that its square is in the range of float32
 NO_GRADIENT = "acts when data are prepared or by comparisons, and has no gradient to follow"
 
 
@@ -49,10 +50,14 @@ class Setting:
 class Number(Setting):
     """A number: the instance stores `raw`, on which an optimiser may step anywhere.
 
-    A default of several numbers makes it an array, given as a list. With `gradient=False` it acts
+    A default of several numbers makes it an array, given as a list of as many; a default of one in
+    a tuple, a list of any length. With `gradient=False` it acts
     when data are prepared, or by comparisons: no derivative goes through it, so that no step can
-    lead it away from what was prepared, and `optimise` takes it for searches only.
+    lead it away from what was prepared, and `optimise` takes it for searches only. Values are from
+    `least` to `most`, and below `LARGEST` in size.
     """
+
+    lower: float = -LARGEST  # of the kind, where the number has no `least` of its own
 
     def __init__(
         self,
@@ -61,9 +66,13 @@ class Number(Setting):
         meaning: str,
         *,
         gradient: bool = True,
+        least: float | None = None,
+        most: float = LARGEST,
     ):
         super().__init__(default, unit, meaning)
         self.gradient = gradient
+        self.least = self.lower if least is None else least
+        self.most = most
 
     @overload
     def __get__(self: S, instance: None, owner: type) -> S: ...
@@ -95,31 +104,45 @@ class Number(Setting):
                 f"the parameter {self.name} is {str(value)[:40]}; give a list of numbers, as "
                 f"{list(self.default)}"
             )
+        if len(value) != len(self.default) > 1:
+            raise InputError(
+                f"the parameter {self.name} has {len(value)} numbers; give {len(self.default)}"
+            )
         for one in value:
             self.check_one(one)
 
     def check_one(self, value: Any) -> None:
         """Raise `InputError` for one of the numbers outside the domain."""
         number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not number or not abs(value) < 1e38:  # the range of float32
+        if not number or not abs(value) < LARGEST:
             raise InputError(
-                f"the parameter {self.name} is {str(value)[:40]}; give a finite number"
+                f"the parameter {self.name} is {str(value)[:40]}; give a finite number below "
+                f"{LARGEST:g} in size"
             )
+        if not self.least <= value <= self.most:
+            raise InputError(f"the parameter {self.name} is {value}; it must {self._bounds()}")
+
+    def _bounds(self) -> str:
+        if self.most == LARGEST:
+            return f"not be below {self.least:g}" if self.least else "not be negative"
+        return f"be from {self.least:g} to {self.most:g}"
+
+    def allows(self, value: Array) -> Array:
+        """Whether `check` would take all of an array, which may be traced."""
+        inside = (value >= self.least) & (value <= self.most) & (jnp.abs(value) < LARGEST)
+        return inside.all()
 
 
 class Positive(Number):
     """A number that stays positive; stored as its logarithm, so 0 is stored as -inf and stays 0."""
+
+    lower = 0.0
 
     def physical(self, raw: Array) -> Array:
         return jnp.exp(raw)
 
     def unconstrained(self, value: Array) -> Array:
         return jnp.log(value)
-
-    def check_one(self, value: Any) -> None:
-        super().check_one(value)
-        if value < 0:
-            raise InputError(f"the parameter {self.name} is {value}; it must not be negative")
 
 
 class Share(Number):
@@ -137,6 +160,9 @@ class Share(Number):
             raise InputError(
                 f"the parameter {self.name} is {value}; it is a share, from 0 to below 1"
             )
+
+    def allows(self, value: Array) -> Array:
+        return ((value >= 0) & (value < 1)).all()
 
 
 class Choice(Setting):

@@ -54,7 +54,8 @@ class Settings:
     A round is a search of all searched parameters followed by `iterations` steps of Adam, whose
     rate falls from `learning_rate`, halved with every round, to a tenth along a cosine. Every
     `every` iterations the validation loss is looked at; a start that has not improved for
-    `patience` iterations stops, and the best of what was looked at counts. `starts` starting points
+    `patience` iterations stops, and the best of what was looked at counts, of parameters within
+    their bounds. `starts` starting points
     are followed at once: the given one, and others drawn around it with a standard deviation of
     `spread` in the unconstrained numbers. `batch` batches make a step, drawn without replacement;
     None: all. `forward` chooses the derivatives' mode; None: the faster.
@@ -108,6 +109,16 @@ class Fitted(Generic[P]):
     loss: float
     history: list[list[Any]]
 
+    @property
+    def diverged(self) -> bool:
+        """Whether the last steps had come to a greater loss than the start, or to none.
+
+        `params` are the best that was looked at all the same.
+        """
+        seen = [line for line in self.history if line[4] is not None]
+        lasts = {line[0]: line[4] for line in seen}  # by start
+        return bool(seen) and not any(loss <= seen[0][4] for loss in lasts.values())
+
 
 def begin(
     params: Parameters,
@@ -140,7 +151,8 @@ def begin(
                 f"the search of {name} is {[low, high, count]}; give [from, to, number of points], "
                 "3 or more, of a parameter that is one number"
             )
-        params.numbers[name].check(float(low))
+        for end in (low, high):
+            params.numbers[name].check(float(end))
     normal = np.random.default_rng(settings.seed).standard_normal
     raw = {}
     for name in names:
@@ -230,8 +242,14 @@ def _value(loss: Loss, params: Parameters, batch: Any) -> Array:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _values(loss: Loss, params: Parameters, raw: dict[str, Array], batch: Any) -> Array:
-    """The loss of each start, (starts,)."""
-    return jax.vmap(lambda one: loss(params.with_raw(one), batch))(raw)
+    """The loss of each start, (starts,); infinite where a parameter is out of bounds."""
+
+    def value(one: dict[str, Array]) -> Array:
+        stepped = params.with_raw(one)
+        allowed = [params.numbers[name].allows(getattr(stepped, name)) for name in one]
+        return jnp.where(jnp.stack(allowed).all(), loss(stepped, batch), jnp.inf)
+
+    return jax.vmap(value)(raw)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

@@ -14,7 +14,8 @@ def add(commands: Any) -> None:
         run,
         "Fit parameters of methods to recordings. It writes them with tables of the errors before "
         "and after, and prints the errors of images that it did not use. An interrupted fit goes "
-        "on with --resume. Several processes, on one machine or many, fit together: each is given "
+        "on with --resume. Where steps lead away, it writes the best parameters seen; the exit "
+        "status is 2 then. Several processes, on one machine or many, fit together: each is given "
         "the same arguments and its number.",
         "configs/fit_slider_depth.toml --out fitted",
         "configs/fit_slider_depth.toml --recording mine.h5 --out mine --resume",
@@ -72,8 +73,11 @@ def run(
 
     from jaxevent.runs.fit import FILES, fit
 
-    fit(config, out, recordings, resume, show_progress(), replace=force)
+    rows = fit(config, out, recordings, resume, show_progress(), replace=force)
     if not devices.first():
         return
     print((out / "results.md").read_text(encoding="utf-8"), end="")
     print(f"\nwritten to {out}: {', '.join(FILES)}")
+    warnings = dict.fromkeys(row["warning"] for row in rows if "warning" in row)
+    if warnings:
+        raise InputError(f"{config}: {'; '.join(warnings)}")

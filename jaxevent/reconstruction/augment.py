@@ -25,19 +25,29 @@ class FrameParams(Parameters):
 
     c_on = Positive(0.1, "ln I", "contrast threshold of ON events")
     c_off = Positive(0.1, "ln I", "contrast threshold of OFF events")
-    I0 = Positive(1.0, "intensity", "offset inside the logarithm, L = ln(I + I0)")
-    clock_offset = Number(0.0, "s", "added to the frames' time stamps", gradient=False)
+    I0 = Positive(1.0, "intensity", "offset inside the logarithm, L = ln(I + I0)", least=1e-6)
+    clock_offset = Number(
+        0.0, "s", "added to the frames' time stamps", gradient=False, least=-1e10, most=1e10
+    )
     deblur = Choice((True, False), "whether events within an exposure sharpen its frame")
-    exposure = Positive(0.0, "s", "exposure of frames whose own is not known", gradient=False)
+    exposure = Positive(
+        0.0, "s", "exposure of frames whose own is not known", gradient=False, most=1e6
+    )
     rho_ref = Positive(
-        0.0, "s", "dead time of a pixel after an event, its change made good", gradient=False
+        0.0,
+        "s",
+        "dead time of a pixel after an event, its change made good",
+        gradient=False,
+        most=1e6,
     )
 
 
 class CertaintyParams(FrameParams):
     """... and of the certainty of frames (4), as far as the camera's response does not tell it."""
 
-    w_min = Positive(0.09, "1", "least certainty w of frames, of dark and saturated pixels")
+    w_min = Positive(
+        0.09, "1", "least certainty w of frames, of dark and saturated pixels", least=1e-9
+    )
     margin = Positive(0.0, "grey / 255", "distance from black and white within which frames clip")
     certainty = Positive(
         (1.0,), "1", "factors on the certainty w at evenly spaced greys, a spline in ln w"

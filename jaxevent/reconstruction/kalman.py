@@ -31,7 +31,9 @@ class Params(AugmentParams):
     sigma_ref = Positive(0.01**0.5, "ln I", "noise of events within rho of the last one")
     rho = Positive(0.01, "s", "bound on the refractory period")
     rho_width = Positive(0.0, "1", "width in ln time of the step at rho; 0: a sharp step")
-    kappa = Positive(7e5, "1 / (intensity^2 s)", "certainty of frames: 7e5 DAVIS, 7e7 FLIR")
+    kappa = Positive(
+        7e5, "1 / (intensity^2 s)", "certainty of frames: 7e5 DAVIS, 7e7 FLIR", least=1e-12
+    )
     P0 = Positive(0.09, "(ln I)^2", "variance at the start")
     above = Number(0.0, "ln I", "how far above the bound of clipping saturated pixels start")
     below = Number(0.0, "ln I", "how far below the bound of clipping black pixels start")

@@ -57,7 +57,7 @@ class Params(CertaintyParams):
     sigma_frame = Positive(0.007, "intensity", "noise of frames where the certainty w is 1")
     sigma_floor = Positive(0.02, "ln I", "noise of frames in log intensity, however certain")
     start = Positive(0.5, "intensity", "mean before the first frame")
-    P_start = Positive(4.0, "(ln I)^2", "variance before the first frame")
+    P_start = Positive(4.0, "(ln I)^2", "variance before the first frame", least=1e-12)
     presets = {
         "hdr": {
             "c_on": 0.2,
@@ -73,7 +73,11 @@ class Params(CertaintyParams):
 
     share = Positive(0.5, "1", "part of an event's change that belongs to its 8 neighbours")
     spread = Positive(
-        0.0, "s", "longest time between events over which a change is spread", gradient=False
+        0.0,
+        "s",
+        "longest time between events over which a change is spread",
+        gradient=False,
+        most=1e6,
     )
     one_sided = Choice((True, False), "whether clipped frames tell that L lies beyond the clip")
 

@@ -62,6 +62,10 @@ from jaxevent.tuning import Fitted, Run, optimise
 
 CHECKPOINT = "checkpoint"  # the name of the file in the folder
 FILES = ("params.toml", "results.json", "results.md", "loss.csv", "loss.png", "config.toml")
+DIVERGED = (
+    "{}: the steps led away, to a greater loss than at the start or to none; the parameters are "
+    "the best that were seen, so lower learning_rate or start elsewhere"
+)
 PERIOD = 2.0  # s between checkpoints
 
 
@@ -94,6 +98,7 @@ def fit(
     Returns:
         Rows as `evaluate.score` gives them, of the recordings and images of each split: `split` is
         "fit", "validation" or "test", `method` the label, with ", before" for the start values.
+        Where the steps led away, so that the best that was seen counts, `warning` says so.
         Those of the tracker are described in `jaxevent.runs.blob`.
 
     Raises:
@@ -214,11 +219,11 @@ def _score(
     plan: Plan, done: Sequence[Fitted], sources: Sources, progress: bool | None
 ) -> list[dict[str, Any]]:
     """Rows of all methods, before and after; several processes share them out."""
-    scored = [
-        (task, label, params)
-        for task, one in zip(plan.tasks, done, strict=True)
-        for label, params in ((f"{task.label}, before", task.params), (task.label, one.params))
-    ]
+    scored: list[tuple[Task, str, Any, dict[str, str]]] = []
+    for task, one in zip(plan.tasks, done, strict=True):
+        said = {"warning": DIVERGED.format(task.label)} if one.diverged else {}
+        scored.append((task, f"{task.label}, before", task.params, {}))
+        scored.append((task, task.label, one.params, said))
     mine = range(jax.process_index(), len(scored), jax.process_count())
     found = devices.in_step(
         lambda: {k: list(_rows(*scored[k], sources, plan, progress)) for k in mine}
@@ -228,10 +233,16 @@ def _score(
 
 
 def _rows(
-    task: Task, label: str, params: Any, sources: Sources, plan: Plan, progress: bool | None
+    task: Task,
+    label: str,
+    params: Any,
+    said: dict[str, str],
+    sources: Sources,
+    plan: Plan,
+    progress: bool | None,
 ) -> Iterator[dict[str, Any]]:
     for row in task.goal.score(sources, plan.split, plan.window, params, progress):
-        yield {**row, "method": label}
+        yield {**row, "method": label, **said}
 
 
 def _results(tasks: Sequence[Task], rows: Sequence[dict[str, Any]]) -> str:

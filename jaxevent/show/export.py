@@ -73,12 +73,17 @@ def write_hdf5(
         }
         for field, unit in units.items():
             fields[field].attrs["unit"] = unit
-        row = 0
+        row, finite = 0, False
         for batch, values in _batches(video, times, colours):
             for field, images in values.items():
                 fields[field][row : row + len(batch)] = images
             check()
+            finite = finite or bool(np.isfinite(values["image"]).any())
             row += len(batch)
+        if not finite:
+            raise InputError(
+                f"{out}: the images hold no finite number; choose other times or parameters"
+            )
     return ""
 
 

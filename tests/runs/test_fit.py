@@ -257,6 +257,24 @@ def test_a_start_that_is_not_finite_is_not_chosen():
     close(fitted.params, b=1.0)
 
 
+def test_what_leads_out_of_the_numbers_is_not_the_best():
+    """A loss that falls for ever, towards an infinite parameter."""
+
+    def loss(params, batch):
+        return jnp.exp(-params.a) + (params.b - 1) ** 2
+
+    fast = dataclasses.replace(QUICK, learning_rate=1000.0, every=1, iterations=10)
+    fitted = optimise(loss, Toy(), ["a"], [ONE], settings=fast)
+    assert math.isfinite(float(fitted.params.a)) and math.isfinite(fitted.loss)
+    Toy(**fitted.params.values())  # which accepts no other
+    assert fitted.diverged
+    assert not optimise(loss, Toy(), ["a"], [ONE], settings=QUICK).diverged
+    away = optimise(loss, Toy(), ["b"], [ONE], settings=fast)
+    assert float(away.params.b) == 0.0 and away.loss == away.history[0][4] and away.diverged
+    still = optimise(loss, Toy(b=1.0), ["b"], [ONE], settings=QUICK)
+    assert not still.diverged
+
+
 @pytest.mark.parametrize(
     ("names", "search", "said"),
     [
@@ -266,6 +284,7 @@ def test_a_start_that_is_not_finite_is_not_chosen():
         (["a"], {"c": (1, 0, 3)}, "search of c"),
         (["a"], {"c": (0, 1, 2)}, "search of c"),
         (["b"], {"a": (-1, 1, 3)}, "must not be negative"),
+        (["b"], {"a": (1, 1e39, 3)}, "finite"),
     ],
 )
 def test_what_cannot_be_fitted(names, search, said):
@@ -693,6 +712,24 @@ def test_a_fit_that_is_killed_ends_as_if_it_had_not_been(folder, capsys, float32
         assert (out / name).read_bytes() == (whole / name).read_bytes()
 
 
+def test_a_fit_that_diverges_says_so(folder, capsys):
+    """It writes what can be used, and tells again when it is asked to go on."""
+    text = EDI.replace("learning_rate = 0.2", "learning_rate = 1000.0\nrounds = 1")
+    text = text.replace("iterations = 30", "iterations = 3\nevery = 1")
+    best = f"params = {{ c_on = {C_ON}, c_off = {C_OFF}, clock_offset = {LATE} }}\n"
+    text = text.partition("search")[0] + best
+    config, out = write(folder, text), folder / "out"
+    for again in ([], ["--resume"]):
+        assert cli.main(["fit", str(config), "--out", str(out), *again]) == 2
+        said = capsys.readouterr()
+        assert said.err.count("\n") == 1 and "edi: the steps led away" in said.err
+        assert "| edi, before" in said.out
+    jaxevent.METHODS["edi"].Params.load(out / "params.toml", "edi")
+    rows = json.loads((out / "results.json").read_text())["rows"]
+    told = {(row["method"], row["split"]): row["mse"] for row in rows}
+    assert told["edi", "validation"] <= told["edi, before", "validation"]
+
+
 def test_recordings_for_each_split_and_in_place_of_those_named(folder, capsys, monkeypatch):
     for name in ("a", "b", "c"):
         jaxevent.save(moving(), folder / f"{name}.h5")
@@ -789,7 +826,7 @@ GOOD = TWO.replace("starts = 2\n", "")
         (GOOD + "seed = 3", "method 2: there is no setting 'seed'"),
         (GOOD + "params = 3", "method 2: params is"),
         (GOOD + "params = { c_one = 1 }", "'c_one'; did you mean 'c_on'"),
-        (GOOD + "params = { I0 = 0 }", "I0 starts at 0"),
+        (GOOD + "params = { I0 = 0 }", "I0 is 0; it must not be below 1e-06"),
         (GOOD.replace('["c_on"]', '["c_onn"]'), "no parameter 'c_onn'; did you mean 'c_on'"),
         (GOOD.replace('["c_on"]', '["clock_offset"]'), "search = { clock_offset = [from, to"),
         (GOOD.replace('["c_on"]', '"c_on"'), "fit is"),

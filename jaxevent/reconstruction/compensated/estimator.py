@@ -8,6 +8,7 @@ around a target time, frames among them, show how the points visible at the targ
 
 import collections
 import dataclasses
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -106,7 +107,13 @@ def schedule_of(recording: Recording, params: Params, images: Images) -> Schedul
         L = images(times[order])[0]
         return L[np.argsort(order, kind="stable")]
 
-    return Schedule(frames, (first, last), speed_of(logs, inner, max(lag, 400)))
+    speed = speed_of(logs, inner, max(lag, 400))
+    if not math.isfinite(speed):
+        raise InputError(
+            f"{recording.name}: with these parameters images at single instants are not finite; "
+            "choose some nearer the defaults"
+        )
+    return Schedule(frames, (first, last), speed)
 
 
 def estimate_motion(

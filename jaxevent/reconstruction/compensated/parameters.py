@@ -44,8 +44,10 @@ class Params(smoother.Params):
 
     c_on = Positive(0.2, "ln I", "contrast threshold of ON events")
     c_off = Positive(0.2, "ln I", "contrast threshold of OFF events")
-    I0 = Positive(0.3, "intensity", "offset inside the logarithm, L = ln(I + I0)")
-    w_min = Positive(0.6, "1", "least certainty w of frames, of dark and saturated pixels")
+    I0 = Positive(0.3, "intensity", "offset inside the logarithm, L = ln(I + I0)", least=1e-6)
+    w_min = Positive(
+        0.6, "1", "least certainty w of frames, of dark and saturated pixels", least=1e-9
+    )
     sigma_event = Positive(0.6, "c", "noise of an event's step, as part of its threshold")
     sigma_bg = Positive(0.05, "ln I / sqrt(s)", "drift without events")
     sigma_frame = Positive(0.002, "intensity", "noise of frames where the certainty w is 1")
@@ -60,10 +62,16 @@ class Params(smoother.Params):
     caution = Positive(
         6.0, "1", "factor on the smoother's variance where motion is estimated", gradient=False
     )
-    robust = Positive(10.0, "1", "standardised squared residual of motion", gradient=False)
+    robust = Positive(
+        10.0, "1", "standardised squared residual of motion", gradient=False, least=1e-6
+    )
     smooth = Positive(40.0, "1 / px^2", "weight of differences of motion", gradient=False)
-    jump = Positive(0.04, "px", "difference of motion that counts linearly", gradient=False)
-    edge = Positive(0.1, "ln I / px", "gradient over which motions part", gradient=False)
+    jump = Positive(
+        0.04, "px", "difference of motion that counts linearly", gradient=False, least=1e-6
+    )
+    edge = Positive(
+        0.1, "ln I / px", "gradient over which motions part", gradient=False, least=1e-6
+    )
     straight = Positive(0.2, "1 / px^2", "weight of acceleration", gradient=False)
     choice = Number(
         CHOICE,
