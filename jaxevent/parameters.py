@@ -445,7 +445,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 def read_toml(path: str | Path) -> dict[str, Any]:
     """The tables of a TOML file; raises `InputError` if it is missing or not TOML."""
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
     except ValueError as error:  # not TOML, not UTF-8, or an integer without end

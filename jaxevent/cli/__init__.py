@@ -63,13 +63,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
     except BrokenPipeError:
-        _silence()
+        _silence(sys.stdout)
         return 128 + signal.SIGPIPE if hasattr(signal, "SIGPIPE") else 1
     except OSError as error:
         # Files' errors are `InputError`s by now: what remains is that of printing.
         if error.filename is not None:
             raise
-        _silence()
+        _silence(sys.stdout)
         _say(f"what was to be printed cannot be written ({error.strerror or error})")
         return 2
     return 0
@@ -125,14 +125,16 @@ def _mend_streams() -> None:
 
 def _say(sentence: str) -> None:
     """Say on stderr why the command ends; silently where nobody can be told."""
-    with contextlib.suppress(OSError, ValueError):
+    try:
         print(f"jaxevent: {' '.join(sentence.split())}", file=sys.stderr, flush=True)
+    except OSError:
+        _silence(sys.stderr)
 
 
-def _silence() -> None:
-    """Have Python's last flush of stdout, at exit, not fail again."""
+def _silence(stream: Any) -> None:
+    """Have Python's last flush of a stream, at exit, not fail again."""
     with contextlib.suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _parser() -> argparse.ArgumentParser:

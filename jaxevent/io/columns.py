@@ -17,6 +17,7 @@ the Event-Camera Dataset's t x y p, with t in seconds. In text, a column of time
 decimal point holds integers.
 """
 
+import codecs
 import functools
 import math
 import re
@@ -92,6 +93,7 @@ def read_npy(
 
 def is_text(head: bytes) -> bool:
     """Whether a file that begins so can be a table of text."""
+    head = head.removeprefix(codecs.BOM_UTF8)
     return bool(re.match(rb"[ -~\t\r\n]*[ -~\t\r\n\x80-\xff]{0,3}\Z", head)) and bool(
         re.search(rb"\d", head) or find(_split(head.splitlines()[0].decode("latin-1")))
     )

@@ -188,7 +188,9 @@ def _image(path: Path) -> NDArray:
 def _times(path: Path) -> tuple[NDArray[np.int64], list[str] | None]:
     """The times (us) of a file of lines "t" or "t name", and the names."""
     with reading(str(path)):
-        lines = [line.split(maxsplit=1) for line in path.read_text(encoding="utf-8").splitlines()]
+        lines = [
+            line.split(maxsplit=1) for line in path.read_text(encoding="utf-8-sig").splitlines()
+        ]
     lines = [words for words in lines if words and not words[0].startswith("#")]
     if len({len(words) for words in lines}) > 1:
         raise InputError(f"{path}: some lines have a name and some have none; give all or none")

@@ -12,6 +12,7 @@ become grey (ITU-R 601 luma).
 """
 
 import zipfile
+from codecs import BOM_UTF8
 from pathlib import Path
 from typing import Any, cast
 
@@ -94,7 +95,9 @@ def _table(
     found = None
     skip = 0
     with reading(source), file.open("rb") as lines:
-        while (line := lines.readline()) and (not line.strip() or line.startswith(b"#")):
+        while (line := lines.readline().removeprefix(BOM_UTF8)) and (
+            not line.strip() or line.startswith(b"#")
+        ):
             skip += 1
         if header is not None and len(fields := line.split()) == len(header.split()):
             if not all(field.isdigit() and int(field) for field in fields):
@@ -152,7 +155,7 @@ def _frames(path: Path, root: Path | zipfile.Path) -> Frames | None:
         return None
     source = f"{path}: images.txt"
     with reading(source):
-        lines = (root / "images.txt").read_text(encoding="utf-8").splitlines()
+        lines = (root / "images.txt").read_text(encoding="utf-8-sig").splitlines()
     stamps, images = [], []
     for number, line in enumerate(lines, 1):
         if not line.strip() or line.startswith("#"):

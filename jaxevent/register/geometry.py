@@ -43,7 +43,7 @@ def read_homography(path: str | Path) -> NDArray[np.float64]:
     """
 
     with reading(str(path)):
-        text = Path(path).read_text(encoding="utf-8")
+        text = Path(path).read_text(encoding="utf-8-sig")
     try:
         rows = [
             [float(word) for word in line.replace(",", " ").split()]

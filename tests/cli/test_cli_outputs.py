@@ -4,14 +4,20 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from commands import fails
 from noise import ONE, small, write_config
 
 import jaxevent
 from jaxevent import cli
+from jaxevent.egomotion.truth import known
 from jaxevent.io import output, places
+from jaxevent.register.geometry import read_homography
+from jaxevent.runs import results
+from jaxevent.runs.blob_positions import read_positions
 
 RECONSTRUCT = "reconstruct {source} --method blend --rate 5 --out {out}"
 COMMANDS = {
@@ -183,3 +189,85 @@ def test_what_another_process_writes_is_refused(folder, capsys):
         fails(capsys, ["convert", "source.h5", "a.h5", "--force"], "another process")
     assert state(folder).keys() == before.keys() | {folder / "a.h5"}
     assert not places.partials(folder / "a.h5")
+
+
+def test_a_fit_has_its_folder_alone(folder, capsys):
+    config = write_config(folder, ONE.replace("small.h5", "source.h5") + 'fit = ["I0"]\n')
+    (folder / "fitted").mkdir()
+    with results.alone(folder / "fitted"):
+        for more in ([], ["--resume"], ["--force"]):
+            argv = ["fit", config, "--out", "fitted", *more]
+            fails(capsys, argv, "fitted: another process writes there")
+    assert not list((folder / "fitted").iterdir())
+
+
+def as_process(*words: object, **how: Any) -> subprocess.CompletedProcess:
+    code = "import sys; from jaxevent.cli import main; sys.exit(main())"
+    env = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    env["PYTHONPATH"] = str(Path(jaxevent.__file__).parents[1])
+    env.update(how.pop("env", {}))
+    return subprocess.run([sys.executable, "-c", code, *map(str, words)], env=env, **how)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_what_cannot_be_printed(folder):
+    """One sentence or, where stderr is lost as well, none; a reader that left is no fault."""
+    sentence = b"jaxevent: what was to be printed cannot be written (No space left on device)\n"
+    with open("/dev/full", "wb") as full:
+        for words in (["info", "source.h5"], ["info", "--help"]):
+            done = as_process(*words, stdout=full, stderr=subprocess.PIPE)
+            assert (done.returncode, done.stderr) == (2, sentence)
+        done = as_process("info", "none.h5", stdout=subprocess.PIPE, stderr=full)
+        assert (done.returncode, done.stdout) == (2, b"")
+    read, write = os.pipe()
+    os.close(read)
+    done = as_process("info", "source.h5", stdout=write, stderr=subprocess.PIPE)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, b"")
+    for closed, said in ((1, "Bad file descriptor"), (2, "")):
+        done = as_process(
+            "convert",
+            "source.h5",
+            f"{closed}.h5",
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=lambda closed=closed: os.close(closed),  # noqa: PLW1509
+        )
+        assert done.returncode == (2 if closed == 1 else 0)
+        assert said in done.stderr and done.stderr.count("\n") == bool(said)
+        assert len(jaxevent.load(folder / f"{closed}.h5").events) == len(small().events)
+
+
+def test_a_terminal_without_other_letters(folder):
+    (folder / "source.h5").rename(folder / "\u00b5.h5")
+    ascii = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+    done = as_process("info", "\u00b5.h5", capture_output=True, env=ascii | {"PYTHONUTF8": "1"})
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert done.stdout.startswith(b"file           ") and b"\\xb5.h5" in done.stdout
+    done = as_process("info", "\u00e9.h5", capture_output=True, env=ascii)
+    assert done.returncode == 2 and done.stderr.startswith(b"jaxevent: ")
+    assert done.stderr.count(b"\n") == 1
+
+
+def test_a_byte_order_mark_is_no_reason_to_refuse(folder):
+    mark = b"\xef\xbb\xbf"
+    place = folder / "sub"
+    for name, text in (
+        ("events.csv", "t,x,y,p\n1,2,3,1\n5,2,3,0\n"),
+        ("events.txt", "# t x y p\n0.1 2 3 1\n0.5 2 3 0\n"),
+        ("params.toml", "c_on = 0.25\n"),
+        ("motion.csv", "t,vx,vy\n0,1,2\n1,1,2\n"),
+        ("positions.csv", "t,x,y\n0,1,2\n1,1,2\n"),
+        ("homography.csv", "1,0,0\n0,1,0\n0,0,1\n"),
+    ):
+        (place / name).write_bytes(mark + text.encode())
+    events = jaxevent.load(place / "events.csv", (10, 10)).events
+    assert (events[:].t.tolist(), events[:].x.tolist()) == ([1, 5], [2, 2])
+    recording = jaxevent.load(place, (10, 10))
+    assert recording.events[:].t.tolist() == [100_000, 500_000]
+    assert float(jaxevent.akf.Params.load(place / "params.toml").c_on) == pytest.approx(0.25)
+    assert known(recording, "planar", place / "motion.csv").t.tolist() == [0, 1_000_000]
+    assert len(read_positions(place / "positions.csv").t) == 2
+    assert read_homography(place / "homography.csv").tolist() == np.eye(3).tolist()
