@@ -58,10 +58,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         _say(str(error))
         return 2
-    except _Signal as signalled:
-        return 128 + signalled.number
-    except KeyboardInterrupt:
-        return 128 + signal.SIGINT
+    except (_Signal, KeyboardInterrupt) as signalled:
+        number = signalled.number if isinstance(signalled, _Signal) else signal.SIGINT
+        if argv is None:
+            # What JAX still computes in its threads crashes when Python takes itself down.
+            with contextlib.suppress(OSError):
+                sys.stdout.flush()
+            os._exit(128 + number)
+        return 128 + number
     except BrokenPipeError:
         _silence(sys.stdout)
         return 128 + signal.SIGPIPE if hasattr(signal, "SIGPIPE") else 1
@@ -84,12 +88,25 @@ class _Signal(BaseException):
 
 @contextlib.contextmanager
 def _terminable() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP unwind the block, so that nothing incomplete is left behind."""
+    """Let SIGTERM and SIGHUP unwind the block, so that nothing incomplete is left behind.
+
+    Python drops what is raised in callbacks, as JAX has one in garbage collection: such a signal,
+    or interrupt, is sent again.
+    """
+    told = sys.unraisablehook
 
     def leave(number: int, frame: Any) -> None:
-        for other in before:
-            signal.signal(other, signal.SIG_IGN)  # once is enough
         raise _Signal(number)
+
+    def again(dropped: Any) -> None:
+        error = dropped.exc_value
+        if isinstance(error, _Signal | KeyboardInterrupt) and hasattr(signal, "pthread_kill"):
+            number = error.number if isinstance(error, _Signal) else signal.SIGINT
+            # To this thread, so that it wakes up.
+            thread = threading.get_ident()
+            threading.Timer(0.02, signal.pthread_kill, (thread, number)).start()
+        else:
+            told(dropped)
 
     numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     before: dict[int, Any] = {}
@@ -97,9 +114,11 @@ def _terminable() -> Iterator[None]:
         for number in numbers:
             if signal.getsignal(number) != signal.SIG_IGN:  # of nohup
                 before[number] = signal.signal(number, leave)
+        sys.unraisablehook = again
     try:
         yield
     finally:
+        sys.unraisablehook = told
         for number, handler in before.items():
             signal.signal(number, handler)
 

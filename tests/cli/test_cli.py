@@ -269,6 +269,32 @@ def test_interrupted_while_it_writes(number, folder):
         assert list((folder / "cache").glob("jaxevent/compiled/*/*-cache"))
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_not_lost_in_a_callback(number, tmp_path):
+    """Python drops what is raised there; JAX has a callback in garbage collection."""
+    code = """
+import gc, os, signal, sys, time
+import jaxevent.io
+from jaxevent import cli
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+def load(*words, **options):
+    def callback(phase, about):
+        gc.callbacks.clear()
+        os.kill(os.getpid(), int(sys.argv.pop()))
+        for _ in range(100):
+            pass
+    gc.callbacks[:] = [callback]
+    gc.collect()
+    time.sleep(20)
+
+jaxevent.io.load = load
+sys.exit(cli.main(["info", "a"]))
+"""
+    done = subprocess.run([sys.executable, "-c", code, str(int(number))], capture_output=True)
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, b"", b"")
+
+
 @contextlib.contextmanager
 def room(size: int):
     """Files cannot grow beyond so many bytes."""

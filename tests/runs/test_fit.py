@@ -716,7 +716,7 @@ def test_a_fit_that_diverges_says_so(folder, capsys):
     """It writes what can be used, and tells again when it is asked to go on."""
     text = EDI.replace("learning_rate = 0.2", "learning_rate = 1000.0\nrounds = 1")
     text = text.replace("iterations = 30", "iterations = 3\nevery = 1")
-    best = f"params = {{ c_on = {C_ON}, c_off = {C_OFF}, clock_offset = {LATE} }}\n"
+    best = f"params = {{ c_on = {C_ON}, c_off = {C_OFF}, clock_offset = {LATE / 1e6} }}\n"
     text = text.partition("search")[0] + best
     config, out = write(folder, text), folder / "out"
     for again in ([], ["--resume"]):
