@@ -278,13 +278,15 @@ import jaxevent.io
 from jaxevent import cli
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-def load(*words, **options):
-    def callback(phase, about):
-        gc.callbacks.clear()
-        os.kill(os.getpid(), int(sys.argv.pop()))
+def callback(phase, about, first=[1]):
+    if first:
+        first.clear()
+        os.kill(os.getpid(), int(sys.argv[-1]))
         for _ in range(100):
             pass
-    gc.callbacks[:] = [callback]
+
+def load(*words, **options):
+    gc.callbacks.append(callback)
     gc.collect()
     time.sleep(20)
 
