@@ -143,6 +143,14 @@ def test_folders_of_results(folder, capsys):
     fails(capsys, fit, "results/results.json", "--force")
 
 
+def test_the_demo_owns_its_folder_and_no_other(folder, monkeypatch):
+    asked = []
+    monkeypatch.setattr("jaxevent.runs.demo.demo", lambda out, **how: asked.append(how["replace"]))
+    for words in (["demo"], ["demo", "--out", "mine"], ["demo", "--out", "mine", "--force"]):
+        assert cli.main(words) == 0
+    assert asked == [True, False, True]
+
+
 @pytest.mark.parametrize("command", ["fit", "evaluate"])
 def test_results_are_not_written_onto_what_the_configuration_names(command, folder, capsys):
     (folder / "results.json").write_text("I0 = 0.2\n")
@@ -226,14 +234,13 @@ def test_what_cannot_be_printed(folder):
     os.close(write)
     assert (done.returncode, done.stderr) == (141, b"")
     for closed, said in ((1, "Bad file descriptor"), (2, "")):
-        done = as_process(
-            "convert",
-            "source.h5",
-            f"{closed}.h5",
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+        program = "import sys; from jaxevent.cli import main; sys.exit(main())"
+        done = subprocess.run(
+            ["sh", "-c", f'exec "$@" {closed}>&-', "sh", sys.executable, "-c", program]
+            + ["convert", "source.h5", f"{closed}.h5"],
+            env={**os.environ, "PYTHONPATH": str(Path(jaxevent.__file__).parents[1])},
+            capture_output=True,
             text=True,
-            preexec_fn=lambda closed=closed: os.close(closed),  # noqa: PLW1509
         )
         assert done.returncode == (2 if closed == 1 else 0)
         assert said in done.stderr and done.stderr.count("\n") == bool(said)
