@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from jaxevent import cache
 
 if TYPE_CHECKING:
-    from jaxevent import blob, camera, egomotion, metrics, register, simulate
+    from jaxevent import blob, camera, egomotion, events, metrics, register, show, simulate
     from jaxevent.errors import InputError
     from jaxevent.estimator import Estimate, Estimator
     from jaxevent.io import load, save
@@ -59,7 +59,8 @@ _HOMES = {
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 _MODULES = {
-    **{name: name for name in ("blob", "camera", "egomotion", "metrics", "register", "simulate")},
+    **{name: name for name in ("blob", "camera", "egomotion", "events", "metrics")},
+    **{name: name for name in ("register", "show", "simulate")},
     "colour": "reconstruction.colour",
 }
 
@@ -85,6 +86,7 @@ __all__ = [
     "edi",
     "egomotion",
     "evaluate",
+    "events",
     "fit",
     "flow",
     "high_pass",
@@ -95,6 +97,7 @@ __all__ = [
     "optimise",
     "register",
     "save",
+    "show",
     "simulate",
 ]
 

@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.core
@@ -22,6 +23,63 @@ class PinholeCamera:
     cx: float
     cy: float
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def distort(self, at: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Where the camera sees normalised coordinates X / Z, Y / Z (n, 2), in px (n, 2)."""
+        bent, _ = _distorted(np.asarray(at, np.float64), self.distortion)
+        return bent * (self.fx, self.fy) + (self.cx, self.cy)
+
+    def normalise(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
+        """Normalised coordinates X / Z, Y / Z (n, 2) of what is seen at places x, y (n,) in px.
+
+        Distortion is undone. NaN where it has no inverse, which is far from the centre. Raises
+        `InputError` for a camera without positive focal lengths.
+        """
+        x, y = np.asarray(x), np.asarray(y)
+        if not (0 < self.fx < np.inf and 0 < self.fy < np.inf):
+            raise InputError(
+                f"a camera of focal lengths {self.fx} and {self.fy} px is not possible; give the "
+                "calibration's positive fx and fy in px"
+            )
+        places, which = np.unique(np.stack([x, y], -1).astype(float), axis=0, return_inverse=True)
+        seen = (places - (self.cx, self.cy)) / (self.fx, self.fy)
+        straight = seen.copy()
+        if any(self.distortion):
+            # Newton's method; the Jacobian is positive definite as far as an inverse exists.
+            for _ in range(20):
+                bent, jacobian = _distorted(straight, self.distortion)
+                straight = straight + _solved(jacobian, seen - bent)
+            bent, jacobian = _distorted(straight, self.distortion)
+            good = np.abs(bent - seen).max(-1) < 1e-9
+            good &= (np.linalg.det(jacobian) > 0) & (np.hypot(*straight.T) < 20)
+            straight[~good] = np.nan
+        return straight[which.reshape(-1)]
+
+
+def _solved(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.linalg.solve(matrix, right[..., None])[..., 0]
+
+
+def _distorted(
+    xy: NDArray[np.float64], distortion: Sequence[float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Brown-Conrady distortion of normalised coordinates (n, 2) and its Jacobian (n, 2, 2)."""
+    k1, k2, p1, p2, k3 = distortion
+    x, y = xy.T
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # of radial, times x or y
+    bent = np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        -1,
+    )
+    across = x * y * slope + 2 * p1 * x + 2 * p2 * y
+    xx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
+    yy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return bent, np.stack([np.stack([xx, across], -1), np.stack([across, yy], -1)], -2)
 
 
 # Grey values or intensities of any shape, in JAX or NumPy.

@@ -8,13 +8,16 @@ means seconds, both on the recording's clock.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.camera import PinholeCamera, Response, TableResponse, UnknownResponse
 from jaxevent.errors import InputError
+
+if TYPE_CHECKING:
+    import pandas
 
 Times = ArrayLike | int | float
 
@@ -97,6 +100,19 @@ class Events:
 
     def index(self, time: int) -> int:
         return int(np.searchsorted(self.t, time))
+
+    def to_structured(self) -> NDArray:
+        """The events as a NumPy structured array: t int64 us, x and y uint16, p bool."""
+        out = np.empty(len(self), [("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "?")])
+        for name in "txyp":
+            out[name] = getattr(self, name)
+        return out
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The events as a pandas table with the columns t (int64 us), x, y and p (bool)."""
+        import pandas
+
+        return pandas.DataFrame({name: getattr(self, name) for name in "txyp"})
 
     def check(self, width: int, height: int, source: str, first_row: int = 0) -> None:
         """Raise `InputError` unless the events are sorted and inside a width x height sensor.

@@ -22,6 +22,7 @@ from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.seeds import read_seeds, span_of
 from jaxevent.errors import InputError
 from jaxevent.estimator import Described
+from jaxevent.events.filters import supported
 from jaxevent.kernels import compiled
 from jaxevent.recording import Recording, Times, check_times
 
@@ -247,7 +248,7 @@ class Packing:
         shape = self.recording.height + 2, self.recording.width + 2
         last = np.full(shape, np.iinfo(np.int64).min // 2)
         for part in (warm, events):
-            kept = _supported(part.t, part.x, part.y, last, self.reach, self.neighbours)
+            kept = supported(part.t, part.x, part.y, last, self.reach, self.neighbours)
         return kept
 
 
@@ -263,21 +264,6 @@ def count_steps(features: Features, chunk: NDArray, time: NDArray) -> NDArray[np
         chunk, :, 0
     ]
     return done.sum(1, dtype=np.int32)
-
-
-@compiled
-def _supported(t, x, y, last, reach, neighbours):
-    """Events of which `neighbours` of the 8 pixels around fired at most `reach` us before."""
-    kept = np.empty(len(t), np.bool_)
-    for i in range(len(t)):
-        count = 0
-        for row in range(int(y[i]), int(y[i]) + 3):
-            for column in range(int(x[i]), int(x[i]) + 3):
-                centre = row == int(y[i]) + 1 and column == int(x[i]) + 1
-                count += not centre and t[i] - last[row, column] <= reach
-        kept[i] = count >= neighbours
-        last[int(y[i]) + 1, int(x[i]) + 1] = t[i]
-    return kept
 
 
 class _Given(NamedTuple):

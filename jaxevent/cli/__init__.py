@@ -1,4 +1,4 @@
-"""The command line: demo, info, convert, register, reconstruct, track, motion and so on.
+"""The command line: demo, info, convert, filter, register, reconstruct, track, motion and so on.
 
 What cannot be used is said in one line on stderr, exit status 2. The libraries are imported by the
 command that needs them, so that help appears at once.
@@ -19,6 +19,7 @@ from jaxevent.cli import (
     convert,
     demo,
     evaluate,
+    filter,
     fit,
     info,
     motion,
@@ -32,7 +33,7 @@ from jaxevent.errors import InputError
 
 # In the order of `jaxevent --help`.
 COMMANDS = (
-    demo, info, convert, register, reconstruct, track, motion, evaluate, fit, simulate,
+    demo, info, convert, filter, register, reconstruct, track, motion, evaluate, fit, simulate,
 )  # fmt: skip
 
 

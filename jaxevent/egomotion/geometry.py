@@ -215,53 +215,16 @@ def undistorted(
     f = sqrt(fx fy). On the host, in float64. Raises `InputError` for a camera without positive
     focal lengths and for pixels at which its distortion has no inverse.
     """
-    x, y = np.asarray(x), np.asarray(y)
-    if not (0 < camera.fx < np.inf and 0 < camera.fy < np.inf):
+    straight = camera.normalise(x, y)
+    if np.isnan(straight).any():
+        row = int(np.argmax(np.isnan(straight).any(-1)))
         raise InputError(
-            f"a camera of focal lengths {camera.fx} and {camera.fy} px is not possible; give the "
-            "calibration's positive fx and fy in px"
+            f"the distortion {camera.distortion} has no inverse at pixel ({np.ravel(x)[row]:g}, "
+            f"{np.ravel(y)[row]:g}); mend the calibration or leave out events that far from the "
+            "centre"
         )
     f = float(np.sqrt(camera.fx * camera.fy))
-    places, which = np.unique(np.stack([x, y], -1).astype(float), axis=0, return_inverse=True)
-    seen = (places - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    straight = seen.copy()
-    if any(camera.distortion):
-        # Newton's method; the Jacobian is positive definite as far as the distortion is invertible.
-        for _ in range(20):
-            bent, jacobian = _distorted(straight, camera.distortion)
-            straight = straight + np.linalg.solve(jacobian, (seen - bent)[..., None])[..., 0]
-        bent, jacobian = _distorted(straight, camera.distortion)
-        good = np.abs(bent - seen).max(-1) < 1e-9
-        good &= (np.linalg.det(jacobian) > 0) & (np.hypot(*straight.T) < 20)
-        if not good.all():
-            at = places[np.argmin(good)]
-            raise InputError(
-                f"the distortion {camera.distortion} has no inverse at pixel ({at[0]:g}, "
-                f"{at[1]:g}); mend the calibration or leave out events that far from the centre"
-            )
-    return f * straight[which.reshape(-1)], f
-
-
-def _distorted(
-    xy: NDArray[np.float64], distortion: Sequence[float]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Brown-Conrady distortion of normalised coordinates (n, 2) and its Jacobian (n, 2, 2)."""
-    k1, k2, p1, p2, k3 = distortion
-    x, y = xy.T
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # of radial, times x or y
-    bent = np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        -1,
-    )
-    across = x * y * slope + 2 * p1 * x + 2 * p2 * y
-    xx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
-    yy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
-    return bent, np.stack([np.stack([xx, across], -1), np.stack([across, yy], -1)], -2)
+    return f * straight, f
 
 
 def _real(value: ArrayLike | float | int) -> Array:

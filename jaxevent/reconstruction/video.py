@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, require
 from jaxevent.estimator import Estimate
 from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
@@ -158,6 +158,25 @@ class ImageSequence(abc.ABC, Generic[P]):
                 array[rows] = values
             done += len(batch)
         return whole
+
+    def to_xarray(self, times: Times) -> Any:
+        """The images at `times` as an `xarray.Dataset`, for labelled axes, netCDF and Dask.
+
+        It has image, variance and valid over t (us), y and x (px). Raises `InputError` as calling
+        does, and without the extra "xarray".
+        """
+        xarray = require("xarray", "xarray")
+        axes, names = ("t", "y", "x"), ("image", "variance", "valid")
+        fields = {name: (axes, part) for name, part in zip(names, self(times), strict=True)}
+        places = {"t": np.atleast_1d(microseconds(times)), "y": np.arange(self.recording.height)}
+        places["x"] = np.arange(self.recording.width)
+        about = {"method": self.estimator.name, "recording": self.recording.name}
+        dataset = xarray.Dataset(fields, places, about)
+        for name, unit in (("t", "us"), ("x", "px"), ("y", "px")):
+            dataset[name].attrs["units"] = unit
+        dataset["image"].attrs["long_name"] = "intensity, 0 black, 1 the frames' white"
+        dataset["variance"].attrs["long_name"] = "variance of ln(intensity + I0)"
+        return dataset
 
     def batches(
         self, times: Times, extrapolate: bool = False

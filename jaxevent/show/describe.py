@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.events import is_hot
 from jaxevent.progress import bar
 from jaxevent.recording import EventSource, Frames, Recording
 
@@ -18,8 +19,7 @@ _TRUTH = ("omega", "rvec", "tvec", "HDR_mat", "hdr", "motion", "tracks")
 def describe(recording: Recording, progress: bool | None = None) -> list[tuple[str, str]]:
     """What a user wants to know first of a recording, as (name, text); reads events in blocks.
 
-    A hot pixel is one that fired more than five times as often as the busiest of its neighbours,
-    and at least 20 times; an edge that passes has busy neighbours. A gap is 0.1 s and more without
+    Hot pixels are those of `jaxevent.events.find_hot_pixels`. A gap is 0.1 s and more without
     an event, an interval between frames or samples counts as one where it exceeds 1.5 medians.
     """
     lines = [
@@ -147,7 +147,7 @@ def _about_events(
                 f"; {gaps} of {GAP // 1000} ms and more, each a jump of the clock or a standstill"
             )
         lines.append(("gaps", text))
-    hot = _hot(at_pixel.reshape(height, width))
+    hot = np.flatnonzero(is_hot(at_pixel.reshape(height, width)))
     share = 100 * at_pixel[hot].sum() / count
     lines.append(
         ("hot pixels", f"{len(hot):,}, with {share:.2f} % of the events" if len(hot) else "none")
@@ -168,18 +168,6 @@ def _short(rate: float) -> str:
         if rate >= unit:
             return f"{rate / unit:.3g}{name}" if rate < 999.5 * unit else f"{rate / unit:.0f}{name}"
     return f"{rate:.0f}"
-
-
-def _hot(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Which pixels are hot, as indices into the flattened counts."""
-    height, width = counts.shape
-    around = np.pad(counts, 1)
-    busiest = np.zeros_like(counts)
-    for dy in range(3):
-        for dx in range(3):
-            if (dy, dx) != (1, 1):
-                np.maximum(busiest, around[dy : dy + height, dx : dx + width], out=busiest)
-    return np.flatnonzero((counts >= 20) & (counts > 5 * busiest))
 
 
 def _about_frames(frames: Frames | None) -> list[tuple[str, str]]:

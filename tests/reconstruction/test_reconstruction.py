@@ -10,6 +10,7 @@ import oracles
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from noise import small
 
 import jaxevent
 from jaxevent.methods import names
@@ -606,3 +607,16 @@ def test_presets():
         jaxevent.akf.Params(weighting="none")
     with pytest.raises(jaxevent.InputError, match="certainty is 2; give a list of numbers"):
         jaxevent.akf.Params(certainty=2)
+
+
+def test_a_video_becomes_an_xarray_dataset():
+    xarray = pytest.importorskip("xarray", reason="needs the extra xarray")
+    recording = small()
+    video = jaxevent.akf.estimate(recording)
+    times = [recording.start + 5_000, recording.start + 1_000]
+    dataset = video.to_xarray(times)
+    assert isinstance(dataset, xarray.Dataset)
+    for name, array in zip(("image", "variance", "valid"), video(times), strict=True):
+        assert dataset[name].dims == ("t", "y", "x")
+        np.testing.assert_array_equal(dataset[name].values, array)
+    assert dataset.t.values.tolist() == times and dataset.attrs["method"] == "akf"
