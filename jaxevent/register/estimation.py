@@ -30,7 +30,7 @@ def estimate(
     features (SIFT, Lowe 2004) of frames, and of their differences, are matched with those of what
     the events alone say of the same times (`jaxevent.high_pass`, and their sums), RANSAC (Barath et
     al., MAGSAC++, CVPR 2020) finds the homography of most of them, and `refine`, which needs no
-    features, makes it sub-pixel. Only this needs OpenCV: pip install 'jaxevent[vision]'. The
+    features, makes it sub-pixel. Only this needs OpenCV, the extra "vision". The
     cameras must have moved, or the scene.
 
     Without `offset` (s, added to the frames' time stamps) the clocks are compared: offsets are

@@ -57,6 +57,7 @@ from jaxevent.runs.checkpoint import finished_rows, restore, save
 from jaxevent.runs.family import Sources
 from jaxevent.runs.fit_config import Plan, Task, read_plan
 from jaxevent.runs.results import alone, check_folder, results, write_rows
+from jaxevent.show import plot_losses
 from jaxevent.splits import SPLITS
 from jaxevent.tuning import Fitted, Run, optimise
 
@@ -289,21 +290,7 @@ def _losses(tasks: Sequence[Task], done: Sequence[Fitted]) -> str:
 
 def _curves(tasks: Sequence[Task], done: Sequence[Fitted]) -> bytes:
     """loss.png: the losses of every method over iterations, a line for each start."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 3 * len(tasks)), layout="constrained")
-    for task, one, axis in zip(
-        tasks, done, figure.subplots(len(tasks), squeeze=False)[:, 0], strict=True
-    ):
-        for start in range(task.settings.starts):
-            lines = [line for line in one.history if line[0] == start]
-            for column, colour, name in ((3, "C0", "fit"), (4, "C1", "validation")):
-                seen = [line for line in lines if line[column] is not None]
-                at = [line[1] * task.settings.iterations + line[2] for line in seen]
-                losses = [line[column] for line in seen]
-                axis.plot(at, losses, colour, lw=1, label=name if start == 0 else None)
-        axis.set(title=task.label, xlabel="iteration", ylabel="loss")
-        axis.legend(frameon=False)
+    figure = plot_losses(done, [task.label for task in tasks])
     image = io.BytesIO()
     figure.savefig(image, format="png", dpi=120)
     return image.getvalue()

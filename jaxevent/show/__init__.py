@@ -1,0 +1,44 @@
+"""Figures of recordings, reconstructions, tracks, motions and fits.
+
+    from jaxevent import show
+
+    show.plot_events(recording)  # shown as it is in a notebook
+    show.plot_image(video, 1.0).savefig("image.png")
+
+Every function returns a `matplotlib.figure.Figure` and raises `InputError` without the extra
+"plot". The other modules here write what the commands write.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jaxevent.show.figures import (
+        plot_events,
+        plot_events_3d,
+        plot_image,
+        plot_losses,
+        plot_motion,
+        plot_tracks,
+    )
+
+__all__ = [
+    "plot_events",
+    "plot_events_3d",
+    "plot_image",
+    "plot_losses",
+    "plot_motion",
+    "plot_tracks",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Load the figures when first used: they know all families, which commands need not."""
+    if name not in __all__:
+        raise AttributeError(f"module 'jaxevent.show' has no attribute {name!r}")
+    from jaxevent.show import figures
+
+    return getattr(figures, name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -18,7 +18,7 @@ from jaxevent.egomotion.comparison import Comparison, compare
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.truth import Known, from_poses, known
-from jaxevent.errors import InputError, require
+from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.estimator import Estimate
 from jaxevent.io.output import complete, complete_hdf5
 from jaxevent.recording import Recording
@@ -136,9 +136,9 @@ class Output:
       window's events in colours of their flow.
 
     `truth` is "auto" (the recording's poses, else its gyro), the path of a table with the columns
-    of motion.csv, or None. `centred` estimates count for the time that what they saw shows. Raises
-    `InputError` for settings that are not possible, a place that cannot be written and without the
-    extra "plot".
+    of motion.csv, or None. `centred` estimates count for the time that what they saw shows. Without
+    the extra "plot" the pictures are left out. Raises `InputError` for settings that are not
+    possible and a place that cannot be written.
     """
 
     path: Path
@@ -154,7 +154,6 @@ class Output:
             )
         if not 0 < self.rate <= 1e6:
             raise InputError(f"--rate {self.rate:g} is not possible; give times per s, up to 1e6")
-        require("matplotlib", "plot")
         # A place that cannot be written is told before the work.
         with contextlib.suppress(_Tried), complete(self.path, directory=True):
             raise _Tried
@@ -206,20 +205,30 @@ class Output:
         with complete(self.path, directory=True) as folder:
             write_motion_table(folder / "motion.csv", motion.model, times, told)
             write_motion(folder / "motion.h5", motion, about)
-            plot_motion(folder / "motion.png", motion, times, true, centred=self.centred)
             if found is not None:
                 write_errors(folder, found)
-            part = window_of(recording, motion)
-            flows = None
-            if self.flow or motion.model.half_line:
-                flows = flow_of(recording, motion, part)
-            plot_warped(folder / "warped.png", recording, motion, part, flows)
             if self.flow:
                 outliers = _write_flow(folder / "flow.h5", recording, motion, progress)
-                assert flows is not None
-                plot_flow(folder / "flow.png", recording, part, flows)
+            left_out = None
+            try:
+                require("matplotlib", "plot")
+            except MissingExtra as missing:
+                left_out = str(missing)
+            else:
+                plot_motion(folder / "motion.png", motion, times, true, centred=self.centred)
+                self._draw_window(folder, recording, motion)
             files = sorted(path.name for path in folder.iterdir())
-        return Written(files, times, told, motion, found, outliers)
+        return Written(files, times, told, motion, found, outliers, left_out)
+
+    def _draw_window(self, folder: Path, recording: Recording, motion: Motion) -> None:
+        """The events of a short window as they fell, moved back, and in colours of their flow."""
+        part = window_of(recording, motion)
+        flows = None
+        if self.flow or motion.model.half_line:
+            flows = flow_of(recording, motion, part)
+        plot_warped(folder / "warped.png", recording, motion, part, flows)
+        if self.flow and flows is not None:
+            plot_flow(folder / "flow.png", recording, part, flows)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,9 +241,16 @@ class Written:
     motion: Motion
     errors: Comparison | None
     outliers: float | None  # percentage of events, where flow was asked for
+    left_out: str | None = None  # why there are no pictures
 
     def summary(self) -> list[str]:
-        """Lines to print: when it was found, means and spreads, errors."""
+        """Lines to print: when it was found, means and spreads, errors, what is left out."""
+        lines = self._found()
+        if self.left_out is not None:
+            lines += ["", f"pictures are left out: {self.left_out}"]
+        return lines
+
+    def _found(self) -> list[str]:
         lost = ~self.told.valid
         first = np.flatnonzero(~lost)
         if not len(first):

@@ -20,10 +20,10 @@ from jaxevent.egomotion.models import Model, Numeric
 from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.truth import Known, axis_error, endpoint_error
 from jaxevent.egomotion.warped import blur, contrast, splat
-from jaxevent.errors import require
 from jaxevent.estimator import Estimate
 from jaxevent.io.output import complete
 from jaxevent.recording import Events, Recording
+from jaxevent.show.canvas import new_figure
 
 _PLOTTED = 4096  # most times of the plot
 _PARTICLES = 30_000  # most particles of a component in the plot
@@ -40,12 +40,19 @@ def plot_motion(
     *,
     centred: bool = False,
 ) -> None:
-    """Draw the components over times (us) as PNG, against the truth and with errors where known.
+    """Draw `motion_figure` as PNG."""
+    _save(motion_figure(motion, times, truth, centred=centred), path)
+
+
+def motion_figure(
+    motion: Motion, times: NDArray[np.int64], truth: Known | None = None, *, centred: bool = False
+) -> Any:
+    """The components over times (us), against the truth and with errors where known.
 
     Bands are two standard deviations, grey spans those in which the motion is lost, dots some of
     the particles, where the motion has a `cloud` (estimates, particles, components).
     """
-    figure = _figure(path)
+    figure = new_figure()
     if len(times) > _PLOTTED:
         times = times[np.linspace(0, len(times) - 1, _PLOTTED).astype(int)]
     told = motion(times, centred=centred)
@@ -103,7 +110,7 @@ def plot_motion(
     grid[0, 0].legend(
         fontsize=8, frameon=False, ncols=4, loc="lower left", bbox_to_anchor=(0, 1), borderpad=0.2
     )
-    _save(figure, path)
+    return figure
 
 
 def _judged(
@@ -300,7 +307,7 @@ def plot_warped(
     told = [_image(_padded(xy), sign, shape) for xy in places]
     images, sharp = [np.asarray(one[0]) for one in told], [float(one[1]) for one in told]
     limit = max(np.percentile(np.abs(images[1]), 99.7), 1e-9)
-    figure = _figure(path)
+    figure = new_figure()
     wide = 5.2
     figure.set_size_inches(2 * wide, wide * shape[0] / shape[1] + 0.8)
     span = (int(events.t[-1] - events.t[0]) * 1e-3) if len(events) else 0.0
@@ -369,7 +376,7 @@ def plot_flow(path: str | Path, recording: Recording, part: Window, flows: Flow)
     image[events.y[now], events.x[now]] = 0.35
     ok = flows.valid & now
     image[events.y[ok], events.x[ok]] = colours(*flows.flow[ok].T.astype(float))
-    figure = _figure(path)
+    figure = new_figure()
     wide = 7.0
     figure.set_size_inches(wide + 1.7, wide * recording.height / recording.width + 0.5)
     left, right = figure.subplots(1, 2, width_ratios=(wide, 1.5))
@@ -382,16 +389,6 @@ def plot_flow(path: str | Path, recording: Recording, part: Window, flows: Flow)
     right.set_title(f"{most:.3g} px/s\nat the rim", fontsize=9)
     right.set_axis_off()
     _save(figure, path)
-
-
-def _figure(path: str | Path) -> Any:
-    require("matplotlib", "plot")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
 
 
 def _save(figure: Any, path: str | Path) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import jaxevent
+from jaxevent.errors import install_command
 from jaxevent.metrics import LOG_OFFSET
 from jaxevent.show.report import Column, columns_of, display_limits, find, number, tone_map
 
@@ -75,7 +76,7 @@ def page(
     parts += _failures(rows)
     parts += ["<h2>Means over recordings</h2>", _means(done, methods, columns)]
     if importlib.util.find_spec("matplotlib") is None:
-        parts.append('<p class="note">Plots need <code>pip install jaxevent[plot]</code>.</p>')
+        parts.append(f'<p class="note">Plots need <code>{install_command("plot")}</code>.</p>')
     else:
         means, over_time = _plotted(done)
         parts.append(_points(done, methods, means))

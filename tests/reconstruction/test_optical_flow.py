@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import sys
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 import jaxevent
 from jaxevent import cli
+from jaxevent.errors import install_command
 from jaxevent.recording import Events, Frames, Recording
 
 SIZE = (64, 96)
@@ -177,12 +179,12 @@ def test_it_cannot_be_fitted(folder, capsys):
 
 def test_without_opencv_its_rows_are_skipped(folder, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(jaxevent.InputError, match=r"pip install 'jaxevent\[vision\]'"):
+    with pytest.raises(jaxevent.InputError, match=re.escape(install_command("vision"))):
         jaxevent.flow.estimate(small())
     out = folder / "out"
     assert cli.main(["evaluate", str(folder / "run.toml"), "--out", str(out)]) == 0
     said = capsys.readouterr()
-    sentence = "this needs the package 'cv2': pip install 'jaxevent[vision]'"
+    sentence = f"this needs the package 'cv2': {install_command('vision')}"
     assert f"jaxevent: along flow is skipped: {sentence}" in said.err.splitlines()
     assert "failed" not in said.err + said.out
     assert f"\nskipped (1): along flow: {sentence}\n" in (out / "results.md").read_text()

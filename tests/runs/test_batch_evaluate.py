@@ -266,7 +266,7 @@ def test_the_page_holds_everything_itself(tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     evaluate(config, tmp_path / "out")
     text = (tmp_path / "out" / "report.html").read_text()
-    assert "pip install jaxevent[plot]" in text and "svg" not in Page(text).links
+    assert "pip install" in text and "svg" not in Page(text).links
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     evaluate(config, tmp_path / "out")
     assert not (tmp_path / "out" / "results.parquet").exists()

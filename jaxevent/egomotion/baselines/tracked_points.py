@@ -4,7 +4,7 @@ Corners of each frame are followed to the next by pyramidal Lucas-Kanade and bac
 return to where they began (forward-backward check) tell the motion between the two frames, by
 robust least squares of their undistorted displacements: d / dt = U(x; motion), at the middle x of
 the way. For a rotation that is B(x) Omega, of second order in the angle between the frames. Needs
-OpenCV: pip install 'jaxevent[vision]'.
+OpenCV, the extra "vision".
 """
 
 import dataclasses

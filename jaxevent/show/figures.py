@@ -1,0 +1,232 @@
+"""One figure for each kind of thing, as `matplotlib.figure.Figure`; see `jaxevent.show`."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.blob.tracks import Tracks
+from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.truth import Known
+from jaxevent.errors import InputError
+from jaxevent.events import event_image
+from jaxevent.reconstruction.video import ImageSequence
+from jaxevent.recording import Events, EventSource, Recording, Times, microseconds
+from jaxevent.show.canvas import new_figure
+from jaxevent.show.motion_pictures import motion_figure
+from jaxevent.tuning import Fitted
+
+ON, OFF = "#c8401e", "#3a78b5"
+WIDE = 7.0  # inches of a figure
+IN_SPACE = 20_000  # events drawn in x, y and t
+PATH_TIMES = 400  # at which a track's path is drawn
+
+
+def plot_events(
+    part: Events | Recording, count: int | None = None, *, size: tuple[int, int] | None = None
+) -> Any:
+    """Draw the `count` events in the middle, ON red and OFF blue, over the frame then.
+
+    By default as many as a quarter of the pixels. Cut the recording for those of other times:
+    `plot_events(recording[1.0:1.02])`. `size` (width, height) is needed for `Events`.
+    """
+    (width, height), events = _sensor(part, size), _middle(part, count, size)
+    figure, axis = _image_figure(width, height)
+    frame = _frame_at(part, events)
+    axis.imshow(np.ones((height, width)) if frame is None else frame, "gray", vmin=0, vmax=1)
+    polarity = event_image(events, size=(width, height))
+    top = max(1, int(np.percentile(np.abs(polarity[polarity != 0]), 95))) if len(events) else 1
+    colours = np.zeros((height, width, 4))
+    colours[polarity > 0, :3], colours[polarity < 0, :3] = _rgb(ON), _rgb(OFF)
+    colours[..., 3] = np.where(polarity == 0, 0, 0.35 + 0.65 * np.clip(abs(polarity) / top, 0, 1))
+    axis.imshow(colours, interpolation="nearest")
+    axis.set_title(_title(part, events), fontsize=10)
+    return figure
+
+
+def plot_events_3d(
+    part: Events | Recording, count: int | None = None, *, size: tuple[int, int] | None = None
+) -> Any:
+    """Draw the `count` events in the middle in x, y and t, ON red and OFF blue.
+
+    By default as many as there are pixels. Of more than 20,000 events every n-th is drawn.
+    """
+    width, height = _sensor(part, size)
+    events = _middle(part, width * height if count is None else count, size)
+    shown = slice(None, None, max(1, math.ceil(len(events) / IN_SPACE)))
+    t, x, y, p = (getattr(events, name)[shown] for name in "txyp")
+    figure = new_figure(WIDE, 5.5)
+    axis = figure.add_subplot(projection="3d")
+    zero = t[0] if len(t) else 0
+    for chosen, colour, label in ((p, ON, "ON"), (~p, OFF, "OFF")):
+        ms = (t[chosen] - zero) / 1000
+        axis.scatter(ms, x[chosen], y[chosen], c=colour, s=1, lw=0, label=label)
+    axis.set(xlabel="t (ms)", ylabel="x (px)", zlabel="y (px)", ylim=(0, width), zlim=(height, 0))
+    axis.legend(frameon=False, fontsize=8, markerscale=6)
+    axis.set_title(_title(part, events), fontsize=10)
+    return figure
+
+
+def plot_image(video: ImageSequence, time: Times) -> Any:
+    """Draw the image of a reconstruction at a time (us or s), and how certain it is.
+
+    White is the image's brightest 0.5 %; black is the frames'. The uncertainty, where the method
+    tells one, is the standard deviation of ln(intensity + I0).
+    """
+    told = video(time)
+    image = np.where(told.valid[0], told.mean[0], np.nan)
+    deviation = np.sqrt(np.where(told.valid[0], told.covariance[0], np.nan))
+    panels = [(image, "intensity", {"cmap": "gray", "vmin": 0.0, "vmax": _bright(image, 1e-6)})]
+    if np.isfinite(deviation).any():
+        scale = {"cmap": "viridis", "vmin": 0.0, "vmax": _bright(deviation, 1e-6)}
+        panels.append((deviation, "standard deviation of ln I", scale))
+    height, width = image.shape
+    figure = new_figure(WIDE * len(panels) / 1.4, WIDE / 1.4 * height / width + 0.6)
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axis, (values, label, scale) in zip(axes, panels, strict=True):
+        shown = axis.imshow(values, interpolation="nearest", **scale)
+        axis.set(xticks=[], yticks=[])
+        axis.set_title(label, fontsize=10)
+        figure.colorbar(shown, ax=axis, fraction=0.046, pad=0.03).outline.set_visible(False)
+    at = int(microseconds(np.ravel(np.asarray(time))[0])) * 1e-6
+    name = video.recording.name
+    figure.suptitle(f"{name} by {video.estimator.name} at {at:.6g} s", fontsize=10)
+    return figure
+
+
+def plot_tracks(tracks: Tracks, ids: Sequence[int] | None = None, *, most: int = 40) -> Any:
+    """Draw the paths of tracks in the image plane over the events of their whole time.
+
+    A path ends in the ellipse of two standard deviations of the blob and the track's id. `ids`
+    chooses tracks; by default the `most` that live longest. Behind is how many events each pixel
+    fired, of at most a million in the middle.
+    """
+    recording = tracks.recording
+    figure, axis = _image_figure(recording.width, recording.height)
+    middle = _middle(recording[tracks.start : tracks.stop], 1_000_000)
+    counts = np.abs(event_image(middle, size=(recording.width, recording.height)))
+    axis.imshow(np.log1p(counts), "Greys", vmax=1.6 * np.log1p(counts.max(initial=1)))
+    if ids is None:
+        longest = np.argsort(tracks.birth - tracks.death, kind="stable")[:most]
+        ids = sorted(tracks.id[longest].tolist())
+    times = np.linspace(tracks.start, tracks.stop - 1, PATH_TIMES).round().astype(np.int64)
+    told = tracks(times, ids)
+    for k, one in enumerate(ids):
+        alive = told.valid[:, k]
+        if not alive.any():  # lived between two of the times
+            continue
+        path = np.where(alive[:, None], told.mean[:, k, :2], np.nan)
+        (line,) = axis.plot(*path.T, lw=1.3)
+        _draw_blob(axis, told.mean[alive, k][-1], line.get_color(), str(one))
+    axis.set(xlim=(-0.5, recording.width - 0.5), ylim=(recording.height - 0.5, -0.5))
+    span = f"{tracks.start * 1e-6:.6g} to {tracks.stop * 1e-6:.6g} s"
+    axis.set_title(f"{recording.name}: {len(ids)} of {len(tracks)} tracks, {span}", fontsize=10)
+    return figure
+
+
+def plot_motion(
+    motion: Motion,
+    times: Times | None = None,
+    truth: Known | None = None,
+    *,
+    centred: bool = False,
+) -> Any:
+    """Draw a motion's components over time, with bands of two standard deviations.
+
+    Grey spans are those in which it is lost. `times` are by default spread over the estimates;
+    against a `truth` (`egomotion.known`) errors are drawn too. Raises `InputError` where there is
+    no estimate and no time.
+    """
+    if times is None and not len(motion):
+        raise InputError(f"{motion.recording}: the motion has no estimate; nothing to draw")
+    if times is None:
+        us = np.linspace(motion.t[0], motion.t[-1], 2000).round().astype(np.int64)
+    else:
+        us = np.atleast_1d(microseconds(times))
+    return motion_figure(motion, np.unique(us), truth, centred=centred)
+
+
+def plot_losses(fitted: Fitted | Sequence[Fitted], names: Sequence[str] = ()) -> Any:
+    """Draw the losses of fits over iterations, a line for each start; `names` are titles."""
+    several = list(fitted) if isinstance(fitted, Sequence) else [fitted]
+    titles = list(names) or [""] * len(several)
+    figure = new_figure(WIDE, 3 * len(several))
+    grid = figure.subplots(len(several), squeeze=False)[:, 0]
+    for one, title, axis in zip(several, titles, grid, strict=True):
+        # Rounds follow each other.
+        length = 1 + max((line[2] for line in one.history), default=0)
+        for start in sorted({line[0] for line in one.history}):
+            lines = [line for line in one.history if line[0] == start]
+            for column, colour, name in ((3, "C0", "fit"), (4, "C1", "validation")):
+                seen = [line for line in lines if line[column] is not None]
+                at = [line[1] * length + line[2] for line in seen]
+                losses = [line[column] for line in seen]
+                axis.plot(at, losses, colour, lw=1, label=name if start == 0 else None)
+        axis.set(title=title, xlabel="iteration", ylabel="loss")
+        axis.spines[["top", "right"]].set_visible(False)
+        if axis.lines:
+            axis.legend(frameon=False)
+    return figure
+
+
+def _image_figure(width: int, height: int) -> tuple[Any, Any]:
+    figure = new_figure(WIDE, min(max(WIDE * height / width, 2), 2 * WIDE) + 0.3)
+    axis = figure.subplots()
+    axis.set(xlabel="x (px)", ylabel="y (px)")
+    return figure, axis
+
+
+def _sensor(part: Events | Recording, size: tuple[int, int] | None) -> tuple[int, int]:
+    if isinstance(part, Recording):
+        return part.width, part.height
+    if size is None:
+        raise InputError("events alone do not tell the sensor; give size=(width, height)")
+    return size
+
+
+def _middle(
+    part: Events | Recording, count: int | None, size: tuple[int, int] | None = None
+) -> Events:
+    width, height = _sensor(part, size)
+    source: EventSource = part.events if isinstance(part, Recording) else part
+    count = width * height // 4 if count is None else count
+    first = max(0, (len(source) - count) // 2)
+    return source[first : first + count]
+
+
+def _frame_at(part: Events | Recording, events: Events) -> NDArray[np.float32] | None:
+    """The frame nearest to the middle of the events, faint, so that they are seen on it."""
+    if not isinstance(part, Recording) or part.frames is None:
+        return None
+    middle = (events.t[0] + events.t[-1]) // 2 if len(events) else part.frames.t[0]
+    row = int(np.argmin(np.abs(part.frames.t - middle)))
+    return 0.35 + 0.65 * part.frames[row : row + 1].intensity[0]
+
+
+def _title(part: Events | Recording, events: Events) -> str:
+    name = f"{part.name}: " if isinstance(part, Recording) else ""
+    span = ""
+    if len(events):
+        span = f", {events.t[0] * 1e-6:.6g} to {events.t[-1] * 1e-6:.6g} s"
+    return f"{name}{len(events):,} events{span}"
+
+
+def _bright(values: NDArray, least: float) -> float:
+    known = values[np.isfinite(values)]
+    return max(least, float(np.percentile(known, 99.5))) if len(known) else least
+
+
+def _rgb(colour: str) -> tuple[float, ...]:
+    return tuple(int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))
+
+
+def _draw_blob(axis: Any, state: NDArray, colour: Any, label: str) -> None:
+    from matplotlib.patches import Ellipse
+
+    x, y, along, across, angle = (float(state[i]) for i in (0, 1, 4, 5, 6))
+    axis.add_patch(
+        Ellipse((x, y), 4 * along, 4 * across, angle=math.degrees(angle), fill=False, color=colour)
+    )
+    axis.annotate(label, (x, y), (4, 4), textcoords="offset points", color=colour, fontsize=8)

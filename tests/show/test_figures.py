@@ -1,0 +1,150 @@
+"""What the figures draw is what things tell; notebooks show it."""
+
+import dataclasses
+import sys
+import types
+
+import numpy as np
+import pytest
+from noise import HEIGHT, WIDTH, small
+
+import jaxevent
+from jaxevent import events, show
+from jaxevent.blob.states import TrackStates
+from jaxevent.egomotion.motion import Motion
+from jaxevent.errors import MissingExtra
+from jaxevent.estimator import Estimate
+from jaxevent.reconstruction.video import ImageSequence
+from jaxevent.recording import Events
+from jaxevent.show import notebook
+from jaxevent.tuning import Fitted
+
+
+class Tracks(jaxevent.blob.tracks.Tracks):
+    """Two tracks on straight lines, the second from 20 ms on."""
+
+    def __init__(self):
+        self.recording, self.start, self.stop = small(), 1_000, 50_000
+        self.id, self.ended = np.array([3, 5]), ("end", "end")
+        self.birth, self.death = np.array([1_000, 20_000]), np.array([50_000, 50_000])
+
+    def __call__(self, times, ids=None, *, extrapolate=False):
+        t = np.asarray(times)[:, None] * 1e-6
+        columns = [0 if one == 3 else 1 for one in (self.id if ids is None else ids)]
+        mean = np.zeros((len(t), len(columns), 8))
+        mean[..., 0], mean[..., 1], mean[..., 4:6] = 100 * t + 2, 5, (2, 1)
+        valid = (self.birth[columns] <= 1e6 * t) & (1e6 * t < self.death[columns])
+        covariance = np.zeros((*mean.shape, 8))
+        return TrackStates(mean, covariance, valid, valid * 0.0, self.id[columns])
+
+
+class Video(ImageSequence):
+    @property
+    def dtype(self):
+        return np.dtype(np.float32)
+
+    def _read(self, times):
+        image = np.arange(WIDTH * HEIGHT, dtype=np.float32).reshape(1, HEIGHT, WIDTH) / 100
+        yield times, Estimate(image, image * 0 + 0.04, image > 1)
+
+
+def motion() -> Motion:
+    n = 20
+    mean = np.stack([np.linspace(-5, 5, n), np.full(n, 2.0)], 1)
+    covariance = np.broadcast_to(np.eye(2) * 0.25, (n, 2, 2))
+    return Motion.of("planar", np.arange(n) * 1000, mean, covariance, np.arange(n) > 3)
+
+
+def test_events_are_drawn_where_they_are():
+    recording = small()
+    axis = show.plot_events(recording, 50).axes[0]
+    part = recording.events[175:225]
+    drawn = np.asarray(axis.images[-1].get_array())
+    image = events.event_image(part, size=(WIDTH, HEIGHT))
+    np.testing.assert_array_equal(drawn[..., 3] > 0, image != 0)
+    assert (drawn[image > 0][:, 0] > drawn[image > 0][:, 2]).all()  # red
+    assert (drawn[image < 0][:, 0] < drawn[image < 0][:, 2]).all()
+    behind = np.asarray(axis.images[0].get_array())
+    row = np.argmin(abs(recording.frames.t - (part.t[0] + part.t[-1]) // 2))
+    np.testing.assert_allclose(behind, 0.35 + 0.65 * recording.frames.intensity[row])
+    assert axis.get_title().startswith("small: 50 events, ")
+    show.plot_events(Events.empty(), size=(4, 3))
+
+
+def test_events_are_drawn_in_space_and_time():
+    recording = small()
+    axis = show.plot_events_3d(recording).axes[0]
+    on, off = axis.collections
+    assert len(on._offsets3d[0]) == recording.events.p.sum()
+    assert len(off._offsets3d[0]) == (~recording.events.p).sum()
+    np.testing.assert_array_equal(on._offsets3d[1], recording.events.x[recording.events.p])
+
+
+def test_an_image_and_its_uncertainty():
+    video = Video(jaxevent.akf, small(), jaxevent.akf.Params())
+    figure = show.plot_image(video, 0.02)
+    image, deviation = (axis.images[0].get_array() for axis in figure.axes[:2])
+    np.testing.assert_allclose(image.filled(np.nan), np.where(
+        video(0.02).valid[0], video(0.02).mean[0], np.nan))  # fmt: skip
+    np.testing.assert_allclose(deviation.compressed(), 0.2)
+    assert figure.get_suptitle() == "small by akf at 0.02 s"
+
+
+def test_tracks_are_lines_over_events():
+    tracks = Tracks()
+    axis = show.plot_tracks(tracks).axes[0]
+    x = [np.asarray(line.get_xdata()) for line in axis.lines]
+    assert np.nanmin(x[0]) == pytest.approx(2.1) and np.nanmax(x[0]) == pytest.approx(7.0, 1e-3)
+    assert np.nanmin(x[1]) == pytest.approx(4.0, 0.01)
+    assert [(e.width, e.height) for e in axis.patches] == [(8, 4), (8, 4)]
+    assert [text.get_text() for text in axis.texts] == ["3", "5"]
+    assert len(show.plot_tracks(tracks, [5]).axes[0].lines) == 1
+
+
+def test_a_motion_and_the_losses_of_a_fit():
+    line = show.plot_motion(motion(), np.arange(5_000, 15_000, 1000)).axes[0].lines[0]
+    np.testing.assert_allclose(line.get_ydata(), np.linspace(-5, 5, 20)[5:15])
+    history = [[0, 0, 0, 3.0, None], [0, 0, 1, 2.0, 2.5], [0, 1, 0, 1.0, None], [1, 0, 0, 4.0, 5.0]]
+    fitted = Fitted(jaxevent.akf.Params(), 1.0, history)
+    (axis,) = show.plot_losses(fitted).axes
+    points = [list(zip(*line.get_data(), strict=True)) for line in axis.lines]
+    assert points == [[(0, 3.0), (1, 2.0), (2, 1.0)], [(1, 2.5)], [(0, 4.0)], [(0, 5.0)]]
+
+
+def test_notebooks_show_a_table_and_a_picture(monkeypatch):
+    video = Video(jaxevent.akf, small(), jaxevent.akf.Params())
+    titles = {"small": small(), "akf": video, "2 tracks of small": Tracks(), "vx": motion()}
+    for title, thing in titles.items():
+        shown = notebook.as_html(thing)
+        assert title in shown and "data:image/png;base64," in shown
+    assert notebook.as_html(3) == "<pre>3</pre>"
+    assert "&lt;b&gt;" in notebook.as_html(dataclasses.replace(small(), name="<b>"))
+    assert show.plot_events(small())._repr_png_().startswith(b"\x89PNG")
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert "pip install" in notebook.as_html(small()) and "img" not in notebook.as_html(small())
+    with pytest.raises(MissingExtra):
+        show.plot_events(small())
+
+
+def test_ipython_is_told_where_it_runs(monkeypatch):
+    told = {}
+
+    class Formatter:
+        def for_type_by_name(self, module, name, function):
+            told[module, name] = function
+
+    shell = types.SimpleNamespace(
+        display_formatter=types.SimpleNamespace(formatters={"text/html": Formatter()})
+    )
+    module = types.SimpleNamespace(get_ipython=lambda: None)
+    monkeypatch.setitem(sys.modules, "IPython", module)
+    jaxevent._tell_notebook()
+    assert not told
+    module.get_ipython = lambda: shell
+    jaxevent._tell_notebook()
+    kinds = [small(), Tracks(), motion()]
+    for thing in kinds:
+        bases = [(kind.__module__, kind.__name__) for kind in type(thing).__mro__]
+        (name,) = set(bases) & set(told)
+        assert told[name](thing) == notebook.as_html(thing)
+    assert ("jaxevent.reconstruction.video", "ImageSequence") in told
