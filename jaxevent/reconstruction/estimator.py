@@ -4,9 +4,11 @@ import abc
 import dataclasses
 from typing import Any, ClassVar
 
+from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator
 from jaxevent.reconstruction.clock import Timing, time_span
 from jaxevent.reconstruction.features import Features, ReadOut
+from jaxevent.reconstruction.live import LiveVideo
 from jaxevent.reconstruction.video import ImageSequence, P, Video
 from jaxevent.reconstruction.windows import prepare
 from jaxevent.recording import Recording, Times, check_times
@@ -102,3 +104,17 @@ class PixelEstimator(ImageEstimator[P]):
         needs.
         """
         return Video(self, recording, self.Params() if params is None else params, **options)
+
+    def live(
+        self, size: tuple[int, int], params: P | None = None, *, frames: bool, **options: Any
+    ) -> LiveVideo:
+        """Images of events, and with `frames` of frames, that are still to come; see `LiveVideo`.
+
+        `size` is (width, height). Options: `window_events`, which are filtered together; `extra`,
+        a recording's further arrays, for a camera response. Raises `InputError` for a method that
+        looks ahead.
+        """
+        if self.looks_ahead:
+            raise InputError(f"the method {self.name!r} needs what comes later; use akf")
+        params = self.Params() if params is None else params
+        return LiveVideo(self, size, params, frames=frames, **options)

@@ -284,6 +284,33 @@ class Video(ImageSequence[P]):
             if stop is None or time < stop:
                 return self._open
 
+    @property
+    def settled(self) -> int | None:
+        """The time (us) before which images can no longer be read; None: all can."""
+        return self._begins[0].start
+
+    def grow(self, recording: Recording) -> None:
+        """Go on with the same recording of which more is known, after its end."""
+        self.recording = recording
+        self._windows.grow(recording)
+        self._open, self._begins = None, self._begins[:1]
+
+    def settle(self, frames: bool) -> tuple[int, int]:
+        """Filter up to where nothing that is added can change the past, and keep that state only.
+
+        Returns the first row of the events and the first frame that are needed from then on. With
+        `frames` more of these will come, else only events.
+        """
+        begin, final = self._begins[0], self._windows.final(frames)
+        while True:
+            self._open = None
+            _, following = self._filter(begin)
+            if following.start is None or following.start > final:
+                break
+            begin = following
+        self._begins = [begin]
+        return self._windows.needed(begin.start, begin.before)
+
     def _look_ahead(self) -> None:
         """Pass over all windows once, to know at each what later ones say."""
         begin, starts, links = self._begins[0], [], []

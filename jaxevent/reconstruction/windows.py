@@ -94,6 +94,7 @@ class WindowedRecording:
         growth: bool = False,
     ):
         self.recording, self.filtering, self.events = recording, filtering, events
+        self._timing = timing
         self.clock = Clock.of(recording, timing)
         self.dead = DeadTime(round(timing.rho_ref * 1e8) / 100, growth)
         self.reach = 0 if filtering else round(timing.spread * 1e6)
@@ -143,6 +144,36 @@ class WindowedRecording:
                 return self._window(start, stop, events, layout, before)
             stop = middle
             own = own[: own.index(stop)]
+
+    def grow(self, recording: Recording) -> None:
+        """Go on with the same recording of which more is known, after its end."""
+        self.recording = recording
+        self.clock = Clock.of(recording, self._timing)
+        self._images = FrameImages(recording, self.dtype)
+
+    def final(self, frames: bool) -> float:
+        """The time (us) up to which windows stay as they are if more is added after the end.
+
+        A window that ends in the exposure of frame k uses frame k + 1 and the events of its
+        exposure. With `frames` more of these will come.
+        """
+        source = self.recording.events
+        last = int(source[len(source) - 1 :].t[0]) - self.reach if len(source) else -np.inf
+        if not frames:
+            return float(last)
+        # Events before `last` are known.
+        known = np.maximum.accumulate(self.clock.right) + self.clock.origin <= last
+        complete = int(np.argmin(known)) if not known.all() else len(known)
+        return float(self.clock.left[complete - 2] + self.clock.origin) if complete > 1 else -np.inf
+
+    def needed(self, start: int | None, before: StreamState) -> tuple[int, int]:
+        """The first row of the events and the first frame that windows from `start` on use."""
+        used = self.clock.used(start, None)
+        begin = 0 if start is None else self.recording.events.index(start)
+        row, _ = self._context(used, begin, begin)
+        if before.last_then is not None:
+            row = min(row, before.context)
+        return row, used.start
 
     def whole(self) -> tuple[EventWindow, Features]:
         """The whole recording as one window, with room from a ladder of steps by a quarter."""

@@ -1,0 +1,231 @@
+"""A reconstruction of events that are still coming: from a camera, a socket, any iterator.
+
+    live = jaxevent.akf.live((346, 260), frames=False)
+    for events in camera:  # `jaxevent.Events`, one chunk after another
+        live.add(events)
+        image, variance, valid = live(live.stop)
+
+Images are those that `estimate` gives of all that has been added so far. What can no longer change
+is filtered once and forgotten, so memory does not grow; only the frames' times are kept.
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError
+from jaxevent.estimator import Estimate
+from jaxevent.reconstruction.video import PixelMethod, Video
+from jaxevent.recording import Events, Frames, Recording, Times, microseconds
+
+WINDOW_EVENTS = 1 << 17  # filtered together, and at most so many anew for an image
+
+
+class Tail:
+    """An `EventSource` of which only the last events, and the very first one, are held."""
+
+    def __init__(self) -> None:
+        self.count = self.dropped = 0
+        self.last = np.iinfo(np.int64).min  # us
+        self._first = Events.empty()
+        self._parts: list[Events] = []
+
+    def __len__(self) -> int:
+        return self.count
+
+    def add(self, events: Events) -> None:
+        if len(events):
+            self._first = self._first if self.count else events[:1]
+            self._parts.append(events)
+            self.count += len(events)
+            self.last = int(events.t[-1])
+
+    def held(self) -> Events:
+        """Those from row `dropped` on."""
+        if len(self._parts) != 1:
+            parts = self._parts or [Events.empty()]
+            joined = (np.concatenate([getattr(e, name) for e in parts]) for name in "txyp")
+            self._parts = [Events(*joined)]
+        return self._parts[0]
+
+    def __getitem__(self, rows: slice) -> Events:
+        first, stop, _ = rows.indices(self.count)
+        if (first, stop) == (0, 1):
+            return self._first
+        if first < self.dropped:
+            raise IndexError(f"events before row {self.dropped} are gone")
+        return self.held()[first - self.dropped : stop - self.dropped]
+
+    def index(self, time: int) -> int:
+        return self.dropped + self.held().index(time)
+
+    def drop(self, row: int) -> None:
+        """Forget the events before a row."""
+        held = self.held()[max(row - self.dropped, 0) :]
+        # A copy: a slice would hold the array that it is of.
+        self._parts = [Events(*(getattr(held, name).copy() for name in "txyp"))]
+        self.dropped = max(row, self.dropped)
+
+
+class TailImages:
+    """An `ImageSource` of which only the last images are held."""
+
+    def __init__(self, images: NDArray, dropped: int = 0):
+        self.images, self.dropped = images, dropped
+        self.dtype = images.dtype
+        self.shape = (dropped + len(images), *images.shape[1:])
+
+    def __getitem__(self, rows: Any) -> Any:
+        first, stop, step = rows.indices(self.shape[0])
+        if first < self.dropped:
+            raise IndexError(f"frames before {self.dropped} are gone")
+        return self.images[first - self.dropped : stop - self.dropped : step]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
+        raise IndexError("frames that are gone cannot be read")
+
+    def grown(self, image: NDArray) -> "TailImages":
+        return TailImages(np.concatenate([self.images, image[None]]), self.dropped)
+
+    def dropping(self, row: int) -> "TailImages":
+        return TailImages(self.images[max(row - self.dropped, 0) :].copy(), row)
+
+
+class LiveVideo:
+    """Images of all that has been added so far: `image, variance, valid = live(times)`.
+
+    `add` takes events and `add_frame` frames, each in order of time. With `frames` a moment is
+    settled when the second frame after it, and the events of its exposure, have come: until then
+    images between frames may change, as those of a recording that ends there do.
+    """
+
+    def __init__(
+        self,
+        estimator: PixelMethod,
+        size: tuple[int, int],
+        params: Any,
+        *,
+        frames: bool,
+        window_events: int = WINDOW_EVENTS,
+        extra: dict[str, NDArray] | None = None,
+    ):
+        self.estimator, self.params, self.window_events = estimator, params, window_events
+        self._expects_frames = frames
+        self._recording = Recording("live", *size, Tail(), extra=extra or {})
+        self._video: Video | None = None
+        self._grown = False
+
+    @property
+    def _events(self) -> Tail:
+        assert isinstance(self._recording.events, Tail)
+        return self._recording.events
+
+    def __repr__(self) -> str:
+        r = self._recording
+        return f"LiveVideo({self.estimator.name}, {r.width}x{r.height}, {len(r.events):,} events)"
+
+    @property
+    def start(self) -> int:
+        """The first time (us) of which images can still be had."""
+        self._check()
+        settled = None if self._video is None else self._video.settled
+        return self._recording.start if settled is None else settled
+
+    @property
+    def stop(self) -> int:
+        """The time (us) of the last event or frame."""
+        self._check()
+        return self._recording.stop
+
+    def add(self, events: Events) -> None:
+        """Add events that are not earlier than those before; raises `InputError` for bad ones."""
+        tail, r = self._events, self._recording
+        events.check(r.width, r.height, "the events added", len(tail))
+        if len(events) and events.t[0] < tail.last:
+            raise InputError(
+                f"the events added begin at {events.t[0]} us, before the last one at {tail.last} "
+                "us; add them in order of time"
+            )
+        tail.add(events)
+        self._grown = True
+        self._settle()
+
+    def add_frame(self, time: Times, image: NDArray, exposure: int | float = 0) -> None:
+        """Add a frame (H, W): mid-exposure time and length of the exposure, us or s."""
+        if not self._expects_frames:
+            raise InputError("frames were not expected; make the live video with frames=True")
+        r, t = self._recording, int(microseconds(time))
+        one = Frames(
+            np.array([t]), np.asarray(image)[None], np.array([int(microseconds(exposure))])
+        )
+        one.check(r.width, r.height, "the frame added")
+        known = r.frames
+        if known is None:
+            frames = dataclasses.replace(one, images=TailImages(np.asarray(one.images)))
+        else:
+            if t <= known.t[-1]:
+                raise InputError(
+                    f"the frame added is at {t} us, not after the one before at {known.t[-1]} us; "
+                    "add them in order of time"
+                )
+            assert isinstance(known.images, TailImages)
+            frames = Frames(
+                np.append(known.t, t),
+                known.images.grown(np.asarray(image)),
+                np.append(known.exposure, one.exposure),
+            )
+        self._recording = dataclasses.replace(r, frames=frames)
+        self._grown = True
+        self._settle()
+
+    def __call__(self, times: Times) -> Estimate:
+        """Images at `times`, from `start` to `stop`, as `Video` gives them."""
+        us = np.atleast_1d(microseconds(times))
+        start, stop = self.start, self.stop
+        if len(us) and not start <= us.min() <= us.max() <= stop:
+            raise InputError(
+                f"images from {us.min()} to {us.max()} us were asked for; those from {start} to "
+                f"{stop} us can be had, earlier ones are forgotten and later ones not known"
+            )
+        return self._following()(us)
+
+    def _check(self) -> None:
+        if not len(self._events) and self._recording.frames is None:
+            raise InputError("nothing has been added yet; add events or a frame first")
+
+    def _following(self) -> Video:
+        """The video of all that has been added."""
+        if self._video is None:
+            self._video = Video(
+                self.estimator, self._recording, self.params,
+                window_events=self.window_events, progress=False,
+            )  # fmt: skip
+        elif self._grown:
+            self._video.grow(self._recording)
+        self._grown = False
+        return self._video
+
+    def _settle(self) -> None:
+        """Filter what can no longer change, once it is a window's worth, and forget it."""
+        tail, frames = self._events, self._recording.frames
+        waiting = tail.count - tail.dropped
+        pictures = 0
+        if frames is not None and isinstance(frames.images, TailImages):
+            pictures = len(frames.images.images)
+        if waiting < 2 * self.window_events and pictures < 32:
+            return
+        if self._expects_frames and (frames is None or len(frames) < 3):
+            return
+        video = self._following()
+        row, first_frame = video.settle(self._expects_frames)
+        if row > tail.dropped:
+            tail.drop(row)
+        if frames is not None and isinstance(frames.images, TailImages):
+            if first_frame > frames.images.dropped:
+                images = frames.images.dropping(first_frame)
+                self._recording = dataclasses.replace(
+                    self._recording, frames=dataclasses.replace(frames, images=images)
+                )
+                self._grown = True
