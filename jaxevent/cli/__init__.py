@@ -29,7 +29,7 @@ from jaxevent.cli import (
     track,
 )
 from jaxevent.cli.arguments import guarded
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, require
 
 # In the order of `jaxevent --help`.
 COMMANDS = (
@@ -157,6 +157,18 @@ def _silence(stream: Any) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
+class _PrintCompletion(argparse.Action):
+    """Print what shtab makes of the parser, and exit."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option: Any = None) -> None:
+        try:
+            shtab = require("shtab", "completion")
+        except InputError as error:
+            parser.error(str(error))
+        print(shtab.complete(parser, values))
+        parser.exit()
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="jaxevent",
@@ -165,6 +177,13 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"jaxevent {jaxevent.__version__}")
+    parser.add_argument(
+        "--print-completion",
+        action=_PrintCompletion,
+        default=argparse.SUPPRESS,
+        choices=["bash", "zsh", "tcsh"],
+        help="print a script that completes words in a shell, for its folder of completions",
+    )
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     for module in COMMANDS:
         module.add(commands)

@@ -76,7 +76,7 @@ from jaxevent.show.report import write_parquet
 
 # Part of the keys of stored results: raised whenever the same recording, method and parameters give
 # other results than before.
-RESULTS_VERSION = 3
+RESULTS_VERSION = 4
 FILES = ("report.html", "results.json", "results.md", "results.parquet", "config.toml")
 
 _opened = Opened()

@@ -255,6 +255,16 @@ class Sample:
     image: NDArray[np.floating]
     truth: NDArray[np.floating]
     hdr: bool
+    deviation: NDArray[np.floating] | None = None  # of log intensity, where it is told
+    given: NDArray[np.floating] | None = None  # the last frame before
+
+
+def _frame_before(given: Recording, t: int) -> NDArray[np.float32] | None:
+    """The last frame up to a time (us, as stamped), of those that a method is given."""
+    if given.frames is None:
+        return None
+    row = int(np.searchsorted(given.frames.t, t, "right")) - 1
+    return given.frames[row : row + 1].intensity[0] if row >= 0 else None
 
 
 def score(
@@ -423,7 +433,10 @@ def score_and_sample(
                 scores.append(_hdr_measures(image, P, truth, names, hdr.clip, I0))
             t.append(int(hidden.t[row]))
             if row == len(hidden) // 2:
-                sample = Sample(t[-1], image, truth, hdr is not None)
+                sample = Sample(
+                    t[-1], image, truth, hdr is not None,
+                    None if P is None else np.sqrt(P), _frame_before(given, t[-1]),
+                )  # fmt: skip
         clock = time.perf_counter()
     external = isinstance(method, External)
     per_frame = {"t": t, **_listed(scores)}

@@ -2,14 +2,14 @@
 
 import base64
 import datetime
-import html
 import importlib.util
 import io
 import math
 import os
 import platform
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePath
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,32 +19,51 @@ from jaxevent.errors import install_command
 from jaxevent.metrics import LOG_OFFSET
 from jaxevent.show.report import Column, columns_of, display_limits, find, number, tone_map
 
-SIDE = 200  # pixels of the longer side of a picture
+SIDE = 360  # pixels of the longer side of a picture
 STRIPS = 12  # recordings with pictures and plots over time; more would make the page slow to open
 POINTS = 300  # of a curve over time, means of so many parts of it
+UNCERTAIN = 0.1  # a standard deviation of log intensity that is shown as bright as can be
 # Errors shown in full colour: of intensity, and of ln(I + 0.003) against an HDR reference.
-FULL = {False: 0.25, True: 2.0}
+FULL = {False: 0.1, True: 1.0}
 HIGHER = {"ssim", "log_ssim", "global_ssim", "hdr_quality", "covered"}  # of these more is better
 
-STYLE = """
-:root { color-scheme: light; }
-body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 76rem;
-       padding: 0 1rem; color: #1d2329; background: #fff; }
-h1 { font-size: 1.5rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; }
-h3 { font-size: 1rem; margin: 1.2rem 0 .4rem; } .meta, figcaption, .note { color: #5a6570; }
-.note { font-size: .9rem; margin: .3rem 0; } .scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .9rem; }
-th, td { padding: .25rem .7rem; text-align: right; border-bottom: 1px solid #e3e7eb;
-         white-space: nowrap; }
-th { border-bottom: 2px solid #b9c2ca; } th.left, td.left { text-align: left; }
-td.wrap { white-space: normal; text-align: left; } td.best { font-weight: 650; }
-.failed { border-left: 4px solid #c0392b; padding: .1rem 1rem; background: #fdf3f1; }
-.strip { display: flex; gap: .6rem; overflow-x: auto; padding-bottom: .4rem; }
-figure { margin: 0; flex: none; } figcaption { font-size: .8rem; max-width: 14rem; }
-figure img { display: block; margin-bottom: 2px; }
-img.plot { max-width: 100%; } details { margin: .5rem 0; } summary { cursor: pointer; }
-pre { background: #f5f7f8; padding: .8rem; overflow-x: auto; font-size: .85rem; }
-"""
+MEANINGS = {
+    "MSE x 1e-2": "mean square error of intensity, times 100; 0 is best",
+    "SSIM": "structural similarity; 1 is best",
+    "log MSE": "mean square error of ln(I + 0.003); 0 is best",
+    "log SSIM": "structural similarity of log images; 1 is best",
+    "bright MSE": "where the frames are saturated",
+    "dark log MSE": "where the frames are black",
+    "well MSE x 1e-2": "where the frames are well exposed",
+    "moving MSE x 1e-2": "where something moves",
+    "moving share": "the share of pixels where something moves",
+    "LPIPS": "perceptual distance; 0 is best",
+    "JOD": "quality by ColorVideoVDP; 10 is best",
+    "frames": "images that were compared",
+    "missing": "images without an estimate",
+    "AEE %": "mean error of the image velocity, of its size",
+    "AAE deg": "mean angle between image velocities",
+    "heading deg": "mean angle between headings",
+    "Omega %": "mean error of the angular velocity, of its size",
+    "AME %": "mean error of the speed, of its size",
+    "lost": "share of time without an estimate",
+    "start-up s": "time until the first estimate",
+    "RMSE px": "root mean square distance of positions",
+    "covered": "share of time at which the truth is tracked",
+    "seconds": "of computing",
+}
+
+
+class Cell(NamedTuple):
+    """A cell of a table: its text, a class of style, how many columns it takes, a hint."""
+
+    text: str
+    kind: str = ""
+    span: int = 0
+    title: str = ""
+
+
+Table = tuple[list[str], list[list[Cell]], int]  # titles, lines, how many columns are text
 
 
 def page(
@@ -65,38 +84,61 @@ def page(
         hosts: The names of the machines that computed it.
         title: Of the page.
     """
+    import jinja2
+
     recordings = list(dict.fromkeys(row["recording"] for row in rows))
     methods = list(dict.fromkeys(row["method"] for row in rows))
     done = [row for row in rows if "error" not in row]
-    columns = columns_of(done)
+    columns, names = columns_of(done), _names(recordings)
     hdr = any("log_mse" in row for row in done)
     now = datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
-    about = f"{len(recordings)} recordings, {len(methods)} methods, protocol {protocol}, {now}"
-    parts = [f"<h1>{_text(title)}</h1>", f'<p class="meta">{_text(about)}</p>']
-    parts += _failures(rows)
-    parts += ["<h2>Means over recordings</h2>", _means(done, methods, columns)]
+    counts = [len([row for row in done if row["method"] == method]) for method in methods]
+    values: dict[str, Any] = {
+        "title": title,
+        "about": f"{len(recordings)} recordings, {len(methods)} methods, protocol {protocol}, "
+        f"{now}",
+        "meaning": MEANINGS,
+        "failures": _failures(rows),
+        "means": _means(done, methods, columns),
+        "unequal": len(set(counts)) > 1,
+        "strips": _strips(rows, pictures, recordings, names),
+        "full": f"{FULL[hdr]:g}",
+        "unit": "ln(I + 0.003)" if hdr else "intensity",
+        "uncertain": UNCERTAIN,
+        "everything": _table(rows, columns, names),
+        "parameters": _parameters(rows, methods),
+        "computed": _computed(hosts),
+        "config": config,
+    }
+    if len(recordings) > STRIPS:
+        values["first_only"] = f"Of {len(recordings)} recordings the first {STRIPS} are shown."
     if importlib.util.find_spec("matplotlib") is None:
-        parts.append(f'<p class="note">Plots need <code>{install_command("plot")}</code>.</p>')
+        values["missing_plots"] = install_command("plot")
     else:
         means, over_time = _plotted(done)
-        parts.append(_points(done, methods, means))
-        parts += ["<h2>Errors over time</h2>", *_curves(done, recordings, methods, over_time)]
-    if any(one is not None for one in pictures):
-        parts += ["<h2>Pictures</h2>", *_strips(rows, pictures, recordings, hdr)]
-    parts += ["<h2>Every recording and method</h2>", _table(rows, columns)]
-    parts += ["<h2>Parameters</h2>", _parameters(rows, methods)]
-    parts += ["<h2>How it was computed</h2>", _computed(hosts)]
-    parts.append(f"<details><summary>configuration</summary><pre>{_text(config)}</pre></details>")
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{_text(title)}'
-        f"</title><style>{STYLE}</style></head>\n<body>\n" + "\n".join(parts) + "\n</body></html>\n"
-    )
+        values["points"] = _points(done, methods, means)
+        values["curves"] = _curves(done, recordings, methods, over_time, names)
+    templates = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True,
+        undefined=jinja2.ChainableUndefined, keep_trailing_newline=True,
+    )  # fmt: skip
+    return templates.get_template("page.html").render(values)
+
+
+def _names(recordings: Sequence[str]) -> dict[str, str]:
+    """What recordings are called: the file's name, the path where several have that."""
+    short = [PurePath(one).name for one in recordings]
+    return {
+        one: name if short.count(name) == 1 else one
+        for one, name in zip(recordings, short, strict=True)
+    }
 
 
 def picture(sample: Any) -> dict[str, Any]:
-    """An image, its error and the truth as base64 of small PNG, from an `evaluate.Sample`.
+    """An image, its error, the truth and more as base64 of PNG, from an `evaluate.Sample`.
 
-    With an HDR reference all are logarithmic, between the truth's limits.
+    With an HDR reference all are logarithmic, between the truth's limits; else they are linear, and
+    dark ones are brightened alike.
     """
     image, truth = (np.asarray(a, np.float64) for a in (sample.image, sample.truth))
     known = np.isfinite(truth) & np.isfinite(image)
@@ -106,15 +148,22 @@ def picture(sample: Any) -> dict[str, Any]:
         low = np.log(np.maximum(truth, 0) + LOG_OFFSET)
         error = np.log(np.maximum(image, 0) + LOG_OFFSET) - low
     else:
-        tone, limits = "linear", (0.0, 1.0)
+        bright = float(np.percentile(truth, 99.5))
+        tone, limits = "linear", (0.0, bright if 0 < bright < 0.8 else 1.0)
         error = image.clip(0, 1) - truth
     error = np.where(known, error / FULL[sample.hdr], 0).clip(-1, 1)
-    return {
+    shown = {
         "t": sample.t,
         "image": _grey(tone_map(image, tone, limits)),
         "truth": _grey(tone_map(truth, tone, limits)),
         "error": _diverging(error),
     }
+    if sample.deviation is not None:
+        share = np.nan_to_num(np.asarray(sample.deviation, np.float64) / UNCERTAIN, nan=1.0)
+        shown["deviation"] = _grey(np.rint(255 * share.clip(0, 1)).astype(np.uint8))
+    if sample.given is not None:
+        shown["given"] = _grey(tone_map(np.asarray(sample.given, np.float64), tone, limits))
+    return shown
 
 
 def _size(shape: tuple[int, ...]) -> tuple[int, int]:
@@ -153,35 +202,17 @@ def _png(image: Any) -> str:
     return base64.b64encode(held.getvalue()).decode()
 
 
-def _text(text: str) -> str:
-    return html.escape(str(text))
-
-
-def _failures(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def _failures(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str]]]:
     parts = []
     for how in ("failed", "skipped"):
         lines = [
-            f"<li>{_text(row['recording'])}, {_text(row['method'])}: {_text(row['error'])}</li>"
+            f"{row['recording']}, {row['method']}: {row['error']}"
             for row in rows
             if "error" in row and ("skipped" in row) == (how == "skipped")
         ]
         if lines:
-            title = f"{len(lines)} of {len(rows)} {how}"
-            parts.append(f'<div class="failed"><h2>{title}</h2><ul>{"".join(lines)}</ul></div>')
+            parts.append((f"{len(lines)} of {len(rows)} {how}", lines))
     return parts
-
-
-def _html_table(head: Iterable[str], lines: Iterable[Iterable[str]], left: int) -> str:
-    """A table of cells, already HTML, of which the first `left` columns are text."""
-    titles = "".join(
-        f'<th class="left">{cell}</th>' if i < left else f"<th>{cell}</th>"
-        for i, cell in enumerate(head)
-    )
-    body = "".join(f"<tr>{''.join(cells)}</tr>" for cells in lines)
-    return (
-        f'<div class="scroll"><table><thead><tr>{titles}</tr></thead>'
-        f"<tbody>{body}</tbody></table></div>"
-    )
 
 
 def _mean(rows: Sequence[Mapping[str, Any]], place: str) -> float | None:
@@ -193,7 +224,7 @@ def _mean(rows: Sequence[Mapping[str, Any]], place: str) -> float | None:
 
 def _means(
     rows: Sequence[Mapping[str, Any]], methods: Sequence[str], columns: Sequence[Column]
-) -> str:
+) -> Table:
     measures = [column for column in columns if column[1] not in ("frames", "missing")]
     mine = {method: [row for row in rows if row["method"] == method] for method in methods}
     means = {
@@ -201,50 +232,43 @@ def _means(
     }
     lines = []
     for i, method in enumerate(methods):
-        cells = [f'<td class="left">{_text(method)}</td>', f"<td>{len(mine[method])}</td>"]
+        cells = [Cell(method, "left"), Cell(str(len(mine[method])))]
         for _, place, factor, digits in measures:
             value = means[place][i]
             others = [one for one in means[place] if one is not None]
             best = others and value == (max if place in HIGHER else min)(others)
             marked = best and len(others) > 1 and place != "seconds"
             cell = number({"mean": value}, "mean", factor, digits)
-            cells.append(f'<td class="best">{cell}</td>' if marked else f"<td>{cell}</td>")
+            cells.append(Cell(cell, "best" if marked else ""))
         lines.append(cells)
-    head = ["method", "recordings", *(_text(title) for title, _, _, _ in measures)]
-    table = _html_table(head, lines, 1)
-    if len({len(some) for some in mine.values()}) > 1:
-        table += (
-            '<p class="note">Methods that failed on some recordings have means over the others, '
-            "which do not compare.</p>"
-        )
-    return table
+    return ["method", "recordings", *(title for title, _, _, _ in measures)], lines, 1
 
 
-def _table(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> str:
+def _table(
+    rows: Sequence[Mapping[str, Any]], columns: Sequence[Column], names: Mapping[str, str]
+) -> Table:
     lines = []
     for row in rows:
-        cells = [f'<td class="left">{_text(row[name])}</td>' for name in ("recording", "method")]
+        path = row["recording"]
+        cells = [Cell(names[path], "left", title=path), Cell(row["method"], "left")]
         if "error" in row:
-            cells.append(f'<td class="wrap" colspan="{len(columns)}">{_text(row["error"])}</td>')
+            cells.append(Cell(row["error"], "wrap", len(columns)))
         else:
-            cells += [f"<td>{number(row, *column[1:])}</td>" for column in columns]
+            cells += [Cell(number(row, *column[1:])) for column in columns]
         lines.append(cells)
-    head = ["recording", "method", *(_text(title) for title, _, _, _ in columns)]
-    return _html_table(head, lines, 2)
+    return ["recording", "method", *(title for title, _, _, _ in columns)], lines, 2
 
 
-def _parameters(rows: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> str:
+def _parameters(rows: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> Table:
     lines = []
     for method in methods:
         row = next(row for row in rows if row["method"] == method)
         values = ", ".join(f"{k} = {v}" for k, v in row["params"].items() if v is not None)
-        lines.append(
-            [f'<td class="left">{_text(method)}</td>', f'<td class="wrap">{_text(values)}</td>']
-        )
-    return _html_table(["method", "values"], lines, 2)
+        lines.append([Cell(method, "left"), Cell(values, "wrap")])
+    return ["method", "values"], lines, 2
 
 
-def _computed(hosts: Sequence[str]) -> str:
+def _computed(hosts: Sequence[str]) -> Table:
     import jax
 
     facts = {
@@ -257,31 +281,17 @@ def _computed(hosts: Sequence[str]) -> str:
         "devices": ", ".join(dict.fromkeys(str(device.device_kind) for device in jax.devices())),
         "machines": ", ".join(hosts),
     }
-    lines = [
-        [f'<td class="left">{_text(k)}</td>', f'<td class="wrap">{_text(v)}</td>']
-        for k, v in facts.items()
-    ]
-    return _html_table(["", ""], lines, 2)
+    return ["", ""], [[Cell(k, "left"), Cell(v, "wrap")] for k, v in facts.items()], 2
 
 
 def _strips(
     rows: Sequence[Mapping[str, Any]],
     pictures: Sequence[Mapping[str, Any] | None],
     recordings: Sequence[str],
-    hdr: bool,
-) -> list[str]:
-    what = "ln(I + 0.003), log" if hdr else "intensity"
-    parts = [
-        '<p class="note">The image in the middle of those asked for, and below it its error: red '
-        f"too bright, blue too dark, in full colour from {FULL[hdr]:g} in {what.split(',')[0]}.</p>"
-    ]
-
-    def figure(top: str, below: str | None, label: str) -> str:
-        images = "".join(
-            f'<img alt="" src="data:image/png;base64,{one}">' for one in (top, below) if one
-        )
-        return f"<figure>{images}<figcaption>{_text(label)}</figcaption></figure>"
-
+    names: Mapping[str, str],
+) -> list[dict[str, Any]]:
+    """Of each recording the truth, the frame before, and every method's pictures."""
+    strips = []
     for recording in recordings[:STRIPS]:
         shown = [
             (row["method"], one)
@@ -290,18 +300,18 @@ def _strips(
         ]
         if not shown:
             continue
-        at = shown[0][1]["t"] / 1e6
-        parts.append(f"<h3>{_text(recording)} at {at:.3f} s</h3>")
-        figures = [figure(shown[0][1]["truth"], None, "truth")]
-        figures += [figure(one["image"], one["error"], method) for method, one in shown]
-        parts.append(f'<div class="strip">{"".join(figures)}</div>')
-    return [*parts, *_more(recordings)]
-
-
-def _more(recordings: Sequence[str]) -> list[str]:
-    if len(recordings) <= STRIPS:
-        return []
-    return [f'<p class="note">Of {len(recordings)} recordings the first {STRIPS} are shown.</p>']
+        first = shown[0][1]
+        figures = [{"label": "truth", "images": [{"what": "image", "data": first["truth"]}]}]
+        if "given" in first:
+            before = [{"what": "image", "data": first["given"]}]
+            figures.append({"label": "last frame given", "images": before})
+        for method, one in shown:
+            kinds = [("image", "image"), ("error", "error"), ("deviation", "uncertainty")]
+            images = [{"what": what, "data": one[kind]} for kind, what in kinds if kind in one]
+            figures.append({"label": method, "images": images})
+        title = f"{names[recording]} at {first['t'] / 1e6:.3f} s"
+        strips.append({"title": title, "figures": figures})
+    return strips
 
 
 NAMES = {
@@ -344,6 +354,7 @@ def _points(
         axis.scatter(places, range(len(methods)), c=colours, zorder=2)
         if measure not in HIGHER and all(place > 0 for place in places if place == place):
             axis.set_xscale("log")
+            _label_plainly(axis.xaxis)
         axis.set(xlabel=NAMES[measure], yticks=range(len(methods)), yticklabels=methods)
         axis.invert_yaxis()
         axis.tick_params(labelleft=measure == measures[0], left=False)
@@ -356,8 +367,9 @@ def _curves(
     recordings: Sequence[str],
     methods: Sequence[str],
     measure: str,
-) -> list[str]:
-    """A plot for each recording of the error of every method at every image."""
+    names: Mapping[str, str],
+) -> list[tuple[str, str]]:
+    """The name of each recording and a plot of the error of every method at every image."""
     from matplotlib.figure import Figure
 
     parts = []
@@ -395,10 +407,20 @@ def _curves(
         axis.set(xlabel="time (s)", ylabel=NAMES[measure])
         if all(np.nanmin(np.asarray(line.get_ydata())) > 0 for line in axis.lines):
             axis.set_yscale("log")
+            _label_plainly(axis.yaxis)
         axis.spines[["top", "right"]].set_visible(False)
         axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8)
-        parts += [f"<h3>{_text(recording)}</h3>", _plot(figure)]
-    return [*parts, *_more(recordings)]
+        parts.append((names[recording], _plot(figure)))
+    return parts
+
+
+def _label_plainly(axis: Any) -> None:
+    """Ticks of a logarithmic axis at 1, 2 and 5 of each decade, as plain numbers."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=12))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _colour(place: int) -> str:
@@ -410,6 +432,5 @@ def _plot(figure: Any) -> str:
 
     held = io.BytesIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "jaxevent"}):
-        figure.savefig(held, format="svg", metadata={"Date": None})
-    data = base64.b64encode(held.getvalue()).decode()
-    return f'<img class="plot" alt="" src="data:image/svg+xml;base64,{data}">'
+        figure.savefig(held, format="svg", metadata={"Date": None}, transparent=True)
+    return base64.b64encode(held.getvalue()).decode()

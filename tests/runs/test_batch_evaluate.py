@@ -242,9 +242,9 @@ def test_the_page_holds_everything_itself(tmp_path, monkeypatch):
     text = (tmp_path / "out" / "report.html").read_text()
     page = Page(text)
     kinds = Counter(link.partition(",")[0] for link in page.links)
-    # The truth, and each method's image and error; means, and errors over time.
-    assert kinds == {"data:image/png;base64": 5, "data:image/svg+xml;base64": 2}
-    assert "url(" not in text and "@import" not in text and "<script" not in text
+    # The truth, the frame before, each method's image and error; means, and errors over time.
+    assert kinds == {"data:image/png;base64": 6, "data:image/svg+xml;base64": 2}
+    assert "url(" not in text and "@import" not in text and "<script src" not in text
     for row in rows:
         at = page.cells.index("small.h5", page.cells.index("small.h5") + 1)
         assert f"{100 * row['mse']:.3f}" in page.cells and f"{row['ssim']:.3f}" in page.cells[at:]
@@ -254,7 +254,8 @@ def test_the_page_holds_everything_itself(tmp_path, monkeypatch):
         if "png" in kind:
             with Image.open(io.BytesIO(base64.b64decode(data))) as image:
                 pictures.append(np.asarray(image.convert("RGB"), np.int64))
-    truth, blend, error, last, _ = pictures
+    truth, before, blend, error, last, _ = pictures
+    np.testing.assert_array_equal(before, last)
     middle = np.asarray(small().frames.images)[3]  # the second of three hidden ones
     np.testing.assert_array_equal(truth, np.repeat(middle[..., None], 3, axis=2))
     np.testing.assert_array_equal(last[..., 0], np.asarray(small().frames.images)[2])

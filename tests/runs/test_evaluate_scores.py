@@ -1,11 +1,14 @@
 """Evaluations of motion and tracks: rows against what the estimators give, keys, bad settings."""
 
+import base64
+import io
 import json
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from PIL import Image
 
 import jaxevent
 from jaxevent import blob, egomotion
@@ -13,7 +16,8 @@ from jaxevent.egomotion.truth import endpoint_error, read_motion
 from jaxevent.errors import InputError
 from jaxevent.runs import evaluate
 from jaxevent.runs.blob_positions import read_positions
-from jaxevent.show.page import page
+from jaxevent.runs.scores import Sample
+from jaxevent.show.page import _names, page, picture
 from jaxevent.show.report import markdown_table
 from jaxevent.simulate import blob_scene, motion_scene
 
@@ -139,3 +143,26 @@ def test_tracks(folder):
 def test_bad_settings(text, named, folder):
     with pytest.raises(InputError, match=named.replace(".", r"\.")):
         evaluate.evaluate(configured(folder, "bad", text))
+
+
+def test_recordings_are_called_by_name_where_that_tells_them_apart():
+    paths = ["a/one.h5", "b/one.h5", "b/two.h5"]
+    assert _names(paths) == {"a/one.h5": "a/one.h5", "b/one.h5": "b/one.h5", "b/two.h5": "two.h5"}
+
+
+def test_a_picture_shows_the_frame_before_and_the_uncertainty():
+    truth = np.full((4, 6), 0.2)
+    truth[0, 0] = 0.4
+    deviation = np.full((4, 6), 0.05)
+    deviation[1, 2] = 7.0
+    sample = Sample(5, truth, truth, False, deviation, truth / 2)
+    shown = {
+        name: np.asarray(Image.open(io.BytesIO(base64.b64decode(png))).convert("L"))
+        for name, png in picture(sample).items()
+        if name != "t"
+    }
+    # White is the truth's brightest 0.5 %, for all alike; an uncertainty of 0.1 is white.
+    assert shown["truth"][0, 0] == 255 and 120 < shown["truth"][2, 2] < 140
+    np.testing.assert_array_equal(shown["image"], shown["truth"])
+    assert abs(int(shown["given"][2, 2]) - shown["truth"][2, 2] / 2) <= 1
+    assert shown["deviation"][1, 2] == 255 and shown["deviation"][0, 0] in (127, 128)
