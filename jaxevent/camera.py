@@ -53,7 +53,7 @@ class PinholeCamera:
             good = np.abs(bent - seen).max(-1) < 1e-9
             good &= (np.linalg.det(jacobian) > 0) & (np.hypot(*straight.T) < 20)
             straight[~good] = np.nan
-        return straight[which.reshape(-1)]
+        return np.asarray(straight[which.reshape(-1)], np.float64)
 
 
 def _solved(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:

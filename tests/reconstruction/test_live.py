@@ -1,6 +1,7 @@
 """A live video is at every moment that of what has been added so far."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,10 +17,10 @@ EVENTS = 128  # of a window
 
 def longer() -> Recording:
     """`small` four times over: 1600 events and 24 frames of 3 ms."""
-    once = small()
+    once: Any = small()
     shift = 55_000 * np.arange(4)[:, None]
-    events = Events(*(np.tile(getattr(once.events, name), 4) for name in "txyp"))
-    events = dataclasses.replace(events, t=(once.events.t + shift).ravel())
+    t, x, y, p = (np.tile(getattr(once.events, name), 4) for name in "txyp")
+    events = Events(t + np.repeat(shift, len(once.events)), x, y, p)
     images = np.tile(once.frames.images, (4, 1, 1))
     frames = Frames((once.frames.t + shift).ravel(), images, np.full(24, 3000))
     return dataclasses.replace(once, events=events, frames=frames)
