@@ -27,7 +27,8 @@ class PinholeCamera:
     def distort(self, at: NDArray[np.floating]) -> NDArray[np.float64]:
         """Where the camera sees normalised coordinates X / Z, Y / Z (n, 2), in px (n, 2)."""
         bent, _ = _distorted(np.asarray(at, np.float64), self.distortion)
-        return bent * (self.fx, self.fy) + (self.cx, self.cy)
+        scale, centre = np.array([self.fx, self.fy]), np.array([self.cx, self.cy])
+        return bent * scale + centre
 
     def normalise(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
         """Normalised coordinates X / Z, Y / Z (n, 2) of what is seen at places x, y (n,) in px.
@@ -57,7 +58,7 @@ class PinholeCamera:
 
 
 def _solved(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.linalg.solve(matrix, right[..., None])[..., 0]
+    return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0], np.float64)
 
 
 def _distorted(

@@ -289,7 +289,7 @@ def test_missing_extras_are_named(module, extra, needs, does_without, folder, ca
         fails(
             capsys,
             ["track", folder / "two.h5", "--out", folder / name],
-            f"jaxevent[{extra}]",
+            f"[{extra}]",
         )
         assert not (folder / name).exists()
     argv = ["track", folder / "two.h5", *METHOD, "--params", folder / "mine.toml", *seeded()]

@@ -197,7 +197,7 @@ def test_without_opencv_its_rows_are_skipped(folder, capsys, monkeypatch):
     # With nothing else to score it is an error.
     config = folder / "alone.toml"
     config.write_text('recordings = ["small.h5"]\n[[method]]\nname = "flow"\n')
-    fails(capsys, ["evaluate", config], "jaxevent[vision]")
+    fails(capsys, ["evaluate", config], install_command("vision"))
 
 
 def test_a_skipped_row_is_computed_once_the_extra_is_there(cv2, folder, monkeypatch):

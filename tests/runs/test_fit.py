@@ -857,7 +857,7 @@ def test_bad_ways_to_fit(folder, capsys, monkeypatch):
         cli.main(["fit", str(config)])
     capsys.readouterr()
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    fails(capsys, ["fit", config, "--out", folder / "out"], "jaxevent[plot]")
+    fails(capsys, ["fit", config, "--out", folder / "out"], "[plot]")
     assert sorted(folder.rglob("*")) == before
 
 
