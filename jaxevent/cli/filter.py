@@ -18,7 +18,7 @@ def add(commands: Any) -> None:
         "street.raw small.h5 --downsample 2 --refractory 1000 --polarity on",
     )
     one.add_argument("source", metavar="SRC", type=Path, help="a recording")
-    one.add_argument("target", metavar="DST", type=Path, help="the HDF5 file to write")
+    arguments.add_output(one, "target", metavar="DST", help="the HDF5 file to write")
     arguments.add_size(one)
     arguments.add_stream(one)
     steps = one.add_argument_group("steps")
