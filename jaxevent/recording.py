@@ -25,18 +25,19 @@ Times = ArrayLike | int | float
 def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
     """Times as int64 microseconds: integers are taken as microseconds, floats as seconds.
 
-    Raises `InputError` for other types and for times that are not finite.
+    Raises `InputError` for other types and for times that are not finite or too large for int64.
     """
     time = np.asarray(time)
-    if time.dtype.kind in "iu":
-        return time.astype(np.int64)
-    if time.dtype.kind != "f":
+    if time.dtype.kind not in "iuf":
         raise InputError(
             f"{what} are {time.dtype}; give integers (microseconds) or floats (seconds)"
         )
     if not np.all(np.isfinite(time)):
         raise InputError(f"{what} contain a value that is not finite; remove it")
-    return np.asarray(np.rint(time.astype(np.float64) * 1e6), np.int64)
+    scaled = np.rint(time.astype(np.float64) * 1e6) if time.dtype.kind == "f" else time
+    if time.size and not -(2**63) <= scaled.min() <= scaled.max() < 2**63:
+        raise InputError(f"{what} contain one that is too large for microseconds; correct the unit")
+    return np.asarray(scaled).astype(np.int64)
 
 
 def check_times(times: Times, start: int, stop: int, name: str) -> None:

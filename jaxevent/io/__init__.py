@@ -25,6 +25,10 @@ from jaxevent.recording import Events, Frames, Recording
 __all__ = ["load", "save"]
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+_SMALL = 1 << 27  # bytes of arrays that every file may unfold to
+_MOST_COMPRESSED = 100  # times that a larger one may unfold to of its own bytes
+_MOST_PIXELS = 1 << 16  # of a side: coordinates are uint16
+_MOST_TIME = 1 << 62  # us, 146,000 years: sums and differences of two times stay in int64
 
 READABLE = (
     "readable are a folder or zip with events.txt (Event-Camera Dataset), AEDAT 2 and 4, "
@@ -60,8 +64,11 @@ def load(
             valid recording; the message names the place and the remedy.
     """
     path = Path(path)
-    if size is not None and min(size) < 1:
-        raise InputError(f"size = {size} must be two positive numbers of pixels, (width, height)")
+    if size is not None and not 1 <= min(size) <= max(size) <= _MOST_PIXELS:
+        raise InputError(
+            f"size = {size} must be two positive numbers of pixels, (width, height), of at most "
+            f"{_MOST_PIXELS}"
+        )
     return _reader(path, in_memory, progress, stream)(path, size).check(str(path))
 
 
@@ -94,9 +101,11 @@ def _reader(
     path: Path, in_memory: bool, progress: bool | None, stream: str | None
 ) -> Callable[[Path, tuple[int, int] | None], Recording]:
     with reading(str(path)):
-        is_folder, exists = path.is_dir(), path.exists()
-    if not is_folder and not exists:
+        is_folder, exists, is_file = path.is_dir(), path.exists(), path.is_file()
+    if not exists:
         raise InputError(f"{path}: there is no such file or folder; correct the path")
+    if not is_folder and not is_file:
+        raise InputError(f"{path}: is a device or pipe; copy what it holds into a file")
     with reading(str(path)):
         head = b"" if is_folder else _head(path)
     if head.startswith((b"#!AER-DAT4", b"#ROSBAG")):
@@ -171,6 +180,8 @@ def _zip_reader(
 ) -> Callable[[Path, tuple[int, int] | None], Recording]:
     with reading(str(path)), zipfile.ZipFile(path) as archive:
         names = archive.namelist()
+        unfolded = sum(member.file_size for member in archive.infolist())
+        check_unfolded(unfolded, path.stat().st_size, str(path))
     if any(name.rpartition("/")[2] == "events.txt" for name in names):
         from jaxevent.io import text
 
@@ -247,6 +258,19 @@ def reading(source: str) -> Iterator[None]:
         ) from error
 
 
+def check_unfolded(size: int, stored: int, source: str) -> None:
+    """Raise `InputError` where `stored` bytes of a file claim to hold far more, `size`.
+
+    Memory stays bounded by what a file holds: real events and images compress less than 20 times.
+    """
+    if size > max(_SMALL, _MOST_COMPRESSED * stored):
+        raise InputError(
+            f"{source}: {stored:,} bytes of the file claim to hold {size:,}, over "
+            f"{_MOST_COMPRESSED} times as many; it is damaged or not a recording, else store it "
+            "with less compression"
+        )
+
+
 def times(
     values: NDArray, source: str, what: str, scale: float = 1e6, first_row: int = 0
 ) -> NDArray[np.int64]:
@@ -255,24 +279,20 @@ def times(
     `first_row` is the row of the first one in `source`.
     """
     values = _numbers(values, source, f"{what} times")
-    if values.dtype.kind != "f":
-        if values.dtype == np.uint64 and len(values) and values.max() > np.iinfo(np.int64).max:
-            row = int(np.argmax(values > np.iinfo(np.int64).max))
-            raise InputError(
-                f"{source}: {what} {first_row + row} has the time {values[row]}, too large for "
-                "microseconds; correct the unit or remove it"
-            )
-        return values.astype(np.int64, copy=False)
-    # int64 ends at 9.2e18; NaN and infinity fail this comparison too.
-    good = np.abs(values) < 9e18 / scale
-    if not good.all():
-        row = int(np.argmin(good))
+    is_float = values.dtype.kind == "f"
+    values = values.astype(np.float64, copy=False) if is_float else values
+    # NaN and infinity fail this comparison too.
+    most = _MOST_TIME / scale if is_float else _MOST_TIME
+    if len(values) and not -most < values.min() <= values.max() < most:
+        row = int(np.argmin((values > -most) & (values < most)))
+        unit = "seconds" if is_float and scale == 1e6 else "microseconds"
         raise InputError(
             f"{source}: {what} {first_row + row} has the time {values[row]:.16g}, not finite "
-            f"or too large for {'seconds' if scale == 1e6 else 'microseconds'}; correct the unit "
-            "or remove it"
+            f"or too large for {unit}; correct the unit or remove it"
         )
-    return np.rint(values.astype(np.float64, copy=False) * scale).astype(np.int64)
+    if not is_float:
+        return values.astype(np.int64, copy=False)
+    return np.rint(values * scale).astype(np.int64)
 
 
 def checked_events(
@@ -291,6 +311,11 @@ def checked_events(
     `t` is int64 us. Coordinates count from `origin`. Polarity is bool, 0/1 or -1/1. `first_row` is
     the row of the first event in `source`. Raises `InputError` for the first bad event.
     """
+    if max(size) > _MOST_PIXELS:
+        raise InputError(
+            f"{source}: the sensor has {size[0]}x{size[1]} pixels, but at most {_MOST_PIXELS} of a "
+            "side can be read; correct its size with size=(width, height) or --size"
+        )
     if not len(t) == len(x) == len(y) == len(p):
         raise InputError(
             f"{source}: t, x, y and p have {len(t)}, {len(x)}, {len(y)} and {len(p)} values; "
@@ -322,7 +347,7 @@ def checked_events(
 
 
 def _polarity(p: NDArray, source: str, first_row: int) -> NDArray[np.bool_]:
-    if p.dtype.kind == "b":
+    if p.dtype.kind == "b" and p.ndim == 1:
         return p
     p = _numbers(p, source, "p")
     if p.dtype == np.uint8 and (not len(p) or p.max() <= 1):
@@ -351,6 +376,15 @@ def pinhole(values: NDArray, source: str) -> PinholeCamera:
         )
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(value) for value in values)
     return PinholeCamera(fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+
+
+def whole_number(value: Any, source: str, what: str) -> int:
+    """One number of a file as an int, or `InputError` unless it is a whole one below 2^62."""
+    value = np.asarray(value)
+    number = value.item() if value.size == 1 and value.dtype.kind in "iuf" else None
+    if number is None or not -_MOST_TIME < number < _MOST_TIME or number != int(number):
+        raise InputError(f"{source}: {what} must be one whole number, not {np.ravel(value)[:3]}; correct it")
+    return int(number)
 
 
 def sensor_size(

@@ -29,11 +29,13 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, require
 from jaxevent.io import reading
+from jaxevent.io import times as microseconds
 from jaxevent.io.decoded import BLOCK, Columns, DecodedImages, decoded
 from jaxevent.recording import Frames, Imu, Recording
 
 MAGIC = b"#!AER-DAT4.0"
 _STANDARD_GRAVITY = 9.80665  # m/s^2
+_COMPRESSED = (b"\x04\x22\x4d\x18", b"\x28\xb5\x2f\xfd")  # the first bytes of LZ4 and Zstandard
 
 
 def read(
@@ -165,7 +167,7 @@ def _others(
                 samples.append(packet["imus"])
     frames = imu = None
     if shape is not None:
-        exposure = np.array(exposures, np.int64)
+        t, exposure = (_signed(values, path) for values in (times, exposures))
         if in_memory:
             stored: Any = np.stack(images)
         else:
@@ -175,7 +177,7 @@ def _others(
                 shape[1],
                 str(path),
             )
-        frames = Frames(np.array(times, np.int64), stored, exposure)
+        frames = Frames(t, stored, exposure)
     if samples:
         rows = np.concatenate(samples)
         gyro, acc = (
@@ -188,6 +190,11 @@ def _others(
         imu = Imu(t, np.deg2rad(gyro), acc * _STANDARD_GRAVITY)
     rgb = np.stack(colours) if colours and len(colours) == len(times) else None
     return frames, rgb, imu
+
+
+def _signed(values: list[int], path: Path) -> NDArray[np.int64]:
+    """Times and spans of frames, which the decoder may give as unsigned numbers."""
+    return microseconds(np.array(values), f"{path}: a frame", "frame")
 
 
 def _images(path: Path, number: int, row: int) -> Iterator[NDArray]:
@@ -221,6 +228,16 @@ def _decoding(path: Path) -> Iterator[None]:
         ) from None
 
 
+def _is_table(file: Any, at: int, length: int) -> bool:
+    """Whether the table of packets stands at a byte, plain or compressed, or the file ends there.
+
+    Decoders stop there: a packet in its place would hide those after it.
+    """
+    file.seek(at)
+    head = file.read(12)
+    return at == length or head[:4] in _COMPRESSED or head[8:12] == b"FTAB"
+
+
 def _walk(path: Path) -> None:
     """Check the header, and that the packets fill the file, to the table of packets or the end.
 
@@ -248,6 +265,8 @@ def _walk(path: Path) -> None:
             start += struct.unpack_from("<I", header, start)[0]
             (count,) = struct.unpack_from("<I", header, start)
             text = header[start + 4 : start + 4 + count]
+            if b"<!" in text:  # entities of XML grow without end
+                raise damaged
             streams = {
                 int(node.get("name", ""))
                 for node in ElementTree.fromstring(text.decode()).iterfind("node/node")
@@ -259,10 +278,10 @@ def _walk(path: Path) -> None:
         at = 18 + size
         if stop < 0:
             stop = length
-        elif not at <= stop <= length:
+        elif not at <= stop <= length or not _is_table(file, stop, length):
             raise InputError(
-                f"{path}: its header puts the table of packets at byte {stop} of {length}; the "
-                "file was cut off, so fetch it again"
+                f"{path}: its header puts the table of packets at byte {stop} of {length}, where "
+                "there is none; the file was cut off or its header is damaged, so fetch it again"
             )
         while at < stop:
             file.seek(at)

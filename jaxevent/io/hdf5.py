@@ -25,6 +25,7 @@ refused before any memory is asked for.
 """
 
 import dataclasses
+import math
 import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
@@ -36,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, require
-from jaxevent.io import checked_events, pinhole, reading, times, vectors
+from jaxevent.io import check_unfolded, checked_events, pinhole, reading, times, vectors, whole_number
 from jaxevent.io.output import complete_hdf5
 from jaxevent.progress import bar
 from jaxevent.recording import Events, EventSource, Frames, ImageSource, Imu, Poses, Recording
@@ -45,6 +46,10 @@ VERSION = 1
 _MOST_COMPRESSED = 4096  # times smaller than in memory that any filter makes real events
 _ECF = 36559  # Prophesee's filter
 _HEAPS = 1 << 24
+_COPY = (
+    "only what a file itself holds is read, so copy all into one file: h5repack, or h5py's "
+    "create_dataset(name, data=dataset[()])"
+)
 # An attribute that is one string: its type, its space, then its length, heap and place in that.
 _STRING = re.compile(rb"\x19.[\x00\x01]\x00\x10\x00\x00\x00\x10.{15}\x01\x00{7}(.{16})", re.DOTALL)
 _BLOCK = 1 << 20  # events copied at a time: 13 MB
@@ -119,7 +124,7 @@ class StoredEvents:
         lead = min(start, 1)
         part = slice(start - lead, stop)
         with reading(f"{self._source}: events"):
-            t = self._t[part].astype(np.int64) + self._offset
+            t = times(self._t[part], self._source, "event", first_row=part.start) + self._offset
             x, y, p = self._x[part], self._y[part], self._p[part]
         events = checked_events(t, x, y, p, self._size, self._source, first_row=start - lead)
         return events[lead:] if lead else events
@@ -137,7 +142,8 @@ class StoredEvents:
                         low = middle + 1
                     else:
                         high = middle
-                row = low + int(np.searchsorted(self._t[low:high].astype(np.int64), since))
+                near = times(self._t[low:high], self._source, "event", first_row=low)
+                row = low + int(np.searchsorted(near, since))
                 fits_before = row == 0 or int(self._t[row - 1]) < since
                 fits_after = row == len(self) or int(self._t[row]) >= since
                 if fits_before and fits_after:
@@ -217,7 +223,15 @@ def open_file(path: Path) -> h5py.File:
     """The open file, or `InputError`."""
     with reading(str(path)):
         check_heaps(path)
-        return h5py.File(path)
+        file = h5py.File(path)
+        known = (h5py.h5l.TYPE_HARD, h5py.h5l.TYPE_SOFT)
+        link = file.id.links.visit(
+            lambda name, info: None if info.type in known else name, info=True
+        )
+        if link is not None:
+            file.close()
+            raise InputError(f"{path}: {link.decode()} is a link to another file; {_COPY}")
+        return file
 
 
 def attribute(of: Any, name: str) -> Any:
@@ -257,19 +271,36 @@ def check_heaps(path: Path) -> None:
                 file.seek(heap + base)
             if count and (heap >= length or count > length or file.read(4) != b"GCOL"):
                 raise damaged
-    for piece in pieces:
-        at = -1
-        while (at := piece.find(b"GCOL\x01\0\0\0", at + 1)) >= 0:
-            if at + 16 > len(piece):
+    if not all(map(_heaps_end, pieces)):
+        raise damaged
+
+
+def _heaps_end(piece: bytes) -> bool:
+    """Whether each heap of strings in some bytes of a file comes to its end.
+
+    Every place is looked at once, as a file of 1 MB can hold 65,536 heaps one inside the other:
+    where one comes to a place of another, it goes on from where that one stopped.
+    """
+    walks: dict[int, int] = {}  # by place, which heap came by
+    ends: list[int] = []
+    at = -1
+    while (at := piece.find(b"GCOL\x01\0\0\0", at + 1)) >= 0:
+        if at + 16 > len(piece):
+            continue
+        (size,) = struct.unpack_from("<Q", piece, at + 8)
+        here, stop = at + 16, at + size
+        while here + 16 <= min(stop, len(piece)):
+            before = walks.setdefault(here, len(ends))
+            if before < len(ends):
+                here = ends[before]
                 continue
-            (size,) = struct.unpack_from("<Q", piece, at + 8)
-            here, stop = at + 16, at + size
-            while here + 16 <= min(stop, len(piece)):
-                index, held = struct.unpack_from("<H6xQ", piece, here)
-                need = held if index == 0 else 16 + held + -held % 8
-                if not 16 <= need <= stop - here:
-                    raise damaged
-                here += need
+            index, held = struct.unpack_from("<H6xQ", piece, here)
+            need = held if index == 0 else 16 + held + -held % 8
+            if not 16 <= need <= stop - here:
+                return False
+            here += need
+        ends.append(here)
+    return True
 
 
 def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Recording:
@@ -296,13 +327,13 @@ def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Rec
     extra = _extra(file, source)
     if size is None and "width" in attributes and "height" in attributes:
         with reading(f"{source}: attributes width and height"):
-            size = (int(attributes["width"]), int(attributes["height"]))
+            width, height = (whole_number(attributes[n], source, n) for n in ("width", "height"))
+            size = (width, height)
     if size is None and "events/width" in file and "events/height" in file:
         with reading(f"{source}: events/width and events/height"):
-            size = (
-                int(array(file, "events/width", source)),
-                int(array(file, "events/height", source)),
-            )
+            names = ("events/width", "events/height")
+            width, height = (whole_number(array(file, n, source), source, n) for n in names)
+            size = (width, height)
     rectify_map = _rectify_map(path) if attributes.get("format") != "jaxevent" else None
     if rectify_map is not None:
         extra["rectify_map"] = rectify_map
@@ -325,8 +356,7 @@ def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Rec
     columns: dict[str, Column] = {n: dataset(file, f"events/{n}", source) for n in "txyp"}
     offset = 0
     if "t_offset" in file:
-        with reading(f"{source}: t_offset"):
-            offset = int(dataset(file, "t_offset", source)[()])
+        offset = whole_number(array(file, "t_offset", source), source, "t_offset")
     table = dataset(file, "ms_to_idx", source) if "ms_to_idx" in file else None
     events = StoredEvents(columns, size, source, offset, table)
     return Recording(name, *size, events, frames, camera, poses, imu, extra)
@@ -456,15 +486,21 @@ def dataset(file: h5py.File, name: str, source: str) -> h5py.Dataset:
         if found.dtype.hasobject and h5py.check_string_dtype(found.dtype) is None:
             raise InputError(f"{source}: {name} holds {found.dtype}; store numbers")
         properties = found.id.get_create_plist()
+        layout = properties.get_layout()
+        if layout == h5py.h5d.VIRTUAL or properties.get_external_count():
+            raise InputError(f"{source}: {name} is made of other data sets or files; {_COPY}")
         filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
         stored = found.id.get_storage_size()
         count = found.size or 0
         for code in filters:
             if not h5py.h5z.filter_avail(code):
                 _bring(code, f"{source}: {name}")
+        if filters:
+            chunk = math.prod(found.chunks or ())
+            size = max(count, chunk) * found.dtype.itemsize
+            check_unfolded(size, found.file.id.get_filesize(), f"{source}: {name}")
         held = stored * (_MOST_COMPRESSED if filters else 1)
-        in_other_file = properties.get_external_count() or found.is_virtual
-        if count * found.dtype.itemsize > held and not in_other_file:
+        if count * found.dtype.itemsize > held:
             raise InputError(
                 f"{source}: {name} claims {count} values but holds {stored} bytes; the file is "
                 "damaged or incomplete, so fetch it again"
@@ -507,6 +543,17 @@ def _vectors(
     return vectors(array(file, name, source), shape, source, name)
 
 
+def _strings(stored: h5py.Dataset, source: str) -> NDArray:
+    """Strings, one by one, as many may stand for one place of the file."""
+    text, longest = stored.asstr(), 1
+    values = np.empty(stored.shape, object)
+    for place in np.ndindex(stored.shape):
+        values[place] = text[place]
+        longest = max(longest, len(values[place]))
+        check_unfolded(4 * longest * values.size, stored.file.id.get_filesize(), source)
+    return values.astype(np.str_)
+
+
 def _extra(file: h5py.File, source: str) -> dict[str, NDArray]:
     extra: dict[str, NDArray] = {}
     group = file.get("extra")
@@ -516,8 +563,9 @@ def _extra(file: h5py.File, source: str) -> dict[str, NDArray]:
             if isinstance(item, h5py.Dataset):
                 item = dataset(file, f"extra/{name}", source)
                 text = h5py.check_string_dtype(item.dtype) is not None and item.dtype.kind == "O"
-                values = item.asstr()[()] if text else item[()]
-                extra[name] = np.asarray(values, dtype=np.str_ if text else None)
+                extra[name] = _strings(item, source) if text else np.asarray(item[()])
+                held = sum(values.nbytes for values in extra.values())
+                check_unfolded(held, file.id.get_filesize(), f"{source}: extra")
 
         with reading(f"{source}: extra"):
             group.visititems(keep)

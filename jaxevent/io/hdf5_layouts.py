@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.io import pinhole, reading, sensor_size, times, vectors
+from jaxevent.io import check_unfolded, pinhole, reading, sensor_size, times, vectors, whole_number
 from jaxevent.io.columns import find
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.hdf5 import (
@@ -115,8 +115,7 @@ def _m3ed(file: Any, path: Path, size: tuple[int, int] | None, group: str) -> Re
     if f"{group}/calib/intrinsics" in file:
         with reading(f"{source}: {group}/calib"):
             if f"{group}/calib/resolution" in file and size is None:
-                width, height = array(file, f"{group}/calib/resolution", source)
-                size = (int(width), int(height))
+                size = _pair(array(file, f"{group}/calib/resolution", source), source)
             camera = _camera(file, f"{group}/calib", source)
     if size is None:
         raise InputError(
@@ -209,15 +208,20 @@ def _columns(file: Any, name: str, source: str) -> dict[str, Column]:
 def _told_size(file: Any, source: str) -> tuple[int, int] | None:
     with reading(f"{source}: attributes"):
         if (size := attribute(file, "sensor_resolution")) is not None:
-            height, width = (int(n) for n in np.ravel(size)[:2])
+            height, width = _pair(size, source)
             return width, height
         if (text := attribute(file, "geometry")) is not None:
             width, _, height = str(text).partition("x")
             return int(width), int(height)
         width, height = (attribute(file, name) for name in ("width", "height"))
         if width is not None and height is not None:
-            return int(width), int(height)
+            return _pair([width, height], source)
     return None
+
+
+def _pair(values: Any, source: str) -> tuple[int, int]:
+    first, second = (whole_number(n, source, "a side of the size") for n in np.ravel(values))
+    return first, second
 
 
 def _images(file: Any, source: str) -> Frames | None:
@@ -226,10 +230,12 @@ def _images(file: Any, source: str) -> Frames | None:
         names = sorted(file["images"])
         if not names:
             return None
-        stamps = np.array([float(attribute(file["images"][name], "timestamp")) for name in names])
+        stamps = np.array([attribute(file["images"][name], "timestamp") for name in names])
     first = dataset(file, f"images/{names[0]}", source)
     if first.ndim not in (2, 3):
         raise InputError(f"{source}: images/{names[0]} has shape {first.shape}; store grey images")
+    held = len(names) * (first.size or 0) * first.dtype.itemsize
+    check_unfolded(held, file.id.get_filesize(), f"{source}: images")
     t = times(stamps, source, "image")
 
     def image(name: str) -> NDArray:
@@ -237,7 +243,8 @@ def _images(file: Any, source: str) -> Frames | None:
         if pixels.ndim == 2:
             return pixels
         # As event_utils stores them with OpenCV: blue, green, red.
-        return np.rint(pixels[..., :3] @ np.array([0.114, 0.587, 0.299])).astype(pixels.dtype)
+        grey = pixels[..., :3] @ np.array([0.114, 0.587, 0.299])
+        return (grey if pixels.dtype.kind == "f" else np.rint(grey)).astype(pixels.dtype)
 
     images = DecodedImages(
         lambda row: (image(name) for name in names[row:]),

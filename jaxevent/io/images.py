@@ -13,6 +13,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from jaxevent.recording import microseconds
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
 TIMES = ("timestamps.txt", "images.txt")
+_DEEP_COLOUR = re.compile(r"\b(L|LA|RGB\w*|CMYK);16")  # Pillow's name of how pixels are stored
 LUMA = np.array([0.299, 0.587, 0.114])
 
 
@@ -72,13 +74,15 @@ def is_series(path: Path) -> bool:
     """Whether these are images with times, not a recording."""
     import h5py
 
+    from jaxevent.io import hdf5
+
     with reading(str(path)):
         if path.is_dir():
             images = any(one.suffix.lower() in SUFFIXES for one in path.iterdir())
             return images and not (path / "events.txt").is_file()
-        if not h5py.is_hdf5(path):
+        if not path.is_file() or not h5py.is_hdf5(path):
             return False
-        with h5py.File(path) as file:
+        with hdf5.open_file(path) as file:
             return {"t", "image"} <= set(file)
 
 
@@ -155,16 +159,15 @@ def _series(
 
 
 def _of_hdf5(path: Path, scale: Scale) -> Series:
-    import h5py
+    from jaxevent.io import hdf5
 
-    with reading(str(path)):
-        file = h5py.File(path)
-        stored, t = file.get("image"), file.get("t")
-    if not isinstance(stored, h5py.Dataset) or not isinstance(t, h5py.Dataset):
+    file = hdf5.open_file(path)
+    if not {"t", "image"} <= set(file):
         raise InputError(
             f"{path}: has no datasets t and image; store t (images,) and image (images, "
             "height, width)"
         )
+    stored, t = (hdf5.dataset(file, name, str(path)) for name in ("image", "t"))
     if t.ndim != 1 or stored.ndim not in (3, 4) or len(t) != len(stored):
         raise InputError(
             f"{path}: image has the shape {stored.shape} and t {t.shape}; store one time for "
@@ -175,14 +178,41 @@ def _of_hdf5(path: Path, scale: Scale) -> Series:
 
 
 def _image(path: Path) -> NDArray:
-    from PIL import Image
-
     if path.suffix.lower() == ".npy":
         return np.load(path, allow_pickle=False)
-    with Image.open(path) as image:
+    return read_image(path, str(path))
+
+
+def read_image(file: Any, source: str, grey: bool = False) -> NDArray:
+    """An image of a path or open file, as stored: (height, width), in colour (height, width, 3).
+
+    Values are uint8, uint16 or float32, and whole numbers of 32 bits become uint16. With `grey`
+    colours become grey (ITU-R 601 luma); transparency is passed over. Raises `InputError` where
+    a value would not be kept: colours of 16 bits, numbers outside 0 to 65535, several images.
+    """
+    from PIL import Image
+
+    with Image.open(file) as image:
         if getattr(image, "n_frames", 1) > 1:
-            raise InputError(f"{path}: holds several images; store each as a file of its own")
-        return np.asarray(image.convert("RGB") if image.mode in ("P", "CMYK") else image)
+            raise InputError(f"{source}: holds several images; store each as a file of its own")
+        if any(_DEEP_COLOUR.search(str(tile[3])) for tile in image.tile):
+            raise InputError(
+                f"{source}: holds colours of 16 bits, of which Pillow reads 8; store it as 16-bit "
+                "grey or 8-bit colours"
+            )
+        if image.mode == "F":
+            return np.asarray(image)
+        if image.mode.startswith("I"):
+            values = np.asarray(image)
+            if values.size and not 0 <= values.min() <= values.max() <= 65535:
+                raise InputError(
+                    f"{source}: holds values from {values.min()} to {values.max()}; store 8 or 16 "
+                    "bits, or floats in [0, 1]"
+                )
+            return values.astype(np.uint16)
+        if grey or image.mode in ("1", "LA"):
+            return np.asarray(image.convert("L"))
+        return np.asarray(image if image.mode in ("L", "RGB", "RGBA") else image.convert("RGB"))
 
 
 def _times(path: Path) -> tuple[NDArray[np.int64], list[str] | None]:

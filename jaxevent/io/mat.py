@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.io import checked_events, reading, sensor_size, times
+from jaxevent.io import check_unfolded, checked_events, reading, sensor_size, times
 from jaxevent.recording import Events, Frames, Recording
 
 _MATRIX, _COMPRESSED = 14, 15  # types of elements
@@ -62,9 +62,10 @@ def _unpacked(path: Path) -> BytesIO:
                 f"{path}: the variable at byte {at} is damaged or cut off; fetch the file again"
             )
         if kind == _COMPRESSED:
-            body = zlib.decompress(body)
-            kind, size = struct.unpack_from(order + "2I", body)
-            body = body[8:]
+            unpacking = zlib.decompressobj()
+            (kind, size) = struct.unpack(order + "2I", unpacking.decompress(body, 8))
+            check_unfolded(out.tell() + size, len(data), str(path))
+            body = unpacking.decompress(unpacking.unconsumed_tail, size + 1)
         if kind != _MATRIX or len(body) != size:
             raise InputError(f"{path}: the variable at byte {at} is damaged; fetch it again")
         if _is_numeric(memoryview(body), order, f"{path}: the variable at byte {at}"):
@@ -118,7 +119,7 @@ def read_v73(path: Path, size: tuple[int, int] | None) -> Recording:
 
     from jaxevent.io import hdf5
 
-    variables = {}
+    variables: dict[str, NDArray] = {}
     with reading(str(path)), hdf5.open_file(path) as file:
         for name, dataset in file.items():
             if isinstance(dataset, h5py.Dataset) and dataset.dtype.kind in "biuf":
@@ -126,7 +127,11 @@ def read_v73(path: Path, size: tuple[int, int] | None) -> Recording:
                     # MATLAB stores the shape of an empty array as its data, and all axes reversed.
                     empty = hdf5.attribute(dataset, "MATLAB_empty")
                     stored = hdf5.array(file, name, str(path))
+                    if empty and stored.all():
+                        raise InputError(f"{path}: {name} is said to be empty but has a size")
                     variables[name] = np.zeros(stored.astype(int)) if empty else stored.T
+                    held = sum(value.nbytes for value in variables.values())
+                    check_unfolded(held, path.stat().st_size, str(path))
     return _recording(path, size, variables)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.io import checked_events, pinhole, reading, sensor_size, times, vectors
+from jaxevent.io import checked_events, pinhole, reading, sensor_size, times, vectors, whole_number
 from jaxevent.io.columns import find, of_records
 from jaxevent.recording import Frames, Imu, Recording
 
@@ -32,6 +32,8 @@ def read(path: Path, size: tuple[int, int] | None) -> Recording:
         for name in names:
             with reading(f"{path}: {name}"):
                 arrays[name] = archive[name]
+            if not isinstance(arrays[name], np.ndarray):
+                raise InputError(f"{path}: {name} is not a NumPy array; remove or replace it")
 
     records = [name for name, array in arrays.items() if array.dtype.names is not None]
     if find(list(arrays)) is None and len(records) == 1:
@@ -49,10 +51,11 @@ def read(path: Path, size: tuple[int, int] | None) -> Recording:
 
     t, x, y, p = take("t", "x", "y", "p")
     frames = _frames(path, arrays, take) if "frames" in arrays else None
-    stored = [arrays.pop(name) for name in ("width", "height") if name in arrays]
+    stored = {name: arrays.pop(name) for name in ("width", "height") if name in arrays}
     told = None
     if size is None and len(stored) == 2:
-        told = (_pixels(path, "width", stored[0]), _pixels(path, "height", stored[1]))
+        width, height = (whole_number(value, str(path), name) for name, value in stored.items())
+        told = (width, height)
     otherwise = f"{path}: has no width and height and no frames; add them or"
     size = sensor_size(size, told, frames=frames, otherwise=otherwise)
     source = str(path)
@@ -92,8 +95,3 @@ def _frames(path: Path, arrays: dict[str, NDArray], take) -> Frames | None:
         )
     return Frames(t, images, exposure) if len(images) or len(t) else None
 
-
-def _pixels(path: Path, name: str, value: NDArray) -> int:
-    if value.size != 1 or value.dtype.kind not in "iuf" or not value.item() == value.item() // 1:
-        raise InputError(f"{path}: {name} must be one whole number of pixels")
-    return int(value.item())

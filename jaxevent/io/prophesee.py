@@ -169,12 +169,13 @@ def _refuse_undefined(path: Path, kind: NDArray, defined: tuple[int, ...], offse
         )
 
 
-def _continued(values: NDArray[np.int64], before: int, bits: int) -> NDArray[np.int64]:
+def _continued(values: NDArray[np.int64], before: int | None, bits: int) -> NDArray[np.int64]:
     """Counter values continued over overflows: a fall by more than half the range is one.
 
-    `before` is the continued value before them, or -1 at the start.
+    `before` is the continued value before them, None at the start. A counter that steps back over
+    its start goes on below 0.
     """
-    if before < 0:
+    if before is None:
         before = int(values[0]) if len(values) else 0
     low = before & ((1 << bits) - 1)
     steps = np.diff(values, prepend=low)
@@ -183,15 +184,17 @@ def _continued(values: NDArray[np.int64], before: int, bits: int) -> NDArray[np.
 
 
 def _timed(
-    is_high: NDArray[np.bool_], high: NDArray[np.int64], chosen: NDArray, before: int
-) -> NDArray[np.int64]:
-    """The continued TIME_HIGH that holds at each chosen word; -1 before the first one."""
-    values = np.concatenate([[before], high])
-    return values[np.cumsum(is_high)[chosen]]
+    is_high: NDArray[np.bool_], high: NDArray[np.int64], chosen: NDArray, before: int | None
+) -> tuple[NDArray[np.int64], int]:
+    """The continued TIME_HIGH that holds at each chosen word, and how many come before any."""
+    number = np.cumsum(is_high)[chosen]
+    untimed = int(np.count_nonzero(number == 0)) if before is None else 0
+    values = np.concatenate([[0 if before is None else before], high])
+    return values[number], untimed
 
 
 def _evt2(path: Path, start: int, found: Counter, state: Any) -> Iterator[tuple[Any, Columns]]:
-    begin, before = state or (start, -1)
+    begin, before = state or (start, None)
     for offset, words in _words(path, begin, "<u4", BLOCK):
         state = (offset, before)
         kind = (words >> 28).astype(np.uint8)
@@ -199,10 +202,9 @@ def _evt2(path: Path, start: int, found: Counter, state: Any) -> Iterator[tuple[
         is_high = kind == 8
         high = _continued((words[is_high] & 0xFFFFFFF).astype(np.int64), before, 28)
         chosen = np.flatnonzero(kind <= 1)
-        t = _timed(is_high, high, chosen, before)
-        if before < 0:
-            untimed = int(np.count_nonzero(t < 0))
-            found.update({"events_without_time": untimed} if untimed else {})
+        t, untimed = _timed(is_high, high, chosen, before)
+        if untimed:
+            found["events_without_time"] += untimed
             chosen, t = chosen[untimed:], t[untimed:]
         if triggers := int(np.count_nonzero(kind == 10)):
             found["triggers"] += triggers
@@ -235,7 +237,7 @@ def _halves_swapped(path: Path, start: int, stated: str) -> bool:
 def _evt21(
     path: Path, start: int, halves_swapped: bool, found: Counter, state: Any
 ) -> Iterator[tuple[Any, Columns]]:
-    begin, before = state or (start, -1)
+    begin, before = state or (start, None)
     # A word may hold 32 events.
     for offset, words in _words(path, begin, "<u8", max(1, BLOCK // 4)):
         state = (offset, before)
@@ -246,11 +248,11 @@ def _evt21(
         is_high = kind == 8
         high = _continued((words[is_high] >> 32 & 0xFFFFFFF).astype(np.int64), before, 28)
         chosen = np.flatnonzero(kind <= 1)
-        t = _timed(is_high, high, chosen, before)
+        t, untimed = _timed(is_high, high, chosen, before)
         mask = (words[chosen] & 0xFFFFFFFF).astype("<u4")
-        if before < 0 and (t < 0).any():
-            found["events_without_time"] += int(np.bitwise_count(mask[t < 0]).sum())
-            chosen, mask, t = chosen[t >= 0], mask[t >= 0], t[t >= 0]
+        if untimed:
+            found["events_without_time"] += int(np.bitwise_count(mask[:untimed]).sum())
+            chosen, mask, t = chosen[untimed:], mask[untimed:], t[untimed:]
         if triggers := int(np.count_nonzero(kind == 10)):
             found["triggers"] += triggers
         before = int(high[-1]) if len(high) else before
@@ -280,7 +282,7 @@ def _dat(path: Path, start: int, header: dict[str, str]) -> tuple[Decoder, int]:
 def _dat_events(
     path: Path, start: int, fields: tuple[int, int], state: Any
 ) -> Iterator[tuple[Any, Columns]]:
-    begin, before = state or (start, -1)
+    begin, before = state or (start, None)
     for_x, for_y = fields
     for offset, words in _words(path, begin, "<u4", 2 * BLOCK):
         state = (offset, before)

@@ -11,6 +11,7 @@ zip the files may lie in one top folder. The exposure of the images is unknown: 
 become grey (ITU-R 601 luma).
 """
 
+import re
 import zipfile
 from codecs import BOM_UTF8
 from pathlib import Path
@@ -19,11 +20,11 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from PIL import Image
 from tqdm import tqdm
 
 from jaxevent.errors import InputError
-from jaxevent.io import checked_events, pinhole, reading, sensor_size, times
+from jaxevent.io import check_unfolded, checked_events, pinhole, reading, sensor_size, times
+from jaxevent.io.images import read_image
 from jaxevent.progress import is_shown
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
@@ -156,7 +157,8 @@ def _frames(path: Path, root: Path | zipfile.Path) -> Frames | None:
     source = f"{path}: images.txt"
     with reading(source):
         lines = (root / "images.txt").read_text(encoding="utf-8-sig").splitlines()
-    stamps, images = [], []
+    stamps, images, unfolded = [], [], 0
+    seen, stored = set(), 0 if path.is_dir() else path.stat().st_size
     for number, line in enumerate(lines, 1):
         if not line.strip() or line.startswith("#"):
             continue
@@ -169,6 +171,11 @@ def _frames(path: Path, root: Path | zipfile.Path) -> Frames | None:
                 f"{source}: line {number} is {line[:60]!r}; each line must be 't path'"
             ) from None
         images.append(_image(path, root, name))
+        if path.is_dir() and name not in seen:
+            seen.add(name)
+            stored += (path / name).stat().st_size
+        unfolded += images[-1].nbytes
+        check_unfolded(unfolded, stored, source)
         if images[-1].shape != images[0].shape or images[-1].dtype != images[0].dtype:
             raise InputError(
                 f"{path}: {name} is {_kind(images[-1])} but the first image is "
@@ -181,16 +188,16 @@ def _frames(path: Path, root: Path | zipfile.Path) -> Frames | None:
 
 
 def _image(path: Path, root: Path | zipfile.Path, name: str) -> NDArray:
+    if name.startswith(("/", "\\")) or ".." in re.split(r"[/\\]", name):
+        raise InputError(f"{path}: images.txt names {name}, outside the recording; copy it inside")
     file = root / name
     if not file.is_file():
         raise InputError(
             f"{path}: images.txt names {name}, which does not exist; add the image or remove "
             "its line"
         )
-    with reading(f"{path}: {name}"), file.open("rb") as stream, Image.open(stream) as image:
-        if image.mode.startswith("I"):  # 16-bit grey
-            return np.asarray(image).astype(np.uint16)
-        return np.asarray(image.convert("L"))
+    with reading(f"{path}: {name}"), file.open("rb") as stream:
+        return read_image(stream, f"{path}: {name}", grey=True)
 
 
 def _kind(image: NDArray) -> str:
