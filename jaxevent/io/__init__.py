@@ -258,12 +258,17 @@ def reading(source: str) -> Iterator[None]:
         ) from error
 
 
+def most_unfolded(stored: int) -> int:
+    """The bytes of arrays that `stored` bytes of a file may unfold to."""
+    return max(_SMALL, _MOST_COMPRESSED * stored)
+
+
 def check_unfolded(size: int, stored: int, source: str) -> None:
     """Raise `InputError` where `stored` bytes of a file claim to hold far more, `size`.
 
     Memory stays bounded by what a file holds: real events and images compress less than 20 times.
     """
-    if size > max(_SMALL, _MOST_COMPRESSED * stored):
+    if size > most_unfolded(stored):
         raise InputError(
             f"{source}: {stored:,} bytes of the file claim to hold {size:,}, over "
             f"{_MOST_COMPRESSED} times as many; it is damaged or not a recording, else store it "

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, require
-from jaxevent.io import reading
+from jaxevent.io import check_unfolded, reading
 from jaxevent.io import times as microseconds
 from jaxevent.io.decoded import BLOCK, Columns, DecodedImages, decoded
 from jaxevent.recording import Frames, Imu, Recording
@@ -228,6 +228,39 @@ def _decoding(path: Path) -> Iterator[None]:
         ) from None
 
 
+def _unfolded(file: Any, at: int, size: int) -> int:
+    """The most bytes to which a packet can unfold, by the headers of its blocks.
+
+    LZ4 (frame format 1.6): blocks of at most 2^(8 + 2 code) bytes. Zstandard (RFC 8878): of at most
+    128 KiB, those of type 1 of the size stated, from one byte.
+    """
+    file.seek(at)
+    head = file.read(18)
+    unfolded, stop = 0, at + size
+    if head[:4] == _COMPRESSED[0]:
+        flags = head[4]
+        at += 7 + 8 * (flags >> 3 & 1) + 4 * (flags & 1)
+        block, checked = 1 << 8 + 2 * (head[5] >> 4 & 7), 4 * (flags >> 4 & 1)
+        while at < stop and file.seek(at) and len(word := file.read(4)) == 4:
+            (stored,) = struct.unpack("<I", word)
+            if stored == 0:
+                break
+            unfolded += block
+            at += 4 + (stored & 0x7FFFFFFF) + checked
+    elif head[:4] == _COMPRESSED[1]:
+        flags = head[4]
+        single = flags >> 5 & 1
+        at += 5 + (1 - single) + (0, 1, 2, 4)[flags & 3]
+        at += (single, 2, 4, 8)[flags >> 6]
+        last = 0
+        while not last and at < stop and file.seek(at) and len(word := file.read(3)) == 3:
+            value = int.from_bytes(word, "little")
+            last, kind, stored = value & 1, value >> 1 & 3, value >> 3
+            unfolded += 1 << 17 if kind == 2 else stored
+            at += 3 + (1 if kind == 1 else stored)
+    return unfolded
+
+
 def _is_table(file: Any, at: int, length: int) -> bool:
     """Whether the table of packets stands at a byte, plain or compressed, or the file ends there.
 
@@ -292,4 +325,5 @@ def _walk(path: Path) -> None:
                     f"{path}: the packet at byte {at} does not fit into the file; the recording "
                     "was cut off or is damaged, so fetch it again"
                 )
+            check_unfolded(_unfolded(file, at + 8, size), length, f"{path}: the packet at byte {at}")
             at += 8 + size

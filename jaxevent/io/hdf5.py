@@ -28,6 +28,7 @@ import dataclasses
 import math
 import re
 import struct
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, require
-from jaxevent.io import check_unfolded, checked_events, pinhole, reading, times, vectors, whole_number
+from jaxevent.io import (
+    check_unfolded,
+    checked_events,
+    most_unfolded,
+    pinhole,
+    reading,
+    times,
+    vectors,
+    whole_number,
+)
 from jaxevent.io.output import complete_hdf5
 from jaxevent.progress import bar
 from jaxevent.recording import Events, EventSource, Frames, ImageSource, Imu, Poses, Recording
@@ -499,6 +509,8 @@ def dataset(file: h5py.File, name: str, source: str) -> h5py.Dataset:
             chunk = math.prod(found.chunks or ())
             size = max(count, chunk) * found.dtype.itemsize
             check_unfolded(size, found.file.id.get_filesize(), f"{source}: {name}")
+            if h5py.h5z.FILTER_DEFLATE in filters:
+                _check_deflated(found, f"{source}: {name}")
         held = stored * (_MOST_COMPRESSED if filters else 1)
         if count * found.dtype.itemsize > held:
             raise InputError(
@@ -506,6 +518,30 @@ def dataset(file: h5py.File, name: str, source: str) -> h5py.Dataset:
                 "damaged or incomplete, so fetch it again"
             )
     return found
+
+
+def _check_deflated(stored: h5py.Dataset, source: str) -> None:
+    """Raise `InputError` for a chunk of gzip that unfolds to more than a chunk.
+
+    libhdf5 unfolds all there is, up to 1032 times its bytes; so chunks that could exceed the
+    bound are tried here first.
+    """
+    whole = math.prod(stored.chunks or ()) * stored.dtype.itemsize
+    length = stored.file.id.get_filesize()
+    large: list[tuple[int, ...]] = []
+
+    def note(chunk: Any) -> None:
+        if 1032 * chunk.size > most_unfolded(length):
+            large.append(chunk.chunk_offset)
+
+    stored.id.chunk_iter(note)
+    for place in large:
+        _, data = stored.id.read_direct_chunk(place)
+        if len(zlib.decompressobj().decompress(data, whole + 1)) > whole:
+            raise InputError(
+                f"{source}: the chunk at {place} unfolds to more than a chunk; the file is "
+                "damaged, so fetch it again"
+            )
 
 
 def _bring(code: int, source: str) -> None:

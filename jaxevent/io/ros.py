@@ -16,6 +16,7 @@ NumPy, at 20 million events/s. importRosbag (GPL) fails with NumPy 2. Both agree
 rosbags.
 """
 
+import contextlib
 import functools
 import struct
 from collections.abc import Iterator
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError, require
-from jaxevent.io import pinhole, reading, sensor_size
+from jaxevent.io import check_unfolded, most_unfolded, pinhole, reading, sensor_size
 from jaxevent.io.decoded import BLOCK, Columns, DecodedImages, decoded
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
@@ -105,8 +106,15 @@ class _Bag:
 
     def _open(self) -> Any:
         from rosbags.rosbag1 import Reader
+        from rosbags.rosbag1.reader import decompressors
 
-        return Reader(self._path)
+        reader = Reader(self._path)
+        reader.open()
+        for place, chunk in reader.chunks.items():
+            if chunk.decompressor is not decompressors["none"]:
+                unfold = functools.partial(_unfolded, self._path)
+                reader.chunks[place] = chunk._replace(decompressor=unfold)
+        return contextlib.closing(reader)
 
     def topics(self, *kinds: str) -> list[str]:
         return sorted({topic for topic, kind, count in self._types if kind in kinds and count})
@@ -140,6 +148,20 @@ class _Bag:
         for number, (_, data) in enumerate(self.messages(topic)):
             if number >= start:
                 yield store.deserialize_ros1(data, kind)
+
+
+def _unfolded(path: Path, data: bytes) -> bytes:
+    """A chunk without its compression, bz2 or LZ4; rosbags takes however much it unfolds to."""
+    import bz2
+
+    import lz4.frame
+
+    length = path.stat().st_size
+    is_bz2 = data.startswith(b"BZh")
+    decompressor: Any = bz2.BZ2Decompressor() if is_bz2 else lz4.frame.LZ4FrameDecompressor()
+    unfolded = decompressor.decompress(data, max_length=most_unfolded(length) + 1)
+    check_unfolded(len(unfolded), length, str(path))
+    return unfolded
 
 
 @functools.cache
