@@ -221,7 +221,7 @@ def _hdf5_reader(
         from jaxevent.io import hdf5_layouts
 
         others = not ours and hdf5_layouts.knows(file)
-        matlab = isinstance(events, h5py.Dataset)
+        matlab = hdf5.is_matlab(path, file)
     if others:
         read = hdf5_layouts.read if in_memory else hdf5_layouts.open_stored
         return functools.partial(read, stream=stream)

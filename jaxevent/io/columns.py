@@ -9,12 +9,15 @@ These are the names of tonic (x y t p), expelliarmus and OpenEB (t x y p), dv-pr
 x y polarity), faery and aedat (t x y on) and event_utils (ts xs ys ps). The order of the columns
 does not count, as it differs from one program to the next; a table without names is refused.
 
-Here are read NumPy structured arrays (.npy) and text: a first line with the names, separated by
-commas, semicolons, tabs or blanks, then one line per event. Lines before it that begin with # or %
-are passed over; a line of two whole numbers before the events is the sensor's width and height, as
-rpg_e2vid writes it. Text of four columns separated by blanks may lack the line of names: then it is
-the Event-Camera Dataset's t x y p, with t in seconds. In text, a column of times without any
-decimal point holds integers.
+Here are read NumPy arrays (.npy), structured or of shape (events, 4), and text: a first line with
+the names, separated by commas, semicolons, tabs or blanks, then one line per event. Lines before it
+that begin with # or % are passed over; a line of two whole numbers before the events is the
+sensor's width and height, as rpg_e2vid writes it.
+
+Four columns without names are told apart by what they hold (`order_of`): t x y p, x y p t, x y t p
+or p t x y. Where more than one of these could be meant, the table is refused.
+
+Times that all are whole numbers are us, also as floats and in text; other floats are seconds.
 """
 
 import codecs
@@ -43,6 +46,9 @@ NAMES = {
 NUMPY_MAGIC = b"\x93NUMPY"
 _BYTES = 1 << 24  # of text parsed together: about a million events
 _LONGEST_LINE = 1 << 12
+_SAMPLE = 1 << 16  # events, or 16 times as many bytes of text, that tell order and unit
+_LONGEST = 1_000_000  # seconds of a recording
+_ORDERS = ("txyp", "xypt", "xytp", "ptxy")
 
 
 def find(names: Sequence[str]) -> dict[str, str] | None:
@@ -54,6 +60,59 @@ def find(names: Sequence[str]) -> dict[str, str] | None:
             return None
         found[field] = fitting[0]
     return found
+
+
+def order_of(rows: NDArray, size: tuple[int, int] | None, source: str) -> str:
+    """The order of four columns without names, as "txyp", from the first rows (rows, 4).
+
+    Times never fall, coordinates are whole numbers on the sensor of `size` (width, height), and
+    polarities are 0 and 1 or -1 and 1. Raises `InputError` unless one order alone fits.
+    """
+
+    def is_p(values: NDArray) -> bool:
+        return bool(np.isin(values, (0, 1)).all() or np.isin(values, (-1, 1)).all())
+
+    def is_place(values: NDArray, count: int) -> bool:
+        return bool(((values >= 0) & (values < count) & (values == np.rint(values))).all())
+
+    def fits(order: str, width: int, height: int) -> bool:
+        t, x, y, p = (rows[:, order.index(name)] for name in "txyp")
+        is_sorted = bool((t[1:] >= t[:-1]).all())
+        return is_sorted and is_p(p) and is_place(x, width) and is_place(y, height)
+
+    largest = (1 << 16, 1 << 16)
+    fitting = [order for order in _ORDERS if fits(order, *(size or largest))]
+    # On a sensor too small for them the one order will do, so that the event outside is named.
+    fitting = fitting or [order for order in _ORDERS if fits(order, *largest)]
+    if len(fitting) != 1:
+        named = " or ".join(" ".join(order) for order in (fitting or _ORDERS))
+        raise InputError(
+            f"{source}: its four columns without names {'could' if fitting else 'cannot'} be "
+            f"{named}; sort by time, or name the columns: a line 't x y p' before the events, or "
+            "an array with these fields"
+        )
+    return fitting[0]
+
+
+def time_scale(t: NDArray, source: str) -> float:
+    """How many us one unit of the events' times is, from some of them: 1 or 1e6.
+
+    Integers are us. Floats that all are whole and not all equal are us too, as no recording has
+    its events at whole seconds; others are seconds. Raises `InputError` where these would span
+    more than `_LONGEST` seconds.
+    """
+    if t.dtype.kind != "f" or not len(t):
+        return 1e6
+    finite = t[np.isfinite(t)].astype(np.float64)
+    span = float(finite.max() - finite.min()) if len(finite) else 0.0
+    if span > 0 and (finite == np.rint(finite)).all():
+        return 1.0
+    if span > _LONGEST:
+        raise InputError(
+            f"{source}: the times are floats that are not whole, so seconds, but span "
+            f"{span / 86400:.0f} days; store them as integer microseconds"
+        )
+    return 1e6
 
 
 def of_records(records: NDArray, source: str) -> dict[str, NDArray]:
@@ -71,20 +130,33 @@ def of_records(records: NDArray, source: str) -> dict[str, NDArray]:
 def read_npy(
     path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
 ) -> Recording:
-    """Read a structured array; `size` is (width, height). Raises `InputError` for bad input."""
+    """Read an array; `size` is (width, height). Raises `InputError` for bad input."""
     source = str(path)
     with reading(source):
         records = np.load(path, mmap_mode="r", allow_pickle=False)
-    of_records(records[:0], source) if records.ndim else of_records(records, source)
+    plain = records.ndim == 2 and records.shape[1] == 4 and records.dtype.kind in "iuf"
+    if not plain:
+        of_records(records[:0] if records.ndim else records, source)
     if size is None:
         raise InputError(
             f"{path}: an array does not tell the sensor's size; give size=(width, height) or --size"
         )
 
+    order = order_of(np.array(records[:_SAMPLE]), size, source) if plain else ""
+
+    def fields_of(rows: slice) -> dict[str, NDArray]:
+        held = np.array(records[rows])
+        if plain:
+            return {name: held[:, order.index(name)] for name in "txyp"}
+        return of_records(held, source)
+
+    ends = [fields_of(part)["t"] for part in (slice(0, _SAMPLE), slice(-1, None))]
+    scale = time_scale(np.concatenate(ends), source)
+
     def decode(state: int | None) -> Iterator[tuple[int, Columns]]:
         for row in range(state or 0, len(records), BLOCK):
-            fields = of_records(np.array(records[row : row + BLOCK]), source)
-            t = times(fields["t"], source, "event", first_row=row)
+            fields = fields_of(slice(row, row + BLOCK))
+            t = times(fields["t"], source, "event", scale, row)
             x, y, p = (np.ascontiguousarray(fields[key]) for key in "xyp")
             yield row, (t, x, y, p)
 
@@ -107,6 +179,7 @@ def read_text(
     with reading(source), path.open("rb") as file:
         table = _table(file, source)
     size = size or table.size
+    table = _told(path, table, size)
     if size is None:
         raise InputError(
             f"{path}: the table does not tell the sensor's size; give size=(width, height) or "
@@ -125,9 +198,11 @@ class _Table:
         separator: str,
         in_seconds: bool,
         size: tuple[int, int] | None,
+        scale: float = 1e6,
     ):
         self.start, self.names, self.fields = start, names, fields
         self.separator, self.in_seconds, self.size = separator, in_seconds, size
+        self.scale = scale  # us in one unit of times with decimals
 
 
 def _split(line: str) -> list[str]:
@@ -167,17 +242,37 @@ def _table(file: Any, source: str) -> _Table:
         break
     mark = next((mark for mark in ",;\t" if mark in line), r"\s+")
     if names is None:
-        if mark in ",;" or len(fields) != 4 or not all(_is_number(field) for field in fields):
+        if len(fields) != 4 or not all(_is_number(field) for field in fields):
             raise InputError(f"{source}: the line {line[:60]!r} comes before any names; {_WANTED}")
-        return _Table(start, ["t", "x", "y", "p"], {n: n for n in "txyp"}, mark, True, size)
+        return _Table(start, list("0123"), {}, mark, False, size)
     if len(fields) != len(names) or len(set(names)) != len(names):
         raise InputError(
             f"{source}: the line {line[:60]!r} does not have the columns {', '.join(names)[:80]}; "
             "each line must have one value for each name"
         )
-    found = find(names) or {}
-    stamp = fields[names.index(found["t"])]
-    return _Table(start, names, found, mark, not re.fullmatch(r"[+-]?\d+", stamp), size)
+    return _Table(start, names, find(names) or {}, mark, False, size)
+
+
+def _told(path: Path, table: _Table, size: tuple[int, int] | None) -> _Table:
+    """The table with the order of its columns and the unit of its times, from the first events."""
+    with reading(str(path)), path.open("rb") as file:
+        file.seek(table.start)
+        text = file.read(16 * _SAMPLE)
+    if len(text) == 16 * _SAMPLE:
+        text = text[: text.rfind(b"\n") + 1]
+    names, fields = table.names, table.fields
+    if not fields:
+        bare = _Table(0, names, {name: name for name in names}, table.separator, False, size)
+        columns = _numbers(path, bare, text, 0)
+        order = order_of(np.stack([np.asarray(c) for c in columns.values()], 1), size, str(path))
+        fields = {name: names[order.index(name)] for name in "txyp"}
+    named = _Table(table.start, names, fields, table.separator, False, table.size)
+    t = _numbers(path, named, text, 0)["t"]
+    first = re.split(table.separator, text.strip().partition(b"\n")[0].decode("latin-1").strip())
+    stamp = first[names.index(fields["t"])].strip()
+    named.in_seconds = not re.fullmatch(r"[+-]?\d+", stamp)
+    named.scale = time_scale(t, str(path))
+    return named
 
 
 _WANTED = (
@@ -216,12 +311,27 @@ def _rows(
 
 
 def _parsed(path: Path, table: _Table, text: bytes, row: int) -> Columns:
-    # The import takes a third of a second.
-    import pandas as pd
-
     if not text.strip():
         none = np.empty(0)
         return none.astype(np.int64), none, none, none
+    columns = _numbers(path, table, text, row)
+    t = columns["t"]
+    if table.in_seconds and t.dtype.kind != "f":
+        t = t.astype(np.float64)
+    elif not table.in_seconds and t.dtype.kind == "f":
+        raise InputError(
+            f"{path}: the times of the events from number {row} on have decimals, those before "
+            "have none; write all as whole microseconds or all as seconds with decimals"
+        )
+    t = times(t, str(path), "event", table.scale, row)
+    return t, columns["x"], columns["y"], columns["p"]
+
+
+def _numbers(path: Path, table: _Table, text: bytes, row: int) -> dict[str, NDArray]:
+    """The columns of some lines by the table's fields, integers where all are whole."""
+    # The import takes a third of a second.
+    import pandas as pd
+
     with reading(str(path)):
         try:
             frame = pd.read_csv(
@@ -254,12 +364,4 @@ def _parsed(path: Path, table: _Table, text: bytes, row: int) -> Columns:
                 numbers = np.array([{"true": 1, "false": 0}.get(word, 9) for word in words])
             values = numbers
         columns[key] = values
-    t = columns["t"]
-    if table.in_seconds and t.dtype.kind != "f":
-        t = t.astype(np.float64)
-    elif not table.in_seconds and t.dtype.kind == "f":
-        raise InputError(
-            f"{path}: the times of the events from number {row} on have decimals, those before "
-            "have none; write all as whole microseconds or all as seconds with decimals"
-        )
-    return (times(t, str(path), "event", first_row=row), columns["x"], columns["y"], columns["p"])
+    return columns

@@ -48,6 +48,7 @@ from jaxevent.io import (
     vectors,
     whole_number,
 )
+from jaxevent.io.columns import time_scale
 from jaxevent.io.output import complete_hdf5
 from jaxevent.progress import bar
 from jaxevent.recording import Events, EventSource, Frames, ImageSource, Imu, Poses, Recording
@@ -71,16 +72,19 @@ Column = Any  # one field of the events: a dataset, or what is sliced like one
 
 
 class Microseconds:
-    """Times in floating-point seconds, read as int64 us."""
+    """Times in floating-point seconds, or in us where all are whole, read as int64 us."""
 
     def __init__(self, seconds: Column, source: str):
         self._seconds, self._source = seconds, source
         self.shape, self.dtype = seconds.shape, np.dtype(np.int64)
+        count = seconds.shape[0] if len(seconds.shape) == 1 else 0
+        ends = [seconds[:_CHUNK], seconds[max(count - 1, 0) :]] if count else [np.empty(0)]
+        self._scale = time_scale(np.concatenate(ends), source)
 
     def __getitem__(self, rows: Any) -> Any:
         values = np.asarray(self._seconds[rows], np.float64)
         first = rows.start or 0 if isinstance(rows, slice) else int(rows)
-        t = times(values.reshape(-1), self._source, "event", first_row=first)
+        t = times(values.reshape(-1), self._source, "event", self._scale, first)
         return t if values.ndim else t[0]
 
 
@@ -242,6 +246,12 @@ def open_file(path: Path) -> h5py.File:
             file.close()
             raise InputError(f"{path}: {link.decode()} is a link to another file; {_COPY}")
         return file
+
+
+def is_matlab(path: Path, file: Any) -> bool:
+    """Whether MATLAB wrote a file with `events`: it puts 512 bytes of its own before HDF5."""
+    with path.open("rb") as stored:
+        return stored.read(6) == b"MATLAB" and isinstance(file.get("events"), h5py.Dataset)
 
 
 def attribute(of: Any, name: str) -> Any:

@@ -8,6 +8,7 @@
     M3ED                        /prophesee/{left, right}/{t, x, y, p}: t in us; ms_map_idx;
                                 calib/{intrinsics (fx fy cx cy), distortion_coeffs, resolution}
     Metavision                  /CD/events, records with fields t, x, y, p; attribute geometry
+    v2e                         /events (N, 4): t in us, x, y, p; the order is told by the content
     others                      /events or the file itself with t, x, y and p, whole lists or
                                 records, under the names that `columns.NAMES` lists
 
@@ -28,7 +29,7 @@ from numpy.typing import NDArray
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
 from jaxevent.io import check_unfolded, pinhole, reading, sensor_size, times, vectors, whole_number
-from jaxevent.io.columns import find
+from jaxevent.io.columns import find, order_of
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.hdf5 import (
     Column,
@@ -49,7 +50,7 @@ _SIDES = {"prophesee": "M3ED", "davis": "MVSEC"}
 
 def knows(file: Any) -> bool:
     """Whether a file holds events in one of these layouts."""
-    if any(isinstance(file.get(name), h5py.Group) for name in _SIDES):
+    if any(isinstance(file.get(name), h5py.Group) for name in _SIDES) or _is_plain(file):
         return True
     return any(_fields(file, name) is not None for name in _GROUPS)
 
@@ -81,14 +82,37 @@ def _recording(
             return read(file, path, size, f"{name}/{side}")
     if stream is not None:
         raise InputError(f"{path}: holds one camera only; leave out stream= or --stream")
-    with reading(source):
-        name = next(name for name in _GROUPS if _fields(file, name) is not None)
-    columns = _columns(file, name, source)
+    if not _is_plain(file):
+        with reading(source):
+            name = next(name for name in _GROUPS if _fields(file, name) is not None)
+        columns = _columns(file, name, source)
+    else:
+        columns = {}
     frames = _images(file, source) if isinstance(file.get("images"), h5py.Group) else None
     told = _told_size(file, source)
     otherwise = f"{path}: neither an attribute nor an image tells the sensor's size;"
     size = sensor_size(size, told, frames=frames, otherwise=otherwise)
+    columns = columns or _plain_columns(file, size, source)
     return Recording(path.stem, *size, StoredEvents(columns, size, source), frames)
+
+
+def _is_plain(file: Any) -> bool:
+    """Whether `events` are four columns without names. (MATLAB's have a header before HDF5.)"""
+    events = file.get("events")
+    if not isinstance(events, h5py.Dataset) or file.userblock_size:
+        return False
+    # Of a virtual dataset the shape cannot be asked for without following it.
+    is_virtual = events.id.get_create_plist().get_layout() == h5py.h5d.VIRTUAL
+    return events.dtype.kind in "iuf" and (is_virtual or events.ndim == 2 and events.shape[1] == 4)
+
+
+def _plain_columns(file: Any, size: tuple[int, int], source: str) -> dict[str, Column]:
+    whole = dataset(file, "events", source)
+    order = order_of(np.asarray(whole[: 1 << 16]), size, source)
+    columns: dict[str, Column] = {name: _Part(whole, order.index(name)) for name in "txyp"}
+    if columns["t"].dtype.kind == "f":
+        columns["t"] = Microseconds(columns["t"], source)
+    return columns
 
 
 def _side(path: Path, group: Any, stream: str | None) -> str:

@@ -8,7 +8,8 @@
     imu_t, gyro, acc      (samples,), (samples, 3) rad/s, (samples, 3) m/s^2
     calib                 fx fy cx cy k1 k2 p1 p2 k3
 
-Times are integers in microseconds or floats in seconds. Only the events are required, and width
+Times are integers in microseconds or floats in seconds, those of events in microseconds too where
+all are whole (`columns.time_scale`). Only the events are required, and width
 and height where there are no frames. The events may have the other names of `columns`, or stand
 together in one structured array of any name. Every other array is kept in `Recording.extra`.
 """
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.io import checked_events, pinhole, reading, sensor_size, times, vectors, whole_number
-from jaxevent.io.columns import find, of_records
+from jaxevent.io.columns import find, of_records, time_scale
 from jaxevent.recording import Frames, Imu, Recording
 
 
@@ -59,7 +60,8 @@ def read(path: Path, size: tuple[int, int] | None) -> Recording:
     otherwise = f"{path}: has no width and height and no frames; add them or"
     size = sensor_size(size, told, frames=frames, otherwise=otherwise)
     source = str(path)
-    events = checked_events(times(t, source, "event"), x, y, p, size, source)
+    t = times(t, source, "event", time_scale(t, source))
+    events = checked_events(t, x, y, p, size, source)
     imu = None
     if "imu_t" in arrays:
         imu_t, gyro, acc = take("imu_t", "gyro", "acc")

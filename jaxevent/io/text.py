@@ -6,7 +6,8 @@
     imu.txt          t ax ay az gx gy gz      m/s^2, rad/s
     calib.txt        fx fy cx cy k1 k2 p1 p2 k3
 
-All t are seconds. Only events.txt is required, and it may be empty where there are images. In a
+All t are seconds; events.txt with whole numbers only, which would be microseconds or worse, is
+refused. Only events.txt is required, and it may be empty where there are images. In a
 zip the files may lie in one top folder. The exposure of the images is unknown: 0. Colour images
 become grey (ITU-R 601 luma).
 """
@@ -61,6 +62,11 @@ def _read(
     )
     size = sensor_size(size, header, frames=frames, otherwise=otherwise)
     t, x, y, p = columns
+    if len(t) > 1 and (t == np.rint(t)).all() and t[0] != t[-1]:
+        raise InputError(
+            f"{source}: all times are whole numbers, but those of this layout are seconds; write "
+            "seconds with decimals, or load a table with the line 't x y p' before events in us"
+        )
     events = checked_events(times(t, source, "event"), x, y, p, size, source)
 
     poses = imu = camera = None

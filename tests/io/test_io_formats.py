@@ -151,7 +151,7 @@ import sys, tracemalloc
 from jaxevent.io import aedat2, aedat4, columns, event_stream, load, prophesee
 for module in (aedat2, aedat4, columns, event_stream, prophesee):
     module.BLOCK = 500
-columns._BYTES = 10_000
+columns._BYTES, columns._SAMPLE = 10_000, 500
 for path in sys.argv[1:]:
     for _ in range(2):
         tracemalloc.start()
@@ -625,7 +625,7 @@ def test_structured_arrays_by_the_names_of_their_fields(tmp_path, names, dtypes)
 
 
 def test_arrays_without_names_are_refused(tmp_path):
-    np.save(tmp_path / "a.npy", np.zeros((5, 4)))
+    np.save(tmp_path / "a.npy", np.zeros((5, 3)))
     with pytest.raises(InputError, match="records with the fields t, x, y and p"):
         load(tmp_path / "a.npy", SIZE)
     np.save(tmp_path / "a.npy", np.zeros(5, [("t", "i8"), ("x", "i2"), ("y", "i2")]))
@@ -666,7 +666,9 @@ def test_tables_tell_the_size(tmp_path, before):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("1,2,3,1\n4,5,6,0\n", "'1,2,3,1' comes before any names; .* line of names such as"),
+        ("1,2,3,1\n4,5,6,0\n", "without names could be t x y p or x y t p; .*a line 't x y p'"),
+        ("9,2,3,5\n4,5,6,0\n", "without names cannot be t x y p or x y p t or"),
+        ("1,2,3\n4,5,6\n", "'1,2,3' comes before any names; .* line of names such as"),
         ("t,x,y,p\n", "holds no event"),
         ("t,x,y,p\n1,2,3\n", "does not have the columns t, x, y, p"),
         ("t,x,y,p\n1,2,3,1\n4,5\n", "event 1 has y = nan"),
