@@ -1,4 +1,4 @@
-"""What a hybrid event camera recorded: events, frames, calibration, ground truth, IMU.
+"""What a hybrid event camera recorded: events, frames, calibration, ground truth, IMU, triggers.
 
 Conventions, said once. Time is int64 microseconds on the recording's own clock. `x` is the column
 (to the right), `y` the row (downwards), both from 0; image arrays are [y, x]. Polarity is True for
@@ -252,6 +252,21 @@ class Imu:
         return Imu(self.t[rows], self.gyro[rows], self.acc[rows])
 
 
+@dataclasses.dataclass(frozen=True)
+class Triggers:
+    """Signals from outside: t (us), edge (1 rising, 0 falling, -1 unknown), channel, each (n,)."""
+
+    t: NDArray[np.int64]
+    edge: NDArray[np.int8]
+    channel: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __getitem__(self, rows: slice) -> "Triggers":
+        return Triggers(self.t[rows], self.edge[rows], self.channel[rows])
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class Recording:
     """One recording of one sensor; see the module for the conventions.
@@ -270,6 +285,7 @@ class Recording:
     poses: Poses | None = None
     imu: Imu | None = None
     extra: Mapping[str, NDArray] = dataclasses.field(default_factory=dict)
+    triggers: Triggers | None = None
 
     def __repr__(self) -> str:
         count = len(self.events)
@@ -277,7 +293,7 @@ class Recording:
         parts = [f"{self.name}: {self.width}x{self.height}", _span("event", count, ends)]
         if self.frames is not None:
             parts.append(_span("frame", len(self.frames), self.frames.t))
-        parts += [n for n in ("camera", "poses", "imu") if getattr(self, n) is not None]
+        parts += [n for n in ("camera", "poses", "imu", "triggers") if getattr(self, n) is not None]
         return f"<{', '.join([*parts, *self.extra])}>"
 
     @property
@@ -353,6 +369,7 @@ class Recording:
             frames=cut(self.frames),
             poses=cut(self.poses),
             imu=cut(self.imu),
+            triggers=cut(self.triggers),
         )
         if not len(part.events) and part.frames is None:
             raise InputError(
@@ -386,7 +403,8 @@ class Recording:
             self.events.check(self.width, self.height, source)
         if self.frames is not None:
             self.frames.check(self.width, self.height, source)
-        for name, part in (("pose", self.poses), ("IMU", self.imu)):
+        named = (("pose", self.poses), ("IMU", self.imu), ("trigger", self.triggers))
+        for name, part in named:
             if part is not None and (np.diff(part.t) < 0).any():
                 raise InputError(f"{source}: {name} times are not sorted; sort them")
         return self

@@ -2,7 +2,7 @@
 
 The layouts are described in the reader modules, and what each was checked against: `aedat2`,
 `aedat4`, `columns` (tables of text and NumPy records), `event_stream`, `hdf5`, `hdf5_layouts`,
-`mat`, `npz`, `prophesee`, `ros` and `text`. They are imported when first needed. This module also
+`mat`, `n_caltech`, `npz`, `prophesee`, `ros` and `text`. They are imported when first needed. This module also
 turns the raw numbers of a file into checked fields, so that every reader accepts the same values
 and words its errors alike.
 """
@@ -33,7 +33,7 @@ _MOST_TIME = 1 << 62  # us, 146,000 years: sums and differences of two times sta
 READABLE = (
     "readable are a folder or zip with events.txt (Event-Camera Dataset), AEDAT 2 and 4, "
     "Prophesee RAW and DAT, Event Stream, ROS 1 bags, HDF5 (jaxevent's own, DSEC, MVSEC, M3ED and "
-    "others), MATLAB .mat (v5 and v7.3), .npz, .npy and tables of text"
+    "others), MATLAB .mat (v5 and v7.3), N-Caltech101 .bin, .npz, .npy and tables of text"
 )
 
 
@@ -172,6 +172,10 @@ def _streamed_reader(path: Path, head: bytes) -> Callable[..., Recording]:
         return columns.read_npy
     if columns.is_text(head):
         return columns.read_text
+    from jaxevent.io import n_caltech
+
+    if n_caltech.is_plausible(path):
+        return n_caltech.read
     raise InputError(f"{path}: the format is not recognised; {READABLE}")
 
 
@@ -388,7 +392,9 @@ def whole_number(value: Any, source: str, what: str) -> int:
     value = np.asarray(value)
     number = value.item() if value.size == 1 and value.dtype.kind in "iuf" else None
     if number is None or not -_MOST_TIME < number < _MOST_TIME or number != int(number):
-        raise InputError(f"{source}: {what} must be one whole number, not {np.ravel(value)[:3]}; correct it")
+        raise InputError(
+            f"{source}: {what} must be one whole number, not {np.ravel(value)[:3]}; correct it"
+        )
     return int(number)
 
 

@@ -1,12 +1,12 @@
-"""AEDAT 2 recordings of DAVIS cameras (jAER): events, frames, inertial samples.
+"""AEDAT 2 recordings of DAVIS cameras and the DVS128 (jAER): events, frames, inertial samples.
 
 After lines of text that begin with "#" every record is 8 bytes, big-endian: an address and a time
 in us. The address, by its bits:
 
     31     0: an event; 1: a sample of a frame or of the IMU
     30-22  row, from the bottom        21-12  column
-    11-10  of events: polarity, and whether it is an external trigger (left out, and counted in
-           `extra["triggers"]`); of samples: 0 reset level, 1 signal level, 3 IMU
+    11-10  of events: polarity, and whether it is an external trigger (kept in
+           `Recording.triggers`); of samples: 0 reset level, 1 signal level, 3 IMU
     9-0    the level that the converter measured
     30-28, 27-12  of the IMU: which of its seven values, and the value
 
@@ -17,6 +17,9 @@ samples; the middle of both is the mean of all samples' times, which is the fram
 with missing samples, as at both ends of a file, are left out and counted in
 `extra["incomplete_frames"]`. Full scales of the IMU and the shutter are taken from jAER's
 preferences in the header, else 1000 degrees/s, 8 g and global. The axes are those of the chip.
+The DVS128 has addresses of its own: bit 0 polarity (1 is OFF), 7-1 column from the right, 14-8 row
+from the bottom, 15 and 31 an external trigger; checked against files written by jAER's layout.
+
 The counter of time continues over its overflow (2^32 us).
 
 Decoder. Those that exist are GPL (jAER itself LGPL), and the records are of one length: decoded
@@ -37,7 +40,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.io import reading
-from jaxevent.io.decoded import BLOCK, Columns, DecodedImages, decoded
+from jaxevent.io.decoded import BLOCK, Columns, DecodedImages, TriggerList, decoded
 from jaxevent.recording import Frames, Imu, Recording
 
 MAGIC = b"#!AER-DAT2"
@@ -50,6 +53,8 @@ _SIZES = (  # by the name of the chip in lower case
     ("davis128", (128, 128)),
     ("davis208", (208, 192)),
 )
+# jAER's chips whose addresses are the DVS128's and nothing more (pairs and boards of two have more).
+_DVS128 = {"dvs128", "tmpdiff128", "dvs128phidget", "arctds_dvs128"}
 _RESET, _SIGNAL, _IMU = 0, 1, 3
 
 
@@ -60,6 +65,7 @@ class _Header:
     gyro_scale: float  # rad/s per unit
     acc_scale: float  # m/s^2 per unit
     global_shutter: bool
+    is_dvs128: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,8 +94,11 @@ def read(
             "bytes; the recording was cut off, so fetch it again or drop these bytes: truncate "
             f"-s -{length % 8} FILE"
         )
+    if header.is_dvs128:
+        return _read_dvs128(path, header, in_memory, progress)
     width, height = header.size
     found: Counter[str] = Counter()
+    triggers = TriggerList()
     levels = _Levels(width, height)
     imu: list[tuple[NDArray[np.int64], NDArray[np.int16]]] = []
     left = np.empty((0, 2), np.int64)
@@ -105,8 +114,7 @@ def read(
                 levels.add(first, a, t, ~is_event & (kind == _SIGNAL), _SIGNAL)
                 chosen = ~is_event & (kind == _IMU)
                 left = _imu_samples(np.concatenate([left, _stack(a, t, chosen)]), imu, found)
-                if triggers := int(np.count_nonzero(is_event & (a >> 10 & 1 == 1))):
-                    found["triggers"] += triggers
+                triggers.add(first, t[is_event & (a >> 10 & 1 == 1)], -1, 0)
                 if unknown := int(np.count_nonzero(~is_event & (kind == 2))):
                     found["samples_of_unknown_kind"] += unknown
             chosen = is_event & (a >> 10 & 1 == 0)
@@ -126,8 +134,34 @@ def read(
         frames = dataclasses.replace(frames, images=np.asarray(frames.images))
     extra = {name: np.array(number) for name, number in sorted(found.items())}
     return Recording(
-        path.stem, *header.size, events, frames, imu=_inertial(imu, header), extra=extra
+        path.stem,
+        *header.size,
+        events,
+        frames,
+        imu=_inertial(imu, header),
+        extra=extra,
+        triggers=triggers.all(),
     )
+
+
+def _read_dvs128(path: Path, header: _Header, in_memory: bool, progress: bool | None) -> Recording:
+    triggers = TriggerList()
+
+    def decode(state: Any) -> Iterator[tuple[Any, Columns]]:
+        for here, first, a, t in _records(path, header.start, state):
+            if (a >> 16 & 0x7FFF).any():
+                row = first + int(np.argmax(a >> 16 & 0x7FFF))
+                raise InputError(
+                    f"{path}: record {row} has the address {int(a[row - first]):#x}, which the "
+                    "DVS128 lacks; the file is damaged or of another chip"
+                )
+            special = a & 0x80008000 != 0
+            triggers.add(first, t[special], -1, 0)
+            a, t = a[~special], t[~special]
+            yield here, (t, 127 - (a >> 1 & 0x7F), 127 - (a >> 8 & 0x7F), a & 1 == 0)
+
+    events = decoded(decode, header.size, str(path), in_memory, progress)
+    return Recording(path.stem, *header.size, events, triggers=triggers.all())
 
 
 def _header(path: Path, size: tuple[int, int] | None) -> _Header:
@@ -142,10 +176,17 @@ def _header(path: Path, size: tuple[int, int] | None) -> _Header:
     chip = re.search(r"^#\s*AEChip:\s*(\S+)", text, re.MULTILINE)
     name = chip.group(1).rpartition(".")[2] if chip else ""
     known = next((size for key, size in _SIZES if name.lower().startswith(key)), None)
+    known = (128, 128) if name.lower() in _DVS128 else known
     if name and known is None:
         raise InputError(
-            f"{path}: was recorded by the chip {name[:40]}, but only DAVIS cameras' AEDAT 2 files "
-            "can be read; convert it to AEDAT 4 with jAER or DV"
+            f"{path}: was recorded by the chip {name[:40]}, but only AEDAT 2 files of DAVIS cameras "
+            "and the DVS128 can be read; convert it to AEDAT 4 with jAER or DV"
+        )
+    tick = re.search(r"[Tt]imestamps? tick is ([\d.]+) *(\w+)", text)
+    if tick and (tick[2] not in ("us", "microseconds") or float(tick[1]) != 1):
+        raise InputError(
+            f"{path}: its times count ticks of {tick[1]} {tick[2]}; only ticks of 1 us can be "
+            "read, so convert it with jAER"
         )
     size = size or known
     if size is None:
@@ -169,6 +210,7 @@ def _header(path: Path, size: tuple[int, int] | None) -> _Header:
         float(np.deg2rad(1 / (16.4 * 2000 / degrees))),
         _STANDARD_GRAVITY * g / 32768,
         shutter.lower() != "false",
+        name.lower() in _DVS128,
     )
 
 

@@ -7,7 +7,8 @@ are not kept are named in `extra["streams_left_out"]`; a file with several camer
 of the stream of events. Times stay those of the file. A frame's time is the middle of its
 exposure; where the file has no exposure, its own timestamp. Colour frames become grey (ITU-R 601
 luma) and are kept in `extra["rgb"]`. Samples turn from g into m/s^2 (9.80665) and from degrees
-into radians per second.
+into radians per second. Triggers have the number of DV's type as channel: 1 and 2 are the edges of a
+signal from outside, 3 its pulse, 4 and 5 those of the generator, 6 to 9 starts and ends of frames.
 
 Decoder. The package aedat (MIT, 1 MB) is taken: 48 million events/s, frames and both ends of their
 exposures. dv-processing (24 MB) decodes the same file (davis346.aedat4) to the same 78,830 events,
@@ -30,8 +31,8 @@ from numpy.typing import NDArray
 from jaxevent.errors import InputError, require
 from jaxevent.io import check_unfolded, reading
 from jaxevent.io import times as microseconds
-from jaxevent.io.decoded import BLOCK, Columns, DecodedImages, decoded
-from jaxevent.recording import Frames, Imu, Recording
+from jaxevent.io.decoded import BLOCK, Columns, DecodedImages, TriggerList, decoded
+from jaxevent.recording import Frames, Imu, Recording, Triggers
 
 MAGIC = b"#!AER-DAT4.0"
 _STANDARD_GRAVITY = 9.80665  # m/s^2
@@ -57,16 +58,16 @@ def read(
         streams: dict[int, dict] = dict(sorted(aedat.Decoder(path).id_to_stream().items()))
     of_kind = {
         kind: [number for number, stream in streams.items() if stream["type"] == kind]
-        for kind in ("events", "frame", "imus")
+        for kind in ("events", "frame", "imus", "triggers")
     }
     number, chosen = _choose(path, of_kind["events"], stream, streams)
-    for kind in ("frame", "imus"):
+    for kind in ("frame", "imus", "triggers"):
         several = of_kind[kind]
         if len(several) == 1:
             chosen[kind] = several[0]
         elif number is not None and len(several) == len(of_kind["events"]):
             chosen[kind] = several[of_kind["events"].index(number)]
-    frames, rgb, imu = _others(path, chosen, in_memory)
+    frames, rgb, imu, triggers = _others(path, chosen, in_memory)
     extra: dict[str, NDArray] = {} if rgb is None else {"rgb": rgb}
     left_out = [
         f"{number} {stream['type']}"
@@ -94,7 +95,7 @@ def read(
             yield first, _columns(held)
 
     events = decoded(decode, size, source, in_memory, progress)
-    return Recording(path.stem, *size, events, frames, imu=imu, extra=extra)
+    return Recording(path.stem, *size, events, frames, imu=imu, extra=extra, triggers=triggers)
 
 
 def _choose(
@@ -134,13 +135,14 @@ def _columns(packets: list[NDArray]) -> Columns:
 
 def _others(
     path: Path, chosen: dict[str, int], in_memory: bool
-) -> tuple[Frames | None, NDArray | None, Imu | None]:
-    """Frames, their colours and inertial samples, in one pass; left-out images are not kept."""
-    if "frame" not in chosen and "imus" not in chosen:
-        return None, None, None
+) -> tuple[Frames | None, NDArray | None, Imu | None, Triggers | None]:
+    """Frames, their colours, inertial samples and triggers, in one pass; left-out images are not kept."""
+    if not chosen.keys() & {"frame", "imus", "triggers"}:
+        return None, None, None, None
     aedat: Any = require("aedat", "aedat")
     times, exposures, images, colours, samples = [], [], [], [], []
-    shape = None
+    triggers = TriggerList()
+    shape, count = None, 0
     with _decoding(path), warnings.catch_warnings():
         # Frames of an unknown kind would be passed over with a warning.
         warnings.simplefilter("error")
@@ -165,6 +167,12 @@ def _others(
                     colours.append(frame["pixels"][..., :3])
             elif packet["stream_id"] == chosen.get("imus", -1):
                 samples.append(packet["imus"])
+            elif packet["stream_id"] == chosen.get("triggers", -1):
+                signals = packet["triggers"]
+                source = signals["source"]
+                edge = np.select([np.isin(source, (1, 4)), np.isin(source, (2, 5))], [1, 0], -1)
+                triggers.add(count, signals["t"].astype(np.int64), edge, source)
+                count += 1
     frames = imu = None
     if shape is not None:
         t, exposure = (_signed(values, path) for values in (times, exposures))
@@ -189,7 +197,7 @@ def _others(
         t = rows["t"].astype(np.int64)
         imu = Imu(t, np.deg2rad(gyro), acc * _STANDARD_GRAVITY)
     rgb = np.stack(colours) if colours and len(colours) == len(times) else None
-    return frames, rgb, imu
+    return frames, rgb, imu, triggers.all()
 
 
 def _signed(values: list[int], path: Path) -> NDArray[np.int64]:
@@ -325,5 +333,7 @@ def _walk(path: Path) -> None:
                     f"{path}: the packet at byte {at} does not fit into the file; the recording "
                     "was cut off or is damaged, so fetch it again"
                 )
-            check_unfolded(_unfolded(file, at + 8, size), length, f"{path}: the packet at byte {at}")
+            check_unfolded(
+                _unfolded(file, at + 8, size), length, f"{path}: the packet at byte {at}"
+            )
             at += 8 + size

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from jaxevent.errors import InputError
 from jaxevent.io import checked_events, reading
 from jaxevent.progress import bar
-from jaxevent.recording import Events, EventSource
+from jaxevent.recording import Events, EventSource, Triggers
 
 BLOCK = 1 << 20  # events decoded together: 13 MB
 
@@ -83,6 +83,28 @@ def _joined(pieces: list[Events]) -> Events:
     for name in ("t", "x", "y", "p"):
         columns.append(np.concatenate([getattr(piece, name) for piece in pieces]))
     return Events(*columns)
+
+
+class TriggerList:
+    """External triggers that a decoder meets on its first pass; later ones add none again."""
+
+    def __init__(self):
+        self._pieces: list[tuple[NDArray, NDArray, NDArray]] = []
+        self._place = -1
+
+    def add(self, place: int, t: NDArray, edge: NDArray | int, channel: NDArray | int) -> None:
+        """Keep triggers of the block at a place of the file, which rises from block to block."""
+        if place > self._place:
+            self._place = place
+            if len(t):
+                of_each = (np.broadcast_to(value, len(t)) for value in (edge, channel))
+                self._pieces.append((t, *of_each))
+
+    def all(self) -> Triggers | None:
+        if not self._pieces:
+            return None
+        t, edge, channel = (np.concatenate(values) for values in zip(*self._pieces, strict=True))
+        return Triggers(t.astype(np.int64), edge.astype(np.int8), channel.astype(np.uint8))
 
 
 class DecodedEvents:

@@ -5,19 +5,22 @@
     /events/x, /events/y  (events,) uint16 column and row, from 0
     /events/p             (events,) uint8, 1 is ON, 0 is OFF
     /t_offset             scalar int64 us: the recording's clock at events/t = 0 (its first event)
-    /ms_to_idx            (milliseconds,) uint64: entry m is the first event with t >= 1000 m
+    /ms_to_idx            (milliseconds,) uint64: entry m is the first event with t >= 1000 m;
+                          absent where it would have over 2^22 entries and two for each event
     /frames/t             (frames,) int64 us, mid-exposure
     /frames/exposure      (frames,) int64 us, 0 where unknown
     /frames/images        (frames, height, width) uint8, uint16 or floats in [0, 1]
     /camera               (9,) float64: fx fy cx cy k1 k2 p1 p2 k3
     /poses/t, position, quaternion   (poses,) int64 us, (poses, 3) m, (poses, 4) x y z w
     /imu/t, gyro, acc     (samples,) int64 us, (samples, 3) rad/s, (samples, 3) m/s^2
+    /triggers/t, edge, channel   (triggers,) int64 us, 1 rising 0 falling -1 unknown, number
     /extra/*              further arrays by name
 
 All times but events/t are on the recording's clock. Only /events is required to read a file, so
 files of DSEC and VECtor (t uint32, no attributes) can be read too, and RVT's (events/width and
 height). DSEC's rectify_map.h5, where it lies beside the file, tells the sensor's size and is kept
-in `extra["rectify_map"]`; otherwise the size must be given. Other layouts: `hdf5_layouts`.
+in `extra["rectify_map"]`; otherwise files of this layout compressed by Blosc, as DSEC and VECtor
+publish theirs, have 640x480 pixels, and of others the size must be given. Other layouts: `hdf5_layouts`.
 
 Data compressed by a filter that HDF5 itself lacks (DSEC: Blosc) need the package hdf5plugin, which
 is imported when first needed. A file that claims many more events than its bytes can hold is
@@ -51,10 +54,20 @@ from jaxevent.io import (
 from jaxevent.io.columns import time_scale
 from jaxevent.io.output import complete_hdf5
 from jaxevent.progress import bar
-from jaxevent.recording import Events, EventSource, Frames, ImageSource, Imu, Poses, Recording
+from jaxevent.recording import (
+    Events,
+    EventSource,
+    Frames,
+    ImageSource,
+    Imu,
+    Poses,
+    Recording,
+    Triggers,
+)
 
 VERSION = 1
 _MOST_COMPRESSED = 4096  # times smaller than in memory that any filter makes real events
+_BLOSC = 32001
 _ECF = 36559  # Prophesee's filter
 _HEAPS = 1 << 24
 _COPY = (
@@ -65,7 +78,7 @@ _COPY = (
 _STRING = re.compile(rb"\x19.[\x00\x01]\x00\x10\x00\x00\x00\x10.{15}\x01\x00{7}(.{16})", re.DOTALL)
 _BLOCK = 1 << 20  # events copied at a time: 13 MB
 _CHUNK = 1 << 16  # values compressed together
-_MOST_MS = 10**9  # 11.6 days; a stray timestamp would otherwise fill the disk with ms_to_idx
+_MOST_MS = 1 << 22  # entries of ms_to_idx, 70 minutes and 33 MB, or two for each event
 
 
 Column = Any  # one field of the events: a dataset, or what is sliced like one
@@ -354,6 +367,8 @@ def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Rec
             names = ("events/width", "events/height")
             width, height = (whole_number(array(file, n, source), source, n) for n in names)
             size = (width, height)
+    if size is None and _is_dsec(file):
+        size = (640, 480)
     rectify_map = _rectify_map(path) if attributes.get("format") != "jaxevent" else None
     if rectify_map is not None:
         extra["rectify_map"] = rectify_map
@@ -372,6 +387,15 @@ def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Rec
         t = _times(file, "imu/t", source)
         gyro, acc = (_vectors(file, f"imu/{name}", (len(t), 3), source) for name in ("gyro", "acc"))
         imu = Imu(t, gyro, acc)
+    triggers = None
+    if isinstance(file.get("triggers"), h5py.Group):
+        t = _times(file, "triggers/t", source)
+        edge, channel = (array(file, f"triggers/{n}", source) for n in ("edge", "channel"))
+        if not edge.shape == channel.shape == t.shape or {edge.dtype.kind, channel.dtype.kind} - {
+            *"iu"
+        }:
+            raise InputError(f"{path}: triggers need one edge and one channel for each time")
+        triggers = Triggers(t, edge.astype(np.int8), channel.astype(np.uint8))
     name = str(attributes.get("name", path.stem))
     columns: dict[str, Column] = {n: dataset(file, f"events/{n}", source) for n in "txyp"}
     offset = 0
@@ -379,7 +403,21 @@ def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Rec
         offset = whole_number(array(file, "t_offset", source), source, "t_offset")
     table = dataset(file, "ms_to_idx", source) if "ms_to_idx" in file else None
     events = StoredEvents(columns, size, source, offset, table)
-    return Recording(name, *size, events, frames, camera, poses, imu, extra)
+    return Recording(name, *size, events, frames, camera, poses, imu, extra, triggers)
+
+
+def _is_dsec(file: Any) -> bool:
+    """Whether DSEC or VECtor published the file: their layout, compressed by Blosc, without size."""
+    kinds = {"t": np.uint32, "x": np.uint16, "y": np.uint16, "p": np.uint8}
+    for name, kind in kinds.items():
+        stored = file.get(f"events/{name}")
+        if not isinstance(stored, h5py.Dataset) or stored.dtype != kind:
+            return False
+        properties = stored.id.get_create_plist()
+        codes = {properties.get_filter(i)[0] for i in range(properties.get_nfilters())}
+        if _BLOSC not in codes:
+            return False
+    return {"ms_to_idx", "t_offset"} <= set(file) and not len(file.attrs)
 
 
 def _rectify_map(path: Path) -> NDArray | None:
@@ -412,11 +450,12 @@ def write(
             width=recording.width,
             height=recording.height,
         )
-        _write_events(file, recording.events, compression, recording.name, progress, check)
+        _write_events(file, recording.events, compression, progress, check)
         for group, part in (
             ("frames", recording.frames),
             ("poses", recording.poses),
             ("imu", recording.imu),
+            ("triggers", recording.triggers),
         ):
             if part is not None:
                 for name, values in vars(part).items():
@@ -431,27 +470,24 @@ def _write_events(
     file: h5py.File,
     events: EventSource,
     compression: str | None,
-    source: str,
     progress: bool | None,
     check: Callable[[], None],
 ) -> None:
     count = len(events)
     offset = int(events[:1].t[0]) if count else 0
     last_ms = (int(events[count - 1 :].t[0]) - offset) // 1000 if count else -1
-    if last_ms >= _MOST_MS:
-        raise InputError(
-            f"{source}: the events span {last_ms / 86_400_000:.0f} days, too long for ms_to_idx; "
-            "remove stray timestamps or cut the recording"
-        )
+    is_sparse = last_ms >= max(_MOST_MS, 2 * count)
     file["t_offset"] = np.int64(offset)
     options = _options(count, compression)
     t, x, y, p = (
         file.create_dataset(f"events/{name}", (count,), dtype, **options)
         for name, dtype in (("t", "i8"), ("x", "u2"), ("y", "u2"), ("p", "u1"))
     )
-    ms_to_idx = file.create_dataset(
-        "ms_to_idx", (last_ms + 1,), "u8", **_options(last_ms + 1, compression)
-    )
+    ms_to_idx = None
+    if not is_sparse:
+        ms_to_idx = file.create_dataset(
+            "ms_to_idx", (last_ms + 1,), "u8", **_options(last_ms + 1, compression)
+        )
     ms = 0
     blocks = range(0, count, _BLOCK)
     for row in bar(blocks, unit="M events", progress=progress):
@@ -460,6 +496,8 @@ def _write_events(
         rows = slice(row, row + len(block))
         t[rows], x[rows], y[rows], p[rows] = since, block.x, block.y, block.p
         check()
+        if ms_to_idx is None:
+            continue
         # The milliseconds that begin after the last block and not after this one's last event.
         end = int(since[-1]) // 1000 + 1
         for first in range(ms, end, _BLOCK):

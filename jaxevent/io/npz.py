@@ -96,4 +96,3 @@ def _frames(path: Path, arrays: dict[str, NDArray], take) -> Frames | None:
             f"{path}: frames have no times; add frame_t (mid-exposure) or exp_start and exp_end"
         )
     return Frames(t, images, exposure) if len(images) or len(t) else None
-

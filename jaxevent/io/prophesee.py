@@ -10,8 +10,8 @@ from the top left already. The words of each format and how they are read:
 
 Times overflow after 2^34 us (EVT2), 2^24 us (EVT3: 16.8 s) or 2^32 us (DAT), and are continued
 here. Events that come before the file's first time (or first row) cannot be placed: they are left
-out and counted in `extra["events_without_time"]`, where there are any. External triggers are
-counted in `extra["triggers"]`. A word of a type that the format does not define means damage.
+out and counted in `extra["events_without_time"]`, where there are any. External triggers of RAW
+files are kept in `Recording.triggers`, with their edge and channel. A word of a type that the format does not define means damage.
 
 Decoders. EVT2, EVT2.1 and DAT have words of one length and are decoded here by NumPy: EVT2 and DAT
 at 56 million events/s, checks included. For EVT3 the package evt3 (MIT) is taken: 48 million
@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, require
 from jaxevent.io import reading
-from jaxevent.io.decoded import BLOCK, Columns, Decoder, decoded
+from jaxevent.io.decoded import BLOCK, Columns, Decoder, TriggerList, decoded
 from jaxevent.recording import Recording
 
 _LONGEST_HEADER = 1 << 16
@@ -68,16 +68,17 @@ def read(
         )
         length = path.stat().st_size
         found: Counter[str] = Counter()
+        triggers = TriggerList()
         if version == "EVT2":
-            decode = functools.partial(_evt2, path, start, found)
+            decode = functools.partial(_evt2, path, start, found, triggers)
             width = 4
         elif version == "EVT21":
             halves_swapped = _halves_swapped(path, start, header.get("format", ""))
-            decode = functools.partial(_evt21, path, start, halves_swapped, found)
+            decode = functools.partial(_evt21, path, start, halves_swapped, found, triggers)
             width = 8
         elif version == "EVT3":
             require("evt3", "prophesee")
-            decode = functools.partial(_evt3, path, start, found)
+            decode = functools.partial(_evt3, path, start, found, triggers)
             width = 2
         elif not version and "version" in header:
             decode, start = _dat(path, start, header)
@@ -97,7 +98,7 @@ def read(
         )
     events = decoded(decode, size, str(path), in_memory, progress)
     extra = {name: np.array(number) for name, number in sorted(found.items())}
-    return Recording(path.stem, *size, events, extra=extra)
+    return Recording(path.stem, *size, events, extra=extra, triggers=triggers.all())
 
 
 def _header(path: Path) -> tuple[dict[str, str], int]:
@@ -193,7 +194,9 @@ def _timed(
     return values[number], untimed
 
 
-def _evt2(path: Path, start: int, found: Counter, state: Any) -> Iterator[tuple[Any, Columns]]:
+def _evt2(
+    path: Path, start: int, found: Counter, triggers: TriggerList, state: Any
+) -> Iterator[tuple[Any, Columns]]:
     begin, before = state or (start, None)
     for offset, words in _words(path, begin, "<u4", BLOCK):
         state = (offset, before)
@@ -206,8 +209,11 @@ def _evt2(path: Path, start: int, found: Counter, state: Any) -> Iterator[tuple[
         if untimed:
             found["events_without_time"] += untimed
             chosen, t = chosen[untimed:], t[untimed:]
-        if triggers := int(np.count_nonzero(kind == 10)):
-            found["triggers"] += triggers
+        at = np.flatnonzero(kind == 10)
+        when, early = _timed(is_high, high, at, before)
+        signals = words[at[early:]]
+        when = when[early:] << 6 | (signals >> 22 & 0x3F).astype(np.int64)
+        triggers.add(offset, when, signals & 1, signals >> 8 & 0x1F)
         before = int(high[-1]) if len(high) else before
         words = words[chosen]
         t = (t << 6) | (words >> 22 & 0x3F)
@@ -235,7 +241,7 @@ def _halves_swapped(path: Path, start: int, stated: str) -> bool:
 
 
 def _evt21(
-    path: Path, start: int, halves_swapped: bool, found: Counter, state: Any
+    path: Path, start: int, halves_swapped: bool, found: Counter, triggers: TriggerList, state: Any
 ) -> Iterator[tuple[Any, Columns]]:
     begin, before = state or (start, None)
     # A word may hold 32 events.
@@ -253,8 +259,11 @@ def _evt21(
         if untimed:
             found["events_without_time"] += int(np.bitwise_count(mask[:untimed]).sum())
             chosen, mask, t = chosen[untimed:], mask[untimed:], t[untimed:]
-        if triggers := int(np.count_nonzero(kind == 10)):
-            found["triggers"] += triggers
+        at = np.flatnonzero(kind == 10)
+        when, early = _timed(is_high, high, at, before)
+        signals = words[at[early:]]
+        when = when[early:] << 6 | (signals >> 54 & 0x3F).astype(np.int64)
+        triggers.add(offset, when, signals >> 32 & 1, signals >> 40 & 0x1F)
         before = int(high[-1]) if len(high) else before
         bits = np.unpackbits(mask.view(np.uint8).reshape(-1, 4), axis=1, bitorder="little")
         word, bit = np.nonzero(bits)
@@ -296,7 +305,36 @@ def _dat_events(
         yield state, (t, x, y, p.astype(np.uint8))
 
 
-def _evt3(path: Path, start: int, found: Counter, state: Any) -> Iterator[tuple[Any, Columns]]:
+def _add_triggers(
+    triggers: TriggerList,
+    offset: int,
+    words: NDArray,
+    kind: NDArray,
+    told: dict[int, int],
+    high: int | None,
+) -> int | None:
+    """Keep a block's triggers; `high` is the continued high time before it, returned after it."""
+    is_high = kind == 8
+    values = (words[is_high] & 0xFFF).astype(np.int64)
+    if len(values):
+        first = values[0] if high is None else high & 0xFFF
+        wraps = np.cumsum(np.diff(values, prepend=first) < -0x800)
+        values += (0 if high is None else high & ~0xFFF) + (wraps << 12)
+    at = np.flatnonzero(kind == 10)
+    when, early = _timed(is_high, values, at, high)
+    # The low time that holds at each: of the last word of time before it, 0 after a high one.
+    clock = np.flatnonzero((kind == 6) | is_high)
+    low = np.where(kind[clock] == 6, words[clock] & 0xFFF, 0).astype(np.int64)
+    low = np.concatenate([[told.get(6, 0) & 0xFFF], low])[np.searchsorted(clock, at)]
+    when = (when << 12 | low)[early:]
+    signals = words[at[early:]]
+    triggers.add(offset, when, signals & 1, signals >> 8 & 0xF)
+    return int(values[-1]) if len(values) else high
+
+
+def _evt3(
+    path: Path, start: int, found: Counter, triggers: TriggerList, state: Any
+) -> Iterator[tuple[Any, Columns]]:
     evt3: Any = require("evt3", "prophesee")
 
     # What an event needs to have been told before: the row 0, the base of a vector 3, the high time
@@ -306,7 +344,7 @@ def _evt3(path: Path, start: int, found: Counter, state: Any) -> Iterator[tuple[
     last = dict(last)
     decoder = evt3.Decoder(2048, 2048)
     decoder.feed(np.array([last[key] for key in (8, 6, 0, 3) if key in last], "<u2").tobytes())
-    shift = 0
+    shift, clock_high = 0, None
     for offset, words in _words(path, begin, "<u2", BLOCK):
         told = dict(last)
         kind = (words >> 12).astype(np.uint8)
@@ -343,8 +381,8 @@ def _evt3(path: Path, start: int, found: Counter, state: Any) -> Iterator[tuple[
             found["events_without_time"] += int(numbers[unplaced].sum())
             numbers[unplaced] = 0
             words = np.where(unplaced, np.uint16(0xE000), words)
-        if triggers := int(np.count_nonzero(kind == 10)):
-            found["triggers"] += triggers
+        if state is None:
+            clock_high = _add_triggers(triggers, offset, words, kind, told, clock_high)
         highs = np.flatnonzero(kind == 8)
         if len(highs):
             times = words[highs].astype(np.int64) & 0xFFF
