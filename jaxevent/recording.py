@@ -263,7 +263,7 @@ class Triggers:
     def __len__(self) -> int:
         return len(self.t)
 
-    def __getitem__(self, rows: slice) -> "Triggers":
+    def __getitem__(self, rows: slice | NDArray) -> "Triggers":
         return Triggers(self.t[rows], self.edge[rows], self.channel[rows])
 
 

@@ -117,11 +117,8 @@ def hdf5_heaps_one_inside_the_other(folder):
 
     def make(group, name):
         heap = b"GCOL\x01\0\0\0" + struct.pack("<Q", 1 << 20)
-        # A piece of index 0x4347 whose size leads to the next one.
-        pieces = bytearray()
-        for number in range(1 << 15):
-            pieces += b"GCOL\x01\0\0\0" + struct.pack("<Q", 16)
-        group[name] = np.frombuffer(heap + bytes(pieces), "u1")
+        pieces = (b"GCOL\x01\0\0\0" + struct.pack("<Q", 16)) * (1 << 16)
+        group[name] = np.frombuffer(heap + pieces, "u1")
 
     return _inside(folder, p=make)
 

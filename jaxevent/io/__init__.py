@@ -2,9 +2,9 @@
 
 The layouts are described in the reader modules, and what each was checked against: `aedat2`,
 `aedat4`, `columns` (tables of text and NumPy records), `event_stream`, `hdf5`, `hdf5_layouts`,
-`mat`, `n_caltech`, `npz`, `prophesee`, `ros` and `text`. They are imported when first needed. This module also
-turns the raw numbers of a file into checked fields, so that every reader accepts the same values
-and words its errors alike.
+`mat`, `n_caltech`, `npz`, `prophesee`, `ros` and `text`. They are imported when first needed. This
+module also turns the raw numbers of a file into checked fields, so that every reader accepts the
+same values and words its errors alike.
 """
 
 import contextlib
@@ -296,7 +296,7 @@ def times(
         row = int(np.argmin((values > -most) & (values < most)))
         unit = "seconds" if is_float and scale == 1e6 else "microseconds"
         raise InputError(
-            f"{source}: {what} {first_row + row} has the time {values[row]:.16g}, not finite "
+            f"{source}: {what} {first_row + row} has the time {values[row].item()!r}, not finite "
             f"or too large for {unit}; correct the unit or remove it"
         )
     if not is_float:

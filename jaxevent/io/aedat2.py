@@ -53,7 +53,7 @@ _SIZES = (  # by the name of the chip in lower case
     ("davis128", (128, 128)),
     ("davis208", (208, 192)),
 )
-# jAER's chips whose addresses are the DVS128's and nothing more (pairs and boards of two have more).
+# jAER's chips whose addresses are the DVS128's; those of two sensors have more.
 _DVS128 = {"dvs128", "tmpdiff128", "dvs128phidget", "arctds_dvs128"}
 _RESET, _SIGNAL, _IMU = 0, 1, 3
 
@@ -179,8 +179,8 @@ def _header(path: Path, size: tuple[int, int] | None) -> _Header:
     known = (128, 128) if name.lower() in _DVS128 else known
     if name and known is None:
         raise InputError(
-            f"{path}: was recorded by the chip {name[:40]}, but only AEDAT 2 files of DAVIS cameras "
-            "and the DVS128 can be read; convert it to AEDAT 4 with jAER or DV"
+            f"{path}: was recorded by the chip {name[:40]}, but only DAVIS cameras' and DVS128's "
+            "AEDAT 2 files can be read; convert it to AEDAT 4 with jAER or DV"
         )
     tick = re.search(r"[Tt]imestamps? tick is ([\d.]+) *(\w+)", text)
     if tick and (tick[2] not in ("us", "microseconds") or float(tick[1]) != 1):

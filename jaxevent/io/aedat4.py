@@ -7,8 +7,9 @@ are not kept are named in `extra["streams_left_out"]`; a file with several camer
 of the stream of events. Times stay those of the file. A frame's time is the middle of its
 exposure; where the file has no exposure, its own timestamp. Colour frames become grey (ITU-R 601
 luma) and are kept in `extra["rgb"]`. Samples turn from g into m/s^2 (9.80665) and from degrees
-into radians per second. Triggers have the number of DV's type as channel: 1 and 2 are the edges of a
-signal from outside, 3 its pulse, 4 and 5 those of the generator, 6 to 9 starts and ends of frames.
+into radians per second. Triggers have the number of DV's type as channel: 1 and 2
+are the edges of a signal from outside, 3 its pulse, 4 and 5 those of the generator, 6 to 9 starts
+and ends of frames.
 
 Decoder. The package aedat (MIT, 1 MB) is taken: 48 million events/s, frames and both ends of their
 exposures. dv-processing (24 MB) decodes the same file (davis346.aedat4) to the same 78,830 events,
@@ -136,7 +137,7 @@ def _columns(packets: list[NDArray]) -> Columns:
 def _others(
     path: Path, chosen: dict[str, int], in_memory: bool
 ) -> tuple[Frames | None, NDArray | None, Imu | None, Triggers | None]:
-    """Frames, their colours, inertial samples and triggers, in one pass; left-out images are not kept."""
+    """Frames, their colours, inertial samples and triggers, in one pass."""
     if not chosen.keys() & {"frame", "imus", "triggers"}:
         return None, None, None, None
     aedat: Any = require("aedat", "aedat")

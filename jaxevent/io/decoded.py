@@ -104,7 +104,9 @@ class TriggerList:
         if not self._pieces:
             return None
         t, edge, channel = (np.concatenate(values) for values in zip(*self._pieces, strict=True))
-        return Triggers(t.astype(np.int64), edge.astype(np.int8), channel.astype(np.uint8))
+        order = np.argsort(t, kind="stable")
+        found = Triggers(t.astype(np.int64), edge.astype(np.int8), channel.astype(np.uint8))
+        return found[order]
 
 
 class DecodedEvents:

@@ -20,7 +20,8 @@ All times but events/t are on the recording's clock. Only /events is required to
 files of DSEC and VECtor (t uint32, no attributes) can be read too, and RVT's (events/width and
 height). DSEC's rectify_map.h5, where it lies beside the file, tells the sensor's size and is kept
 in `extra["rectify_map"]`; otherwise files of this layout compressed by Blosc, as DSEC and VECtor
-publish theirs, have 640x480 pixels, and of others the size must be given. Other layouts: `hdf5_layouts`.
+publish theirs, have 640x480 pixels, and of others the size must be given. Other
+layouts: `hdf5_layouts`.
 
 Data compressed by a filter that HDF5 itself lacks (DSEC: Blosc) need the package hdf5plugin, which
 is imported when first needed. A file that claims many more events than its bytes can hold is
@@ -391,10 +392,11 @@ def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Rec
     if isinstance(file.get("triggers"), h5py.Group):
         t = _times(file, "triggers/t", source)
         edge, channel = (array(file, f"triggers/{n}", source) for n in ("edge", "channel"))
-        if not edge.shape == channel.shape == t.shape or {edge.dtype.kind, channel.dtype.kind} - {
-            *"iu"
-        }:
-            raise InputError(f"{path}: triggers need one edge and one channel for each time")
+        fit = edge.shape == channel.shape == t.shape
+        if not fit or not np.isin(edge, (-1, 0, 1)).all() or not np.isin(channel, range(256)).all():
+            raise InputError(
+                f"{path}: triggers need an edge, -1, 0 or 1, and a channel, 0 to 255, for each time"
+            )
         triggers = Triggers(t, edge.astype(np.int8), channel.astype(np.uint8))
     name = str(attributes.get("name", path.stem))
     columns: dict[str, Column] = {n: dataset(file, f"events/{n}", source) for n in "txyp"}
@@ -407,7 +409,7 @@ def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Rec
 
 
 def _is_dsec(file: Any) -> bool:
-    """Whether DSEC or VECtor published the file: their layout, compressed by Blosc, without size."""
+    """Whether a file has the layout of DSEC and VECtor, compressed by Blosc, and no size."""
     kinds = {"t": np.uint32, "x": np.uint16, "y": np.uint16, "p": np.uint8}
     for name, kind in kinds.items():
         stored = file.get(f"events/{name}")

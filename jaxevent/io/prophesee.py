@@ -11,7 +11,8 @@ from the top left already. The words of each format and how they are read:
 Times overflow after 2^34 us (EVT2), 2^24 us (EVT3: 16.8 s) or 2^32 us (DAT), and are continued
 here. Events that come before the file's first time (or first row) cannot be placed: they are left
 out and counted in `extra["events_without_time"]`, where there are any. External triggers of RAW
-files are kept in `Recording.triggers`, with their edge and channel. A word of a type that the format does not define means damage.
+files are kept in `Recording.triggers`, those before the first time counted as
+`triggers_without_time`. A word of a type that the format does not define means damage.
 
 Decoders. EVT2, EVT2.1 and DAT have words of one length and are decoded here by NumPy: EVT2 and DAT
 at 56 million events/s, checks included. For EVT3 the package evt3 (MIT) is taken: 48 million
@@ -211,6 +212,7 @@ def _evt2(
             chosen, t = chosen[untimed:], t[untimed:]
         at = np.flatnonzero(kind == 10)
         when, early = _timed(is_high, high, at, before)
+        found.update({"triggers_without_time": early} if early else {})
         signals = words[at[early:]]
         when = when[early:] << 6 | (signals >> 22 & 0x3F).astype(np.int64)
         triggers.add(offset, when, signals & 1, signals >> 8 & 0x1F)
@@ -261,6 +263,7 @@ def _evt21(
             chosen, mask, t = chosen[untimed:], mask[untimed:], t[untimed:]
         at = np.flatnonzero(kind == 10)
         when, early = _timed(is_high, high, at, before)
+        found.update({"triggers_without_time": early} if early else {})
         signals = words[at[early:]]
         when = when[early:] << 6 | (signals >> 54 & 0x3F).astype(np.int64)
         triggers.add(offset, when, signals >> 32 & 1, signals >> 40 & 0x1F)

@@ -1,4 +1,4 @@
-"""Files that somebody made to do harm are refused in a sentence, before they cost memory or time."""
+"""Files made to do harm are refused in a sentence, before they cost memory or time."""
 
 import resource
 
@@ -11,11 +11,14 @@ from jaxevent.errors import InputError
 NEEDS = {"bag": "rosbags", "aedat4": "aedat"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", crafted.FILES, ids=lambda build: build.__name__)
 def test_crafted_files_are_refused(build, tmp_path):
     pytest.importorskip(NEEDS.get(build.__name__.partition("_")[0], "numpy"))
     path = build(tmp_path)
-    for in_memory in (True, False):
+    # Events are left in the file by HDF5 and by what is decoded; the others are read whole.
+    whole = build.__name__.startswith(("text", "npz", "mat"))
+    for in_memory in (True,) if whole else (True, False):
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         with pytest.raises(InputError, match=crafted.FILES[build]) as error:
             io.load(path, crafted.SIZE, in_memory)

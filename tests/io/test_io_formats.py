@@ -313,7 +313,7 @@ def test_events_before_the_first_time_are_counted(tmp_path):
     assert len(got.events) == 40
     assert {key: int(value) for key, value in got.extra.items()} == {
         "events_without_time": 2,
-        "triggers": 1,
+        "triggers_without_time": 1,
     }
 
 
@@ -403,8 +403,8 @@ def test_other_versions_and_chips_of_aedat(tmp_path):
     path.write_bytes(b"#!AER-DAT3.1\r\n" + bytes(200))
     with pytest.raises(InputError, match="is AEDAT 3.1; only AEDAT 2 and 4"):
         load(path)
-    path.write_bytes(b"#!AER-DAT2.0\r\n# AEChip: ch.unizh.DVS128\r\n" + bytes(80))
-    with pytest.raises(InputError, match="by the chip DVS128, but only DAVIS"):
+    path.write_bytes(b"#!AER-DAT2.0\r\n# AEChip: ch.unizh.DVS128StereoBoard\r\n" + bytes(80))
+    with pytest.raises(InputError, match="by the chip DVS128StereoBoard, but only DAVIS"):
         load(path)
     path.write_bytes(b"#!AER-DAT2.0\r\n# AEChip: x.DAVIS240C\r\n" + bytes(81))
     with pytest.raises(InputError, match="ends inside a record, 1 bytes after"):

@@ -2,14 +2,13 @@
 
 import struct
 from io import BytesIO
-from pathlib import Path
 from typing import Any
 
 import formats
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -56,14 +55,6 @@ def test_no_coordinate_wraps(kind, tmp_path):
         for in_memory in (True, False):
             with pytest.raises(InputError, match="70000x30 pixels, but at most 65536"):
                 load(path, None, in_memory).events[:]
-    assert kind in ("h5", "evt2", "npz") or len(load_or_none(path) or ()) == 0
-
-
-def load_or_none(path):
-    try:
-        return load(path, (65_536, 30)).events
-    except InputError:
-        return None
 
 
 @pytest.mark.parametrize("value", [40.5, "wide", [40, 41], np.nan])
@@ -130,7 +121,7 @@ def test_a_clock_below_its_start_loses_no_event(name, tmp_path):
 
 def test_float_times_are_seconds_or_whole_microseconds(tmp_path):
     columns = {name: getattr(EVENTS, name) for name in "xyp"}
-    for unit, scale in (("us", 1.0), ("s", 1e6)):
+    for scale in (1.0, 1e6):  # us, s
         t = EVENTS.t / scale
         np.savez(tmp_path / "a.npz", t=t, **columns)
         same(load(tmp_path / "a.npz", SIZE).events, EVENTS)
@@ -138,7 +129,7 @@ def test_float_times_are_seconds_or_whole_microseconds(tmp_path):
             for name, values in {"ts": t, **columns}.items():
                 file[f"events/{name}"] = values
         for in_memory in (True, False):
-            same(load(tmp_path / "a.h5", SIZE, in_memory).events, EVENTS), unit
+            same(load(tmp_path / "a.h5", SIZE, in_memory).events, EVENTS)
     np.savez(tmp_path / "a.npz", t=EVENTS.t * 1e3 + 0.5, **columns)
     with pytest.raises(InputError, match="span .* days; store them as integer microseconds"):
         load(tmp_path / "a.npz", SIZE)
@@ -171,6 +162,7 @@ def test_a_day_between_two_events_makes_no_large_index(tmp_path):
 
 
 @pytest.mark.parametrize("order", ["txyp", "xypt", "xytp", "ptxy"])
+@settings(max_examples=6)
 @given(seed=st.integers(0, 2**32 - 1), sign=st.booleans())
 def test_columns_are_told_apart_by_what_they_hold(order, seed, sign, tmp_path_factory):
     events = formats.events_of(seed, 60, SIZE, start=5_000)
@@ -281,7 +273,7 @@ def _dvs128(events, triggers=(), tick="1 us") -> bytes:
         (t, (127 - y) << 8 | (127 - x) << 1 | (not p)) for t, x, y, p in formats.rows(events)
     ] + [(t, 0x8000) for t in triggers]
     words = np.array([(address, t) for t, address in sorted(records)], ">u4")
-    head = f"#!AER-DAT2.0\r\n# AEChip: ch.unizh.ini.jaer.chip.retina.DVS128\r\n"
+    head = "#!AER-DAT2.0\r\n# AEChip: ch.unizh.ini.jaer.chip.retina.DVS128\r\n"
     return (head + f"# Timestamps tick is {tick}\r\n").encode() + words.tobytes()
 
 
@@ -291,8 +283,7 @@ def test_dvs128(tmp_path):
     for in_memory in (True, False):
         got = load(tmp_path / "a.aedat", None, in_memory)
         assert (got.width, got.height) == (128, 128)
-        order = np.argsort(got.events[:].t, kind="stable")
-        assert sorted(formats.rows(got.events[:][order])) == sorted(formats.rows(events))
+        assert sorted(formats.rows(got.events[:])) == sorted(formats.rows(events))
         assert got.triggers.t.tolist() == [7, 70_000] and got.triggers.edge.tolist() == [-1, -1]
     (tmp_path / "a.aedat").write_bytes(_dvs128(events, tick="20 ms"))
     with pytest.raises(InputError, match="count ticks of 20 ms"):
