@@ -97,8 +97,8 @@ class TriggerList:
         if place > self._place:
             self._place = place
             if len(t):
-                of_each = (np.broadcast_to(value, len(t)) for value in (edge, channel))
-                self._pieces.append((t, *of_each))
+                edge, channel = np.broadcast_to(edge, len(t)), np.broadcast_to(channel, len(t))
+                self._pieces.append((t, edge, channel))
 
     def all(self) -> Triggers | None:
         if not self._pieces:

@@ -39,6 +39,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from h5py import h5l
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, require
@@ -252,7 +253,7 @@ def open_file(path: Path) -> h5py.File:
     with reading(str(path)):
         check_heaps(path)
         file = h5py.File(path)
-        known = (h5py.h5l.TYPE_HARD, h5py.h5l.TYPE_SOFT)
+        known = (h5l.TYPE_HARD, h5l.TYPE_SOFT)
         link = file.id.links.visit(
             lambda name, info: None if info.type in known else name, info=True
         )

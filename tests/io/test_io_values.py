@@ -362,6 +362,7 @@ def test_triggers_are_saved_and_cut(tmp_path):
     assert recording[20_000:60_000].triggers.t.tolist() == [50_000]
     assert recording[20_000:30_000].triggers is None
     with h5py.File(tmp_path / "a.h5", "r+") as file:
-        file["triggers/edge"][0] = 5
+        del file["triggers/edge"]
+        file["triggers/edge"] = [5, 1]
     with pytest.raises(InputError, match="triggers need an edge, -1, 0 or 1"):
         load(tmp_path / "a.h5")
