@@ -295,8 +295,9 @@ def times(
     if len(values) and not -most < values.min() <= values.max() < most:
         row = int(np.argmin((values > -most) & (values < most)))
         unit = "seconds" if is_float and scale == 1e6 else "microseconds"
+        shown = f"{values[row]:.16g}" if is_float else str(values[row])
         raise InputError(
-            f"{source}: {what} {first_row + row} has the time {values[row].item()!r}, not finite "
+            f"{source}: {what} {first_row + row} has the time {shown}, not finite "
             f"or too large for {unit}; correct the unit or remove it"
         )
     if not is_float:

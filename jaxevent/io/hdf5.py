@@ -39,7 +39,6 @@ from typing import Any
 
 import h5py
 import numpy as np
-from h5py import h5l
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, require
@@ -253,7 +252,8 @@ def open_file(path: Path) -> h5py.File:
     with reading(str(path)):
         check_heaps(path)
         file = h5py.File(path)
-        known = (h5l.TYPE_HARD, h5l.TYPE_SOFT)
+        links: Any = getattr(h5py, "h5l")  # noqa: B009  (its stubs lack it)
+        known = (links.TYPE_HARD, links.TYPE_SOFT)
         link = file.id.links.visit(
             lambda name, info: None if info.type in known else name, info=True
         )
