@@ -29,12 +29,8 @@ def keep_compiled() -> Path | None:
     jax = sys.modules.get("jax")  # if it was imported before, it has read its variables already
     if wanted == "0" or theirs or (jax and jax.config.jax_compilation_cache_dir):
         return None
-    folder = (Path(wanted) if wanted else _user_folder()) / _processor()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:  # no home, as in some containers: everything works without
-        return None
-    if not os.access(folder, os.W_OK):
+    folder = folder_for_compiled()
+    if folder is None:
         return None
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(LEAST))
@@ -45,6 +41,19 @@ def keep_compiled() -> Path | None:
     # What cannot be kept, or was damaged, is compiled again.
     warnings.filterwarnings("ignore", "Error (read|writ)ing persistent compilation cache")
     return folder
+
+
+def folder_for_compiled() -> Path | None:
+    """The folder in which compiled programs are kept; None where none can be."""
+    wanted = os.environ.get("JAXEVENT_CACHE", "")
+    if wanted == "0":
+        return None
+    folder = (Path(wanted) if wanted else _user_folder()) / _processor()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:  # no home, as in some containers: everything works without
+        return None
+    return folder if os.access(folder, os.W_OK) else None
 
 
 def _user_folder() -> Path:

@@ -15,6 +15,11 @@ def compiled(function: Callable) -> Any:
     return numba.njit(cache=True, nogil=True)(inspect.unwrap(function))
 
 
+def part(function: Callable) -> Any:
+    """The same for what compiled functions alone call: they are kept, with it inside."""
+    return numba.njit(nogil=True, error_model="numpy")(inspect.unwrap(function))
+
+
 THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

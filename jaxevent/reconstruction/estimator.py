@@ -97,7 +97,9 @@ class PixelEstimator(ImageEstimator[P]):
             self.check_span(recording, times, params)
         return prepare(recording, times, Timing.of(params), filtering=self.filters)
 
-    def estimate(self, recording: Recording, params: P | None = None, **options: Any) -> Video[P]:
+    def estimate(
+        self, recording: Recording, params: P | None = None, **options: Any
+    ) -> ImageSequence[P]:
         """Video of a recording: `image, variance, valid = estimate(recording, params)(times)`.
 
         `options` are those of `Video`. Raises `InputError` if the recording lacks what the method

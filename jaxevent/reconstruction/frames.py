@@ -24,6 +24,18 @@ class FrameImages:
         """Intensities of 256 evenly spaced grey values."""
         return np.asarray(self._tables[1](jnp.linspace(0, 1, 256)), self.dtype)
 
+    def tables(self) -> NDArray:
+        """Grey values, intensities and certainties of the levels that whole numbers stand for."""
+        assert self.recording.frames is not None
+        kind = self.recording.frames.images.dtype
+        levels = 1 + (np.iinfo(kind).max if kind.kind in "iu" else 0)
+        return self.values(np.arange(levels) / max(levels - 1, 1))
+
+    def values(self, images: NDArray) -> NDArray:
+        """Grey values, intensities and certainties [3, ...] of images in [0, 1]."""
+        made = [np.asarray(table(jnp.asarray(images)), self.dtype) for table in self._tables]
+        return np.stack(made)
+
     def read(self, used: slice, room: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Grey values, intensities, certainties [room, pixels] and gains of a range of frames.
 
@@ -36,13 +48,14 @@ class FrameImages:
         if n:
             assert self.recording.frames is not None
             images = np.asarray(self.recording.frames[used].images).reshape(n, pixels)
-            for table, out in zip(self._tables, (grey, intensity, certainty), strict=True):
-                if images.dtype.kind == "f":
-                    out[:n] = table(jnp.asarray(images))
-                else:
-                    greys = np.arange(np.iinfo(images.dtype).max + 1)
-                    entries = table(jnp.asarray(greys / greys[-1]))
-                    np.take(np.asarray(entries, self.dtype), images, out=out[:n])
+            outs = (grey, intensity, certainty)
+            if images.dtype.kind == "f":
+                for values, out in zip(self.values(images), outs, strict=True):
+                    out[:n] = values
+            else:
+                for table, out in zip(self.tables(), outs, strict=True):
+                    np.take(table, images, out=out[:n])
+            for out in outs:
                 out[n:] = out[n - 1]
             gain[:n] = self._gain[used]
             intensity[:n] /= gain[:n, None]

@@ -123,16 +123,16 @@ class WindowedRecording:
 
     def prepare(self, start: int | None, before: StreamState) -> tuple[EventWindow, Features]:
         """The window that begins at `start`, shorter if its events are very unevenly spread."""
-        stop = self._stop(start)
+        stop = self.stop_after(start)
         source = self.recording.events
         begin = 0 if start is None else source.index(start)
         end = len(source) if stop is None else source.index(stop)
-        context, finish = self._context(self.clock.used(start, stop), begin, end)
+        context, finish = self.context_of(self.clock.used(start, stop), begin, end)
         if self.reach and stop is not None:
             finish = max(finish, source.index(stop + self.reach))
         around = source[context:finish]
         if before.last_then is not None:
-            before = self._move_context(before, context)
+            before = self.move_context(before, context)
         own = around[begin - context : end - context]
         while True:
             layout = self._layout(own)
@@ -170,7 +170,7 @@ class WindowedRecording:
         """The first row of the events and the first frame that windows from `start` on use."""
         used = self.clock.used(start, None)
         begin = 0 if start is None else self.recording.events.index(start)
-        row, _ = self._context(used, begin, begin)
+        row, _ = self.context_of(used, begin, begin)
         if before.last_then is not None:
             row = min(row, before.context)
         return row, used.start
@@ -192,7 +192,7 @@ class WindowedRecording:
         same = WindowEvents(events, events, events)
         return self._window(None, None, same, layout, self.initial())
 
-    def _stop(self, start: int | None) -> int | None:
+    def stop_after(self, start: int | None) -> int | None:
         """Where the window that starts at `start` should end; None: at the recording's end."""
         stops = []
         clock, source = self.clock, self.recording.events
@@ -213,7 +213,7 @@ class WindowedRecording:
                 stops.append(stop)
         return min(stops, default=None)
 
-    def _context(self, used: slice, begin: int, end: int) -> tuple[int, int]:
+    def context_of(self, used: slice, begin: int, end: int) -> tuple[int, int]:
         """The rows of the events in the frames' exposures and from begin to end."""
         if used.start < used.stop:
             # Of overlapping exposures, a later one may begin or an earlier one end further out.
@@ -223,7 +223,7 @@ class WindowedRecording:
             end = max(end, source.index(int(right.max()) + self.reach))
         return begin, end
 
-    def _move_context(self, state: StreamState, context: int) -> StreamState:
+    def move_context(self, state: StreamState, context: int) -> StreamState:
         """The same, with each pixel's last event before the row `context`."""
         last, row = state.last_then, state.context
         assert last is not None

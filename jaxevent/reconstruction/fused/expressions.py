@@ -1,0 +1,122 @@
+"""Scalar expressions: what a traced function computes for one pixel, as a graph of numbers.
+
+A `Node` is one number. Equal nodes are the same object, so what is computed twice is computed once,
+and what does not reach a result is never written. Constants are folded as they appear.
+"""
+
+import dataclasses
+import enum
+from typing import Any
+
+import numpy as np
+
+
+class Untranslatable(Exception):
+    """A function uses what there is no translation for; the scan serves it."""
+
+
+class Level(enum.IntEnum):
+    """When a number is known: the later, the more often it is computed."""
+
+    CONSTANT = 0  # when the program is written
+    HOST = 1  # with the parameters
+    PIECE = 2  # when a piece begins, equal for all pixels
+    TABLE = 3  # when a piece begins, for each pixel
+    POINT = 4  # at an event or image
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Node:
+    """One number: an operation on others, or an input with a name."""
+
+    op: str  # the primitive's name, or "input", "number", "entry"
+    args: tuple[Any, ...]
+    kind: str  # "f", "i" or "b": a real number, an integer, a truth value
+    level: Level
+    number: int  # in order of creation; arguments come before what uses them
+
+
+class Graph:
+    """Makes nodes."""
+
+    def __init__(self):
+        self._known: dict[Any, Node] = {}
+
+    def node(self, op: str, args: tuple[Any, ...], kind: str, level: Level) -> Node:
+        key = (op, kind, *(a.number if isinstance(a, Node) else ("", a) for a in args))
+        if key not in self._known:
+            self._known[key] = Node(op, args, kind, level, len(self._known))
+        return self._known[key]
+
+    def input(self, name: str, kind: str, level: Level) -> Node:
+        return self.node("input", (name,), kind, level)
+
+    def constant(self, value: Any) -> Node:
+        value = np.asarray(value)
+        kind = {"f": "f", "i": "i", "u": "i", "b": "b"}.get(value.dtype.kind)
+        if kind is None:
+            raise Untranslatable(f"numbers of type {value.dtype}")
+        text = {"f": float, "i": int, "b": bool}[kind](value)
+        return self.node("constant", (repr(text),), kind, Level.CONSTANT)
+
+    def apply(self, op: str, args: tuple[Any, ...], kind: str) -> Node:
+        """An operation on nodes; further arguments are plain values."""
+        simple = self._folded(op, args)
+        if simple is not None:
+            return simple
+        level = max(a.level for a in args if isinstance(a, Node))
+        return self.node(op, args, kind, level)
+
+    def _folded(self, op: str, args: tuple[Any, ...]) -> Node | None:
+        """The same in simpler form. Tables and parameters are taken to be finite."""
+        value = [value_of(a) for a in args]
+        if op == "mul":
+            for k in (0, 1):
+                if value[k] == 1:
+                    return args[1 - k]
+                if value[k] == 0:
+                    return args[k]
+        if op == "add":
+            for k in (0, 1):
+                if value[k] == 0:
+                    return args[1 - k]
+        if op == "sub":
+            if value[1] == 0:
+                return args[0]
+            if args[0] is args[1] and args[0].level <= Level.HOST:
+                return self.constant(0.0 if args[0].kind == "f" else 0)
+        if op == "div" and value[1] == 1:
+            return args[0]
+        if op in ("and", "or"):
+            for k in (0, 1):
+                if value[k] is not None:
+                    return args[1 - k] if value[k] == (op == "and") else args[k]
+        if op == "select_n":
+            if args[1] is args[2]:
+                return args[1]
+            if value[0] is not None:
+                return args[1 + int(value[0])]
+        return None
+
+
+def value_of(node: Any) -> Any:
+    """The value of a constant, None of all others."""
+    if not isinstance(node, Node) or node.op != "constant":
+        return None
+    if node.kind == "f":
+        return float(node.args[0])
+    return {"True": True, "False": False}[node.args[0]] if node.kind == "b" else int(node.args[0])
+
+
+def needed(results: list[Node], stop: set[Node] | None = None) -> list[Node]:
+    """The nodes that the results rest on, in order; `stop`: known, not looked behind."""
+    found: dict[int, Node] = {}
+    waiting = list(results)
+    while waiting:
+        node = waiting.pop()
+        if node.number in found:
+            continue
+        found[node.number] = node
+        if stop is None or node not in stop:
+            waiting += [a for a in node.args if isinstance(a, Node)]
+    return [found[number] for number in sorted(found)]

@@ -1,0 +1,229 @@
+"""The part of a traced function that rests on parameters alone, in NumPy, and run again for others.
+
+A few hundred operations on single numbers: XLA would compile longer than they take.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jax.extend.core import ClosedJaxpr
+from numpy.typing import NDArray
+
+from jaxevent.reconstruction.fused.expressions import Untranslatable
+
+# What a primitive computes, by its name: of any arrays, element by element.
+ELEMENTWISE: dict[str, Callable[..., Any]] = {
+    "add": np.add,
+    "add_any": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "max": np.maximum,
+    "min": np.minimum,
+    "pow": np.power,
+    "rem": np.fmod,
+    "neg": np.negative,
+    "abs": np.abs,
+    "sign": np.sign,
+    "exp": np.exp,
+    "log": np.log,
+    "log1p": np.log1p,
+    "expm1": np.expm1,
+    "sqrt": np.sqrt,
+    "rsqrt": lambda x: 1 / np.sqrt(x),
+    "logistic": lambda x: 1 / (1 + np.exp(-x)),
+    "tanh": np.tanh,
+    "sin": np.sin,
+    "cos": np.cos,
+    "floor": np.floor,
+    "ceil": np.ceil,
+    "square": np.square,
+    "is_finite": np.isfinite,
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "lt_to": np.less,
+    "le_to": np.less_equal,
+    "and": np.logical_and,
+    "or": np.logical_or,
+    "not": np.logical_not,
+    "stop_gradient": lambda x: x,
+    "copy": lambda x: x,
+    "copy_p": lambda x: x,
+}
+CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
+
+
+def inner(eqn: Any) -> Any | None:
+    """The closed jaxpr that an equation only calls; None where it does more."""
+    if eqn.primitive.name in ("scan", "while", "cond"):
+        return None
+    for name in CALLS:
+        if name in eqn.params:
+            called = eqn.params[name]
+            return called if hasattr(called, "consts") else ClosedJaxpr(called, [])
+    return None
+
+
+def rearranged(eqn: Any, values: list[Any]) -> NDArray | None:
+    """What a primitive makes that only moves elements, of any kind; None for other primitives.
+
+    Indices are known numbers.
+    """
+    name, p = eqn.primitive.name, eqn.params
+    x = np.asarray(values[0]) if values else None
+    if name == "iota":
+        shape = [1] * len(p["shape"])
+        shape[p["dimension"]] = -1
+        count = np.arange(p["shape"][p["dimension"]], dtype=p["dtype"])
+        return np.broadcast_to(count.reshape(shape), p["shape"])
+    if x is None:
+        return None
+    if name == "broadcast_in_dim":
+        shape = [1] * len(p["shape"])
+        for axis, size in zip(p["broadcast_dimensions"], x.shape, strict=True):
+            shape[axis] = size
+        return np.broadcast_to(x.reshape(shape), p["shape"])
+    if name == "reshape":
+        return x.reshape(p["new_sizes"])
+    if name in ("squeeze", "expand_dims"):
+        return x.reshape(eqn.outvars[0].aval.shape)
+    if name == "transpose":
+        return x.transpose(p["permutation"])
+    if name == "rev":
+        return np.flip(x, p["dimensions"])
+    if name == "slice":
+        steps = p["strides"] or [1] * x.ndim
+        bounds = zip(p["start_indices"], p["limit_indices"], steps, strict=True)
+        return x[tuple(slice(*bound) for bound in bounds)]
+    if name == "concatenate":
+        return np.concatenate([np.asarray(v) for v in values], p["dimension"])
+    if name == "stack":
+        return np.stack([np.asarray(v) for v in values], p["axis"])
+    if name == "dynamic_slice":
+        starts = [
+            int(np.clip(int(start), 0, n - size))
+            for start, n, size in zip(values[1:], x.shape, p["slice_sizes"], strict=True)
+        ]
+        return x[tuple(slice(s, s + n) for s, n in zip(starts, p["slice_sizes"], strict=True))]
+    if name == "gather":
+        return _gather(eqn, x, np.asarray(values[1]))
+    return None
+
+
+def _gather(eqn: Any, x: NDArray, indices: NDArray) -> NDArray:
+    numbers, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
+    if numbers.operand_batching_dims or numbers.start_indices_batching_dims:
+        raise Untranslatable("a gather with batch dimensions")
+    batch = indices.shape[:-1]
+    kept = [size for axis, size in enumerate(sizes) if axis not in numbers.collapsed_slice_dims]
+    out = np.empty((*batch, *kept), x.dtype)
+    for place in np.ndindex(*batch):
+        start = [0] * x.ndim
+        for axis, value in zip(numbers.start_index_map, indices[place], strict=True):
+            start[axis] = int(np.clip(int(value), 0, x.shape[axis] - sizes[axis]))
+        part = x[tuple(slice(s, s + n) for s, n in zip(start, sizes, strict=True))]
+        out[place] = part.reshape(kept)[()]
+    axes = list(range(len(batch), out.ndim))
+    order = [0] * out.ndim
+    at_offset, rest = iter(axes), iter(range(len(batch)))
+    for axis in range(out.ndim):
+        order[axis] = next(at_offset) if axis in numbers.offset_dims else next(rest)
+    return out.transpose(order)
+
+
+def evaluate(eqn: Any, values: list[NDArray]) -> list[NDArray]:
+    """What an equation makes of numbers."""
+    name = eqn.primitive.name
+    called = inner(eqn)
+    if called is not None:
+        return run(called, values)
+    if name == "scan":
+        return _scan(eqn, values)
+    with np.errstate(all="ignore"):
+        made = rearranged(eqn, values)
+        if made is None and name in ELEMENTWISE:
+            made = ELEMENTWISE[name](*values)
+        elif made is None and name == "div":
+            whole = np.asarray(values[0]).dtype.kind in "iu"
+            made = values[0] // values[1] if whole else values[0] / values[1]
+        elif made is None and name == "integer_pow":
+            made = np.power(np.asarray(values[0]), float(eqn.params["y"]))
+        elif made is None and name == "select_n" and len(values) == 3:
+            made = np.where(values[0], values[2], values[1])
+        elif made is None and name == "convert_element_type":
+            made = np.asarray(values[0]).astype(eqn.params["new_dtype"])
+    if made is None:
+        made = eqn.primitive.bind(*values, **eqn.params)
+        many = made if eqn.primitive.multiple_results else [made]
+        return [np.asarray(v) for v in many]
+    return [np.asarray(made, eqn.outvars[0].aval.dtype)]
+
+
+def run(closed: Any, values: list[NDArray]) -> list[NDArray]:
+    """What a closed jaxpr makes of numbers."""
+    known: dict[Any, NDArray] = dict(zip(closed.jaxpr.invars, values, strict=True))
+    known |= dict(zip(closed.jaxpr.constvars, map(np.asarray, closed.consts), strict=True))
+
+    def of(atom: Any) -> NDArray:
+        return np.asarray(atom.val) if hasattr(atom, "val") else known[atom]
+
+    for eqn in closed.jaxpr.eqns:
+        made = evaluate(eqn, [of(a) for a in eqn.invars])
+        known |= dict(zip(eqn.outvars, made, strict=True))
+    return [of(a) for a in closed.jaxpr.outvars]
+
+
+def _scan(eqn: Any, values: list[NDArray]) -> list[NDArray]:
+    p = eqn.params
+    fixed, carried = p["num_consts"], p["num_carry"]
+    if len(values) > fixed + carried or len(eqn.outvars) > carried or p["reverse"]:
+        made = eqn.primitive.bind(*values, **p)
+        return [np.asarray(v) for v in made]
+    carry = values[fixed:]
+    for _ in range(p["length"]):
+        carry = run(p["jaxpr"], [*values[:fixed], *carry])
+    return carry
+
+
+@dataclasses.dataclass
+class HostProgram:
+    """Numbers known with the parameters: inputs, and the equations that make others of them."""
+
+    values: list[NDArray] = dataclasses.field(default_factory=list)
+    inputs: int = 0
+    steps: list[tuple[Any, list[Any], list[int]]] = dataclasses.field(default_factory=list)
+    decided: list[int] = dataclasses.field(default_factory=list)  # truth values that chose a way
+    _known: dict[Any, list[int]] = dataclasses.field(default_factory=dict)
+
+    def add_input(self, value: NDArray) -> int:
+        assert not self.steps
+        self.values.append(np.asarray(value))
+        self.inputs += 1
+        return len(self.values) - 1
+
+    def add(self, eqn: Any, arguments: list[Any]) -> list[int]:
+        """Arguments are numbers of values (int), or arrays. The same again gives the same."""
+        what = eqn.primitive.name, str(eqn.params)
+        key = (what, *(a if isinstance(a, int) else (a.tobytes(), a.shape) for a in arguments))
+        if key in self._known:
+            return self._known[key]
+        made = evaluate(eqn, [self.values[a] if isinstance(a, int) else a for a in arguments])
+        first = len(self.values)
+        self.values += made
+        numbers = list(range(first, first + len(made)))
+        self.steps.append((eqn, arguments, numbers))
+        self._known[key] = numbers
+        return numbers
+
+    def again(self, inputs: list[NDArray]) -> list[NDArray] | None:
+        """All values for other inputs; None where a truth value that chose a way is another."""
+        values: list[NDArray] = [*inputs]
+        for eqn, arguments, _ in self.steps:
+            values += evaluate(eqn, [values[a] if isinstance(a, int) else a for a in arguments])
+        same = all(np.array_equal(values[n], self.values[n]) for n in self.decided)
+        return values if same else None

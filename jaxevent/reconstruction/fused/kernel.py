@@ -1,0 +1,123 @@
+"""Kernels: a method's text compiled by numba, kept in the user's cache folder, with its numbers."""
+
+import dataclasses
+import functools
+import hashlib
+import importlib.util
+import os
+import sys
+import tempfile
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import jax
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent import cache
+from jaxevent.reconstruction.fused import numeric
+from jaxevent.reconstruction.fused.loop import Functions
+from jaxevent.reconstruction.fused.pixel import (
+    FilterMethod,
+    PixelProgram,
+    Traced,
+    traced,
+    translated,
+)
+from jaxevent.reconstruction.fused.source import Source, evaluate_arrays, write
+
+
+@dataclasses.dataclass(frozen=True)
+class Kernel:
+    """A method compiled for the host, with the numbers of its parameters."""
+
+    functions: Functions
+    program: PixelProgram
+    source: Source
+    values: list[NDArray]  # of the host program
+    numbers: NDArray  # what the loop takes
+
+    def start(self, variant: int, known: Any) -> list[NDArray]:
+        """The state at the start, of arrays of inputs that `known(name)` gives."""
+        nodes = self.program.start[variant]
+        return evaluate_arrays(nodes, known, self.values, self.program.traced.dtype)
+
+
+@dataclasses.dataclass
+class _Programs:
+    """What has been made of a method whose functions were traced once."""
+
+    traced: Traced
+    known: list[tuple[PixelProgram, dict[int, tuple[Source, ModuleType]]]]
+
+
+_programs: dict[Any, _Programs] = {}
+
+
+def kernel_of(
+    method: FilterMethod,
+    observe: Any,
+    params: Any,
+    response: NDArray,
+    present: bool,
+    exposed: bool,
+    dtype: np.dtype,
+    stride: int,
+) -> Kernel:
+    """The kernel of a method with its parameters; raises `Untranslatable`.
+
+    Its functions are traced once for parameters of a kind, translated once for every way that
+    conditions on parameters can choose, compiled once for a machine.
+    """
+    leaves, tree = jax.tree.flatten(params)
+    key = (method, tree, tuple(np.shape(leaf) for leaf in leaves), exposed, dtype)
+    if key not in _programs:
+        _programs[key] = _Programs(traced(method, observe, params, exposed, dtype), [])
+    made = _programs[key]
+    given = [np.asarray(leaf) for leaf in leaves]
+    given += [np.asarray(response, dtype), np.asarray(float(present), dtype)]
+    again = ((known, known[0].host.again(given)) for known in made.known)
+    found = next(((known, values) for known, values in again if values is not None), None)
+    if found is None:
+        program = translated(made.traced, params, response, float(present))
+        found = (program, {}), program.host.values
+        made.known.append(found[0])
+    (program, modules), values = found
+    if stride not in modules:
+        source = write(program, stride)
+        modules[stride] = source, _module(source.text)
+    source, module = modules[stride]
+    functions = Functions(module.events, module.images, module.tables, module.excess)
+    numbers = source.numbers_of(values, dtype)
+    return Kernel(functions, program, source, values, numbers)
+
+
+def _module(text: str) -> ModuleType:
+    """The module of a text, from a file that numba keeps compiled functions beside."""
+    about = f"{numba.__version__} {_shared()}\n{text}"
+    name = f"kernel_{hashlib.blake2b(about.encode(), digest_size=8).hexdigest()}"
+    folder = cache.folder_for_compiled() or Path(_own_folder().name)
+    path = folder / f"{name}.py"
+    if not path.exists():  # numba looks at its time: it is written once
+        with tempfile.NamedTemporaryFile("w", dir=folder, suffix=".py", delete=False) as file:
+            file.write(text)
+        os.replace(file.name, path)
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@functools.cache
+def _shared() -> str:
+    """What kernels are made of beside their text."""
+    return hashlib.blake2b(Path(numeric.__file__).read_bytes()).hexdigest()
+
+
+@functools.cache
+def _own_folder() -> "tempfile.TemporaryDirectory[str]":
+    return tempfile.TemporaryDirectory(prefix="jaxevent")

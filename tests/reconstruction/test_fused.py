@@ -1,0 +1,174 @@
+"""Kernels, which numba compiles from filters' own functions, against loops over events."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import own_filter
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from noise import small
+from test_own_filter import by_hand
+from test_reconstruction import (
+    OPTIONS,
+    PARAMS,
+    look,
+    params_of,
+    random_recording,
+    recordings,
+    times_of,
+)
+
+import jaxevent
+from jaxevent import kernels
+from jaxevent.reconstruction.fused import bands, numeric
+from jaxevent.reconstruction.fused.host import HostProgram, run
+from jaxevent.reconstruction.fused.video import FusedVideo
+from jaxevent.reconstruction.video import Video
+
+# Of the same choices, so that the functions are traced once; conditions on numbers choose the way.
+DEAD = {**PARAMS, "rho_ref": 0.0008, "clock_offset": 0.0007}
+ALL = {**OPTIONS, "clock_offset": -0.0021}
+
+
+def check(name, recording, values, **options):
+    """Images by a kernel in double precision are those of the loop over events."""
+    method = jaxevent.METHODS[name]
+    params = params_of(method, **{"weighting": "linear", **values})
+    times = times_of(recording)
+    video = method.estimate(recording, params, compiler="numba", **options)
+    assert isinstance(video, FusedVideo)
+    image, variance = look(video, times)
+    expected, P = oracles.reconstruct(name, recording, params.values(), times)
+    np.testing.assert_allclose(image, expected, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(variance, P, rtol=1e-10)
+    # Read again, from the start: windows are opened anew from their kept states.
+    np.testing.assert_array_equal(look(video, times[2])[:, 0], [image[2], variance[2]])
+
+
+@settings(max_examples=8)
+@given(recording=recordings(fewest_frames=1), events=st.sampled_from([7, 1000]))
+def test_kernel_of_edi_equals_loop_over_events(recording, events):
+    check("edi", recording, ALL, window_events=events)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["akf", "cf", "cf-augmented", "high-pass", "augmented"])
+@settings(max_examples=10)
+@given(
+    recording=recordings(fewest_frames=1),
+    values=st.sampled_from([PARAMS, DEAD, ALL]),
+    events=st.sampled_from([7, 1000]),
+)
+def test_kernel_equals_loop_over_events(name, recording, values, events):
+    check(name, recording, values, window_events=events)
+
+
+@pytest.mark.slow
+@settings(max_examples=6)
+@given(recording=recordings())
+def test_kernel_without_frames(recording):
+    recording = dataclasses.replace(recording, frames=None)
+    if len(recording.events):
+        check("akf", recording, PARAMS, window_events=7)
+
+
+def test_kernel_of_a_users_own_filter():
+    """A state of three numbers, one of them whole; nothing is written twice."""
+    recording, params = small(), own_filter.Params(gain=0.3, alpha=20.0)
+    times = np.array([9_000, 30_000, 52_000])
+    video = own_filter.trend.estimate(recording, params, compiler="numba", window_events=90)
+    image, variance, valid = video(times)
+    np.testing.assert_allclose(image, by_hand(recording, params, times), rtol=1e-10)
+    scan = own_filter.trend.estimate(recording, params, compiler="xla")(times)
+    np.testing.assert_allclose(variance, scan.covariance, rtol=1e-12)
+    assert valid.all()
+
+
+def test_bands_and_cores_do_not_change_a_bit(monkeypatch):
+    recording = random_recording(7, 900, 5, size=(11, 9), exposure=0)
+    times, params = times_of(recording), params_of(jaxevent.high_pass, **PARAMS)
+
+    def images():
+        return look(jaxevent.high_pass.estimate(recording, params, compiler="numba"), times)
+
+    whole = images()
+    # Bands of one row each: an event is the neighbour's of the bands above and below too.
+    monkeypatch.setattr(bands, "STRIDES", (3 * 13,))
+    layout = bands.BandLayout.of(11, 9)
+    assert layout is not None and len(layout.edges) == 10
+    np.testing.assert_array_equal(images(), whole)
+    monkeypatch.setattr(kernels, "THREADS", 1)
+    np.testing.assert_array_equal(images(), whole)
+
+
+def test_float_frames_are_those_of_their_levels():
+    recording = random_recording(8, 90, 4)
+    frames = recording.frames
+    floats = dataclasses.replace(frames, images=np.asarray(frames.images) / 255.0)
+    times, params = times_of(recording), jaxevent.edi.Params(exposure=0.004)
+    one, two = (
+        look(jaxevent.edi.estimate(r, params, compiler="numba"), times)
+        for r in (recording, dataclasses.replace(recording, frames=floats))
+    )
+    np.testing.assert_allclose(one[0], two[0], rtol=1e-12)
+
+
+def test_which_compiler_serves(float32):
+    recording, blend = small(), jaxevent.blend
+    assert isinstance(blend.estimate(recording), FusedVideo)
+    assert isinstance(blend.estimate(recording, devices=jax.devices()[:1]), FusedVideo)
+    assert type(blend.estimate(recording, compiler="xla")) is Video
+    with jax.enable_x64(True):
+        assert type(blend.estimate(recording)) is Video
+    # Where a function has no translation the scan serves.
+    for advance, reason in (
+        (lambda p, s, dt, f: dataclasses.replace(s, L=jax.lax.erf(f.level)), "'erf'"),
+        (lambda p, s, dt, f: 1 / 0, "fail for one pixel"),
+    ):
+        odd = dataclasses.replace(jaxevent.cf, advance=advance)
+        assert type(odd.estimate(recording)) is Video
+        with pytest.raises(jaxevent.InputError, match=reason):
+            odd.estimate(recording, compiler="numba")
+    with pytest.raises(jaxevent.InputError, match="numba or xla"):
+        blend.estimate(recording, compiler="gcc")
+
+
+def test_functions_of_single_precision():
+    x = np.concatenate([np.linspace(-87, 88, 3001), [0, 1e-30, 1e-7, -1e-7]]).astype(np.float32)
+    exact = np.exp(x.astype(float))
+    assert max(abs(numeric.exp32(v) / e - 1) for v, e in zip(x, exact, strict=True)) < 2e-7
+    positive = np.geomspace(1e-37, 1e38, 3001).astype(np.float32)
+    for v, e in zip(positive, np.log(positive.astype(float)), strict=True):
+        assert abs(numeric.log32(v) - e) <= 2e-7 * max(abs(e), 1e-3)
+    for v in np.array([-0.9, -1e-3, -1e-9, 0, 1e-9, 1e-4, 0.3, 7, 1e9], np.float32):
+        assert numeric.log1p32(v) == pytest.approx(np.log1p(float(v)), rel=3e-7)
+        assert numeric.logistic32(v) == pytest.approx(1 / (1 + np.exp(-float(v))), rel=3e-7)
+    inf, nan = np.float32(np.inf), np.float32(np.nan)
+    assert numeric.exp32(inf) == inf and numeric.exp32(-inf) == 0 and np.isnan(numeric.exp32(nan))
+    assert numeric.log32(np.float32(0)) == -inf and numeric.log32(inf) == inf
+    assert np.isnan(numeric.log32(np.float32(-1))) and np.isnan(numeric.log32(nan))
+
+
+def test_numbers_of_parameters_are_found_without_compiling():
+    """NumPy gives what JAX gives: interpolation, a table, a sum, choices."""
+
+    def numbers(a, b):
+        table = jnp.linspace(0, 1, 8) ** 2
+        place = jnp.interp(a, jnp.arange(8), table)
+        return place, jnp.where(b > 0, jnp.log1p(b), b), table[1:3] @ jnp.stack([a, b]), table[::-1]
+
+    closed = jax.make_jaxpr(numbers)(2.3, -0.4)
+    for given_numbers in ((2.3, -0.4), (9.0, 0.7)):
+        made = run(closed, [np.asarray(v) for v in given_numbers])
+        for one, other in zip(made, numbers(*given_numbers), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-12)
+    program = HostProgram()
+    first = program.add_input(np.asarray(2.0))
+    greater = jax.make_jaxpr(lambda x: x > 1)(2.0).eqns[0]
+    program.decided += program.add(greater, [first, np.asarray(1.0)])
+    assert program.again([np.asarray(3.0)]) is not None
+    assert program.again([np.asarray(0.5)]) is None
