@@ -1,13 +1,15 @@
 """Speed, memory and compilation of reconstruction, as ratios measured in one run.
 
-    python experiments/bench.py [--gate | --bless] [--json FILE] [--skip-memory] [--blob | --motion]
+    python experiments/bench.py [--gate | --bless] [--json FILE] [--skip-memory]
+                                [--blob | --motion | --video]
 
 A stream of 5 M events at 346x260 (gamma-distributed pixel rates, 2 s, 25 frames per second) is
 filtered, prepared and read. Beside it run, on one core: the whole filter as a plain numba program
 over events, which is what a C++ program does; its recursion with and without the look-up of
 neighbours; and the Accumulator of dv-processing. The tracker of blobs runs on a simulated blob,
 beside the same filter as a numba loop and what its authors publish, 0.1 M updates/s; `--blob` runs
-nothing else, and `--motion` nothing but egomotion, see bench_motion.py. `--gate` compares the
+nothing else, `--motion` nothing but egomotion, see bench_motion.py, and `--video` nothing but the
+complete path, in CPU seconds. `--gate` compares the
 ratios with bench_baseline.json and exits with 1 if one is worse than its tolerance; `--bless`
 writes them.
 """
@@ -22,6 +24,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -49,6 +52,7 @@ GATED = {
     "features and packing / numba program": ("higher", 0.5),
     "loss and gradient of 8 parameters / loss": ("lower", 0.5),
     "complete path / dv-processing Accumulator": ("higher", 0.5),
+    "complete path / the same compiled by XLA, CPU": ("higher", 0.5),
     "compilations for a second recording": ("lower", 0.0),
     "peak memory of 100 M events, GB": ("lower", 0.25),
     "blob filter, event by event / numba loop": ("higher", 0.5),
@@ -59,22 +63,25 @@ GATED = {
 }
 
 
-def stream(events: int, seconds: float, seed: int) -> Recording:
+def stream(
+    events: int, seconds: float, seed: int, size: tuple[int, int] = (WIDTH, HEIGHT)
+) -> Recording:
     """Events at gamma-distributed rates per pixel, frames of noise at 25 per second."""
     rng = np.random.default_rng(seed)
-    rate = rng.gamma(2.0, 1.0, WIDTH * HEIGHT)
-    pixel = rng.choice(WIDTH * HEIGHT, events, p=rate / rate.sum())
+    width, height = size
+    rate = rng.gamma(2.0, 1.0, width * height)
+    pixel = rng.choice(width * height, events, p=rate / rate.sum())
     t = np.sort(rng.integers(0, int(seconds * 1e6), events))
-    y, x = np.divmod(pixel, WIDTH)
+    y, x = np.divmod(pixel, width)
     frames = int(25 * seconds)
     return Recording(
         "bench",
-        WIDTH,
-        HEIGHT,
+        width,
+        height,
         Events(t, x.astype(np.uint16), y.astype(np.uint16), rng.random(events) < 0.5),
         Frames(
             (np.arange(frames) * 40_000 + 5_000).astype(np.int64),
-            rng.integers(0, 256, (frames, HEIGHT, WIDTH), np.uint8),
+            rng.integers(0, 256, (frames, height, width), np.uint8),
             np.zeros(frames, np.int64),
         ),
     )
@@ -294,6 +301,59 @@ def complete_seconds(path: Path) -> tuple[float, float]:
             pass
 
     return best(run, 3), reading
+
+
+def cpu_bench(recording: Recording, path: Path) -> tuple[dict[str, float], dict[str, float]]:
+    """The complete path by both compilers in CPU seconds, which other work on the machine spares.
+
+    Interleaved, the least of each: the numba program, which makes no images; 100 and 500 images per
+    second; and 5 M events of a sensor of 1280x720 in 2 s with 25 images per second, from memory.
+    """
+    e, frames = recording.events, recording.frames
+    assert isinstance(e, Events) and frames is not None
+    grey = frames.intensity.astype(np.float64)
+    numbers = (0.1, 5e-4, 0.03, 0.01, 0.01, 7e5, 0.09)
+    large = stream(5_000_000, 2.0, 1, (1280, 720))
+
+    def images(given: Recording | None, compiler: Any, rate: int) -> None:
+        given = load(path) if given is None else given
+        times = np.arange(given.start, given.stop, 1_000_000 // rate)
+        video = jaxevent.akf.estimate(given, compiler=compiler)
+        for _ in video.batches(times):
+            pass
+
+    tasks = {
+        "program": lambda: program(e.t, e.x, e.y, e.p, grey, frames.t, *numbers),
+        "reading": lambda: load(path),
+    }
+    for compiler in ("numba", "xla"):
+        for name, given, rate in (("100", None, 100), ("500", None, 500), ("large", large, 25)):
+            if (compiler, name) != ("xla", "500"):
+                tasks[f"{compiler} {name}"] = functools.partial(images, given, compiler, rate)
+    least: dict[str, float] = {}
+    for repeat in range(4):
+        for name, task in tasks.items():
+            start = time.process_time()
+            task()
+            if repeat:  # the first compiles
+                least[name] = min(least.get(name, np.inf), time.process_time() - start)
+    extra = 1e9 * (least["numba 500"] - least["numba 100"]) / (800 * WIDTH * HEIGHT)
+    n = len(e) / 1e6
+    speed = {
+        "numba program, per CPU second": n / least["program"],
+        "reading HDF5, per CPU second": n / least["reading"],
+        "complete path, per CPU second": n / least["numba 100"],
+        "complete path compiled by XLA, per CPU second": n / least["xla 100"],
+        "1280x720 at 25 Hz, per CPU second": n / least["numba large"],
+        "1280x720 at 25 Hz compiled by XLA, per CPU second": n / least["xla large"],
+    }
+    ratio = {
+        "complete path / numba program, CPU": least["program"] / least["numba 100"],
+        "the same without reading": least["program"] / (least["numba 100"] - least["reading"]),
+        "complete path / the same compiled by XLA, CPU": least["xla 100"] / least["numba 100"],
+        "ns of CPU per pixel of an image more": extra,
+    }
+    return speed, ratio
 
 
 def accumulator_seconds(recording: Recording) -> float:
@@ -633,6 +693,7 @@ def main() -> int:
     parser.add_argument("--skip-memory", action="store_true", help="leave out the 100 M events")
     parser.add_argument("--blob", action="store_true", help="the tracker of blobs alone")
     parser.add_argument("--motion", action="store_true", help="egomotion alone")
+    parser.add_argument("--video", action="store_true", help="the complete path alone, CPU seconds")
     parser.add_argument("--long", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.long:
@@ -644,6 +705,10 @@ def main() -> int:
     if arguments.motion:
         return finish(arguments, *motion_bench())
     recording = stream(5_000_000, 2.0, 0)
+    if arguments.video:
+        with tempfile.TemporaryDirectory() as folder:
+            save(recording, Path(folder) / "bench.h5")
+            return finish(arguments, *cpu_bench(recording, Path(folder) / "bench.h5"))
     n = len(recording.events) / 1e6
     speed, ratio = {}, {}
     print(machine())
@@ -657,6 +722,7 @@ def main() -> int:
         preparing = n / prepare_seconds(recording)
         loss, gradient = gradient_seconds(recording)
         whole, reading = complete_seconds(path)
+        cpu_speed, cpu_ratio = cpu_bench(recording, path)
         path.unlink()
         assert isinstance(recording.events, Events)
         text = text_seconds(Path(folder), recording.events[:1_000_000])
@@ -685,8 +751,8 @@ def main() -> int:
             "compilations for a second recording": compilations(),
         }
         blob_speed, blob_ratio = blob_bench()
-        speed |= blob_speed
-        ratio |= blob_ratio
+        speed |= cpu_speed | blob_speed
+        ratio |= cpu_ratio | blob_ratio
         if not arguments.skip_memory:
             gigabytes, seconds = long_run(Path(folder))
             ratio["peak memory of 100 M events, GB"] = gigabytes
