@@ -254,9 +254,9 @@ class Links:
         live.confirmed = live.confirmed | (heard & enough & apart)
 
     def _part(self, part: Part, owner: NDArray, labels: NDArray, blobs: int) -> None:
-        """Leave a target the larger of two blobs whose distance changes: the other is another one.
+        """Leave a target the larger of two blobs that move apart: the other is another one.
 
-        Parts of one object, such as both sides of an outline, keep their distance.
+        Of parts of one object, such as both sides of an outline, the distance does not double.
         """
         live = self.live
         longish = _larger(live.C) > LONGISH**2 * np.linalg.det(live.C) / _larger(live.C)
@@ -271,8 +271,7 @@ class Links:
                 continue
             distance = float(np.hypot(*(two.p[a] - two.p[b])))
             first, windows = before.get(int(live.id[i]), (distance, 0))
-            size = np.sqrt(_larger(two.C[[a, b]])).sum()
-            if windows >= PARTS and abs(distance - first) > size:
+            if windows >= PARTS and distance > 2 * first:
                 live.p[i], live.C[i], live.n[i] = two.p[a], two.C[a], two.n[a]
                 continue
             self.pairs[int(live.id[i])] = first, windows + 1
