@@ -20,9 +20,9 @@ def add(commands: Any) -> None:
         "Estimate how the camera moved. It writes a folder of tables (motion.csv, motion.h5), "
         "plots and an image of the events before and after they are moved back along the motion, "
         "and with --truth the errors. The camera's axes are x to the right, y down, z forward.",
-        "slider_depth.zip --model planar --truth --out slider",
+        "slider_depth.zip --model auto --out slider",
         "spin.h5 --model rotation --truth spin.csv --flow --out spin",
-        "drone.h5 --model general --gyro --start 2 --stop 3 --out drone",
+        "drone.h5 --model general --imu --start 2 --stop 3 --out drone",
     )
     one.add_argument("path", metavar="PATH", type=Path, help="a recording; frames are not needed")
     one.add_argument(
@@ -30,8 +30,8 @@ def add(commands: Any) -> None:
         metavar="MODEL",
         required=True,
         help="planar: image velocity vx, vy (px/s); rotation: angular velocity wx, wy, wz (rad/s); "
-        "general: heading tx, ty, tz, a unit vector, and angular velocity; or one of your own, "
-        "package.module:Class",
+        "general: heading tx, ty, tz, a unit vector, and angular velocity; auto: the simplest of "
+        "these that explains the recording; or one of your own, package.module:Class",
     )
     one.add_argument(
         "--method",
@@ -56,9 +56,24 @@ def add(commands: Any) -> None:
         "recording's poses or else its gyro",
     )
     one.add_argument(
-        "--gyro",
+        "--depth",
+        metavar="M",
+        type=float,
+        help="of the scene, with --truth: the image velocity that poses make at it; default: at "
+        "the depth that fits best",
+    )
+    one.add_argument(
+        "--imu",
         action="store_true",
-        help="let the recording's gyro help, with batch",
+        help="let the recording's gyro help, with batch; its bias is told by --still, else it is "
+        "found from a first estimate",
+    )
+    one.add_argument(
+        "--imu-rotation",
+        metavar="AXES",
+        help="the gyro's axes: camera (x right, y down, z forward; default), y-up (x right, y up, "
+        "z backward, as jAER), x-left (x left, y down, z backward), turned (x left, y up), or nine "
+        "numbers of the rotation from its axes to the camera's, row by row",
     )
     one.add_argument(
         "--still",
@@ -99,7 +114,9 @@ def run(
     params: Path | None,
     seed: int,
     truth: Path | str | None,
-    gyro: bool,
+    depth: float | int | None,
+    imu: bool,
+    imu_rotation: str | None,
     still: tuple[float, float] | None,
     rate: float | int,
     centred: bool,
@@ -113,71 +130,66 @@ def run(
 ) -> None:
     import json
 
-    from jaxevent.camera import PinholeCamera
-    from jaxevent.egomotion import MODELS, find_model, from_gyro, gyro_bias
+    from jaxevent.egomotion import find_model
+    from jaxevent.egomotion.choice import choose
+    from jaxevent.egomotion.truth import gyro_bias
+    from jaxevent.egomotion.truth import imu_rotation as rotation_of
     from jaxevent.io import load
-    from jaxevent.methods import names
     from jaxevent.runs.egomotion import find_estimator
     from jaxevent.show.motion import Output
 
-    kind = find_model(model)
-    estimator = find_estimator(method or kind.method)
-    estimator.find_model(kind)
-    values = (
-        estimator.start(kind) if params is None else estimator.Params.load(params, estimator.name)
-    )
+    kind = None if model == "auto" else find_model(model)
+    if kind is not None:
+        _check(find_estimator(method or kind.method), kind, imu, smooth)
     if seed < 0:
         raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
-    for option, used in (("gyro", gyro), ("smooth", smooth)):
-        if used and option not in estimator.options:
-            others = [name for name in names("egomotion") if option in find_estimator(name).options]
-            raise InputError(
-                f"--{option} is not for the method {estimator.name}; leave it out or use "
-                f"{' or '.join(others)}"
-            )
+    turned = None if imu_rotation is None else rotation_of(imu_rotation)
     output = Output(out, rate, truth, centred, flow)
     recording = load(path, size, in_memory=False, progress=show_progress())
-    recording = dataclasses.replace(recording, name=str(path))  # for messages
+    recording = _with_camera(dataclasses.replace(recording, name=str(path)), focal)
     if not len(recording.events):
         raise InputError(f"{path}: holds no events; choose another recording")
-    if focal is not None:
-        if not 0 < focal < math.inf:
-            raise InputError(f"--focal {focal:g} is not possible; give pixels above 0")
-        if recording.camera is not None:
-            raise InputError(f"{path}: has a calibration; leave out --focal")
-        centre = (recording.width - 1) / 2, (recording.height - 1) / 2
-        recording = dataclasses.replace(recording, camera=PinholeCamera(focal, focal, *centre))
-    if kind.needs_camera and recording.camera is None:
-        others = [name for name, one in MODELS.items() if not one.needs_camera]
+    if recording.imu is None and (imu or still is not None):
         raise InputError(
-            f"{path}: has no calibration, which {kind.title} needs; give --focal or choose "
-            f"--model {' or '.join(others)}"
-        )
-    imu = recording.imu
-    if imu is None and (gyro or still is not None):
-        raise InputError(
-            f"{path}: holds no IMU; leave out {'--gyro' if gyro else '--still'} or choose another "
+            f"{path}: holds no IMU; leave out {'--imu' if imu else '--still'} or choose another "
             "recording"
         )
-    bias = None if imu is None or still is None else gyro_bias(imu, *still)
-    true = output.known(recording, kind, bias)
-    settings: dict[str, Any] = {"cloud": CLOUD} if "cloud" in estimator.options else {}
-    if smooth:
-        settings["smooth"] = True
-    if imu is not None and gyro:
-        settings["gyro"] = from_gyro(imu) if bias is None else from_gyro(imu, bias)
+    bias = None
+    if recording.imu is not None and still is not None:
+        bias = gyro_bias(recording.imu, *still)
+    whole = recording
     if start is not None or stop is not None:
-        poses, measured = recording.poses, recording.imu
-        recording = dataclasses.replace(recording[start:stop], poses=poses, imu=measured)
+        kept = {"poses": recording.poses, "imu": recording.imu}
+        recording = dataclasses.replace(recording[start:stop], **kept)
         if not len(recording.events):
             raise InputError(f"{path}: holds no events from --start to --stop; choose other times")
+    if kind is None:
+        choice = choose(recording)
+        print("\n".join(choice.lines))
+        kind = choice.model
+    estimator = find_estimator(method or kind.method)
+    _check(estimator, kind, imu, smooth)
+    _need_camera(recording, kind)
+    true = output.known(whole, kind, bias, turned, depth)
+    values, given = _parameters(estimator, kind, params)
+    values, line = estimator.suit(recording, values, given=given)
+    if line:
+        print(line)
     clock = time.perf_counter()
-    told = estimator.estimate(
-        recording, values, model=kind, seed=seed, progress=show_progress(), **settings
-    )
+    settings: dict[str, Any] = {"model": kind, "seed": seed, "progress": show_progress()}
+    if "cloud" in estimator.options:
+        settings["cloud"] = CLOUD
+    if smooth:
+        settings["smooth"] = True
+    if imu:
+        settings["gyro"] = _gyro(estimator, recording, values, settings, bias, turned)
+    told = estimator.estimate(recording, values, **settings)
+    told, warning = told.with_layers(recording)
+    if warning:
+        print(warning)
     seconds = time.perf_counter() - clock
     about = {"method": estimator.name, "parameters": json.dumps(values.values()), "seed": seed}
-    about |= {"smooth": smooth, "gyro": gyro, "centred": centred}
+    about |= {"smooth": smooth, "gyro": imu, "centred": centred}
     written = output.write(recording, told, about, true, show_progress())
     print("\n".join([f"{kind.title} by {estimator.name}:", *written.summary()]))
     count = len(recording.events)
@@ -185,3 +197,77 @@ def run(
         f"\n{', '.join(written.files)} in {out}: {count:,} events in {seconds:.2f} s, "
         f"{count / seconds:,.0f} events/s"
     )
+
+
+def _check(estimator: Any, kind: Any, imu: bool, smooth: bool) -> None:
+    """Raise `InputError` for a model or an option that the method does not know."""
+    from jaxevent.methods import names
+    from jaxevent.runs.egomotion import find_estimator
+
+    estimator.find_model(kind)
+    for option, name, used in (("gyro", "imu", imu), ("smooth", "smooth", smooth)):
+        if used and option not in estimator.options:
+            others = [one for one in names("egomotion") if option in find_estimator(one).options]
+            raise InputError(
+                f"--{name} is not for the method {estimator.name}; leave it out or use "
+                f"{' or '.join(others)}"
+            )
+
+
+def _with_camera(recording: Any, focal: float | int | None) -> Any:
+    """The recording, with a camera of a focal length that was given."""
+    from jaxevent.camera import PinholeCamera
+
+    if focal is None:
+        return recording
+    if not 0 < focal < math.inf:
+        raise InputError(f"--focal {focal:g} is not possible; give pixels above 0")
+    if recording.camera is not None:
+        raise InputError(f"{recording.name}: has a calibration; leave out --focal")
+    centre = (recording.width - 1) / 2, (recording.height - 1) / 2
+    return dataclasses.replace(recording, camera=PinholeCamera(focal, focal, *centre))
+
+
+def _need_camera(recording: Any, kind: Any) -> None:
+    from jaxevent.egomotion import MODELS
+
+    if kind.needs_camera and recording.camera is None:
+        others = [name for name, one in MODELS.items() if not one.needs_camera]
+        raise InputError(
+            f"{recording.name}: has no calibration, which {kind.title} needs; give --focal or "
+            f"choose --model {' or '.join(others)}"
+        )
+
+
+def _parameters(estimator: Any, kind: Any, path: Path | None) -> tuple[Any, set[str]]:
+    """The parameters, and the names of those that a file gives."""
+    from jaxevent.parameters import read_toml
+
+    if path is None:
+        return estimator.start(kind), set()
+    values = estimator.Params.load(path, estimator.name)
+    table = read_toml(path)
+    return values, {*table, *table.get(estimator.name, {})}
+
+
+def _gyro(
+    estimator: Any, recording: Any, values: Any, settings: Any, bias: Any, turned: Any
+) -> Any:
+    """What the gyro measured, without its bias: if it is not known, that of a first estimate."""
+    import numpy as np
+
+    from jaxevent.egomotion import from_gyro
+    from jaxevent.egomotion.truth import constant_between
+
+    zero = np.zeros(3) if bias is None else bias
+    measured = from_gyro(recording.imu, zero, turned)
+    if bias is not None:
+        return measured
+    told = estimator.estimate(recording, values, **settings)
+    at = told.t[told.valid & (told.t >= measured.start) & (told.t <= measured.stop)]
+    if not len(at):
+        return measured
+    rows = next(part.rows for part in told.model.parts if part.figure == "Omega")
+    off = constant_between(told(at).mean[:, rows], measured(at)[1])
+    print(f"the gyro's bias, from a first estimate: {', '.join(f'{v:+.3f}' for v in off)} rad/s")
+    return dataclasses.replace(measured, Omega=measured.Omega - off)

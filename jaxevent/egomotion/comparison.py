@@ -21,7 +21,8 @@ class Comparison:
     """How far a motion is from the truth: `figures` of `motion_errors` over `count` times.
 
     Left out are the `startup` (s) before the motion was first found and the times at which it was
-    lost later, a share `lost` of all later ones. `truth` says in words what the truth is.
+    lost later, a share `lost` of all later ones. `truth` says in words what the truth is, `notes`
+    what else there is to say of it.
     """
 
     figures: Mapping[str, float]
@@ -29,6 +30,7 @@ class Comparison:
     lost: float
     count: int
     truth: str
+    notes: tuple[str, ...] = ()
 
     def rows(self) -> list[tuple[str, float, str]]:
         """Names, values and units."""
@@ -40,6 +42,7 @@ class Comparison:
         rows = [(name, f"{value:.4g}", unit) for name, value, unit in self.rows()]
         wide = [max(len(row[i]) for row in rows) for i in range(2)]
         lines = [f"{name:{wide[0]}}  {value:>{wide[1]}} {unit}" for name, value, unit in rows[:-2]]
+        lines += self.notes if lines else ()
         return [
             *(lines or ["the motion was never found where the truth is known"]),
             f"of {self.count:,} times against {self.truth}; the first {self.startup:.3f} s and "

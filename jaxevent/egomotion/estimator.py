@@ -1,7 +1,7 @@
 """Estimators of the camera's motion under the common contract (`jaxevent.estimator`)."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.models import MODELS, Model, find_model, in_words
 from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.patches import Speed, usual_speed
 from jaxevent.egomotion.truth import Known
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator
@@ -71,10 +72,14 @@ class MotionEstimator(Estimator[P]):
 
     Attributes:
         linear: Whether it needs a flow that is linear in the motion.
+        lengths: Parameters that suit the speed of the image, of `lengths(params, speed)`.
     """
 
     family: ClassVar[str] = "egomotion"
     linear: bool = dataclasses.field(default=False, kw_only=True)
+    lengths: Callable[[Any, Speed], dict[str, float]] | None = dataclasses.field(
+        default=None, kw_only=True
+    )
     options: frozenset[str] = dataclasses.field(default=COMMON, kw_only=True)
 
     def knows(self, model: type[Model]) -> bool:
@@ -115,6 +120,35 @@ class MotionEstimator(Estimator[P]):
     def start(self, model: type[Model]) -> P:
         """The parameters that it starts with."""
         return self.Params()
+
+    def suit(
+        self,
+        recording: Recording,
+        params: P,
+        *,
+        camera: PinholeCamera | None = None,
+        given: Collection[str] = (),
+    ) -> tuple[P, str]:
+        """Parameters with windows as long as the recording needs, and a line that says so.
+
+        Lengths of time are chosen by how fast the image moves (`patches.usual_speed`), where the
+        defaults are far from right. Those named in `given` stay as they are.
+        """
+        if self.lengths is None:
+            return params, ""
+        speed = usual_speed(recording, camera)
+        if speed is None:
+            return params, (
+                "nothing was seen to move in windows of 1.6 ms to 1.6 s; windows are as by default"
+            )
+        chosen = self.lengths(params, speed)
+        chosen = {name: value for name, value in chosen.items() if name not in given}
+        said = ", ".join(
+            f"{name} = {value:.2g} {self.Params.settings()[name].unit}"
+            for name, value in chosen.items()
+        )
+        moves = f"the image moves at about {speed.usual:.2g} px/s"
+        return params.replace(**chosen), f"{moves}: {said or 'windows are as given or by default'}"
 
     def follow(
         self,
@@ -237,6 +271,9 @@ class OnHost(MotionEstimator[P]):
 
         Raises `InputError` for a model that is unknown or that the method does not know, where the
         model needs a camera and there is none, and for what the method needs and is not there.
+        Without parameters they are the defaults, with windows that `suit` the recording.
         """
         given, _ = self.prepare(recording, np.zeros(0, np.int64), params, **options)
-        return self.run(self.start(given.model) if params is None else params, given)[0]
+        if params is None:
+            params, _ = self.suit(recording, self.start(given.model), camera=given.camera)
+        return self.run(params, given)[0]

@@ -253,6 +253,11 @@ class Model(eqx.Module):
         """The motions (n, d) of twists at the depth that fits estimates (n, d), NaN where lost."""
         raise NotImplementedError
 
+    @classmethod
+    def at_depth(cls, twists: "Twists", f: float, depth: float) -> NDArray[np.float64]:
+        """The motions (n, d) of twists before a scene at a depth (m)."""
+        raise NotImplementedError
+
 
 class Planar(Model):
     """The image velocity (px/s), the same everywhere."""
@@ -302,6 +307,14 @@ class Planar(Model):
         square = (across[use] ** 2).sum()
         rho = ((mean - turn)[use] * across[use]).sum() / square if square > 0 else 0.0
         return turn + max(float(rho), 0.0) * across
+
+    @classmethod
+    def at_depth(cls, twists, f, depth):
+        if not depth > 0:
+            raise InputError(f"the depth {depth:g} is not possible; give metres above 0")
+        T, Omega = twists.T, twists.Omega
+        assert T is not None  # poses tell it
+        return f * (np.stack([-Omega[:, 1], Omega[:, 0]], 1) - T[:, :2] / depth)
 
 
 class Rotation(Model):

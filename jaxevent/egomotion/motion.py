@@ -1,6 +1,7 @@
 """What every estimator of the camera's motion gives: a `Motion`, which answers at any time."""
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +9,20 @@ from numpy.typing import NDArray
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.estimator import Estimate
 from jaxevent.recording import Recording, Times, check_times, microseconds
+
+ACROSS = 0.1  # of the spread of speeds at several depths, that of the velocity across them
+
+
+class Calibration(NamedTuple):
+    """What errors are made of beside the covariance C of a fit: factor C + share^2 |m|^2 + change.
+
+    The last is change^2 (d d' + b b'), d the change of the motion within what an estimate sees and
+    b by how much it bends there. Chosen on simulated scenes: `experiments/egomotion_sigmas.py`.
+    """
+
+    factor: float = 1.0
+    share: float = 0.0
+    change: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +78,50 @@ class Motion:
         n = len(find_model(model).components)
         return cls.of(model, np.zeros(0, np.int64), np.zeros((0, n)), np.zeros((0, n, n)))
 
+    def calibrated(
+        self, by: Calibration, length: float | int | NDArray[np.floating] = 0.0
+    ) -> "Motion":
+        """The same with the covariance that its errors have; an estimate sees `length` seconds."""
+        if not len(self):
+            return self
+        mean = np.nan_to_num(self.mean)
+        half, found = 5e5 * np.broadcast_to(length, self.t.shape), self.valid
+        change, bend = np.zeros_like(mean), np.zeros_like(mean)
+        if found.sum() > 1:
+            t = self.t[found].astype(float)
+            for i, column in enumerate(mean.T):
+                early, now, late = (
+                    np.interp(self.t + k * half, t, column[found]) for k in (-1, 0, 1)
+                )
+                change[:, i], bend[:, i] = late - early, late + early - 2 * now
+        covariance = by.factor * self.covariance
+        for d in (change, bend):
+            covariance = covariance + by.change**2 * d[:, :, None] * d[:, None, :]
+        eye = np.eye(mean.shape[1])
+        covariance = covariance + by.share**2 * (mean**2).sum(1)[:, None, None] * eye
+        return dataclasses.replace(self, covariance=covariance)
+
+    def with_layers(self, recording: Recording) -> tuple["Motion", str]:
+        """The same, with the spread of the image's parts in its covariance, and a line of warning.
+
+        One velocity of the whole image is no better than by how much its parts differ, as those at
+        several depths do; see `choice.layers`. Of other models it is the same.
+        """
+        from jaxevent.egomotion.choice import layers
+
+        found = layers(recording) if self.model.uniform else None
+        if found is None or not found.several:
+            return self, ""
+        mean = np.nan_to_num(self.mean)
+        size2 = (mean**2).sum(1)[:, None, None]
+        along = found.spread**2 * mean[:, :, None] * mean[:, None, :]
+        across = (found.spread * ACROSS) ** 2 * size2 * np.eye(mean.shape[1])
+        line = (
+            f"the image does not move as one: parts of it at {found.slow:.0f} to {found.fast:.0f} "
+            "px/s, as at several depths; sigmas count that, and --model general may explain it"
+        )
+        return dataclasses.replace(self, covariance=self.covariance + along + across), line
+
     def within(self, recording: Recording) -> "Motion":
         """The same, of that recording."""
         span = None
@@ -111,4 +170,5 @@ class Motion:
         share = share[:, None, None]
         covariance = (1 - share) * self.covariance[before] + share * self.covariance[after]
         valid = self.valid[before] & self.valid[after] & (times >= at[0]) & inside
+        valid &= np.isfinite(mean).all(1) & np.isfinite(covariance).all((1, 2))
         return Estimate(mean, covariance, valid)

@@ -20,6 +20,14 @@ from jaxevent.egomotion.models import Model, find_model, in_words
 from jaxevent.errors import InputError
 from jaxevent.recording import Imu, Poses, Recording, Times, microseconds
 
+# Rotations from the axes of an IMU to the camera's, x to the right, y down, z forward, by name.
+AXES = {
+    "camera": np.eye(3),
+    "y-up": np.diag([1.0, -1.0, -1.0]),  # x right, y up, z backward, as jAER has them
+    "x-left": np.diag([-1.0, 1.0, -1.0]),  # x left, y down, z backward
+    "turned": np.diag([-1.0, -1.0, 1.0]),  # x left, y up, z forward
+}
+LARGEST_BIAS = 0.2  # rad/s, of a gyro's rate that may be taken for its bias
 _OUTLIER = 0.05  # relative magnitude error from which the thesis counts an outlier
 
 
@@ -133,6 +141,52 @@ def gyro_bias(imu: Imu, start: Times, stop: Times) -> NDArray[np.float64]:
     return imu.gyro[rows].mean(0)
 
 
+def imu_rotation(text: str) -> NDArray[np.float64]:
+    """The rotation (3, 3) from the axes of an IMU to the camera's.
+
+    A name of `AXES`, or nine numbers with commas between, row by row. Raises `InputError` for
+    others.
+    """
+    if text in AXES:
+        return AXES[text]
+    try:
+        R = np.array([float(part) for part in text.split(",")]).reshape(3, 3)
+    except ValueError:
+        raise InputError(
+            f"--imu-rotation {text!r} is not known; give {', '.join(AXES)}, or the nine numbers of "
+            "a rotation matrix, row by row"
+        ) from None
+    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
+        raise InputError(f"--imu-rotation {text} is no rotation; give an orthogonal matrix")
+    return R
+
+
+def constant_between(
+    estimate: NDArray[np.floating], measured: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """The constant (3,) in rad/s by which rates (n, 3) were measured too high: a gyro's bias.
+
+    The median of the differences, of which what is beyond `LARGEST_BIAS` is no bias.
+    """
+    middle = np.median(measured - estimate, 0)
+    return np.clip(middle, -LARGEST_BIAS, LARGEST_BIAS)
+
+
+def nearest_axes(estimate: NDArray[np.floating], measured: NDArray[np.floating]) -> str | None:
+    """The name of `AXES` in which measured rates (n, 3) are like the estimate, but for a constant.
+
+    None where the axes as they are fit about as well.
+    """
+    off = {}
+    for name, R in AXES.items():
+        turned = measured @ R.T
+        left = turned - estimate - constant_between(estimate, turned)
+        # The rates themselves tell axes apart that their changes do not, as of a roll.
+        off[name] = float(np.sqrt((left**2).mean() + ((turned - estimate) ** 2).mean() / 10))
+    best = min(off, key=lambda name: off[name])
+    return best if off[best] < off["camera"] / 2 else None
+
+
 @dataclasses.dataclass(frozen=True)
 class Known:
     """A motion that is known at times t (us), n of them: values (n, components) of `model`."""
@@ -169,6 +223,9 @@ def known(
     source: str | Path = "auto",
     bias: ArrayLike = (0.0, 0.0, 0.0),
     span: float | int = 0.02,
+    *,
+    rotation: ArrayLike | None = None,
+    depth: float | int | None = None,
 ) -> Known:
     """What is true of a recording's motion.
 
@@ -178,6 +235,8 @@ def known(
         source: "poses", "gyro", "auto" (poses, else the gyro), or the path of a table.
         bias: Taken off the gyro, rad/s.
         span: Time (s) over which velocities are taken from poses.
+        rotation: From the gyro's axes to the camera's; see `from_gyro`.
+        depth: Of the scene (m): with it poses tell an image velocity too.
 
     Raises:
         InputError: The model is unknown, the recording holds no such truth, or the table cannot be
@@ -187,6 +246,17 @@ def known(
     if source not in ("auto", "poses", "gyro"):
         return read_motion(source, model)
     parts = in_words([part.name for part in model.parts])
+    if depth is not None and not model.fits_depth:
+        raise InputError(f"a depth does not help to know {parts}; leave it out")
+    if depth is not None:
+        if recording.poses is None or recording.camera is None:
+            lacking = "poses" if recording.poses is None else "calibration"
+            raise InputError(
+                f"{recording.name}: holds no {lacking}, which a depth belongs to; "
+                "leave it out and give a table of the true motion"
+            )
+        twists, f = from_poses(recording.poses, span), recording.camera.fx * recording.camera.fy
+        return Known(model, twists.t, model.at_depth(twists, float(np.sqrt(f)), float(depth)))
     if not model.known_from:
         raise InputError(
             f"{recording.name}: {parts} is known neither from poses nor from a gyro; give a table "
@@ -198,7 +268,7 @@ def known(
     if source != "gyro" and by_poses and poses is not None:
         twists = from_poses(poses, span)
     elif source != "poses" and by_gyro and imu is not None:
-        twists = from_gyro(imu, bias)
+        twists = from_gyro(imu, bias, rotation)
     else:
         what = {"auto": "neither poses nor an IMU", "poses": "no poses", "gyro": "no IMU"}[
             str(source)
@@ -230,6 +300,8 @@ def read_motion(path: str | Path, model: str | type[Model]) -> Known:
     numbers = np.stack(
         [np.asarray(pd.to_numeric(table[name], errors="coerce"), np.float64) for name in names], 1
     )
+    if "lost" in table.columns:  # as `jaxevent motion` writes them: rows without a motion
+        numbers = numbers[~(np.asarray(table["lost"], float) > 0)]
     finite = np.isfinite(numbers).all(1)
     if not len(numbers) or not finite.all():
         line = int(np.argmin(finite)) + 2 if len(numbers) else 2

@@ -6,6 +6,7 @@ Settings beside `protocol = "motion"`:
     truth = "*.csv"                     # beside each recording, * being its name without suffix;
                                         # or "poses", "gyro" of the recording itself
     gyro_bias = [0.0, 0.0, 0.0]         # rad/s, taken off the gyro first
+    depth = 2.0                         # m, of the scene: poses then tell a planar motion too
     settle = 0.0                        # s after the first event before errors count
     centred = false                     # compare with the motion that candidates show, `lag` ago
     smooth = false                      # a backward pass, of methods that have one
@@ -33,7 +34,7 @@ from jaxevent.egomotion.truth import Known, from_gyro, known
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
-from jaxevent.runs.config import NOT_NEGATIVE, Check
+from jaxevent.runs.config import NOT_NEGATIVE, POSITIVE, Check
 from jaxevent.runs.family import Protocol
 
 
@@ -56,6 +57,7 @@ SETTINGS: dict[str, Check] = {
         'the name of tables beside the recordings, as "*.csv", or "poses", "gyro"',
     ),
     "gyro_bias": (_vector, "three numbers, rad/s"),
+    "depth": POSITIVE,
     "settle": (NOT_NEGATIVE[0], "a number of seconds, 0 or more"),
     "centred": (_flag, "true or false"),
     "smooth": (_flag, "true or false"),
@@ -90,7 +92,8 @@ def files(path: Path, options: Mapping[str, Any]) -> list[Path]:
 def true_motion(recording: Recording, options: Mapping[str, Any]) -> Known:
     """What is true of the motion of a recording, whose name is its path."""
     source = (files(Path(recording.name), options) or [options["truth"]])[0]
-    return known(recording, model_of(options), source, _bias(options))
+    depth = options.get("depth")
+    return known(recording, model_of(options), source, _bias(options), depth=depth)
 
 
 def _bias(options: Mapping[str, Any]) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -17,7 +17,7 @@ from jaxevent.egomotion import flow as event_flow
 from jaxevent.egomotion.comparison import Comparison, compare
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.egomotion.motion import Motion
-from jaxevent.egomotion.truth import Known, from_poses, known
+from jaxevent.egomotion.truth import Known, constant_between, from_poses, known, nearest_axes
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.estimator import Estimate
 from jaxevent.io.output import complete, complete_hdf5
@@ -37,13 +37,14 @@ def write_motion_table(
 ) -> None:
     """Write motion at times (us) as CSV: t (s), the components, sigma_<component>, lost (0 or 1).
 
-    A sigma is the square root of its component's variance.
+    A sigma is the square root of its component's variance. Where the motion is lost both are empty.
     """
     names = find_model(model).components
+    lost = ~told.valid[:, None]
     variance = np.diagonal(told.covariance, axis1=1, axis2=2)
     columns: dict[str, Any] = {"t": times / 1e6}
-    columns |= dict(zip(names, told.mean.T, strict=True))
-    sigma = np.sqrt(np.maximum(variance, 0))
+    columns |= dict(zip(names, np.where(lost, np.nan, told.mean).T, strict=True))
+    sigma = np.where(lost, np.nan, np.sqrt(np.maximum(variance, 0)))
     columns |= {f"sigma_{name}": s for name, s in zip(names, sigma.T, strict=True)}
     _write_csv(path, columns | {"lost": (~told.valid).astype(int)})
 
@@ -120,6 +121,46 @@ def fitted_velocity(recording: Recording, motion: Motion, span: float | int = 0.
     return Known(model, twists.t, model.at_one_depth(twists, f, mean))
 
 
+UNDECIDED = 1.0  # rad, standard deviation of a direction that is not told
+
+
+class Truth(NamedTuple):
+    """A known motion, what it is in words, and further lines about it."""
+
+    known: Known
+    words: str
+    notes: tuple[str, ...] = ()
+
+
+def measured_rotation(truth: Known, motion: Motion, unbiased: bool, turned: bool) -> Truth:
+    """The truth of a gyro, as it is compared with an estimate.
+
+    Where nothing has told its bias (`unbiased`) the constant that fits the estimate is taken off.
+    Where nothing has told its axes (`turned`) and others fit far better, a note says so.
+    """
+    told = motion(truth.t, centred=True, extrapolate=True)
+    rows = told.valid & np.isfinite(told.mean).all(1)
+    words, notes = "the gyro", []
+    if not rows.any():
+        return Truth(truth, words)
+    estimate, measured = told.mean[rows], truth.values[rows]
+    axes = None if turned else nearest_axes(estimate, measured)
+    if axes is not None:
+        notes.append(
+            f"the gyro is like the estimate in other axes: give --imu-rotation {axes} if they are "
+            "its own"
+        )
+    elif not unbiased:
+        bias = constant_between(estimate, measured)
+        words = "the gyro without its bias"
+        notes.append(
+            f"a constant of {', '.join(f'{v:+.3f}' for v in bias)} rad/s was taken off the gyro: "
+            "its bias, or the estimate's, which --still S,S tells apart"
+        )
+        truth = dataclasses.replace(truth, values=truth.values - bias)
+    return Truth(truth, words, tuple(notes))
+
+
 @dataclasses.dataclass(frozen=True)
 class Output:
     """What is written of a motion: `output.write(recording, motion, ...)`.
@@ -163,29 +204,41 @@ class Output:
         recording: Recording,
         model: str | type[Model],
         bias: NDArray[np.float64] | None = None,
-    ) -> tuple[Callable[[Motion], Known], str] | None:
-        """The truth, given the motion, and what it is, in words; None where none is asked for.
+        rotation: NDArray[np.float64] | None = None,
+        depth: float | int | None = None,
+    ) -> Callable[[Motion], Truth] | None:
+        """The truth, given the motion; None where none is asked for.
 
-        `bias` (rad/s) is taken off the gyro, which is looked at where there are no poses. Raises
-        `InputError` for a truth that is not there.
+        Of a gyro, which is looked at where there are no poses, `bias` (rad/s) is taken off and
+        `rotation` takes its axes to the camera's; see `measured_rotation` for what is done without
+        them. `depth` (m) is the scene's. Raises `InputError` for a truth that is not there.
         """
         if self.truth is None:
             return None
         model = find_model(model)
         if self.truth != "auto":
-            table = known(recording, model, self.truth)
-            return lambda motion: table, str(self.truth)
+            table = Truth(known(recording, model, self.truth), str(self.truth))
+            return lambda motion: table
+        if depth is not None:
+            at = Truth(known(recording, model, depth=depth), f"poses at the depth {depth:g} m")
+            return lambda motion: at
         if model.fits_depth and recording.poses is not None and recording.camera is not None:
-            return lambda motion: fitted_velocity(recording, motion), "poses at one fitted depth"
-        truth = known(recording, model, "auto", np.zeros(3) if bias is None else bias)
-        return lambda motion: truth, "the gyro" if recording.poses is None else "poses"
+            words = "poses at one fitted depth"
+            return lambda motion: Truth(fitted_velocity(recording, motion), words)
+        zero = np.zeros(3) if bias is None else bias
+        truth = known(recording, model, "auto", zero, rotation=rotation)
+        if recording.poses is not None:
+            return lambda motion: Truth(truth, "poses")
+        return lambda motion: measured_rotation(
+            truth, motion, bias is not None, rotation is not None
+        )
 
     def write(
         self,
         recording: Recording,
         motion: Motion,
         about: Mapping[str, Any] = MappingProxyType({}),
-        truth: tuple[Callable[[Motion], Known], str] | None = None,
+        truth: Callable[[Motion], Truth] | None = None,
         progress: bool | None = None,
     ) -> "Written":
         """Write everything, complete or not at all; `about` are attributes of motion.h5."""
@@ -195,12 +248,13 @@ class Output:
         count = math.floor((stop - start) * self.rate / 1e6 + 1e-9) + 1
         times = start + np.rint(np.arange(count) * (1e6 / self.rate)).astype(np.int64)
         told = motion(times, centred=self.centred)
-        true = None if truth is None else truth[0](motion)
+        true = None if truth is None else truth(motion)
         found = None
-        if true is not None and truth is not None:
+        if true is not None:
             found = compare(
-                motion, true, times, start=start, centred=self.centred, named=truth[1]
-            )  # fmt: skip
+                motion, true.known, times, start=start, centred=self.centred, named=true.words
+            )
+            found = dataclasses.replace(found, notes=true.notes)
         outliers = None
         with complete(self.path, directory=True) as folder:
             write_motion_table(folder / "motion.csv", motion.model, times, told)
@@ -215,7 +269,8 @@ class Output:
             except MissingExtra as missing:
                 left_out = str(missing)
             else:
-                plot_motion(folder / "motion.png", motion, times, true, centred=self.centred)
+                shown = None if true is None else true.known
+                plot_motion(folder / "motion.png", motion, times, shown, centred=self.centred)
                 self._draw_window(folder, recording, motion)
             files = sorted(path.name for path in folder.iterdir())
         return Written(files, times, told, motion, found, outliers, left_out)
@@ -254,7 +309,11 @@ class Written:
         lost = ~self.told.valid
         first = np.flatnonzero(~lost)
         if not len(first):
-            return [f"{len(self.motion):,} estimates: the motion was never found"]
+            lines = [f"{len(self.motion):,} estimates: the motion was never found"]
+            return [
+                *lines,
+                "another --model or --method, or --params of other windows, may find it",
+            ]
         since = (self.times[first[0]] - self.times[0]) * 1e-6
         later = lost[first[0] :].mean()
         lines = [
@@ -276,6 +335,15 @@ class Written:
             "  ".join(cell.rjust(w) for cell, w in zip(line, widths, strict=True)).rstrip()
             for line in cells
         ]
+        for part in model.parts:
+            if part.direction:
+                blocks = self.told.covariance[first, part.rows, part.rows]
+                unknown = np.trace(blocks, axis1=1, axis2=2) > UNDECIDED**2
+                if unknown.any():
+                    lines.append(
+                        f"translation is not observable {100 * unknown.mean():.0f} % of the time: "
+                        f"rotation alone explains the events, and the {part.name} is not told"
+                    )
         if self.outliers is not None:
             lines.append(
                 f"{self.outliers:.1f} % of the events have no predecessor that it explains"

@@ -27,7 +27,7 @@ from jaxevent.show.canvas import new_figure
 
 _PLOTTED = 4096  # most times of the plot
 _PARTICLES = 30_000  # most particles of a component in the plot
-_WAY, _SHORTEST, _LONGEST = 8.0, 0.02, 0.05  # px and s: of the window that is warped
+_WAY, _SHORTEST, _USUAL, _LONGEST = 8.0, 0.02, 0.05, 0.5  # px and s: of the window that is warped
 _MOST = 500_000  # events that are warped or coloured
 _TRUE, _ESTIMATE, _LOST, _CLOUD = "black", "#c8401e", "#bbbbbb", "#3a78b5"
 
@@ -103,6 +103,8 @@ def motion_figure(
             axis.set_ylim(0, 1.15 * max(np.percentile(good, 99), 1e-9))
     for axis in grid.ravel():
         _shade(axis, seconds, ~told.valid)
+        if not told.valid.any():
+            axis.text(0.5, 0.5, "never found", transform=axis.transAxes, ha="center", va="center")
         axis.spines[["top", "right"]].set_visible(False)
         axis.set_xlim(seconds[0], max(seconds[-1], seconds[0] + 1e-6))
     for axis in grid[-1]:
@@ -147,7 +149,7 @@ def _contrasts(motion: Motion, times: NDArray[np.int64]) -> list[tuple[str, NDAr
     """Without a truth: how much better than chance the motion explains the events."""
     if not np.isfinite(motion.contrast).any():
         return []
-    return [("contrast", np.interp(times, motion.t, np.nan_to_num(motion.contrast)))]
+    return [("contrast", np.interp(times, motion.t, motion.contrast))]
 
 
 def _cloud(axis: Any, motion: Motion, component: int, centred: bool) -> None:
@@ -190,7 +192,7 @@ def span_of(recording: Recording) -> tuple[int, int]:
 
 
 def window_of(recording: Recording, motion: Motion) -> Window:
-    """In the middle of the recording, or of where the motion is found: 20 to 50 ms.
+    """In the middle of the recording, or of where the motion is found: 20 to 500 ms.
 
     So long that the image moves by 8 px, at the median speed over the sensor. Events beyond the
     first half million are left out.
@@ -201,7 +203,7 @@ def window_of(recording: Recording, motion: Motion) -> Window:
     if len(good) and not motion(middle, extrapolate=True).valid[0]:
         middle = int(good[np.argmin(np.abs(good - middle))])
     told = motion(middle, extrapolate=True)
-    span = _LONGEST
+    span = _USUAL
     if told.valid[0] and np.isfinite(told.mean).all():
         xi, f = coordinates(recording.width, recording.height, recording.camera)
         xi = xi[::8, ::8].reshape(-1, 2)
@@ -316,6 +318,8 @@ def plot_warped(
     )
     gain = sharp[1] / sharp[0] if sharp[0] > 0 else math.nan
     titles = (f"as they fell: contrast {sharp[0]:.3g}", f"warped: {sharp[1]:.3g}, {gain:.2f} times")
+    if not motion(part.reference, extrapolate=True).valid[0]:
+        titles = (titles[0], "not warped: the motion is not found here")
     for axis, image, title in zip(figure.subplots(1, 2), images, titles, strict=True):
         axis.imshow(image, cmap="gray", vmin=-limit, vmax=limit, interpolation="nearest")
         axis.set_title(title, fontsize=10)

@@ -60,7 +60,8 @@ def folder(stored: Path, tmp_path: Path) -> Path:
 def read_table(path: Path) -> tuple[list[str], np.ndarray]:
     with path.open() as file:
         lines = list(csv.reader(file))
-    return lines[0], np.array(lines[1:], float).reshape(-1, len(lines[0]))
+    rows = [[float(cell or "nan") for cell in line] for line in lines[1:]]
+    return lines[0], np.array(rows).reshape(-1, len(lines[0]))
 
 
 def run(folder: Path, *words: object) -> None:
@@ -89,17 +90,21 @@ def test_a_folder_of_everything(folder, capsys):
     assert all(name in said for name in names) and "planar motion by voting" in said
 
     recording = jaxevent.load(path)[:0.2]
-    params = voting.Params.of(read_toml(folder / "mine.toml"))
-    motion = voting.estimate(recording, params, seed=3, cloud=64)
+    given = read_toml(folder / "mine.toml")
+    params, line = voting.suit(recording, voting.Params.of(given), given=given)
+    assert "px/s" in line and line in said
+    motion, _ = voting.estimate(recording, params, seed=3, cloud=64).with_layers(recording)
     header, table = read_table(out / "motion.csv")
     assert header == ["t", "vx", "vy", "sigma_vx", "sigma_vy", "lost"]
     events = recording.events
     times = events.t[0] + 1000 * np.arange(1 + (events.t[-1] - events.t[0]) // 1000)
     states = motion(times)
     assert np.array_equal(table[:, 0], times / 1e6)
-    np.testing.assert_allclose(table[:, 1:3], states.mean, rtol=1e-12)
+    found = states.valid
+    np.testing.assert_allclose(table[found, 1:3], states.mean[found], rtol=1e-12)
     variance = np.diagonal(states.covariance, axis1=1, axis2=2)
-    np.testing.assert_allclose(table[:, 3:5] ** 2, variance, rtol=1e-9)
+    np.testing.assert_allclose(table[found, 3:5] ** 2, variance[found], rtol=1e-9)
+    assert np.isnan(table[~found, 1:5]).all() and not found.all()
     assert np.array_equal(table[:, 5], ~states.valid)
     with h5py.File(out / "motion.h5") as file:
         for name in ("t", "mean", "covariance", "lag", "contrast", "evidence", "cloud"):
@@ -109,6 +114,7 @@ def test_a_folder_of_everything(folder, capsys):
     assert (about["model"], about["method"], about["seed"]) == ("planar", "voting", 3)
     assert list(about["components"]) == ["vx", "vy"] and list(about["units"]) == ["px/s"] * 2
     assert json.loads(about["parameters"]) == params.values()
+    assert params.particles == 100
 
     # The errors by hand.
     _, truth = read_table(folder / "planar.csv")
@@ -193,7 +199,7 @@ def test_a_gyro_helps_a_method_that_takes_one(folder, monkeypatch):
     mine = WithGyro("voting", voting.Params, options=frozenset({"gyro"}))
     monkeypatch.setattr("jaxevent.egomotion.particle_filter.estimator.voting", mine)
     monkeypatch.setattr(methods, "_load", methods._load.__wrapped__)
-    words = ("--model", "planar", "--gyro", "--still=-0.1,0", "--seed", 7, "--stop", 0.1)
+    words = ("--model", "planar", "--imu", "--still=-0.1,0", "--seed", 7, "--stop", 0.1)
     run(folder, folder / "imu.h5", *words)
     [(events, seed, told)] = given
     assert (events, seed) == (len(recording[:0.1].events), 7)
@@ -221,11 +227,12 @@ def test_general_motion_is_written_too(tmp_path):
         motion_of(known, ~lost), cloud=np.zeros((len(known.t), 3, 6)) + known.values[:, None]
     )
     output = pictures.Output(tmp_path / "out")
-    written = output.write(recording, motion, {}, (lambda _: known, "itself"))
+    written = output.write(recording, motion, {}, lambda _: pictures.Truth(known, "itself"))
     header, table = read_table(tmp_path / "out" / "motion.csv")
     names = ["tx", "ty", "tz", "wx", "wy", "wz"]
     assert header == ["t", *names, *(f"sigma_{name}" for name in names), "lost"]
-    np.testing.assert_allclose(table[:, 7:13], 0.1)
+    np.testing.assert_allclose(table[table[:, -1] == 0, 7:13], 0.1)
+    assert np.isnan(table[table[:, -1] == 1, 1:13]).all()
     error = written.errors
     assert error is not None
     for name in ("AAE_T", "AAE_Omega", "AME", "vector_error"):
@@ -346,7 +353,7 @@ def test_bad_input_is_said_before_the_work(folder, capsys):
     for name, said in (("none.csv", "cannot be read"), ("short.csv", "no column 'vy'")):
         fails(capsys, ["motion", planar, *model, "--truth", folder / name, *to], name, said)
     fails(capsys, ["motion", planar, *model, "--truth", folder / "turn.csv", *to], "'vx'")
-    fails(capsys, ["motion", turn, *model, "--gyro", *to], "--gyro", "voting")
+    fails(capsys, ["motion", turn, *model, "--imu", *to], "--imu", "voting")
     fails(capsys, ["motion", turn, *model, "--still", "0,1", *to], "no IMU", "--still")
     fails(capsys, ["motion", turn, *model, "--seed", -1, *to], "--seed -1")
     fails(capsys, ["motion", turn, *model, "--start", 3, *to], "reaches from")
@@ -433,8 +440,12 @@ def test_simulated_motion_and_its_truth(folder, capsys):
 
 def test_a_table_of_states_is_exact(tmp_path):
     states = Estimate(
-        np.array([[1.5, -2.0]]), np.array([[[4.0, 1.0], [1.0, 9.0]]]), np.array([False])
-    )
-    pictures.write_motion_table(tmp_path / "a.csv", "planar", np.array([1_500_000]), states)
+        np.array([[1.5, -2.0]] * 2), np.array([[[4.0, 1.0], [1.0, 9.0]]] * 2),
+        np.array([True, False]),
+    )  # fmt: skip
+    times = np.array([1_500_000, 2_500_000])
+    pictures.write_motion_table(tmp_path / "a.csv", "planar", times, states)
     lines = (tmp_path / "a.csv").read_text().splitlines()
-    assert lines == ["t,vx,vy,sigma_vx,sigma_vy,lost", "1.5,1.5,-2.0,2.0,3.0,1"]
+    assert lines == ["t,vx,vy,sigma_vx,sigma_vy,lost", "1.5,1.5,-2.0,2.0,3.0,0", "2.5,,,,,1"]
+    known = egomotion.truth.read_motion(tmp_path / "a.csv", "planar")  # the row that is found
+    assert known.t.tolist() == [1_500_000] and known.values.tolist() == [[1.5, -2.0]]

@@ -41,7 +41,8 @@ from jaxevent.egomotion.baselines.local_planes import Fit, held
 from jaxevent.egomotion.candidates import coordinates
 from jaxevent.egomotion.estimator import Given, OnHost
 from jaxevent.egomotion.models import Model
-from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.motion import Calibration, Motion
+from jaxevent.egomotion.patches import Speed
 from jaxevent.egomotion.warped import blur, splat
 from jaxevent.parameters import Choice, Count, Parameters, Positive, Share
 from jaxevent.progress import bar
@@ -54,6 +55,9 @@ TRIED = 4  # motions of the grid that are followed up
 CELL = 24  # px, of the image's parts that err independently
 PROBE = 0.5  # px at the window's end, between which and the maximum the curvature is taken
 ENOUGH = 1e-3  # 1/px; a smaller slope, in shares of the objective, ends the ascent
+WAY, WAYS = 10.0, (5.0, 60.0)  # px in a window: at best, and with which the default is kept
+SHORTEST, LONGEST = 0.002, 2.0  # s
+CALIBRATION, SHARE = Calibration(change=0.33), 0.012  # the share is planar motion's
 SPREAD = 2.0  # px^2; the inverse curvature, in the same unit, that an ascent begins with
 
 Numeric = Array | np.ndarray
@@ -331,6 +335,14 @@ class Windows:
                 start, stop = (events.index(int(begin) + k) for k in (0, self._length))
                 yield int(begin) + self._length // 2, start, stop
 
+    def span(self, start: int, stop: int) -> float:
+        """The length (s) of the window of some rows."""
+        if self.params.window == "duration":
+            return 1e-6 * self._length
+        events = self.recording.events
+        ends = events[start : start + 1].t, events[stop - 1 : stop].t
+        return 1e-6 * float(ends[1][0] - ends[0][0]) if len(ends[0]) and len(ends[1]) else 0.0
+
     def cut(self, t: int, start: int, stop: int, short: bool = False) -> Window:
         """The window of some rows about t (us); `short`: only its middle, for a search.
 
@@ -398,9 +410,10 @@ def solve(params: Params, given: Given) -> Motion:
     windows = Windows(given.recording, params, given.model, given.camera, given.seed)
     if not len(windows):
         return Motion.nothing(given.model)
-    motion, t, fits, contrasts = None, [], [], []
+    motion, t, fits, contrasts, spans = None, [], [], [], []
     for middle, start, stop in bar(windows, unit="window", progress=given.progress):
         t.append(middle)
+        spans.append(windows.span(start, stop))
         if stop - start < params.fewest:
             motion = None
             fits.append(None)
@@ -415,7 +428,17 @@ def solve(params: Params, given: Given) -> Motion:
         motion = None if fit is None else fit.mean
         fits.append(fit)
         contrasts.append(told.contrast)
-    return held(given.model, np.array(t), fits, np.array(contrasts))
+    found = held(given.model, np.array(t), fits, np.array(contrasts))
+    by = CALIBRATION._replace(share=SHARE if windows.model.uniform else 0.0)
+    return found.calibrated(by, np.array(spans))
+
+
+def lengths(params: Params, speed: Speed) -> dict[str, float]:
+    """A duration in which the image moves by some pixels."""
+    way = speed.fast * float(params.duration)
+    if params.window != "duration" or WAYS[0] <= way <= WAYS[1]:
+        return {}
+    return {"duration": min(max(WAY / speed.fast, SHORTEST), LONGEST)}
 
 
 contrast = OnHost(
@@ -423,6 +446,7 @@ contrast = OnHost(
     Params,
     solve,
     linear=True,
+    lengths=lengths,
     about="The motion that makes the image of warped events sharpest (Gallego et al., CVPR 2018), "
     "in overlapping windows of time, each by itself.",
 )

@@ -29,7 +29,7 @@ from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.candidates import NEVER, READ_ROWS, coordinates
 from jaxevent.egomotion.estimator import Given, OnHost
 from jaxevent.egomotion.models import Model
-from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.motion import Calibration, Motion
 from jaxevent.kernels import compiled
 from jaxevent.parameters import Choice, Count, Parameters, Positive
 from jaxevent.progress import bar
@@ -38,6 +38,7 @@ from jaxevent.recording import Recording
 CELL = 16  # px; constraints of a cell are taken to err together
 HUBER = 1.345  # standard deviations from which a residual counts linearly: 95 % efficient
 ROUNDS = 20  # of reweighting
+CALIBRATION = Calibration(factor=9.0)
 LEAST_NORMALS = 0.02  # of the larger information, for the smaller not to be noise: aperture
 
 
@@ -140,7 +141,7 @@ def solve(params: Params, given: Given) -> Motion:
         fits.append(robust_fit(rows_of, np.ones(len(valid)), cells, size) if enough else None)
         lags.append(flows.age[valid].mean() if len(valid) else 0.0)
     motion = held(given.model, begins + window // 2, fits)
-    return dataclasses.replace(motion, lag=np.array(lags))
+    return dataclasses.replace(motion, lag=np.array(lags)).calibrated(CALIBRATION)
 
 
 def _events(recording: Recording, rows: NDArray) -> tuple[NDArray, NDArray]:

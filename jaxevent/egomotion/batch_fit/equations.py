@@ -75,7 +75,7 @@ class Problem(NamedTuple):
 
     def pull(self, now: Array, unit: Array) -> Array:
         """What the priors on the path's rows and the skew cost, in units of the rows."""
-        more = 10 * now[FREE] ** 2
+        more = self.prior.skew_weight * (now[FREE] - self.prior.skew) ** 2
         return pull_of_rows(now[:FREE], unit, self.prior, self.tracks.half, ROWS, more)
 
 
@@ -273,6 +273,8 @@ def linearise(problem: Problem, seen: Seen, settling: Array) -> Equations:
     at, node, Jt, Jd = differentiate(problem, seen, unit)
     free = (seen.on > 0) & ~settling
     Jt, Jd = jnp.where(free, Jt, 0), jnp.where(free & ~plane, Jd, 0)
+    Jt = jnp.concatenate([Jt[: 3 * ROWS], prior.moves * Jt[3 * ROWS : FREE], Jt[FREE:]])
+    Jd = prior.moves * Jd
     jacobian = Jacobian(tracks, at, node, Jt, Jd, weight, totals(weight, tracks))
     left = jacobian.subtract_mean(seen.e)
 

@@ -119,6 +119,9 @@ class Prior(NamedTuple):
     bond: Array  # of the photometric fit, as smooth
     flat: Array
     alike: Array
+    skew: Array | float = 0.0  # of the thresholds, about
+    skew_weight: Array | float = 10.0
+    moves: Array | float = 1.0  # 0: translation and depths are held
 
 
 def normalised(path: Path) -> Path:

@@ -58,7 +58,7 @@ from jaxevent.egomotion.batch_fit.gauss_newton import (
 from jaxevent.egomotion.batch_fit.path import LEAST, ROWS, Path, Prior, normalised, rays_of
 from jaxevent.egomotion.batch_fit.tracks import Scene, Tracks, subtract_mean, totals
 
-CELL = 24  # px, whose errors are alike
+CELLS = 24, 48  # px, whose errors are alike
 
 
 class Report(NamedTuple):
@@ -110,7 +110,7 @@ def _adjust(
     steps: Array,
     plane: Array,
 ) -> tuple[Scene, Report]:
-    problem, nothing = _begin(tracks, scene, prior, sigma, plane)
+    problem, nothing = begin(tracks, scene, prior, sigma, plane)
 
     def go(walk: _Walk) -> _Walk:
         n, kept = walk.number, walk.kept
@@ -141,7 +141,7 @@ def _adjust(
     return kept.scene, report(problem, kept)
 
 
-def _begin(
+def begin(
     tracks: Tracks, scene: Scene, prior: Prior, sigma: Array, plane: Array
 ) -> tuple[Problem, Seen]:
     """What steps have in common, and what is kept before the first one: nothing."""
@@ -219,13 +219,15 @@ def compute_covariance(
 def _compute_covariance(
     tracks: Tracks, scene: Scene, prior: Prior, sigma: Array, plane: Array
 ) -> Array:
-    problem, nothing = _begin(tracks, scene, prior, sigma, plane)
+    problem, nothing = begin(tracks, scene, prior, sigma, plane)
     seen = look(problem, scene, nothing.weight)
     return spread(linearise(problem, seen, jnp.asarray(False)), seen)
 
 
 def spread(equations: Equations, seen: Seen) -> Float[Array, "6 6"]:
     """H^-1 (sum_c g_c g_c' + the priors') H^-1, with c cells, within which errors are alike.
+
+    Of cells of 24 and of 48 px those that tell more.
 
     H counts the weights w of misfits e, the curvature of their robust cost is less: the mean of
     d(w e)/de = w (1 - 3 u) / (1 + u), u = (e / 3 sigma)^2 (Huber). Errors are then 1 to 3 times
@@ -236,9 +238,9 @@ def spread(equations: Equations, seen: Seen) -> Float[Array, "6 6"]:
     u = left**2 / equations.problem.limit
     curved = (weight * (1 - 3 * u) / (1 + u)).sum() / jnp.maximum(weight.sum(), 1)
     less = 1 / jnp.maximum(curved, 0.1) ** 2
-    rows, columns = (-(-n // CELL) for n in tracks.shape)
-    across = (tracks.x - tracks.corner[0]) // CELL
-    cell = ((tracks.y - tracks.corner[1]) // CELL * columns + across).astype(jnp.int32)
+    rows, columns = (-(-n // CELLS[0]) for n in tracks.shape)
+    across = (tracks.x - tracks.corner[0]) // CELLS[0]
+    cell = ((tracks.y - tracks.corner[1]) // CELLS[0] * columns + across).astype(jnp.int32)
     chosen = jnp.concatenate([jnp.arange(3 * ROWS, 3 * ROWS + 3), jnp.arange(3)])
     zero = jax.tree.map(jnp.zeros_like, equations.gradient)
     undamped = jnp.zeros((), left.dtype)
@@ -250,4 +252,10 @@ def spread(equations: Equations, seen: Seen) -> Float[Array, "6 6"]:
         return told * equations.unit[i], v[1] * equations.unit[i]
 
     told, own = lax.map(column, chosen)
-    return less * (told @ told.T) + own @ equations.known @ own.T
+    size = CELLS[1] // CELLS[0]
+    wide = told.reshape(6, rows, columns)
+    wide = jnp.pad(wide, [(0, 0), (0, -rows % size), (0, -columns % size)])
+    wide = wide.reshape(6, -(-rows // size), size, -(-columns // size), size).sum((2, 4))
+    both = [part @ part.T for part in (told, wide.reshape(6, -1))]
+    larger = jnp.where(jnp.trace(both[1]) > jnp.trace(both[0]), both[1], both[0])
+    return less * larger + own @ equations.known @ own.T

@@ -17,11 +17,12 @@ from jaxevent.egomotion.candidates import Candidates, Expected, Gatherer
 from jaxevent.egomotion.estimator import COMMON, Batch, MotionEstimator, Stretch, truth_of
 from jaxevent.egomotion.geometry import length
 from jaxevent.egomotion.models import Model
-from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.motion import Calibration, Motion
 from jaxevent.egomotion.particle_filter import filtering
 from jaxevent.egomotion.particle_filter.filtering import Info, Noise, State
 from jaxevent.egomotion.particle_filter.parameters import Params
 from jaxevent.egomotion.particle_filter.smoothing import smoothed
+from jaxevent.egomotion.patches import Speed
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.progress import bar
@@ -32,6 +33,9 @@ SPAN = 0.1  # of tau_max, or after so long
 CHANGE = 1.2  # factor by which speeds are expected to change until then
 GATE = 3.5  # sigma_x, how far from the flow of the mean candidates are still looked at, at least
 CELL = 16  # px: which candidates are looked at is chosen for parts of the sensor of about this size
+AGES, OLDEST = 1.2, 1.0  # of the oldest candidates: in baselines of the usual speed, s at most
+PLANAR, OTHERS = Calibration(change=0.12), Calibration(factor=0.7, change=0.05)
+FASTEST = 2.5  # usual speeds, that a search goes to at least
 SPREAD = 0.2  # of the first particles of a fit, in shares of the true motion
 
 _run = eqx.filter_jit(filtering.run)
@@ -168,7 +172,8 @@ class Voting(MotionEstimator[Params]):
 
         Args:
             recording: Events; nothing else is looked at but the calibration.
-            params: See `Params`; by default as they are there, with the model's `preset`.
+            params: See `Params`; by default as they are there, with the model's `preset` and ages
+                that `suit` the recording.
             model: What moves: see `models`.
             camera: The calibration, by default the recording's.
             seed: Of the particles; the same seed gives the same motion.
@@ -179,8 +184,10 @@ class Voting(MotionEstimator[Params]):
         Raises:
             InputError: The model is unknown, or it needs a camera and there is none.
         """
+        if params is None:
+            found, _ = self.place(recording, model, camera)
+            params, _ = self.suit(recording, self.start(found), camera=camera)
         kind, gatherer = self.gatherer(recording, params, model, camera)
-        params = self.start(type(kind)) if params is None else params
         batches = -(-CHUNK // params.batch)
         key, corners = jax.random.key(seed), _corners(kind, gatherer)
         state, parts, number, span = None, [], 0, SPAN * float(params.tau_max)
@@ -218,7 +225,8 @@ class Voting(MotionEstimator[Params]):
             whole("evidence"),
             whole("cloud") if cloud else None,
         ).within(recording)
-        return smoothed(motion, params) if smooth else motion
+        by = PLANAR if kind.uniform else OTHERS
+        return (smoothed(motion, params) if smooth else motion).calibrated(by, 2 * motion.lag)
 
     def follow(
         self,
@@ -356,6 +364,18 @@ def _corners(model: Model, gatherer: Gatherer) -> NDArray[np.floating]:
     return np.asarray(model.basis(jnp.asarray(xi.astype(np.dtype(jnp.result_type(float))))))
 
 
+def lengths(params: Params, speed: Speed) -> dict[str, float]:
+    """The oldest candidates, so old that most of the image has moved by the baseline."""
+    if params.likelihood == "literal":
+        return {}
+    chosen, oldest = {}, AGES * float(params.baseline) / speed.usual
+    if oldest > float(params.tau_max):
+        chosen["tau_max"] = min(oldest, OLDEST)
+    if FASTEST * speed.usual > float(params.speed_max):
+        chosen["speed_max"] = FASTEST * speed.usual
+    return chosen
+
+
 class Looked(NamedTuple):
     """At which candidates the next batches can need to look; see `Gatherer.gather`."""
 
@@ -399,6 +419,7 @@ def look(params: Params, model: Model, corners: NDArray, state: State | None) ->
 voting = Voting(
     "voting",
     Params,
+    lengths=lengths,
     options=COMMON | {"smooth", "cloud"},
     about="Motion by voting: a particle filter whose likelihood asks the earlier neighbours of "
     "events (Egomotion thesis, chapters 5 and 6, with all neighbours voting, softly).",

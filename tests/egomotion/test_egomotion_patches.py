@@ -1,0 +1,164 @@
+"""How fast patches move, which model explains them, and what errors are made of."""
+
+import numpy as np
+import pytest
+
+from jaxevent.camera import PinholeCamera
+from jaxevent.egomotion import contrast, find_model, truth, voting
+from jaxevent.egomotion.choice import choose, layers, standard
+from jaxevent.egomotion.geometry import A, B
+from jaxevent.egomotion.motion import Calibration, Motion
+from jaxevent.egomotion.patches import usual_speed
+from jaxevent.errors import InputError
+from jaxevent.recording import Events, Imu, Poses, Recording
+from jaxevent.show.motion import Written
+
+WIDTH, HEIGHT, F = 120, 96, 100.0
+CAMERA = PinholeCamera(F, F, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+
+
+def moving(flow, seconds: float, number: int = 700, every: float = 0.7, camera=CAMERA, seed=0):
+    """Events of points that follow `flow(places)`, constant along each way, one each `every` px."""
+    rng = np.random.default_rng(seed)
+    place = rng.uniform([-20, -20], [WIDTH + 20, HEIGHT + 20], (number, 2))
+    U = flow(place - [(WIDTH - 1) / 2, (HEIGHT - 1) / 2])
+    sign = rng.random(number) < 0.5
+    parts = []
+    for x, u, p in zip(place, U, sign, strict=True):
+        n = max(int(np.hypot(*u) * seconds / every), 2)
+        t = (np.arange(n) + rng.random(n)) / n * seconds
+        at = np.rint(x + (t - seconds / 2)[:, None] * u).astype(int)
+        inside = (at >= 0).all(1) & (at < [WIDTH, HEIGHT]).all(1)
+        parts.append(np.c_[np.rint(1e6 * t), at, np.full(n, p)][inside])
+    rows = np.concatenate(parts).astype(np.int64)
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    events = Events(
+        rows[:, 0], rows[:, 1].astype(np.uint16), rows[:, 2].astype(np.uint16), rows[:, 3] > 0
+    )
+    return Recording("moving", WIDTH, HEIGHT, events, camera=camera)
+
+
+@pytest.mark.parametrize(("speed", "seconds"), [(12.0, 2.0), (90.0, 0.6), (900.0, 0.1)])
+def test_a_speed_is_told(speed, seconds):
+    recording = moving(lambda x: np.tile([0.8 * speed, -0.6 * speed], (len(x), 1)), seconds)
+    found = usual_speed(recording)
+    assert found is not None and abs(found.usual / speed - 1) < 0.2
+    suited, line = contrast.suit(recording, contrast.Params())
+    way = float(suited.duration) * speed
+    assert 4 < way < 61 and "px/s" in line
+    suited, _ = contrast.suit(recording, contrast.Params(duration=0.07), given=["duration"])
+    assert float(suited.duration) == pytest.approx(0.07)  # a number that is given wins
+    suited, _ = voting.suit(recording, voting.Params())
+    assert float(suited.tau_max) * speed > float(suited.baseline)
+
+
+def test_noise_has_no_speed():
+    rng, n = np.random.default_rng(0), 6000
+    t = np.sort(rng.integers(0, 300_000, n))
+    x, y = (rng.integers(0, size, n).astype(np.uint16) for size in (WIDTH, HEIGHT))
+    noise = Recording("noise", WIDTH, HEIGHT, Events(t, x, y, rng.random(n) < 0.5), camera=CAMERA)
+    assert usual_speed(noise) is None
+    params, line = voting.suit(noise, voting.Params())
+    assert "nothing was seen" in line and params.values() == voting.Params().values()
+    with pytest.raises(InputError, match="nothing is seen to move"):
+        choose(noise)
+
+
+def rates(x, T, Omega, rho):
+    return np.array(
+        [
+            np.asarray(A(place[0], place[1], F)) @ T * r
+            + np.asarray(B(place[0], place[1], F)) @ Omega
+            for place, r in zip(x, rho, strict=True)
+        ]
+    )
+
+
+@pytest.mark.slow
+def test_models_are_told_apart():
+    one = np.array([70.0, 20.0])
+    plane = moving(lambda x: np.tile(one, (len(x), 1)), 0.6)
+    turning = moving(lambda x: rates(x, np.zeros(3), [0.2, -0.3, 1.5], np.ones(len(x))), 0.6)
+
+    def deep(x):
+        # Near and far stripes, across which the camera slides.
+        rho = np.where((x[:, 1] // 24) % 2 == 0, 1.0, 0.5)
+        return rates(x, np.array([-0.9, 0.0, 0.2]), np.zeros(3), rho)
+
+    sliding = moving(deep, 0.6, 900)
+    turns, slides = choose(turning), choose(sliding)
+    assert turns.model.name == "rotation" and slides.model.name == "general"
+    assert turns.z["rotation", "planar"] > 3 and "better than" in " ".join(turns.lines)
+    flat, several = layers(plane), layers(sliding)
+    assert flat is None or not flat.several
+    assert several is not None and several.several and 0.2 < several.spread < 0.9
+    assert several.slow < 50 and several.fast > 75  # 45 and 90 px/s
+    bare = moving(lambda x: np.tile(one, (len(x), 1)), 0.6, camera=None)
+    assert choose(bare).model.name == "planar"
+
+    t = np.array([100_000, 500_000])
+    motion = Motion.of("planar", t, np.tile(one, (2, 1)), np.tile(np.eye(2), (2, 1, 1)))
+    wider, line = motion.with_layers(sliding)
+    along = several.spread**2 * (1 + 0.1**2) * (one @ one)
+    unit = one / np.linalg.norm(one)
+    assert unit @ wider.covariance[0] @ unit == pytest.approx(1 + along) and "depths" in line
+
+
+def test_a_heading_that_nothing_tells_is_said():
+    t, mean = np.array([0, 100_000]), np.tile([0.0, 0, 1, 0.1, 0, 0], (2, 1))
+    covariance = np.tile(np.diag([1.2, 1.2, 0, 1e-4, 1e-4, 1e-4]), (2, 1, 1))
+    for sigma2, said in ((1.2, True), (1e-4, False)):
+        covariance[:, [0, 1], [0, 1]] = sigma2
+        motion = Motion.of("general", t, mean, covariance)
+        lines = Written([], t, motion(t), motion, None, None, None).summary()
+        assert ("not observable" in " ".join(lines)) == said
+
+
+def test_standard():
+    assert standard(np.array([1.0, 1, 1, 1])) == pytest.approx(2)
+    assert standard(np.zeros(3)) == 0
+
+
+def test_errors_are_made_of_three():
+    t = np.array([0, 100_000, 200_000])
+    mean = np.array([[1.0, 0], [2, 0], [3, 0]])
+    motion = Motion.of("planar", t, mean, np.tile(np.eye(2), (3, 1, 1)))
+    told = motion.calibrated(Calibration(factor=4, share=0.5, change=0.2), 0.1)
+    expected = 4 + 0.25 * 4 + 0.04 * 1.0**2  # the motion changes by 1 in 0.1 s, and is straight
+    np.testing.assert_allclose(told.covariance[1], np.diag([expected, 5]))
+    lost = Motion.of("planar", t, mean, np.full((3, 2, 2), np.nan))
+    assert not lost(t).valid.any()  # without a sigma
+
+
+def test_a_gyro_in_other_axes_and_with_a_bias():
+    t = np.linspace(0, 1, 50)
+    Omega = np.stack([0.3 * np.sin(7 * t), 0.2 * np.cos(5 * t), 0.5 + 0.2 * np.sin(9 * t)], 1)
+    bias = np.array([0.05, -0.06, 0.02])
+    np.testing.assert_allclose(truth.constant_between(Omega, Omega + bias), bias)
+    for name, R in truth.AXES.items():
+        assert np.linalg.det(R) == pytest.approx(1)
+        measured = (Omega + bias) @ R  # R takes the gyro's axes to the camera's
+        found = truth.nearest_axes(Omega, measured)
+        assert found == (None if name == "camera" else name)
+        imu = Imu(np.rint(1e6 * t).astype(np.int64), measured, np.zeros_like(measured))
+        np.testing.assert_allclose(truth.from_gyro(imu, rotation=R).Omega, Omega + bias)
+    np.testing.assert_array_equal(truth.imu_rotation("y-up"), np.diag([1.0, -1, -1]))
+    np.testing.assert_array_equal(truth.imu_rotation("0,1,0,0,0,1,1,0,0")[0], [0, 1, 0])
+    for wrong in ("y_up", "1,2", "1,0,0,0,1,0,0,0,-1"):
+        with pytest.raises(InputError, match="imu-rotation"):
+            truth.imu_rotation(wrong)
+
+
+def test_poses_and_a_depth_tell_an_image_velocity():
+    t = np.arange(0, 1_000_001, 50_000)
+    position = np.stack([0.4e-6 * t, -0.1e-6 * t, 0 * t], 1)
+    quaternion = np.tile([0.0, 0, 0, 1], (len(t), 1))
+    recording = Recording(
+        "r", WIDTH, HEIGHT, Events.empty(), camera=CAMERA, poses=Poses(t, position, quaternion)
+    )
+    known = truth.known(recording, "planar", depth=2.0)
+    np.testing.assert_allclose(known.values, np.tile([-F * 0.2, F * 0.05], (len(known.t), 1)))
+    with pytest.raises(InputError, match="depth"):
+        truth.known(recording, "rotation", depth=2.0)
+    with pytest.raises(InputError, match="depth 0"):
+        truth.known(recording, find_model("planar"), depth=0.0)

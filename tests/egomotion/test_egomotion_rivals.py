@@ -1,0 +1,66 @@
+"""Rivals of a window, compared on pixels left out; the thresholds' skew by counts."""
+
+import inspect
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxevent.camera import PinholeCamera
+from jaxevent.egomotion.batch_fit import rivals
+from jaxevent.egomotion.batch_fit.path import Path
+from jaxevent.egomotion.batch_fit.windows import Params, Windows, inflation
+from jaxevent.egomotion.geometry import A, B
+from jaxevent.recording import Events, Recording
+
+
+def test_cells_err_independently(monkeypatch):
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 240, (2, 400))
+    one, other = rng.random((2, 400))
+    on = (rng.random(400) < 0.9) * 1.0
+    costs = {"one": (jnp.asarray(one), jnp.asarray(on)), "other": (jnp.asarray(other), on + 0)}
+    monkeypatch.setattr(rivals, "_costs", lambda tracks, scene, prior, sigma: costs[scene])
+    tracks: object = SimpleNamespace(x=jnp.asarray(x), y=jnp.asarray(y), corner=(0.0, 0.0),
+                                     shape=(240, 240))  # fmt: skip
+    compared = inspect.unwrap(rivals.compared)  # without checks of types
+    z = compared(tracks, "one", "other", None, 0.1)
+    sums: dict[tuple[int, int], float] = {}
+    for i in range(400):
+        place = int(x[i] // 48), int(y[i] // 48)
+        sums[place] = sums.get(place, 0.0) + on[i] * (one[i] - other[i])
+    D = np.array(list(sums.values()))
+    assert z == pytest.approx(D.sum() / np.sqrt((D**2).sum()), rel=1e-4)
+
+
+def test_rotation_alone_makes_about_the_same_flow():
+    heading, Omega, f, rho = np.array([0.6, -0.8, 0.0]), np.array([0.1, 0.2, 0.3]), 200.0, 0.2
+    path = Path.constant(heading, Omega, np.full(4, np.log(rho)), jnp.float32)
+    still = rivals.without_translation(path)
+    assert np.exp(still.log_rho).max() < 1e-3
+    middle = np.asarray(A(0.0, 0.0, f)) @ heading * rho + np.asarray(B(0.0, 0.0, f)) @ Omega
+    np.testing.assert_allclose(np.asarray(B(0.0, 0.0, f)) @ still.O[0], middle, rtol=1e-5)
+
+
+def test_skew_is_that_by_which_pixels_end_where_they_began():
+    # Three ON and two OFF events at every pixel; one more shows ON events alone.
+    rows = []
+    for pixel in range(50):
+        for k, on in enumerate([True, False, True, False, True]):
+            rows.append((1000 * k + pixel, pixel, on))
+    for k in range(30):
+        rows.append((100 * k, 60, True))
+    t, x, p = zip(*sorted(rows), strict=True)
+    none = np.zeros(len(t), np.uint16)
+    events = Events(np.array(t), np.array(x, np.uint16), none, np.array(p))
+    camera = PinholeCamera(50.0, 50.0, 32.0, 24.0)
+    recording = Recording("r", 64, 48, events, camera=camera)
+    windows = Windows(recording, Params(), camera)
+    skew, weight = windows.skew(2500, 0.1)
+    assert skew == pytest.approx(-0.2) and weight == pytest.approx(1 / 0.03**2, rel=0.01)
+
+
+def test_errors_grow_where_little_is_explained():
+    assert inflation(1.0) == inflation(0.95) == pytest.approx(2.5**2)
+    assert np.sqrt(inflation(0.58)) == pytest.approx(2.5 * np.exp(5 * 0.37))
