@@ -76,9 +76,11 @@ def measure_blobs(part: Part, labels: NDArray[np.int32], number: int) -> Blobs:
     def mean(values: NDArray) -> NDArray:
         return np.bincount(labels, values, number + 1) / np.maximum(n, 1)
 
+    some = np.flatnonzero(labels)
+    labels, in_x, in_y = labels[some], part.x[some], part.y[some]
     n = np.bincount(labels, minlength=number + 1).astype(np.float64)
-    x, y = mean(part.x), mean(part.y)
-    ex, ey = part.x - x[labels], part.y - y[labels]
+    x, y = mean(in_x), mean(in_y)
+    ex, ey = in_x - x[labels], in_y - y[labels]
     xx, xy, yy = mean(ex**2), mean(ex * ey), mean(ey**2)
     C = np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2) + np.eye(2) / 12
     return Blobs(n[1:], np.stack([x, y], 1)[1:], C[1:])

@@ -100,8 +100,11 @@ def _candidates(t: Any, x: Any, y: Any, joined: Any, limit: float | int) -> Any:
     for k in range(len(joined.window)):
         first, last, w = joined.first[k], joined.first[k + 1] - 1, joined.window[k]
         begin, end = joined.t[first] - w // 2, joined.t[last] + w // 2
-        row = first
-        for i in range(np.searchsorted(t, begin), np.searchsorted(t, end)):
+        i0, i1 = np.searchsorted(t, begin), np.searchsorted(t, end)
+        if i0 == i1:
+            continue
+        row = max(first, first + np.searchsorted(joined.t[first : last + 1], t[i0], "right") - 1)
+        for i in range(i0, i1):
             while row < last and joined.t[row + 1] <= t[i]:
                 row += 1
             following = min(row + 1, last)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.finding.paths import NOBODY, Joined, Path, candidates, join
+from jaxevent.blob.finding.paths import NOBODY, Path, candidates, join
 from jaxevent.recording import Recording
 
 BATCH = 1 << 20  # events read at a time
@@ -26,16 +26,15 @@ class Part(NamedTuple):
 class Stream:
     """Events of a recording from `start` to before `stop` (us), without those that are left out.
 
-    Left out are `hot` pixels, once they are known, and what is within `sigmas` standard deviations
-    of the paths given to `without`. Nothing is copied: events are read where they are needed.
+    Left out are `hot` pixels, once they are known, and what is near the paths given to `without`.
+    Events are read where they are needed; `without` takes a byte for each.
     """
 
     def __init__(self, recording: Recording, start: int, stop: int):
         self.recording, self.start, self.stop = recording, start, stop
         self.width, self.height = recording.width, recording.height
         self.hot = np.zeros((recording.height, recording.width), bool)
-        self._out: Joined | None = None
-        self._sigmas = 0.0
+        self._kept: NDArray[np.bool_] | None = None  # of all rows from `start` to `stop`
 
     @property
     def duration(self) -> float:
@@ -48,9 +47,16 @@ class Stream:
         return events.index(self.stop) - events.index(self.start)
 
     def without(self, paths: Sequence[Path], sigmas: float | int) -> "Stream":
-        """The same without events near some paths."""
+        """The same without events within `sigmas` standard deviations of some paths."""
         stream = Stream(self.recording, self.start, self.stop)
-        stream.hot, stream._out, stream._sigmas = self.hot, join(paths), sigmas
+        first, last = (self.recording.events.index(t) for t in (self.start, self.stop))
+        kept = np.ones(last - first, bool) if self._kept is None else self._kept.copy()
+        joined = join(paths)
+        for row in range(first, last, BATCH):
+            events = self.recording.events[row : min(row + BATCH, last)]
+            near = candidates(events, joined, sigmas) != NOBODY
+            kept[row - first : row - first + len(near)] &= ~near
+        stream.hot, stream._kept = self.hot, kept
         return stream
 
     def window(self, begin: float | int, end: float | int) -> Part:
@@ -75,7 +81,8 @@ class Stream:
     def _rows(self, first: int, last: int) -> Part:
         events = self.recording.events[first:last]
         kept = ~self.hot[events.y, events.x]
-        if self._out is not None and len(events):
-            kept &= candidates(events, self._out, self._sigmas) == NOBODY
+        if self._kept is not None:
+            before = self.recording.events.index(self.start)
+            kept &= self._kept[first - before : last - before]
         t = np.asarray((events.t[kept] - self.start) * 1e-6, np.float64)
         return Part(t, events.x[kept].astype(np.int64), events.y[kept].astype(np.int64))
