@@ -1,12 +1,13 @@
 """Tracking without settings: simulated scenes and what simple trackers make of them.
 
-    python experiments/blob_finding.py --out finding [--scenes NAME ...] [--seeds 2]
+    python experiments/blob_finding.py --out finding --first 10 [--scenes NAME ...] [--data DIR]
 
 Every scene is tracked as a new user does it, `moment.estimate(recording)`. Beside it: the targets
 that `find` alone gives; `clusters`, connected components of event images, each linked to the
 nearest of the image before; and `kalman`, a tracker of constant velocity on the same centroids with
 optimal assignment, births after three and deaths after five images, as norfair and motpy do it.
-Both baselines get the window and cell that `find` chose. Makes table.md and results.json.
+Both baselines get the window and cell that `find` chose. Makes table.md and results.json. With
+--data, a folder that holds spinning_dot.npz and davis346_street.npz, these are tracked too.
 
 Scores are taken at 200 times: a track and a target are one where they are nearer than 2 sizes and
 3 px. `idf1` is that of Ristani et al. 2016 (identities assigned once for the whole recording),
@@ -31,6 +32,7 @@ from jaxevent.blob import Found, find, moment
 from jaxevent.blob.finding.background import measure_background
 from jaxevent.blob.finding.detection import detect, measure_blobs
 from jaxevent.blob.finding.stream import Stream
+from jaxevent.io import load
 from jaxevent.recording import Recording
 from jaxevent.simulate.blobs import (
     Circle,
@@ -43,6 +45,7 @@ from jaxevent.simulate.blobs import (
 
 VGA = (640, 480)
 TIMES = 200
+DOT_CENTRE = (314.29, 202.35)  # px, of a circle fitted to the same events
 
 
 class Answer(NamedTuple):
@@ -344,6 +347,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(SCENES))
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--data", type=Path, help="folder of real recordings")
     args = parser.parse_args()
     rows = []
     for name in args.scenes:
@@ -369,9 +373,31 @@ def main() -> None:
                     flush=True,
                 )
     args.out.mkdir(parents=True, exist_ok=True)
+    if args.data is not None:
+        print("\n".join(_real(args.data)))
     (args.out / "results.json").write_text(json.dumps(rows, indent=1))
     (args.out / "table.md").write_text(_table(rows))
     print(_table(rows))
+
+
+def _real(data: Path) -> list[str]:
+    """Lines about tracks of real recordings, as a new user gets them."""
+    lines = []
+    for name in ("spinning_dot", "davis346_street"):
+        recording = load(data / f"{name}.npz")
+        tracks = moment.estimate(recording, progress=False)
+        lives = (tracks.death - tracks.birth) * 1e-6
+        lines.append(f"{name}: tracks of {', '.join(f'{life:.3f}' for life in lives)} s")
+        if name == "spinning_dot":
+            t = np.linspace(0.003, 0.0499, 900)
+            state = tracks(t, [int(tracks.id[np.argmax(lives)])]).mean[:, 0]
+            radius = np.hypot(state[:, 0] - DOT_CENTRE[0], state[:, 1] - DOT_CENTRE[1])
+            speed = np.hypot(state[:, 2], state[:, 3])
+            lines[-1] += (
+                f"; radius {radius.mean():.2f} +- {radius.std():.2f} px, "
+                f"speed {np.median(speed):,.0f} px/s"
+            )
+    return lines
 
 
 def _table(rows: list[dict]) -> str:
