@@ -317,7 +317,7 @@ def test_strange_streams():
         rec = recording(np.array(t), xy, name=name)
         for tracks in (
             follow(rec, Params(**short), seeds, detect=True),
-            follow(rec, Params(t_coast=1e6, sigma_max=1e30), seeds),
+            follow(rec, Params(t_coast=1e6, sigma_max=1e14), seeds),
         ):
             states = tracks(np.r_[rec.start, rec.stop, rec.stop // 2], extrapolate=True)
             assert np.isfinite(states.mean[states.valid]).all(), name

@@ -292,7 +292,7 @@ def test_without_events_the_filter_tends_to_the_augmented_frame():
 
 def test_without_belief_in_frames_the_filter_integrates_events():
     recording = random_recording(3, 80, 3)
-    params = jaxevent.akf.Params(kappa=1e-30, c_on=0.2, c_off=0.15)
+    params = jaxevent.akf.Params(kappa=1e-12, c_on=0.2, c_off=0.15)
     image, _, _ = jaxevent.akf.estimate(recording, params)(recording.stop)
     first, _ = look(jaxevent.akf.estimate(recording, params), recording.start - 1)
     total = np.zeros((3, 4))
