@@ -1,8 +1,11 @@
 """What tests of commands share."""
 
 import subprocess
+import tomllib
 from pathlib import Path
+from typing import Any
 
+import h5py
 import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
@@ -28,3 +31,18 @@ def decoded(path: Path, height: int, width: int, pixels: str = "gray") -> tuple[
     done = subprocess.run(decode, capture_output=True, check=True)
     shape = (-1, height, width) if pixels == "gray" else (-1, height, width, 3)
     return np.frombuffer(done.stdout, np.uint8).reshape(shape), done.stderr.decode()
+
+
+def described(path: Path, *unknown: str) -> dict[str, Any]:
+    """What an HDF5 file says of itself, its TOML read; all datasets but `unknown` have a unit."""
+    with h5py.File(path) as file:
+
+        def look(name: str, one: Any) -> None:
+            if isinstance(one, h5py.Dataset) and name not in unknown:
+                assert isinstance(one.attrs["unit"], str), name
+
+        file.visititems(look)
+        told = dict(file.attrs)
+    for name in {"inputs", "params"} & set(told):
+        told[name] = tomllib.loads(told[name])
+    return told

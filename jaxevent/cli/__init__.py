@@ -53,7 +53,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             finally:
                 sys.stdout.flush()  # help
             command = arguments.pop("command")
-            with guarded(arguments) as options:
+            words = ["jaxevent", *(sys.argv[1:] if argv is None else argv)]
+            with guarded(arguments, words) as options:
                 command(**options)
             sys.stdout.flush()
     except InputError as error:

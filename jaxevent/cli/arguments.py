@@ -4,7 +4,7 @@ import argparse
 import contextlib
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,10 +63,11 @@ def add_output(
 
 
 @contextlib.contextmanager
-def guarded(options: dict[str, Any]) -> Iterator[dict[str, Any]]:
+def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str, Any]]:
     """The options that a command's `run` takes, once its outputs are known to cost nothing.
 
-    All paths among the options that are no outputs are inputs. Raises `InputError` as
+    All paths among the options that are no outputs are inputs. Within the block, files that are
+    written say that the command line `words` made them of these. Raises `InputError` as
     `jaxevent.io.places.check` does.
     """
     outputs = options.get("outputs", {})
@@ -75,6 +76,7 @@ def guarded(options: dict[str, Any]) -> Iterator[dict[str, Any]]:
     if any(outputs.values()):
         yield {**taken, "force": force}
     elif outputs:
+        from jaxevent.io.description import Command, running
         from jaxevent.io.output import into_folders
         from jaxevent.io.places import check
 
@@ -85,7 +87,7 @@ def guarded(options: dict[str, Any]) -> Iterator[dict[str, Any]]:
             if isinstance(value, Path) and name not in outputs
         ]
         check(named, inputs, force=force)
-        with into_folders(force):
+        with into_folders(force), running(Command(words, inputs)):
             yield taken
     else:
         yield taken

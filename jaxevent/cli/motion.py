@@ -128,8 +128,6 @@ def run(
     size: tuple[int, int] | None,
     out: Path,
 ) -> None:
-    import json
-
     from jaxevent.egomotion import find_model
     from jaxevent.egomotion.choice import choose
     from jaxevent.egomotion.truth import gyro_bias
@@ -188,9 +186,8 @@ def run(
     if warning:
         print(warning)
     seconds = time.perf_counter() - clock
-    about = {"method": estimator.name, "parameters": json.dumps(values.values()), "seed": seed}
-    about |= {"smooth": smooth, "gyro": imu, "centred": centred}
-    written = output.write(recording, told, about, true, show_progress())
+    about = {"seed": seed, "smooth": smooth, "gyro": imu, "centred": centred}
+    written = output.write(recording, told, about, true, show_progress(), estimator.name, values)
     print("\n".join([f"{kind.title} by {estimator.name}:", *written.summary()]))
     count = len(recording.events)
     print(

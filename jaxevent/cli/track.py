@@ -107,8 +107,7 @@ def run(
 ) -> None:
     from jaxevent import methods
     from jaxevent.blob import find
-    from jaxevent.io import load
-    from jaxevent.runs import toml
+    from jaxevent.io import load, toml
     from jaxevent.show.tracks import Output
 
     tracker = methods.find(method, "blob")
@@ -133,12 +132,14 @@ def run(
     tracks = tracker.estimate(recording, given, **options, progress=show_progress())
     seconds = time.perf_counter() - clock
     texts = {"params.toml": toml.parameters(tracks.params) + "\n"}
-    written = output.write(tracks, show_progress(), texts)
+    written = output.write(tracks, show_progress(), texts, tracker.name)
     count = recording.events.index(tracks.stop) - recording.events.index(tracks.start)
     if len(tracks):
         print("\n".join(written.summary()))
     else:
         print("no blob was found; say where one is with --seed X,Y,SIZE, or try --detect")
+    if written.left_out:
+        print("\n" + "\n".join(written.left_out))
     how = ", ".join(written.files) + f" in {out}" if not out.suffix else str(out)
     slow = "" if written.slow is None else f"; the video plays at {written.slow:.3g} of real time"
     print(

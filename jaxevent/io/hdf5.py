@@ -53,6 +53,7 @@ from jaxevent.io import (
     whole_number,
 )
 from jaxevent.io.columns import time_scale
+from jaxevent.io.description import CLOCK
 from jaxevent.io.output import complete_hdf5
 from jaxevent.progress import bar
 from jaxevent.recording import (
@@ -67,6 +68,48 @@ from jaxevent.recording import (
 )
 
 VERSION = 1
+_LEVELS = "levels: 0 black, {most} white"  # of images
+_UNITS = {
+    "t_offset": CLOCK,
+    "events/t": "us since t_offset",
+    "events/x": "px",
+    "events/y": "px",
+    "events/p": "1 ON, 0 OFF",
+    "ms_to_idx": "rows of events",
+    "frames/t": CLOCK,
+    "frames/exposure": "us",
+    "camera": "px (fx, fy, cx, cy), 1 (k1, k2, p1, p2, k3)",
+    "poses/t": CLOCK,
+    "poses/position": "m",
+    "poses/quaternion": "1",
+    "imu/t": CLOCK,
+    "imu/gyro": "rad/s",
+    "imu/acc": "m/s^2",
+    "triggers/t": CLOCK,
+    "triggers/edge": "1 rising, 0 falling, -1 unknown",
+    "triggers/channel": "1",
+    # Of the simulators and of `register`. What further arrays mean is not known here.
+    "extra/hdr": "linear intensity: 0 is the frames' black, 1 their white",
+    "extra/hdr_t": CLOCK,
+    "extra/response": "intensity of grey values from 0 to 1",
+    "extra/certainty": "1, of grey values from 0 to 1",
+    "extra/clip": "intensity",
+    "extra/gain": "1",
+    "extra/hot": "1",
+    "extra/covered": "1",
+    "extra/homography": "px to px",
+    "extra/register_offset": "s",
+    "extra/c_on": "ln I",
+    "extra/c_off": "ln I",
+    "extra/mismatch": "1",
+    "extra/dark_offset": "intensity",
+    "extra/refractory": "s",
+    "extra/background_rate": "Hz",
+    "extra/white": "linear light of the video, 1 its white",
+    "extra/cut": "levels: 0 black, 255 white",
+    "extra/read_noise": "levels: 0 black, 255 white",
+    "extra/clock_offset": "s",
+}
 _MOST_COMPRESSED = 4096  # times smaller than in memory that any filter makes real events
 _BLOSC = 32001
 _ECF = 36559  # Prophesee's filter
@@ -467,6 +510,15 @@ def write(
             file["camera"] = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
         for name, values in recording.extra.items():
             _write(file, f"extra/{name}", values, compression)
+        _tell_units(file)
+
+
+def _tell_units(file: h5py.File) -> None:
+    for name in ("frames/images", "extra/rgb", *_UNITS):
+        if isinstance(stored := file.get(name), h5py.Dataset):
+            whole = stored.dtype.kind in "iu"
+            levels = _LEVELS.format(most=np.iinfo(stored.dtype).max if whole else 1)
+            stored.attrs["unit"] = _UNITS.get(name, levels)
 
 
 def _write_events(

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxevent.errors import InputError
+from jaxevent.io.description import describe
 from jaxevent.io.places import abandoned, locked, partial_of
 from jaxevent.parameters import Parameters
 
@@ -110,9 +111,12 @@ def _move_files(new: Path, folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def complete_hdf5(path: Path) -> Iterator[tuple["h5py.File", Callable[[], None]]]:
+def complete_hdf5(
+    path: Path, method: str | None = None, params: Parameters | None = None
+) -> Iterator[tuple["h5py.File", Callable[[], None]]]:
     """An HDF5 file to write, with what `complete` promises, and `check()` for long writers.
 
+    It says of itself what `jaxevent.io.description` lists.
     Where the disk is full nothing is said before `check()` or the end of the block: HDF5 cannot
     recover from a failed write, and crashes at exit.
     """
@@ -121,6 +125,7 @@ def complete_hdf5(path: Path) -> Iterator[tuple["h5py.File", Callable[[], None]]
     with complete(path) as partial, partial.open("r+b", buffering=0) as raw:
         sink = _Sink(raw)
         with h5py.File(sink, "w") as file:
+            describe(file, method, params)
             yield file, sink.check
         sink.check()
 

@@ -84,6 +84,11 @@ def partial_of(path: Path) -> Path:
     return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.part")
 
 
+def is_partial(path: Path) -> bool:
+    """Whether a name is one of `partial_of`, or that of a moment before."""
+    return re.fullmatch(r"\..+\.[0-9a-f]{12}\.(part|new)", path.name) is not None
+
+
 def partials(path: Path) -> list[Path]:
     """What is beside `path` of writes of it that go on, or were broken off."""
     path = path.absolute()

@@ -50,9 +50,8 @@ import jax
 
 from jaxevent import devices
 from jaxevent.errors import InputError, require
-from jaxevent.io import load
+from jaxevent.io import load, toml
 from jaxevent.recording import Recording
-from jaxevent.runs import toml
 from jaxevent.runs.checkpoint import finished_rows, restore, save
 from jaxevent.runs.family import Sources
 from jaxevent.runs.fit_config import Plan, Task, read_plan

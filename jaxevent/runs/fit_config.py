@@ -11,9 +11,9 @@ import jax.numpy as jnp
 
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
+from jaxevent.io import toml
 from jaxevent.methods import find
 from jaxevent.parameters import Parameters, read_toml
-from jaxevent.runs import toml
 from jaxevent.runs.config import (
     NAME,
     NATURAL,

@@ -20,7 +20,9 @@ from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.truth import Known, constant_between, from_poses, known, nearest_axes
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.estimator import Estimate
+from jaxevent.io.description import CLOCK
 from jaxevent.io.output import complete, complete_hdf5
+from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
 from jaxevent.show.motion_pictures import (
     flow_of,
@@ -65,13 +67,25 @@ def _write_csv(path: str | Path, columns: Mapping[str, Any]) -> None:
         pd.DataFrame(dict(columns)).to_csv(partial, index=False)
 
 
-def write_motion(path: str | Path, motion: Motion, about: Mapping[str, Any] | None = None) -> None:
+def write_motion(
+    path: str | Path,
+    motion: Motion,
+    about: Mapping[str, Any] | None = None,
+    method: str | None = None,
+    params: Parameters | None = None,
+) -> None:
     """Write the estimates as HDF5: t (us), mean, covariance, lost, lag (s), contrast, evidence.
 
-    The attributes are model, components, units, and what `about` holds, of numbers and texts.
+    The attributes are recording, model, components, units, what `about` holds, of numbers and
+    texts, and what `jaxevent.io.description` lists.
     """
-    with complete_hdf5(Path(path)) as (file, _):
+    units = {
+        "t": CLOCK, "mean": "units", "covariance": "units[i] units[j]", "lost": "1", "lag": "s",
+        "contrast": "1", "evidence": "1, of a natural logarithm", "cloud": "units",
+    }  # fmt: skip
+    with complete_hdf5(Path(path), method, params) as (file, _):
         file.attrs["format"] = "jaxevent motion"
+        file.attrs["recording"] = motion.recording
         file.attrs["model"] = motion.model.name
         file.attrs["components"] = motion.model.components
         file.attrs["units"] = motion.model.units
@@ -82,8 +96,13 @@ def write_motion(path: str | Path, motion: Motion, about: Mapping[str, Any] | No
             if isinstance(value, np.ndarray) and field.name != "valid":
                 file[field.name] = value
         file["lost"] = ~motion.valid
-        file["t"].attrs["unit"] = "us on the recording's clock"
-        file["lag"].attrs["unit"] = "s"
+        for name, unit in units.items():
+            if name not in file:
+                continue
+            file[name].attrs["unit"] = unit
+            if unit.startswith("units"):
+                file[name].attrs["columns"] = motion.model.components
+                file[name].attrs["units"] = motion.model.units
 
 
 def write_errors(folder: Path, found: Comparison) -> None:
@@ -240,8 +259,10 @@ class Output:
         about: Mapping[str, Any] = MappingProxyType({}),
         truth: Callable[[Motion], Truth] | None = None,
         progress: bool | None = None,
+        method: str | None = None,
+        params: Parameters | None = None,
     ) -> "Written":
-        """Write everything, complete or not at all; `about` are attributes of motion.h5."""
+        """Write everything, complete or not at all; motion.h5 says `about`, `method`, `params`."""
         if not len(recording.events):
             raise InputError(f"{recording.name}: holds no events; choose another recording")
         start, stop = span_of(recording)
@@ -258,7 +279,7 @@ class Output:
         outliers = None
         with complete(self.path, directory=True) as folder:
             write_motion_table(folder / "motion.csv", motion.model, times, told)
-            write_motion(folder / "motion.h5", motion, about)
+            write_motion(folder / "motion.h5", motion, about, method, params)
             if found is not None:
                 write_errors(folder, found)
             if self.flow:
@@ -363,7 +384,7 @@ def _write_flow(path: Path, recording: Recording, motion: Motion, progress: bool
     total = len(recording.events)
     params = event_flow.Params.of({})
     kinds = {"t": np.int64, "u": np.float32, "v": np.float32, "valid": np.bool_}
-    with complete_hdf5(path) as (file, check):
+    with complete_hdf5(path, "flow", params) as (file, check):
         file.attrs["format"] = "jaxevent event flow"
         stored = {name: file.create_dataset(name, (total,), kind) for name, kind in kinds.items()}
         for part in event_flow.iterate(recording, motion, params, progress=progress):
@@ -379,10 +400,9 @@ def _write_flow(path: Path, recording: Recording, motion: Motion, progress: bool
             known_count += int(known.sum())
             over += int((part.residual[known] > float(params.limit)).sum())
             row = stop
-        stored["t"].attrs["unit"] = "us on the recording's clock"
-        for name in ("u", "v"):
-            stored[name].attrs["unit"] = "px/s, undistorted"
+        units = {"t": CLOCK, "u": "px/s, undistorted", "v": "px/s, undistorted", "valid": "1"}
+        for name, unit in units.items():
+            stored[name].attrs["unit"] = unit
         outliers = 100 * over / known_count if known_count else 0.0
         file.attrs["outliers"] = outliers
-        file.attrs["limit"] = float(params.limit)
     return outliers

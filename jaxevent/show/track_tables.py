@@ -6,6 +6,7 @@ rad; valid (T, N), False where a track does not exist and its numbers may be any
 """
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -15,7 +16,9 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.errors import InputError
+from jaxevent.io.description import CLOCK
 from jaxevent.io.output import complete, complete_hdf5
+from jaxevent.parameters import Parameters
 from jaxevent.recording import Times, microseconds
 
 COLUMNS = ("x", "y", "vx", "vy", "lambda1", "lambda2", "theta", "q")
@@ -34,22 +37,26 @@ def write_tracks(
 
     A table is written as it is instead where ids are (rows,), mean (rows, 8), covariance (rows, 8,
     8) and `times` (rows,), say one row per event. CSV has the columns t (s), id, the state x, y,
-    vx, vy, lambda1, lambda2, theta, q and their standard deviations std_x ... std_q. HDF5 has t
+    vx, vy, lambda1, lambda2, theta, q and their standard deviations sigma_x ... sigma_q. HDF5 has t
     (rows,) int64 us, id (rows,), mean (rows, 8) and covariance (rows, 8, 8), with the attributes
-    `columns` and `units`. Raises `InputError` for another suffix and shapes that do not fit.
+    `columns` and `units`, and says what `jaxevent.io.description` lists. Raises `InputError` for
+    another suffix and shapes that do not fit.
     """
     with track_writer(path) as write:
         write(times, ids, mean, covariance, valid)
 
 
 @contextlib.contextmanager
-def track_writer(path: str | Path) -> Iterator[Callable[..., None]]:
+def track_writer(
+    path: str | Path, method: str | None = None, params: Parameters | None = None
+) -> Iterator[Callable[..., None]]:
     """Open a file as of `write_tracks` and give the function that appends to it.
 
-    The file appears at the end, complete.
+    The file appears at the end, complete. HDF5 says what `method` and `params` made the tracks.
     """
     path = Path(path)
-    kinds = {".csv": _csv_writer, ".h5": _hdf5_writer, ".hdf5": _hdf5_writer}
+    hdf5 = functools.partial(_hdf5_writer, method=method, params=params)
+    kinds = {".csv": _csv_writer, ".h5": hdf5, ".hdf5": hdf5}
     if path.suffix.lower() not in kinds:
         raise InputError(
             f"{path}: tracks cannot be stored as {path.suffix or 'a file without suffix'}; end the "
@@ -76,7 +83,7 @@ def track_writer(path: str | Path) -> Iterator[Callable[..., None]]:
 @contextlib.contextmanager
 def _csv_writer(path: Path) -> Iterator[Callable[..., None]]:
     with complete(path) as partial, partial.open("w", newline="") as file:
-        names = ("t", "id", *COLUMNS, *(f"std_{name}" for name in COLUMNS))
+        names = ("t", "id", *COLUMNS, *(f"sigma_{name}" for name in COLUMNS))
         file.write(",".join(names) + "\n")
 
         def append(t: NDArray, number: NDArray, mean: NDArray, covariance: NDArray) -> None:
@@ -89,8 +96,10 @@ def _csv_writer(path: Path) -> Iterator[Callable[..., None]]:
 
 
 @contextlib.contextmanager
-def _hdf5_writer(path: Path) -> Iterator[Callable[..., None]]:
-    with complete_hdf5(path) as (file, check):
+def _hdf5_writer(
+    path: Path, method: str | None, params: Parameters | None
+) -> Iterator[Callable[..., None]]:
+    with complete_hdf5(path, method, params) as (file, check):
         file.attrs["format"] = "jaxevent tracks"
         row = 0
 
@@ -113,9 +122,11 @@ def _hdf5_writer(path: Path) -> Iterator[Callable[..., None]]:
         yield append
         if "t" not in file:
             append(*no_rows())
-        file["t"].attrs["unit"] = "us on the recording's clock"
-        for name in ("mean", "covariance"):
+        for name, unit in (("t", CLOCK), ("id", "1")):
+            file[name].attrs["unit"] = unit
+        for name, unit in (("mean", "units"), ("covariance", "units[i] units[j]")):
             file[name].attrs["columns"], file[name].attrs["units"] = COLUMNS, UNITS
+            file[name].attrs["unit"] = unit
 
 
 def no_rows() -> tuple[NDArray, NDArray, NDArray, NDArray]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_range
 from jaxevent.blob.tracks import Tracks
-from jaxevent.errors import InputError, require
+from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.io.output import complete
 from jaxevent.progress import bar
 from jaxevent.recording import Recording
@@ -26,6 +26,7 @@ from jaxevent.show.track_plots import plot_tracks
 from jaxevent.show.track_tables import no_rows, track_writer
 
 _PLOTS = (".png", ".pdf", ".svg")
+_EXTRAS = {".mp4": ("imageio_ffmpeg", "video")} | {kind: ("matplotlib", "plot") for kind in _PLOTS}
 _COARSE, _PLOTTED = 4096, 16  # most times of the plot and of quantities, most tracks plotted
 _FPS, _PICTURES = 60.0, 300  # of a video: most pictures per second, and least in all
 _STRETCH = 2_000_000  # events of which rows are written at a time
@@ -48,9 +49,10 @@ class Output:
 
     quantities.csv has the columns t (s), id, other, inverse_ttc (1/s), range (m) and their standard
     deviations; where `other` is empty, inverse_ttc is that of the growth of one blob, see
-    `quantities`. `extent` (m), `focal` (px) and `size_factor` are those of `size_range`. Raises
-    `InputError` for settings that do not fit each other, a place that cannot be written and for
-    the extras "video" and "plot" where they are needed and missing.
+    `quantities`. `extent` (m), `focal` (px) and `size_factor` are those of `size_range`. A folder
+    goes without tracks.mp4 or tracks.png where the extra "video" or "plot" is missing. Raises
+    `InputError` for settings that do not fit each other, a place that cannot be written and a
+    video or plot as the one file without its extra.
     """
 
     path: Path
@@ -91,20 +93,22 @@ class Output:
             )
         if self.background != "events" and suffix not in ("", ".mp4"):
             raise InputError(f"{path}: --background is for a video; leave it out")
-        if suffix in ("", ".mp4"):
-            require("imageio_ffmpeg", "video")
-        if suffix in ("", *_PLOTS):
-            require("matplotlib", "plot")
+        if suffix in _EXTRAS:
+            require(*_EXTRAS[suffix])
         # A place that cannot be written is told before the work.
         with contextlib.suppress(_Tried), complete(path, directory=not suffix):
             raise _Tried
 
     def write(
-        self, tracks: Tracks, progress: bool | None = None, texts: Mapping[str, str] | None = None
+        self,
+        tracks: Tracks,
+        progress: bool | None = None,
+        texts: Mapping[str, str] | None = None,
+        method: str | None = None,
     ) -> "Written":
         """Write everything, complete or not at all; raises `InputError` for an unknown pair.
 
-        `texts` are further files of a folder, by name.
+        `texts` are further files of a folder, by name; `method` made the tracks, as HDF5 says.
         """
         known = tracks.id.tolist()
         if self.pair is not None and not set(self.pair) <= set(known):
@@ -113,17 +117,30 @@ class Output:
                 f"tracks found, {', '.join(map(str, known[:20])) or 'none'}"
             )
         if self.path.suffix:
-            return self._all(tracks, {self.path.suffix.lower(): self.path}, progress)
+            return self._all(tracks, {self.path.suffix.lower(): self.path}, progress, method)
         with complete(self.path, directory=True) as folder:
             places = {kind: folder / f"tracks{kind}" for kind in (".csv", ".h5", ".mp4", ".png")}
+            left_out = []
+            for kind in set(places) & set(_EXTRAS):
+                try:
+                    require(*_EXTRAS[kind])
+                except MissingExtra as missing:
+                    left_out.append(f"{places.pop(kind).name} is left out: {missing}")
             if self.pair is not None or self.extent is not None:
                 places["quantities"] = folder / "quantities.csv"
             for name, text in (texts or {}).items():
                 (folder / name).write_text(text, encoding="utf-8")
-            written = self._all(tracks, places, progress)
-            return dataclasses.replace(written, files=[*written.files, *(texts or {})])
+            written = self._all(tracks, places, progress, method)
+            files = [*written.files, *(texts or {})]
+            return dataclasses.replace(written, files=files, left_out=sorted(left_out))
 
-    def _all(self, tracks: Tracks, places: Mapping[str, Path], progress: bool | None) -> "Written":
+    def _all(
+        self,
+        tracks: Tracks,
+        places: Mapping[str, Path],
+        progress: bool | None,
+        method: str | None,
+    ) -> "Written":
         duration = (tracks.stop - tracks.start) * 1e-6
         rate = 1000.0 if self.rate is None else float(self.rate)
         coarse = _evenly(tracks, min(rate, _COARSE / duration))
@@ -133,7 +150,9 @@ class Output:
         times = _evenly(tracks, rate) if tables and self.rate is not None else coarse[:0]
         rows = _Rows(coarse, tracks.id)
         with contextlib.ExitStack() as stack:
-            writers = [stack.enter_context(track_writer(path)) for path in tables]
+            writers = [
+                stack.enter_context(track_writer(path, method, tracks.params)) for path in tables
+            ]
 
             def write(*table: Any) -> None:
                 for one in writers:
@@ -178,7 +197,7 @@ class Output:
                 Q_lambda=float(tracks.params.Q_lambda),
             )  # fmt: skip
         slow = min(often, _FPS) / often if ".mp4" in places else None
-        return Written(tracks, rows, [path.name for path in places.values()], slow)
+        return Written(tracks, rows, [path.name for path in places.values()], slow, [])
 
     def _factor(self) -> float | int:
         return SIZE_FACTORS["ring"] if self.size_factor is None else self.size_factor
@@ -189,11 +208,11 @@ class Output:
         Q_lambda = float(tracks.params.Q_lambda)
 
         def add(one: int, other: int | None, seen: NDArray, *values: Any) -> None:
-            names = ("inverse_ttc", "std_inverse_ttc", "range", "std_range")
+            names = ("inverse_ttc", "sigma_inverse_ttc", "range", "sigma_range")
             table: dict[str, Any] = {"t": rows.t / 1e6, "id": one, "other": other}
             for name, value in zip(names, values, strict=True):
                 value = np.asarray(value, np.float64)
-                table[name] = np.sqrt(np.maximum(value, 0)) if name.startswith("std") else value
+                table[name] = np.sqrt(np.maximum(value, 0)) if name.startswith("sigma") else value
             tables.append(pd.DataFrame(table)[seen])
 
         nothing = np.full(len(rows.t), np.nan)
@@ -209,7 +228,7 @@ class Output:
             (a, b), (P_a, P_b) = np.moveaxis(mean, 1, 0), np.moveaxis(covariance, 1, 0)
             value = _closing(a, P_a, b, P_b)
             add(*self.pair, np.asarray(valid.all(1)), *value, nothing, nothing)
-        names = ["t", "id", "other", "inverse_ttc", "std_inverse_ttc", "range", "std_range"]
+        names = ["t", "id", "other", "inverse_ttc", "sigma_inverse_ttc", "range", "sigma_range"]
         table = pd.DataFrame(columns=names)
         if tables:
             table = pd.concat([part.astype({"other": "Int64"}) for part in tables])
@@ -220,12 +239,16 @@ class Output:
 
 @dataclasses.dataclass(frozen=True)
 class Written:
-    """What `Output.write` has written: the names of the files, and how slowly the video plays."""
+    """What `Output.write` has written: the names of the files, and how slowly the video plays.
+
+    `left_out` are sentences that say which files are missing and why.
+    """
 
     tracks: Tracks
     rows: "_Rows"
     files: list[str]
     slow: float | None
+    left_out: list[str]
 
     def summary(self, most: int = 20) -> list[str]:
         """Lines of a table of the longest tracks: times in s, median speed and size in px."""

@@ -356,8 +356,8 @@ def test_csv_holds_every_living_row(tmp_path, flat):
     else:
         write_tracks(tmp_path / "tracks.csv", times, ids, mean, P, valid)
     table = pd.read_csv(tmp_path / "tracks.csv")
-    first = "t id x y vx vy lambda1 lambda2 theta q std_x std_y std_vx std_vy std_lambda1"
-    assert list(table.columns) == [*first.split(), "std_lambda2", "std_theta", "std_q"]
+    first = "t id x y vx vy lambda1 lambda2 theta q sigma_x sigma_y sigma_vx sigma_vy sigma_lambda1"
+    assert list(table.columns) == [*first.split(), "sigma_lambda2", "sigma_theta", "sigma_q"]
     assert len(table) == 12 + 8
     np.testing.assert_allclose(table["t"], times[row], rtol=0, atol=1e-9)
     np.testing.assert_array_equal(table["id"], ids[column])

@@ -1,7 +1,7 @@
 """The command line: what it writes, and that bad input is said in one line and leaves nothing."""
 
 import contextlib
-import json
+import hashlib
 import os
 import re
 import resource
@@ -14,7 +14,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from commands import decoded, fails
+from commands import decoded, described, fails
 from noise import HEIGHT, ONE, STAMPS, WIDTH, small, write_config
 from PIL import Image
 
@@ -444,10 +444,19 @@ def test_reconstruct_to_hdf5(folder, capsys):
         assert said.startswith(f"{folder / name}: 6 images") and said.count("\n") == 1
         with h5py.File(folder / name) as file:
             contents.append({key: np.asarray(file[key]) for key in ("t", "image", "variance")})
-            attributes = dict(file.attrs)
-    params = json.loads(str(attributes.pop("params")))
-    assert attributes == {"method": "akf", "recording": "small"}
-    assert (params["c_on"], params["c_off"], params["clock_offset"]) == (0.2, 0.1, 0.0025)
+            # An image is read by itself, and by every HDF5 library.
+            image = file["image"]
+            assert image.chunks == (1, HEIGHT, WIDTH) and image.compression == "gzip"
+        told = described(folder / name)
+        assert told["method"] == "akf" and told["recording"] == "small"
+        assert told["command"] == f"jaxevent {argv} {folder / name}"
+        digests = {
+            str(one): hashlib.sha256(one.read_bytes()).hexdigest()
+            for one in (folder / "small.h5", params)
+        }
+        assert {one: about["sha256"] for one, about in told["inputs"].items()} == digests
+        given = {"c_on": 0.2, "c_off": 0.1, "clock_offset": 0.0025}
+        assert {key: told["params"][key] for key in given} == pytest.approx(given, rel=1e-12)
     assert all(contents[0][key].tobytes() == contents[1][key].tobytes() for key in contents[0])
 
     params = jaxevent.akf.Params.of({"c_on": 0.2, "clock_offset": 0.0025})
@@ -562,6 +571,7 @@ def test_simulate_a_scene(tmp_path, capsys):
     source = Pan(scene("night"), (24, 20), 0.3, "fast", 3)
     recording = simulate(source, SENSORS["poor"], 3, "night-fast")
     equal(jaxevent.load(out), recording)
+    assert described(out)["command"].startswith(f"jaxevent {argv}") and not described(out)["inputs"]
     said = capsys.readouterr().out
     assert said.startswith(f"{out}: {len(recording.events):,} events, 15 frames, 0.")
     assert said.count("\n") == 1 and [file.name for file in tmp_path.iterdir()] == ["night.h5"]
@@ -607,6 +617,7 @@ def test_simulate_a_video(film, capsys):
         recording = from_video(film, SENSORS["ideal"], cut=30, speed=0.5, seed=2, **settings)
         assert recording.frames is not None
         equal(jaxevent.load(film.parent / out), recording)
+        assert described(film.parent / out)["inputs"][str(film)]["files"] == 12
         said = f"{out}: {len(recording.events):,} events, {len(recording.frames)} frames, "
         assert said in capsys.readouterr().out
     argv = f"reconstruct {film.parent}/b.h5 --method blend --rate 10 --colour --out {film}/c"

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from commands import fails
+from commands import described, fails
 from noise import HEIGHT, WIDTH, small
 
 import jaxevent
@@ -33,6 +33,7 @@ def test_steps_are_those_of_the_library_in_the_order_of_the_help(stored, tmp_pat
     expected = events.select_polarity(events.filter_refractory(expected, 3), False)
     expected = events.downsample(expected, 2, 900)
     found = jaxevent.load(target)
+    assert described(target)["inputs"].keys() == {str(source)}
     assert 0 < len(found.events) < len(stored.events)
     for name in "txyp":
         np.testing.assert_array_equal(getattr(found.events, name), getattr(expected.events, name))

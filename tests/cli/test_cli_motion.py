@@ -10,7 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from commands import fails
+from commands import described, fails
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -78,8 +78,8 @@ def test_columns_are_exact():
 
 
 def test_a_folder_of_everything(folder, capsys):
-    path, table = folder / "planar.h5", folder / "planar.csv"
-    words = ("--model", "planar", "--truth", table, "--flow", "--seed", 3, "--stop", 0.2)
+    path, table_path = folder / "planar.h5", folder / "planar.csv"
+    words = ("--model", "planar", "--truth", table_path, "--flow", "--seed", 3, "--stop", 0.2)
     run(folder, path, *words)
     said, out = capsys.readouterr().out, folder / "out"
     names = [
@@ -113,7 +113,14 @@ def test_a_folder_of_everything(folder, capsys):
         about = dict(file.attrs)
     assert (about["model"], about["method"], about["seed"]) == ("planar", "voting", 3)
     assert list(about["components"]) == ["vx", "vy"] and list(about["units"]) == ["px/s"] * 2
-    assert json.loads(about["parameters"]) == params.values()
+    assert about["recording"] == str(path)
+    about, of_flow = described(out / "motion.h5"), described(out / "flow.h5")
+    told, wanted = voting.Params.of(about["params"]).values(), params.values()
+    exact = {name: pytest.approx(wanted[name], rel=1e-12) for name in params.numbers}
+    assert told == {**wanted, **exact}
+    assert of_flow["command"] == about["command"] and str(table_path) in about["command"]
+    assert set(about["inputs"]) == {str(one) for one in (path, table_path, folder / "mine.toml")}
+    assert of_flow["params"].keys() == egomotion.flow.Params().values().keys()
     assert params.particles == 100
 
     # The errors by hand.

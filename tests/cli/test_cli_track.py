@@ -2,6 +2,7 @@
 
 import csv
 import functools
+import shlex
 import sys
 import tomllib
 from pathlib import Path
@@ -10,13 +11,14 @@ import h5py
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from commands import decoded, fails
+from commands import decoded, described, fails
 from PIL import Image
 
 import jaxevent
 from jaxevent import cli
 from jaxevent.blob import constant_velocity
 from jaxevent.blob.quantities import inverse_ttc, size_range
+from jaxevent.errors import install_command
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.show import tracks as written
 from jaxevent.show.track_pictures import track_colour
@@ -86,7 +88,7 @@ def test_a_folder_of_everything(folder, capsys):
     states = tracks(times)
     assert states.valid.all()
     header, table = read_table(out / "tracks.csv")
-    assert header == [*HEADER, *(f"std_{name}" for name in COLUMNS)]
+    assert header == [*HEADER, *(f"sigma_{name}" for name in COLUMNS)]
     assert np.array_equal(table[:, 0], np.repeat(times, 2) / 1e6)
     assert np.array_equal(table[:, 1], np.tile([0, 1], 25))
     np.testing.assert_allclose(table[:, 2:10], states.mean.reshape(-1, 8), rtol=1e-12)
@@ -112,20 +114,20 @@ def test_a_folder_of_everything(folder, capsys):
 
     with (out / "quantities.csv").open() as file:
         rows = list(csv.DictReader(file))
-    names = ["t", "id", "other", "inverse_ttc", "std_inverse_ttc", "range", "std_range"]
+    names = ["t", "id", "other", "inverse_ttc", "sigma_inverse_ttc", "range", "sigma_range"]
     assert list(rows[0]) == names and len(rows) == 75
     pair = [row for row in rows if row["other"] == "1"]
     a, b = (jnp.asarray(states.mean[:, k]) for k in (0, 1))
     P_a, P_b = (jnp.asarray(states.covariance[:, k]) for k in (0, 1))
     value, variance = inverse_ttc(a, P_a, b, P_b)
     np.testing.assert_allclose([float(row["inverse_ttc"]) for row in pair], value, rtol=1e-9)
-    deviation = [float(row["std_inverse_ttc"]) for row in pair]
+    deviation = [float(row["sigma_inverse_ttc"]) for row in pair]
     np.testing.assert_allclose(deviation, np.sqrt(variance), rtol=1e-9)
     one = [row for row in rows if row["id"] == "1"]
     value, variance = size_range(b, P_b, 0.3, 200, 0.25)
     assert [row["other"] for row in one] == [""] * 25
     np.testing.assert_allclose([float(row["range"]) for row in one], value, rtol=1e-9)
-    np.testing.assert_allclose([float(row["std_range"]) ** 2 for row in one], variance, rtol=1e-9)
+    np.testing.assert_allclose([float(row["sigma_range"]) ** 2 for row in one], variance, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -277,23 +279,35 @@ def test_bad_ways_to_track(folder, capsys):
 
 
 @pytest.mark.parametrize(
-    ("module", "extra", "needs", "does_without"),
-    [
-        ("imageio_ffmpeg", "video", ("out", "a.mp4"), "a.csv"),
-        ("matplotlib", "plot", ("out", "a.png"), "a.h5"),
-    ],
+    ("module", "extra", "name"),
+    [("imageio_ffmpeg", "video", "a.mp4"), ("matplotlib", "plot", "a.png")],
 )
-def test_missing_extras_are_named(module, extra, needs, does_without, folder, capsys, monkeypatch):
+def test_missing_extras_are_named(module, extra, name, folder, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
-    for name in needs:
-        fails(
-            capsys,
-            ["track", folder / "two.h5", "--out", folder / name],
-            f"[{extra}]",
-        )
-        assert not (folder / name).exists()
+    fails(capsys, ["track", folder / "two.h5", "--out", folder / name], f"[{extra}]")
+    assert not (folder / name).exists()
+
+
+def test_without_extras_the_tables_are_written(folder, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     argv = ["track", folder / "two.h5", *METHOD, "--params", folder / "mine.toml", *seeded()]
-    assert cli.main([*map(str, argv), "--rate", "100", "--out", str(folder / does_without)]) == 0
+    argv = [*map(str, argv), "--rate", "100", "--pair", "0,1", "--out", str(folder / "out")]
+    assert cli.main(argv) == 0
+    names = ["params.toml", "quantities.csv", "tracks.csv", "tracks.h5"]
+    assert sorted(path.name for path in (folder / "out").iterdir()) == names
+    said = capsys.readouterr().out
+    for name, extra in (("tracks.mp4", "video"), ("tracks.png", "plot")):
+        assert f"{name} is left out: this needs the package" in said
+        assert install_command(extra) in said
+    assert "tracks.csv, tracks.h5, quantities.csv, params.toml in" in said
+
+    told = described(folder / "out" / "tracks.h5")
+    assert told["method"] == "constant_velocity"
+    assert told["command"] == shlex.join(["jaxevent", *argv])
+    assert set(told["inputs"]) == {str(folder / "two.h5"), str(folder / "mine.toml")}
+    # The values that the run took, to the last digit.
+    assert told["params"] == tomllib.loads((folder / "out" / "params.toml").read_text())
 
 
 @pytest.mark.parametrize(

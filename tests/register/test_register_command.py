@@ -3,7 +3,7 @@
 import dataclasses
 
 import numpy as np
-from commands import fails
+from commands import described, fails
 from PIL import Image
 from rigs import small
 
@@ -26,6 +26,8 @@ def test_an_hdr_reference_from_a_folder(tmp_path, capsys):
     assert cli.main([str(word) for word in command]) == 0
     assert "offset added to the other camera's time stamps, given: -1.0" in capsys.readouterr().out
     both = jaxevent.load(out)
+    names = {str(tmp_path / "own.h5"), str(folder), str(tmp_path / "H.csv")}
+    assert described(out, "extra/kept")["inputs"].keys() == names
     np.testing.assert_array_equal(both.extra["hdr_t"], [0, 40_000, 80_000])
     assert np.isnan(both.extra["hdr"][:, :, :2]).all()
     seen = both.extra["hdr"][:, :5, 2:]
@@ -54,6 +56,7 @@ def test_a_folder_of_images_and_a_calibration(tmp_path):
     ):
         out = tmp_path / f"{k}.h5"
         assert cli.main([str(word) for word in [*command, *far, "--out", out]]) == 0
+        described(out, "extra/kept")
         stored.append(jaxevent.load(out))
         # 0.5 m at 4.5 m and 9 px: a pixel to the right, so that the last column is not seen.
         assert stored[k].extra["covered"].sum(0).tolist() == [6] * 7 + [0]

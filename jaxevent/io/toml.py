@@ -30,7 +30,7 @@ def dump(table: Mapping[str, Any]) -> str:
 
 
 def key(name: str) -> str:
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else text(name)
 
 
 def text(value: Any) -> str:
@@ -39,5 +39,8 @@ def text(value: Any) -> str:
         return "{ " + ", ".join(f"{key(k)} = {text(v)}" for k, v in value.items()) + " }"
     if isinstance(value, list):
         return "[" + ", ".join(map(text, value)) + "]"
-    # JSON's text and numbers are TOML's, but for NaN and infinity.
-    return repr(value) if isinstance(value, float) else json.dumps(value)
+    # JSON's text and numbers are TOML's, but for NaN and infinity, characters beyond 16 bits, which
+    # JSON escapes as two halves, and DEL, which it does not escape.
+    if isinstance(value, float):
+        return repr(value)
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
