@@ -147,7 +147,7 @@ class MotionEstimator(Estimator[P]):
             f"{name} = {value:.2g} {self.Params.settings()[name].unit}"
             for name, value in chosen.items()
         )
-        moves = f"the image moves at about {speed.usual:.2g} px/s"
+        moves = f"the image moves at about {speed.usual:.3g} px/s"
         return params.replace(**chosen), f"{moves}: {said or 'windows are as given or by default'}"
 
     def follow(
