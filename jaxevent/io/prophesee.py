@@ -1,4 +1,4 @@
-"""Recordings of Prophesee's cameras: RAW with EVT2, EVT2.1 or EVT3, and DAT with 2-D events.
+"""Recordings of Prophesee's cameras: RAW with EVT2, EVT2.1 or EVT3, and DAT.
 
 All four begin with lines of text, "% key value". Times are us of the camera's clock; x and y count
 from the top left already. The words of each format and how they are read:
@@ -6,13 +6,16 @@ from the top left already. The words of each format and how they are read:
     EVT2    32 bits  CD_OFF, CD_ON (6 low bits of the time, 11 of x, 11 of y), TIME_HIGH (28 bits)
     EVT2.1  64 bits  the same with a mask of 32 pixels of a row; either half of a word may be first
     EVT3    16 bits  y, x, vectors of x, 12 low and 12 high bits of the time, each only when changed
-    DAT     64 bits  32 bits of time, then x (14), y (14) and polarity (4); event types 0 and 12
+    DAT     64 bits  32 bits of time, then x (14), y (14) and polarity (4); event types 0 and 12.
+                     Triggers, type 14: time, then edge (4), unused (22) and channel (6)
 
 Times overflow after 2^34 us (EVT2), 2^24 us (EVT3: 16.8 s) or 2^32 us (DAT), and are continued
 here. Events that come before the file's first time (or first row) cannot be placed: they are left
-out and counted in `extra["events_without_time"]`, where there are any. External triggers of RAW
-files are kept in `Recording.triggers`, those before the first time counted as
-`triggers_without_time`. A word of a type that the format does not define means damage.
+out and counted in `extra["events_without_time"]`, where there are any. External triggers are kept
+in `Recording.triggers`, those before the first time counted as `triggers_without_time`. A DAT file
+holds events or triggers: of NAME_cd.dat and NAME_td.dat, triggers are read from NAME_trigger.dat
+where that is beside it, as Metavision's tools write them. A word of a type that the format does not
+define means damage.
 
 Decoders. EVT2, EVT2.1 and DAT have words of one length and are decoded here by NumPy: EVT2 and DAT
 at 56 million events/s, checks included. For EVT3 the package evt3 (MIT) is taken: 48 million
@@ -29,7 +32,7 @@ all 1,218,618 events but for a constant time, EVT2 with an unpacked copy (spinni
 import functools
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +45,7 @@ from jaxevent.io.decoded import BLOCK, Columns, Decoder, TriggerList, decoded
 from jaxevent.recording import Recording
 
 _LONGEST_HEADER = 1 << 16
+_DAT_TRIGGERS = 14  # the type of a DAT file's records
 _SIZES = (  # of sensors whose files may not tell their size, by the name of Metavision's plugin
     ("gen31", (640, 480)),
     ("gen3", (640, 480)),
@@ -78,11 +82,11 @@ def read(
             decode = functools.partial(_evt21, path, start, halves_swapped, found, triggers)
             width = 8
         elif version == "EVT3":
-            require("evt3", "prophesee")
-            decode = functools.partial(_evt3, path, start, found, triggers)
+            words_from = functools.partial(_words_from, path, start)
+            decode = functools.partial(evt3_events, str(path), words_from, found, triggers)
             width = 2
         elif not version and "version" in header:
-            decode, start = _dat(path, start, header)
+            decode, start = _dat(path, start, header, triggers)
             width = 8
         else:
             raise InputError(
@@ -159,14 +163,22 @@ def _words(path: Path, offset: int, dtype: str, count: int) -> Iterator[tuple[in
             offset += words.nbytes
 
 
-def _refuse_undefined(path: Path, kind: NDArray, defined: tuple[int, ...], offset: int, width: int):
+def _words_from(path: Path, start: int, offset: int | None) -> Iterator[tuple[int, int, NDArray]]:
+    """Blocks of a RAW file's EVT3 words from an offset on, as `evt3_events` takes them."""
+    for at, words in _words(path, start if offset is None else offset, "<u2", BLOCK):
+        yield at, at, words
+
+
+def _refuse_undefined(
+    source: Path | str, kind: NDArray, defined: tuple[int, ...], offset: int, width: int
+):
     known = np.zeros(16, bool)
     known[list(defined)] = True
     good = known[kind]
     if not good.all():
         row = int(np.argmin(good))
         raise InputError(
-            f"{path}: the word at byte {offset + row * width} has the type {int(kind[row]):#x}, "
+            f"{source}: the word at byte {offset + row * width} has the type {int(kind[row]):#x}, "
             "which the format does not define; the file is damaged, so fetch it again"
         )
 
@@ -277,10 +289,17 @@ def _evt21(
         yield state, (t[word], x, y, (kind[chosen] == 1)[word])
 
 
-def _dat(path: Path, start: int, header: dict[str, str]) -> tuple[Decoder, int]:
+def _dat(
+    path: Path, start: int, header: dict[str, str], triggers: TriggerList
+) -> tuple[Decoder, int]:
     with path.open("rb") as file:
         file.seek(start)
         described = file.read(2)
+    if described == bytes([_DAT_TRIGGERS, 8]):
+        raise InputError(
+            f"{path}: holds external triggers only; read the file of events, whose triggers these "
+            "are where it is NAME_cd.dat or NAME_td.dat beside NAME_trigger.dat"
+        )
     if len(described) != 2 or described[0] not in (0, 12) or described[1] != 8:
         raise InputError(
             f"{path}: holds DAT events of type {described[:1].hex() or '?'} and "
@@ -288,6 +307,9 @@ def _dat(path: Path, start: int, header: dict[str, str]) -> tuple[Decoder, int]:
             "00 and 0c, 8 bytes) can be read"
         )
     fields = (14, 14) if header["version"] != "1" else (9, 8)
+    beside = path.with_name(re.sub("_(cd|td)$", "_trigger", path.stem) + path.suffix)
+    if beside != path and beside.is_file():
+        _dat_triggers(beside, triggers)
     return functools.partial(_dat_events, path, start + 2, fields), start + 2
 
 
@@ -306,6 +328,23 @@ def _dat_events(
         # Version 1 has one bit of polarity, then others.
         p = word >> (for_x + for_y) & (0xF if for_x == 14 else 1)
         yield state, (t, x, y, p.astype(np.uint8))
+
+
+def _dat_triggers(path: Path, triggers: TriggerList) -> None:
+    """Keep the triggers of a DAT file of them. Raises `InputError` where it is none."""
+    with reading(str(path)):
+        _, start = _header(path)
+        with path.open("rb") as file:
+            file.seek(start)
+            described = file.read(2)
+    if described != bytes([_DAT_TRIGGERS, 8]):
+        raise InputError(f"{path}: holds no external triggers (type 0e, 8 bytes); move it away")
+    _whole_words(path, path.stat().st_size - start - 2, 8)
+    before = None
+    for offset, words in _words(path, start + 2, "<u4", 2 * BLOCK):
+        t, signal = _continued(words[0::2].astype(np.int64), before, 32), words[1::2]
+        before = int(t[-1])
+        triggers.add(offset, t, signal & 0xF, signal >> 26)
 
 
 def _add_triggers(
@@ -335,23 +374,33 @@ def _add_triggers(
     return int(values[-1]) if len(values) else high
 
 
-def _evt3(
-    path: Path, start: int, found: Counter, triggers: TriggerList, state: Any
+def evt3_events(
+    source: str,
+    words_from: Callable[[Any], Iterator[tuple[int, Any, NDArray]]],
+    found: Counter,
+    triggers: TriggerList,
+    state: Any,
 ) -> Iterator[tuple[Any, Columns]]:
+    """Decode EVT3, wherever its words are stored: a `Decoder` but for its first arguments.
+
+    `words_from(place)` iterates over the words (n,) uint16 from a place on, None is the start: the
+    offset in bytes of a block of them, its place, the block. Events without a time are counted in
+    `found`, triggers kept in `triggers`.
+    """
     evt3: Any = require("evt3", "prophesee")
 
     # What an event needs to have been told before: the row 0, the base of a vector 3, the high time
     # 8. `last` holds the latest word of each, of the base the x to which vectors moved it, and the
     # low time 6 unless a high one, which sets it to 0, came after it.
-    begin, last, first_t = state or (start, {}, None)
+    begin, last, first_t = state or (None, {}, None)
     last = dict(last)
     decoder = evt3.Decoder(2048, 2048)
     decoder.feed(np.array([last[key] for key in (8, 6, 0, 3) if key in last], "<u2").tobytes())
     shift, clock_high = 0, None
-    for offset, words in _words(path, begin, "<u2", BLOCK):
+    for offset, place, words in words_from(begin):
         told = dict(last)
         kind = (words >> 12).astype(np.uint8)
-        _refuse_undefined(path, kind, (0, 2, 3, 4, 5, 6, 7, 8, 10, 14, 15), offset, 2)
+        _refuse_undefined(source, kind, (0, 2, 3, 4, 5, 6, 7, 8, 10, 14, 15), offset, 2)
         data = words & 0xFFF
         data[kind == 5] &= 0xFF
         numbers = np.where(kind == 2, 1, 0).astype(np.uint8)
@@ -401,7 +450,7 @@ def _evt3(
         events = decoder.feed(words.tobytes())
         if len(events.t) != int(numbers.sum(dtype=np.int64)):
             raise InputError(
-                f"{path}: {int(numbers.sum(dtype=np.int64)):,} events stand in the words from "
+                f"{source}: {int(numbers.sum(dtype=np.int64)):,} events stand in the words from "
                 f"byte {offset} on but {len(events.t):,} were decoded; the file is damaged, so "
                 "fetch it again"
             )
@@ -410,4 +459,4 @@ def _evt3(
             # The decoder has not seen the overflows before this block.
             shift, first_t = first_t - int(t[0]), None
         t += shift
-        yield (offset, told, int(t[0]) if len(t) else None), (t, events.x, events.y, events.p)
+        yield (place, told, int(t[0]) if len(t) else None), (t, events.x, events.y, events.p)

@@ -352,6 +352,31 @@ def test_triggers_of_evt3_continue_over_the_clocks_end(tmp_path, monkeypatch):
         assert got.events.t.tolist() == [0xFFE << 12 | 5, 1 << 24 | 9]
 
 
+def test_triggers_of_dat_lie_beside_the_events(tmp_path, monkeypatch):
+    monkeypatch.setattr("jaxevent.io.prophesee.BLOCK", 2)
+    head = b"% Data file containing trigger events.\n% Version 2\n"
+    # The third comes after the end of the clock.
+    signals = [(0xF0000000, 1 | 6 << 26), (0xFFFFFFFE, 0), (9, 1 | 63 << 26)]
+    content = head + bytes([14, 8]) + np.array(signals, "<u4").tobytes()
+    (tmp_path / "a_trigger.dat").write_bytes(content)
+    for name in ("a_cd", "a_td"):
+        (tmp_path / f"{name}.dat").write_bytes(formats.dat(EVENTS, SIZE))
+        for in_memory in (True, False):
+            got = load(tmp_path / f"{name}.dat", None, in_memory)
+            assert len(got.events) == len(EVENTS)
+            assert got.triggers.t.tolist() == [0xF0000000, 0xFFFFFFFE, (1 << 32) + 9]
+            assert got.triggers.edge.tolist() == [1, 0, 1]
+            assert got.triggers.channel.tolist() == [6, 0, 63]
+    with pytest.raises(InputError, match="holds external triggers only; read the file of events"):
+        load(tmp_path / "a_trigger.dat")
+    (tmp_path / "a_trigger.dat").write_bytes(content[:-3])
+    with pytest.raises(InputError, match="a_trigger.dat: ends inside a word, 5 bytes after"):
+        load(tmp_path / "a_cd.dat")
+    (tmp_path / "a_trigger.dat").write_bytes(formats.dat(EVENTS, SIZE))
+    with pytest.raises(InputError, match="a_trigger.dat: holds no external triggers"):
+        load(tmp_path / "a_cd.dat")
+
+
 def test_triggers_are_saved_and_cut(tmp_path):
     triggers = Triggers(np.array([10, 50_000]), np.array([1, -1], "i1"), np.array([0, 7], "u1"))
     recording = Recording("a", *SIZE, EVENTS, triggers=triggers)
