@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from jaxevent.events import is_hot
 from jaxevent.progress import bar
-from jaxevent.recording import EventSource, Frames, Recording
+from jaxevent.recording import EventSource, Frames, Recording, Triggers
 
 BLOCK = 1 << 20  # events looked at together: 13 MB
 BIN = 10_000  # us over which the peak rate is taken
@@ -44,6 +44,8 @@ def describe(recording: Recording, progress: bool | None = None) -> list[tuple[s
     for name, part in (("poses", recording.poses), ("IMU", recording.imu)):
         if part is not None and len(part):
             lines.append((name, f"{len(part):,}{_rate_of(part.t)}"))
+    if (triggers := recording.triggers) is not None and len(triggers):
+        lines.append(("triggers", _about_triggers(triggers)))
     lines += [("clocks", text) for text in _about_clocks(recording)]
     lines.append(("ground truth", _truth(recording, recording.extra)))
     for name, values in recording.extra.items():
@@ -65,6 +67,19 @@ def _truth(recording: Recording, extra: Mapping[str, NDArray]) -> str:
 
 def _rate_of(t: NDArray[np.int64]) -> str:
     return f", {(len(t) - 1) / ((t[-1] - t[0]) / 1e6):.1f} per s" if t[-1] > t[0] else ""
+
+
+def _about_triggers(triggers: Triggers) -> str:
+    channels, counts = np.unique(triggers.channel, return_counts=True)
+    shown = [
+        f"{count:,} on channel {channel}" for channel, count in zip(channels, counts, strict=True)
+    ]
+    edges = [
+        f"{count:,} {name}"
+        for name, value in (("rising", 1), ("falling", 0), ("of unknown edge", -1))
+        if (count := np.count_nonzero(triggers.edge == value))
+    ]
+    return f"{len(triggers):,}: {', '.join(shown)}; {', '.join(edges)}"
 
 
 def _about_clocks(recording: Recording) -> list[str]:
