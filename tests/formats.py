@@ -4,6 +4,7 @@ Every writer takes events (t us, x, y from the top left, p bool) on a sensor of 
 height) and returns the bytes of a file, or writes one where a library does.
 """
 
+import functools
 import struct
 from collections.abc import Callable
 from io import BytesIO
@@ -477,3 +478,122 @@ def bag(path: Path, events, size, images=(), image_t=(), prefix="/dvs", message=
                 region,
             )
             writer.write(info, at, store.serialize_ros1(one, "sensor_msgs/msg/CameraInfo"))
+
+
+_PACKET = """std_msgs/Header header
+uint32 height
+uint32 width
+uint64 seq
+uint64 time_base
+string encoding
+bool is_bigendian
+uint8[] events"""
+
+
+@functools.cache
+def ros2_types():
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    event = "uint16 x\nuint16 y\nbuiltin_interfaces/Time ts\nbool polarity"
+    for package in ("dvs_msgs", "prophesee_event_msgs"):
+        store.register(get_types_from_msg(event, f"{package}/msg/Event"))
+        array = f"std_msgs/Header header\nuint32 height\nuint32 width\n{package}/Event[] events"
+        store.register(get_types_from_msg(array, f"{package}/msg/EventArray"))
+    store.register(get_types_from_msg(_PACKET, "event_camera_msgs/msg/EventPacket"))
+    return store
+
+
+def packed(events, encoding, size, message, clock=0):
+    """Events as (row of the first, words) of event_camera_msgs; `clock` (us) is the camera's."""
+    if encoding == "evt3":
+        # One stream, cut anywhere between words: most packets do not begin with a time.
+        held = Events(events.t - clock, events.x, events.y, events.p)
+        words = np.frombuffer(evt3(held, size).partition(b"% end\n")[2], "<u2")
+        cuts = range(0, len(words), 2 * message)
+        return [(min(at // 3, len(events) - 1), words[at : at + 2 * message]) for at in cuts]
+    pieces = []
+    for at in range(0, len(events), message):
+        part = events[at : at + message]
+        dt = (part.t - part.t[0]).astype("<u8") * 1000
+        word = dt | part.x.astype("<u8") << 32 | part.y.astype("<u8") << 48
+        pieces.append((at, word | part.p.astype("<u8") << 63))
+    return pieces
+
+
+def bag2(
+    path: Path,
+    events,
+    size,
+    encoding="dvs_msgs",
+    storage="mcap",
+    images=(),
+    image_t=(),
+    message=50,
+    topics=("/dvs/events",),
+    little_endian=True,
+    compression=None,
+):
+    """A folder of ROS 2, by rosbags; `encoding` is a package of EventArray or of EventPacket."""
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+    store = ros2_types()
+    types = store.types
+
+    def header(t):
+        stamp = types["builtin_interfaces/msg/Time"](int(t) // 10**6, int(t) % 10**6 * 1000)
+        return types["std_msgs/msg/Header"](stamp, "cam")
+
+    def array(kind, part):
+        one = types[kind.replace("Array", "")]
+        held = [one(x, y, header(t).stamp, p) for t, x, y, p in rows(part)]
+        return types[kind](header(part.t[0]), size[1], size[0], held)
+
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    if compression:
+        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+    with writer:
+        for topic in topics:
+            if encoding in ("dvs_msgs", "prophesee_event_msgs"):
+                kind = f"{encoding}/msg/EventArray"
+                cuts = range(0, len(events), message)
+                messages = [array(kind, events[at : at + message]) for at in cuts]
+            else:
+                kind = "event_camera_msgs/msg/EventPacket"
+                clock = int(events.t[0]) - 77
+                messages = [
+                    types[kind](
+                        header(events.t[at]),
+                        size[1],
+                        size[0],
+                        number,
+                        (int(events.t[at]) - clock) * 1000,
+                        encoding,
+                        False,
+                        words.view(np.uint8),
+                    )
+                    for number, (at, words) in enumerate(
+                        packed(events, encoding, size, message, clock)
+                    )
+                ]
+            link = writer.add_connection(topic, kind, typestore=store)
+            for number, one in enumerate(messages):
+                # Several messages of one time of recording.
+                at = 10**18 + number // 4 * 10**6
+                writer.write(link, at, store.serialize_cdr(one, kind, little_endian=little_endian))
+        kind = "sensor_msgs/msg/Image"
+        if len(images):
+            link = writer.add_connection("/dvs/image_raw", kind, typestore=store)
+            camera = writer.add_connection(
+                "/dvs/camera_info", "sensor_msgs/msg/CameraInfo", typestore=store
+            )
+        for number, (image, t) in enumerate(zip(images, image_t, strict=True)):
+            one = types[kind](header(t), size[1], size[0], "mono8", 0, size[0], image.ravel())
+            writer.write(link, 10**18 + number, store.serialize_cdr(one, kind))
+            region = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+            d, k = np.arange(5) / 10, np.array([5.0, 0, 2, 0, 6, 3, 0, 0, 1])
+            told = (header(t), size[1], size[0], "plumb_bob", d, k, np.zeros(9), np.zeros(12))
+            one = types["sensor_msgs/msg/CameraInfo"](*told, 0, 0, region)
+            data = store.serialize_cdr(one, "sensor_msgs/msg/CameraInfo")
+            writer.write(camera, 10**18 + number, data)

@@ -2,9 +2,9 @@
 
 The layouts are described in the reader modules, and what each was checked against: `aedat2`,
 `aedat4`, `columns` (tables of text and NumPy records), `event_stream`, `hdf5`, `hdf5_layouts`,
-`mat`, `n_caltech`, `npz`, `prophesee`, `ros` and `text`. They are imported when first needed. This
-module also turns the raw numbers of a file into checked fields, so that every reader accepts the
-same values and words its errors alike.
+`mat`, `n_caltech`, `npz`, `prophesee`, `ros` (with `bags` and `ros_events`) and `text`. They are
+imported when first needed. This module also turns the raw numbers of a file into checked fields, so
+that every reader accepts the same values and words its errors alike.
 """
 
 import contextlib
@@ -24,6 +24,7 @@ from jaxevent.recording import Events, Frames, Recording
 
 __all__ = ["load", "save"]
 
+_BAGS = (b"#ROSBAG", b"\x89MCAP0\r\n", b"SQLite format 3\0")
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _SMALL = 1 << 27  # bytes of arrays that every file may unfold to
 _MOST_COMPRESSED = 100  # times that a larger one may unfold to of its own bytes
@@ -32,8 +33,9 @@ _MOST_TIME = 1 << 62  # us, 146,000 years: sums and differences of two times sta
 
 READABLE = (
     "readable are a folder or zip with events.txt (Event-Camera Dataset), AEDAT 2 and 4, "
-    "Prophesee RAW and DAT, Event Stream, ROS 1 bags, HDF5 (jaxevent's own, DSEC, MVSEC, M3ED and "
-    "others), MATLAB .mat (v5 and v7.3), N-Caltech101 .bin, .npz, .npy and tables of text"
+    "Prophesee RAW and DAT, Event Stream, bags of ROS 1 and ROS 2, HDF5 (jaxevent's own, DSEC, "
+    "MVSEC, M3ED and others), MATLAB .mat (v5 and v7.3), N-Caltech101 .bin, .npz, .npy and tables "
+    "of text"
 )
 
 
@@ -108,20 +110,13 @@ def _reader(
         raise InputError(f"{path}: is a device or pipe; copy what it holds into a file")
     with reading(str(path)):
         head = b"" if is_folder else _head(path)
-    if head.startswith((b"#!AER-DAT4", b"#ROSBAG")):
-        from jaxevent.io import aedat4, ros
-
-        read = aedat4.read if head.startswith(b"#!AER-DAT4") else ros.read
+    if read := _reader_of_streams(path, head):
         return functools.partial(read, in_memory=in_memory, progress=progress, stream=stream)
     if not is_folder and head.startswith(HDF5_MAGIC) or _later_hdf5(path, is_folder):
         return _hdf5_reader(path, in_memory, stream)
     if stream is not None:
         raise InputError(f"{path}: holds one camera only; leave out stream= or --stream")
     if is_folder:
-        if (path / "metadata.yaml").is_file():
-            raise InputError(
-                f"{path}: is a ROS 2 bag; turn it into a ROS 1 bag first, with rosbags-convert"
-            )
         if not (path / "events.txt").is_file():
             raise InputError(f"{path}: the folder holds no events.txt; {READABLE}")
         from jaxevent.io import text
@@ -145,6 +140,19 @@ def _head(path: Path) -> bytes:
     if not head:
         raise InputError(f"{path}: the file is empty; fetch it again")
     return head
+
+
+def _reader_of_streams(path: Path, head: bytes) -> Callable[..., Recording] | None:
+    """The reader of a format but HDF5 that may hold several cameras; a folder's head is empty."""
+    if head.startswith(b"#!AER-DAT4"):
+        from jaxevent.io import aedat4
+
+        return aedat4.read
+    if head.startswith(_BAGS) or (not head and (path / "metadata.yaml").is_file()):
+        from jaxevent.io import ros
+
+        return ros.read
+    return None
 
 
 def _streamed_reader(path: Path, head: bytes) -> Callable[..., Recording]:

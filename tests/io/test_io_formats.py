@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 
 from jaxevent import io
 from jaxevent.errors import InputError, install_command
-from jaxevent.io import aedat2, aedat4, columns, event_stream, prophesee, ros, save
-from jaxevent.recording import Events, Frames, Imu, Recording
+from jaxevent.io import aedat2, aedat4, columns, event_stream, prophesee, ros_events, save
+from jaxevent.recording import Events, Frames, Imu, Recording, Triggers
 from jaxevent.show import describe
 
 pytestmark = pytest.mark.slow
@@ -76,7 +76,7 @@ def blocks_of(monkeypatch):
     """Blocks of so many events, so that short files consist of several."""
 
     def set_to(count):
-        for module in (prophesee, event_stream, aedat2, aedat4, columns, ros):
+        for module in (prophesee, event_stream, aedat2, aedat4, columns, ros_events):
             monkeypatch.setattr(module, "BLOCK", count)
         monkeypatch.setattr(columns, "_BYTES", 20 * count)
 
@@ -340,8 +340,8 @@ def test_headers_of_prophesee(tmp_path):
         path.write_bytes(header.encode() + words)
         with pytest.raises(InputError, match=message):
             load(path)
-    path.write_bytes(formats.dat(events, SIZE, kind=14))
-    with pytest.raises(InputError, match="holds DAT events of type 0e and 8 bytes"):
+    path.write_bytes(formats.dat(events, SIZE, kind=1))
+    with pytest.raises(InputError, match="holds DAT events of type 01 and 8 bytes"):
         load(path)
 
 
@@ -487,12 +487,6 @@ def test_raw_bytes_are_what_rosbags_serialises(tmp_path):
     for typed in (True, False):
         formats.bag(tmp_path / f"{typed}.bag", events, SIZE, typed=typed)
         assert_events(load(tmp_path / f"{typed}.bag").events, events)
-
-
-def test_ros_2_is_named(tmp_path):
-    (tmp_path / "metadata.yaml").write_text("")
-    with pytest.raises(InputError, match="is a ROS 2 bag; .* rosbags-convert"):
-        load(tmp_path)
 
 
 # HDF5
@@ -715,7 +709,10 @@ def test_hot_pixels_and_jumps_of_clocks(monkeypatch):
     frames = Frames(frame_t, np.zeros((5, 30, 40), np.uint8), np.zeros(5, np.int64))
     late = Imu(2_000_000 + np.arange(3), np.zeros((3, 3)), np.zeros((3, 3)))
     extra = {"omega": np.zeros(3), "triggers": np.array(4)}
-    recording = Recording("r", 40, 30, events, frames, imu=late, extra=extra)
+    signals = Triggers(
+        np.arange(5), np.array([1, 0, 1, -1, 1], "i1"), np.array([7, 7, 2, 7, 7], "u1")
+    )
+    recording = Recording("r", 40, 30, events, frames, imu=late, extra=extra, triggers=signals)
     told = describe.describe(recording)
     monkeypatch.setattr(describe, "BLOCK", 7)
     assert describe.describe(recording) == told
@@ -729,6 +726,9 @@ def test_hot_pixels_and_jumps_of_clocks(monkeypatch):
         value = float(text.removesuffix("k")) * (1000 if text.endswith("k") else 1)
         assert value == pytest.approx(rate, rel=0.01)
     assert lines["ground truth"] == "omega" and lines["extra triggers"] == "4"
+    assert lines["triggers"] == (
+        "5: 1 on channel 2, 4 on channel 7; 3 rising, 1 falling, 1 of unknown edge"
+    )
     clocks = [text for name, text in told if name == "clocks"]
     assert clocks[0] == (
         "frames: 1 intervals over 1.5 medians, the longest 300.000 ms after 0.200000 s"
