@@ -3,9 +3,11 @@
     python experiments/fuzz.py --inputs 10000
     python experiments/fuzz.py --inputs 10000 --formats evt3 aedat4 --seed 7
 
-Each format is read in a process of its own that may use --memory MB more than at its start and
-60 s for one file. An input is made from the number of its seed alone, so that one printed here
-fails again with --inputs 1 --seed N. Exit status 1 where a reader failed.
+The first line is the nightly form; tests/io/test_io_fuzz.py runs a few inputs of each format. The
+last four formats are archives, HDF5 files, images and headers of wrong structure, built by
+tests/malformed.py. Each format is read in a process of its own that may use --memory MB more than
+at its start and 60 s for one file. An input is made from the number of its seed alone, so that one
+printed here fails again with --inputs 1 --seed N. Exit status 1 where a reader failed.
 """
 
 import argparse
@@ -36,6 +38,7 @@ from jaxevent.errors import InputError  # noqa: E402
 from jaxevent.recording import Frames, Recording  # noqa: E402
 
 formats: Any = importlib.import_module("formats")
+malformed: Any = importlib.import_module("malformed")
 
 SIZE = (40, 30)
 EVENTS = formats.events_of(0, 400, SIZE)
@@ -48,6 +51,21 @@ def _bag() -> bytes:
         path = Path(folder) / "a.bag"
         formats.bag(path, EVENTS, SIZE, IMAGES, IMAGE_T)
         return path.read_bytes()
+
+
+def _bag2(encoding: str, storage: str, suffix: str) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a"
+        formats.bag2(path, EVENTS, SIZE, encoding, storage, IMAGES, IMAGE_T)
+        return next(path.glob(f"*.{suffix}")).read_bytes()
+
+
+def _v2e() -> bytes:
+    held = BytesIO()
+    columns = [EVENTS.t, EVENTS.x, EVENTS.y, EVENTS.p]
+    with h5py.File(held, "w") as file:
+        file["events"] = np.stack(columns, 1).astype(np.uint32)
+    return held.getvalue()
 
 
 def _ours() -> bytes:
@@ -118,6 +136,15 @@ FORMATS = {
     "text": _zip,
     "csv": lambda: formats.csv(EVENTS, SIZE),
     "mat73": _mat73,
+    "n_caltech": lambda: formats.n_caltech(EVENTS),
+    "dvs128": lambda: formats.dvs128(EVENTS),
+    "v2e": _v2e,
+    "mcap": lambda: _bag2("mono", "mcap", "mcap"),
+    "db3": lambda: _bag2("dvs_msgs", "sqlite3", "db3"),
+    "archives": _zip,
+    "links": lambda: formats.dsec(EVENTS, SIZE),
+    "images": _zip,
+    "headers": lambda: formats.evt2(EVENTS, SIZE),
 }
 _WHOLE: dict[str, bytes] = {}
 
@@ -132,6 +159,8 @@ def whole(name: str) -> bytes:
 def damaged(name: str, seed: int) -> tuple[str, bytes]:
     """What was done to the file, and its bytes, from a seed alone."""
     random = np.random.default_rng([seed, list(FORMATS).index(name)])
+    if name in malformed.BUILDERS:
+        return malformed.BUILDERS[name](random)
     data = bytearray(whole(name))
     kind = ("cut", "bits", "bytes", "header", "numbers", "moved", "random")[random.integers(7)]
 
@@ -177,7 +206,7 @@ def outcome(name: str, seed: int, path: Path) -> str:
     kind, data = damaged(name, seed)
     path.write_bytes(data)
     # AEDAT 2 tells the chip, which has more pixels than these events' sensor.
-    size = SIZE if seed % 4 or name == "aedat2" else None
+    size = None if name == "dvs128" else SIZE if seed % 4 or name == "aedat2" else None
     try:
         recording = io.load(path, size)
         recording.check()
@@ -220,7 +249,7 @@ def _one_format(name: str, inputs: int, seed: int, memory: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.bin"
         path.write_bytes(whole(name))
-        io.load(path, SIZE)
+        io.load(path, None if name == "dvs128" else SIZE)
         used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         counts: Counter[str] = Counter()
         more, slowest, began = 0, 0.0, time.perf_counter()

@@ -212,6 +212,17 @@ def aedat2(events, size, images=(), image_t=(), exposure=200, imu=(), chip="DAVI
 # AEDAT 4, not compressed
 
 
+def dvs128(events, triggers=(), tick="1 us") -> bytes:
+    records = [(t, (127 - y) << 8 | (127 - x) << 1 | (not p)) for t, x, y, p in rows(events)] + [
+        (t, 0x8000) for t in triggers
+    ]
+    words = np.array(
+        [(address, t) for t, address in sorted(records, key=lambda record: record[0])], ">u4"
+    )
+    head = "#!AER-DAT2.0\r\n# AEChip: ch.unizh.ini.jaer.chip.retina.DVS128\r\n"
+    return (head + f"# Timestamps tick is {tick}\r\n").encode() + words.tobytes()
+
+
 def flatbuffer(name: bytes, fields: dict[int, tuple]) -> bytes:
     """A FlatBuffers table with its size before it: slot -> (format, value) or (bytes, count).
 
@@ -391,6 +402,20 @@ def csv(events, size, names="t,x,y,p", separator=",", seconds=False, minus=False
         held = {"t": stamp, "x": x, "y": y, "p": (1 if p else -1) if minus else int(p)}
         lines.append(separator.join(str(held[name]) for name in order))
     return ("\n".join(lines) + "\n").encode()
+
+
+# N-Caltech101
+
+
+def n_caltech(events) -> bytes:
+    out, overflows = bytearray(), 0
+    for t, x, y, p in rows(events):
+        while t - (overflows << 13) >= 1 << 13:  # the row of 240 comes as the counter overflows
+            overflows += 1
+            out += bytes([0, 240, 0, 0, 0])
+        low = t - (overflows << 13)
+        out += bytes([x, y, p << 7 | low >> 16, low >> 8 & 255, low & 255])
+    return bytes(out)
 
 
 # ROS

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 pytestmark = pytest.mark.slow
 
 SCRIPT = Path(__file__).parents[2] / "experiments" / "fuzz.py"
-NEEDS = {"evt3": "evt3", "aedat4": "aedat", "bag": "rosbags"}
+NEEDS = {"evt3": "evt3", "aedat4": "aedat", "bag": "rosbags", "mcap": "rosbags", "db3": "rosbags"}
 
 
 def _script():
@@ -30,7 +30,7 @@ fuzz = _script()
 
 @pytest.mark.parametrize("name", fuzz.FORMATS)
 @given(seed=st.integers(0, 2**31 - 1))
-@settings(max_examples=100)
+@settings(max_examples=50)
 @example(seed=123)  # aedat: not UTF-8 in the header, which aborts the decoder
 @example(seed=92)  # mat: an unknown type, which SciPy takes as an index
 @example(seed=14)  # m3ed: a damaged group where a name is looked for

@@ -268,27 +268,18 @@ def test_a_table_of_packets_where_a_packet_is(tmp_path):
         load(tmp_path / "a.aedat4")
 
 
-def _dvs128(events, triggers=(), tick="1 us") -> bytes:
-    records = [
-        (t, (127 - y) << 8 | (127 - x) << 1 | (not p)) for t, x, y, p in formats.rows(events)
-    ] + [(t, 0x8000) for t in triggers]
-    words = np.array([(address, t) for t, address in sorted(records)], ">u4")
-    head = "#!AER-DAT2.0\r\n# AEChip: ch.unizh.ini.jaer.chip.retina.DVS128\r\n"
-    return (head + f"# Timestamps tick is {tick}\r\n").encode() + words.tobytes()
-
-
 def test_dvs128(tmp_path):
     events = formats.events_of(3, 300, (128, 128), span=10**6)
-    (tmp_path / "a.aedat").write_bytes(_dvs128(events, [7, 70_000]))
+    (tmp_path / "a.aedat").write_bytes(formats.dvs128(events, [7, 70_000]))
     for in_memory in (True, False):
         got = load(tmp_path / "a.aedat", None, in_memory)
         assert (got.width, got.height) == (128, 128)
         assert sorted(formats.rows(got.events[:])) == sorted(formats.rows(events))
         assert got.triggers.t.tolist() == [7, 70_000] and got.triggers.edge.tolist() == [-1, -1]
-    (tmp_path / "a.aedat").write_bytes(_dvs128(events, tick="20 ms"))
+    (tmp_path / "a.aedat").write_bytes(formats.dvs128(events, tick="20 ms"))
     with pytest.raises(InputError, match="count ticks of 20 ms"):
         load(tmp_path / "a.aedat")
-    (tmp_path / "a.aedat").write_bytes(_dvs128(events) + struct.pack(">2I", 1 << 20, 10**7))
+    (tmp_path / "a.aedat").write_bytes(formats.dvs128(events) + struct.pack(">2I", 1 << 20, 10**7))
     with pytest.raises(InputError, match="record 300 has the address 0x100000"):
         load(tmp_path / "a.aedat")
 
@@ -296,22 +287,11 @@ def test_dvs128(tmp_path):
 # N-Caltech101
 
 
-def _n_caltech(events) -> bytes:
-    out, overflows = bytearray(), 0
-    for t, x, y, p in formats.rows(events):
-        while t - (overflows << 13) >= 1 << 13:  # the row of 240 comes as the counter overflows
-            overflows += 1
-            out += bytes([0, 240, 0, 0, 0])
-        low = t - (overflows << 13)
-        out += bytes([x, y, p << 7 | low >> 16, low >> 8 & 255, low & 255])
-    return bytes(out)
-
-
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(20, 60))
 def test_n_caltech(seed, count, tmp_path_factory):
     events = formats.events_of(seed, count, (200, 180), 100_000)
     path = tmp_path_factory.getbasetemp() / "a.bin"
-    path.write_bytes(_n_caltech(events))
+    path.write_bytes(formats.n_caltech(events))
     for in_memory in (True, False):
         same(load(path, (200, 180), in_memory).events, events)
     with pytest.raises(InputError, match="could be a .bin of N-Caltech101"):

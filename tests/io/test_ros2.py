@@ -1,4 +1,4 @@
-"""Bags that rosbags wrote, most of ROS 2: events of each message type, frames, and what is refused."""
+"""Bags that rosbags wrote, most of ROS 2: events of each type, frames, and what is refused."""
 
 import sqlite3
 import struct
