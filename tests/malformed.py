@@ -11,6 +11,7 @@ import struct
 import zipfile
 import zlib
 from io import BytesIO
+from typing import Any
 
 import formats
 import h5py
@@ -155,7 +156,7 @@ def links(random) -> tuple[str, bytes]:
             lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None
         )
         path, _, name = _chosen(random, names).rpartition("/")
-        group = file[path or "/"]
+        group: Any = file[path or "/"]
         simple = group[name].ndim == 1 and group[name].dtype.kind in "iub"
         change = _retyped if simple and len(group[name]) == len(EVENTS) else _linked
         kind = (change if random.random() < 0.6 else _linked)(random, group, name)

@@ -141,17 +141,25 @@ def _unfolded(path: Path, data: bytes) -> bytes:
     return unfolded
 
 
+def _check_chunk(size: int, data: bytes) -> None:
+    """Raise `ValueError` for a chunk that claims too much; who reads the file names it."""
+    if size > most_unfolded(len(data)):
+        raise ValueError(f"a chunk of {len(data):,} bytes claims to hold {size:,}")
+
+
 @functools.cache
 def _bound_chunks() -> None:
-    """Let rosbags unfold a chunk of MCAP to the size that its index tells, and no further."""
+    """Let rosbags unfold a chunk of MCAP to the size that it claims, within bounds, no further."""
     import lz4.frame
 
     storage_mcap: Any = importlib.import_module("rosbags.rosbag2.storage_mcap")
 
     def lz4_chunk(data: bytes, size: int) -> bytes:
+        _check_chunk(size, data)
         return lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
 
     def zstd_chunk(data: bytes, size: int) -> bytes:
+        _check_chunk(size, data)
         return storage_mcap.zstd.ZstdDecompressor().decompress(data, max_length=size + 1)
 
     storage_mcap.DECOMPRESSORS.update({"lz4": lz4_chunk, "zstd": zstd_chunk})
