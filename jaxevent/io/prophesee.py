@@ -374,6 +374,14 @@ def _add_triggers(
     return int(values[-1]) if len(values) else high
 
 
+def _moved_base(base: int, kind: NDArray) -> int:
+    """The word of a base of vectors after a block, with the x to which its vectors moved it."""
+    since = np.flatnonzero(kind == 3)[-1] if (kind == 3).any() else 0
+    steps = int(12 * np.sum(kind[since:] == 4) + 8 * np.sum(kind[since:] == 5))
+    # Only a damaged vector, refused as outside the sensor, or the end of a row exceeds 0x7FF.
+    return base & ~0x7FF | min((base & 0x7FF) + steps, 0x7FF)
+
+
 def evt3_events(
     source: str,
     words_from: Callable[[Any], Iterator[tuple[int, Any, NDArray]]],
@@ -420,15 +428,7 @@ def evt3_events(
             if kind[clock[-1]] == 6:
                 last[6] = int(words[clock[-1]])
         if 3 in last:
-            since = np.flatnonzero(kind == 3)[-1] if (kind == 3).any() else 0
-            steps = 12 * np.count_nonzero(kind[since:] == 4) + 8 * np.count_nonzero(
-                kind[since:] == 5
-            )
-            x = (last[3] & 0x7FF) + steps
-            if x > 0x7FF:
-                # Only a damaged vector, refused as outside the sensor, or the end of a row does so.
-                x = 0x7FF
-            last[3] = last[3] & ~0x7FF | x
+            last[3] = _moved_base(last[3], kind)
         if unplaced.any():
             found["events_without_time"] += int(numbers[unplaced].sum())
             numbers[unplaced] = 0
