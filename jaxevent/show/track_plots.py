@@ -3,12 +3,14 @@
 Arrays as in `jaxevent.show.track_tables`.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_range
@@ -24,6 +26,8 @@ _TELLS, _OFTEN = (
     3.0,
     0.2,
 )  # standard deviations from 0 of a growth, and share of its times, to be told
+_SIZE, _TTC, _RANGE = "lambda (px)", "1 / TTC (1/s)", "range (m)"
+_FAINT = 0.2  # of bands
 _LEGEND = 16  # most tracks that a legend lists
 
 
@@ -65,17 +69,11 @@ def plot_tracks(
     filled = np.where(valid[..., None], mean, 1.0)
     filled_P = np.where(valid[..., None, None], covariance, np.eye(8))
     m, P = jnp.asarray(filled), jnp.asarray(filled_P)
-    since = jnp.asarray((t - t[0]) * 1e-6, m.dtype)
-    grown, spread = jax.vmap(
-        lambda m, P, seen: growth(since, m, P, seen, Q=Q, Q_lambda=Q_lambda), in_axes=1, out_axes=1
-    )(m, P, jnp.asarray(valid))
-    grown, spread = np.asarray(grown, np.float64), np.asarray(spread, np.float64)
-    clear = valid & (np.abs(grown) > _TELLS * np.sqrt(np.maximum(spread, 0)))
-    grows = clear.sum(0) > _OFTEN * np.maximum(valid.sum(0), 1)
+    grown, spread, grows = _growths(t, m, P, valid, Q, Q_lambda)
 
-    names = ["lambda (px)"]
-    names += ["1 / TTC (1/s)"] * bool(grows.any() or pair is not None)
-    names += ["range (m)"] * (extent is not None)
+    names = (
+        [_SIZE] + [_TTC] * bool(grows.any() or pair is not None) + [_RANGE] * (extent is not None)
+    )
     high = 7.0 * min(recording.height / recording.width, 1.2)
     figure = Figure(figsize=(8, high + 2.2 * len(names)), layout="constrained")
     suffix = Path(path).suffix.lstrip(".").lower()
@@ -87,56 +85,83 @@ def plot_tracks(
     grid = figure.add_gridspec(1 + len(names), 1, height_ratios=[high, *([2.2] * len(names))])
     seconds = (t - recording.start) * 1e-6
     _draw_paths(figure, figure.add_subplot(grid[0]), recording, t, seconds, known, mean, valid)
-    first = figure.add_subplot(grid[1])
-    axes = {names[0]: first}
-    for row, name in enumerate(names[1:], 2):
-        axes[name] = figure.add_subplot(grid[row], sharex=first)
-    bounds, faint = [], min(0.2, 0.5 / max(len(known), 1))
-
-    def band(name: str, value, variance, seen: NDArray, colour: str, **line) -> None:
-        deviation = np.sqrt(np.maximum(np.asarray(variance, np.float64), 0))
-        value = np.where(seen & np.isfinite(deviation), np.asarray(value, np.float64), np.nan)
-        axes[name].plot(seconds, value, color=colour, lw=1.3, **line)
-        low, high = value - 2 * deviation, value + 2 * deviation
-        axes[name].fill_between(seconds, low, high, color=colour, alpha=faint, lw=0)
-        if name == "1 / TTC (1/s)" and np.isfinite(value).any():
-            # Before anything has been measured a band reaches beyond every scale.
-            clear = np.isfinite(value) & (deviation <= 3 * np.nanmedian(deviation[seen]))
-            bounds.extend([np.nanmin(low[clear]), np.nanmax(high[clear])])
-
+    bands = _Bands({name: figure.add_subplot(grid[k + 1]) for k, name in enumerate(names)}, seconds)
     ranges = None
     if extent is not None and focal is not None:
         ranges = jax.jit(size_range)(m, P, extent, focal, size_factor)
     for i, one in enumerate(known):
-        colour = "#{:02x}{:02x}{:02x}".format(*track_colour(one, dark=True))
-        for axis, style in ((4, "-"), (5, "--")):
-            label = f"{one}" if axis == 4 else None
-            variance = filled_P[:, i, axis, axis]
-            band(names[0], filled[:, i, axis], variance, valid[:, i], colour, ls=style, label=label)
+        seen, label = valid[:, i], f"{one}"
+        line: dict[str, Any] = {
+            "color": "#{:02x}{:02x}{:02x}".format(*track_colour(one, dark=True))
+        }
+        for axis, more in ((4, {"label": label}), (5, {"ls": "--"})):
+            bands.add(_SIZE, filled[:, i, axis], filled_P[:, i, axis, axis], seen, **line, **more)
         if grows[i]:
-            seen = valid[:, i]
-            band(names[1], grown[:, i], spread[:, i], seen, colour, label=f"{one}, growth")
+            bands.add(_TTC, grown[:, i], spread[:, i], seen, **line, label=f"{one}, growth")
         if ranges is not None:
             value, variance = ranges
-            band(names[-1], value[:, i], variance[:, i], valid[:, i], colour, label=f"{one}")
+            bands.add(_RANGE, value[:, i], variance[:, i], seen, **line, label=label)
     if pair is not None:
         a, b = (known.index(one) for one in pair)
         value, variance = jax.jit(inverse_ttc)(m[:, a], P[:, a], m[:, b], P[:, b])
-        both = valid[:, a] & valid[:, b]
-        band(names[1], value, variance, both, "black", label=f"{pair[0]} and {pair[1]}")
-    for name, axis in axes.items():
-        axis.set_ylabel(name)
-        axis.spines[["top", "right"]].set_visible(False)
-        if 0 < len(known) <= _LEGEND:
-            axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
-    if bounds:
-        axes[names[1]].set_ylim(min(bounds), max(bounds) + 1e-9)
-    axes[names[0]].set_title(
-        "lambda1 solid, lambda2 dashed; bands: 2 standard deviations", fontsize=9
-    )
-    axes[names[-1]].set_xlabel("t (s) from the recording's start")
+        label = f"{pair[0]} and {pair[1]}"
+        bands.add(_TTC, value, variance, valid[:, a] & valid[:, b], color="black", label=label)
+    bands.finish(legend=0 < len(known) <= _LEGEND)
     with complete(Path(path)) as temporary:
         figure.savefig(temporary, format=suffix, dpi=150)
+
+
+def _growths(
+    t: NDArray[np.int64],
+    m: Array,
+    P: Array,
+    valid: NDArray[np.bool_],
+    Q: float | int,
+    Q_lambda: float | int | None,
+) -> tuple[NDArray, NDArray, NDArray]:
+    """1 / TTC of each growth (T, N), its variance, and of which tracks it differs from 0."""
+    since = jnp.asarray((t - t[0]) * 1e-6, m.dtype)
+    grown, spread = jax.vmap(
+        lambda m, P, seen: growth(since, m, P, seen, Q=Q, Q_lambda=Q_lambda), in_axes=1, out_axes=1
+    )(m, P, jnp.asarray(valid))
+    grown, spread = np.asarray(grown, np.float64), np.asarray(spread, np.float64)
+    clear = valid & (np.abs(grown) > _TELLS * np.sqrt(np.maximum(spread, 0)))
+    return grown, spread, clear.sum(0) > _OFTEN * np.maximum(valid.sum(0), 1)
+
+
+class _Bands:
+    """Panels of lines over time, with bands of two standard deviations."""
+
+    def __init__(self, axes: Mapping[str, Any], seconds: NDArray[np.float64]):
+        self.axes, self.seconds = axes, seconds
+        self.bounds: list[float] = []
+        first = axes[_SIZE]
+        for axis in axes.values():
+            if axis is not first:
+                axis.sharex(first)
+
+    def add(self, name: str, value: Any, variance: Any, seen: NDArray, color: str, **line: Any):
+        deviation = np.sqrt(np.maximum(np.asarray(variance, np.float64), 0))
+        value = np.where(seen & np.isfinite(deviation), np.asarray(value, np.float64), np.nan)
+        self.axes[name].plot(self.seconds, value, color=color, lw=1.3, **line)
+        low, high = value - 2 * deviation, value + 2 * deviation
+        self.axes[name].fill_between(self.seconds, low, high, color=color, alpha=_FAINT, lw=0)
+        if name == _TTC and np.isfinite(value).any():
+            # Before anything has been measured a band reaches beyond every scale.
+            clear = np.isfinite(value) & (deviation <= 3 * np.nanmedian(deviation[seen]))
+            self.bounds += [float(np.nanmin(low[clear])), float(np.nanmax(high[clear]))]
+
+    def finish(self, legend: bool) -> None:
+        for name, axis in self.axes.items():
+            axis.set_ylabel(name)
+            axis.spines[["top", "right"]].set_visible(False)
+            if legend:
+                axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
+        if self.bounds:
+            self.axes[_TTC].set_ylim(min(self.bounds), max(self.bounds) + 1e-9)
+        title = "lambda1 solid, lambda2 dashed; bands: 2 standard deviations"
+        self.axes[_SIZE].set_title(title, fontsize=9)
+        list(self.axes.values())[-1].set_xlabel("t (s) from the recording's start")
 
 
 def _draw_paths(
