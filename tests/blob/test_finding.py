@@ -41,6 +41,7 @@ def crossed():
     return recording, truth, blob.find(recording, progress=False)
 
 
+@pytest.mark.slow
 def test_two_that_cross_keep_their_identities(crossed):
     recording, truth, found = crossed
     assert len(found) == 2 and found.summary().startswith("2 targets")
@@ -58,6 +59,7 @@ def test_two_that_cross_keep_their_identities(crossed):
     np.testing.assert_allclose(again.mean, states.mean, rtol=1e-4, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_what_the_user_sets_wins_over_what_is_found(crossed):
     _, _, found = crossed
     settings = found.settings()
@@ -104,6 +106,7 @@ def stopped():
     return recording, truth, blob.find(recording, progress=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["moment", "chi2", "constant_velocity"])
 def test_a_silent_target_stands_still(method, stopped):
     recording, truth, found = stopped
@@ -215,6 +218,7 @@ def test_agility_is_the_most_likely():
     assert ours == pytest.approx(total + constant, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_targets_do_not_depend_on_the_clock(crossed):
     recording, _, found = crossed
     events = recording.events[:]

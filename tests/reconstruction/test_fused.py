@@ -49,6 +49,7 @@ def check(name, recording, values, **options):
     np.testing.assert_array_equal(look(video, times[2])[:, 0], [image[2], variance[2]])
 
 
+@pytest.mark.slow
 @settings(max_examples=8)
 @given(recording=recordings(fewest_frames=1), events=st.sampled_from([7, 1000]))
 def test_kernel_of_edi_equals_loop_over_events(recording, events):
