@@ -64,3 +64,19 @@ def test_skew_is_that_by_which_pixels_end_where_they_began():
 def test_errors_grow_where_little_is_explained():
     assert inflation(1.0) == inflation(0.95) == pytest.approx(2.5**2)
     assert np.sqrt(inflation(0.58)) == pytest.approx(2.5 * np.exp(5 * 0.37))
+
+
+@pytest.mark.parametrize("first", [30, 101, 160])
+def test_pixels_left_out_are_others_and_no_more_events(first):
+    rng = np.random.default_rng(3)
+    pixel = np.repeat(np.arange(60), rng.integers(2, 40, 60))
+    t = rng.permutation(len(pixel)) + 1
+    order = np.argsort(t)
+    x = (pixel[order] % 64).astype(np.uint16)
+    events = Events(t[order], x, np.zeros(len(x), np.uint16), np.ones(len(x), bool))
+    camera = PinholeCamera(50.0, 50.0, 32.0, 24.0)
+    windows = Windows(Recording("r", 64, 48, events, camera=camera), Params(), camera)
+    centre, half = len(x) // 2, 1.0
+    parts = windows.tracks(centre, half, 300, first), windows.tracks(centre, half, 300, 300, first)
+    held = [set(np.asarray(part.pixel)[np.asarray(part.pixel) < 64 * 48]) for part in parts]
+    assert held[0] and held[1] and not held[0] & held[1]

@@ -302,7 +302,8 @@ class Windows:
         order = order[count[order] > 1]
         taken = np.zeros(pixels, bool)
         number = np.cumsum(count[order])
-        taken[order[(number > skip) & (number <= skip + limit)]] = True
+        # A pixel that holds event number `skip` is of neither part.
+        taken[order[(number - count[order] >= skip) & (number <= skip + limit)]] = True
         keep = np.flatnonzero(taken[pixel])
         keep = keep[np.argsort(pixel[keep], kind="stable")]
         n, where = len(keep), pixel[keep]
