@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.finding.paths import Path
+from jaxevent.blob.finding.paths import STILL, Path
 from jaxevent.blob.finding.scale import Choice
 from jaxevent.blob.params import TrackerParams
 from jaxevent.recording import Recording
@@ -15,7 +15,6 @@ from jaxevent.recording import Recording
 P = TypeVar("P", bound=TrackerParams)
 
 FIRST = 4  # windows that tell the size at the start
-STILL = 2  # windows of silence after which a target stands still
 FOREVER = 1e3  # s; what was found tells when targets end
 
 

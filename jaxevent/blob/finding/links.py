@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jaxevent.blob.finding.agility import fit_agility
 from jaxevent.blob.finding.background import Background
 from jaxevent.blob.finding.detection import FALSE_ALARMS, Scale, detect, evidence, measure_blobs
-from jaxevent.blob.finding.paths import Path
+from jaxevent.blob.finding.paths import STILL, Path
 from jaxevent.blob.finding.scale import CONTACT
 from jaxevent.blob.finding.stream import Part, Stream
 from jaxevent.progress import bar
@@ -26,7 +26,6 @@ HOLD, HOLD_NEW = (
     24,
     2,
 )  # windows that silent targets are held: confirmed ones (and twice those seen), others
-STILL = 2  # windows of silence after which a target stands still
 SEEN, SEEN_NEW = 1e-3, 1e-5  # false alarms of a look where a target is known to be
 FAINT = 0.02  # of its own rate: a target with fewer events is silent
 GAIN = 0.2  # of size and rate

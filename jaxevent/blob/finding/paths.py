@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from jaxevent.kernels import compiled
 from jaxevent.recording import Events
 
+STILL = 2  # windows of silence after which a target stands still
 NOBODY, ANYBODY = -1, -2  # whose an event is: of no path, of one of several
 
 

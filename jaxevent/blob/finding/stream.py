@@ -34,7 +34,8 @@ class Stream:
         self.recording, self.start, self.stop = recording, start, stop
         self.width, self.height = recording.width, recording.height
         self.hot = np.zeros((recording.height, recording.width), bool)
-        self._kept: NDArray[np.bool_] | None = None  # of all rows from `start` to `stop`
+        self._first, self._last = (recording.events.index(t) for t in (start, stop))
+        self._kept: NDArray[np.bool_] | None = None  # of all these rows
 
     @property
     def duration(self) -> float:
@@ -43,14 +44,13 @@ class Stream:
 
     def __len__(self) -> int:
         """Events in all, those left out included."""
-        events = self.recording.events
-        return events.index(self.stop) - events.index(self.start)
+        return self._last - self._first
 
     def without(self, paths: Sequence[Path], sigmas: float | int) -> "Stream":
         """The same without events within `sigmas` standard deviations of some paths."""
         stream = Stream(self.recording, self.start, self.stop)
-        first, last = (self.recording.events.index(t) for t in (self.start, self.stop))
-        kept = np.ones(last - first, bool) if self._kept is None else self._kept.copy()
+        first, last = self._first, self._last
+        kept = np.ones(len(self), bool) if self._kept is None else self._kept.copy()
         joined = join(paths)
         for row in range(first, last, BATCH):
             events = self.recording.events[row : min(row + BATCH, last)]
@@ -67,14 +67,13 @@ class Stream:
 
     def batches(self) -> Iterator[Part]:
         """All events, one batch after another."""
-        first, last = (self.recording.events.index(t) for t in (self.start, self.stop))
-        for row in range(first, last, BATCH):
-            yield self._rows(row, min(row + BATCH, last))
+        for row in range(self._first, self._last, BATCH):
+            yield self._rows(row, min(row + BATCH, self._last))
 
     def times(self, number: int) -> NDArray[np.float64]:
         """Times (s) of some events that are equally many events apart."""
-        first, last = (self.recording.events.index(t) for t in (self.start, self.stop))
-        rows = first + ((np.arange(number) + 0.5) / number * (last - first)).astype(np.int64)
+        share = (np.arange(number) + 0.5) / number
+        rows = self._first + (share * len(self)).astype(np.int64)
         us = [int(self.recording.events[row : row + 1].t[0]) for row in rows]
         return (np.array(us) - self.start) * 1e-6
 
@@ -82,7 +81,6 @@ class Stream:
         events = self.recording.events[first:last]
         kept = ~self.hot[events.y, events.x]
         if self._kept is not None:
-            before = self.recording.events.index(self.start)
-            kept &= self._kept[first - before : last - before]
+            kept &= self._kept[first - self._first : last - self._first]
         t = np.asarray((events.t[kept] - self.start) * 1e-6, np.float64)
         return Part(t, events.x[kept].astype(np.int64), events.y[kept].astype(np.int64))
