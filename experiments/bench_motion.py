@@ -19,7 +19,7 @@ import numba
 import numpy as np
 
 from jaxevent.egomotion import voting
-from jaxevent.egomotion.batch_fit import equations, lattice
+from jaxevent.egomotion.batch_fit import equations, lattice, sequence
 from jaxevent.egomotion.batch_fit import tracks as tracks_of
 from jaxevent.egomotion.batch_fit import windows as batch
 from jaxevent.egomotion.batch_fit.path import ROWS, Path, advanced
@@ -169,7 +169,7 @@ def batch_bench() -> tuple[dict[str, float], dict[str, float]]:
             return windows.ended(250_000, [windows.followed(250_000, warm)])
 
         def every(params: batch.Params = params) -> Motion:
-            return batch.batch.estimate(recording, params)
+            return sequence.batch.estimate(recording, params)
 
         name = f"batch general motion, s per window, {events // 1000} k events"
         speed[f"{name}, from nothing"] = timed(whole, 2)

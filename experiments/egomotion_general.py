@@ -24,6 +24,7 @@ import numpy as np
 import pandas as pd
 
 from jaxevent.egomotion import truth
+from jaxevent.egomotion.batch_fit import sequence
 from jaxevent.egomotion.batch_fit import windows as batch
 from jaxevent.simulate import motion_scene
 
@@ -57,7 +58,7 @@ def window(scene: str, motion: str, seed: int, params: batch.Params) -> dict[str
 def whole(scene: str, seed: int, params: batch.Params, seconds: float) -> dict[str, Any]:
     recording, source = motion_scene(scene, "varying", seed, duration=seconds)
     clock = time.perf_counter()
-    found = batch.batch.estimate(recording, params)
+    found = sequence.batch.estimate(recording, params)
     spent = time.perf_counter() - clock
     kept = found.valid
     T, Omega = source.twist(found.t[kept])

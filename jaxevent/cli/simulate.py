@@ -46,6 +46,10 @@ def add(commands: Any) -> None:
         metavar="NAME",
         help="of the camera: planar, rotation, or general before a wall, shapes or texture",
     )
+    _add_settings(one)
+
+
+def _add_settings(one: Any) -> None:
     arguments.add_output(one, "--out", metavar="FILE", required=True, help="the HDF5 file to write")
     one.add_argument(
         "--sensor",
@@ -120,11 +124,8 @@ def run(
     cut: float | int | None,
     max_size: int | None,
 ) -> None:
-    from jaxevent import simulate as sim
-    from jaxevent.io import save
-    from jaxevent.io.output import complete
     from jaxevent.parameters import nearest
-    from jaxevent.simulate.scenes import SPEEDS
+    from jaxevent.simulate import SENSORS
 
     if seed < 0:
         raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
@@ -132,65 +133,94 @@ def run(
         raise InputError(f"--duration {duration:g} is not possible; give seconds above 0")
     if size is not None and min(size) < 1:
         raise InputError(f"--size {size[0]},{size[1]} is not possible; give it in pixels")
-    if sensor is not None and sensor not in sim.SENSORS:
-        raise InputError(f"there is no sensor {sensor!r}; {nearest(sensor, sim.SENSORS)}")
-    if blobs is not None or motion is not None:
-        given = {"start": start, "cut": cut, "max-size": max_size}
-        if blobs is not None:
-            given |= {"sensor": sensor, "speed": speed, "size": size, "change": change}
-        for name, value in given.items():
-            if value is not None:
-                what = "blobs" if blobs is not None else "the motion of a camera"
-                raise InputError(f"--{name} is not for {what}; leave it out")
-        if blobs is not None:
-            _simulate_blobs(blobs, truth, out, seed, duration)
-        else:
-            assert motion is not None
-            how = {"change": change or "constant", "sensor": sensor, "speed": speed}
-            _simulate_motion(motion, truth, out, seed, duration or 0.5, size or (240, 180), **how)
-        return
-    if truth is not None:
-        raise InputError(
-            "--truth is that of --blobs and --motion; HDR scenes hold theirs, leave it out"
+    if sensor is not None and sensor not in SENSORS:
+        raise InputError(f"there is no sensor {sensor!r}; {nearest(sensor, SENSORS)}")
+    of_video = {"start": start, "cut": cut, "max-size": max_size}
+    if blobs is not None:
+        own = {"sensor": sensor, "speed": speed, "size": size, "change": change}
+        _refuse("is not for blobs; leave it out", **of_video, **own)
+        return _simulate_blobs(blobs, truth, out, seed, duration)
+    if motion is not None:
+        _refuse("is not for the motion of a camera; leave it out", **of_video)
+        how = {"change": change or "constant", "sensor": sensor, "speed": speed}
+        return _simulate_motion(
+            motion, truth, out, seed, duration or 0.5, size or (240, 180), **how
         )
-    if change is not None:
-        raise InputError("--change is for --motion; leave it out")
-    sensor = sensor or "davis"
-    given: dict[str, Any] = {"start": start, "cut": cut, "max_size": max_size}
-    given = {name: value for name, value in given.items() if value is not None}
+    what = "that of --blobs and --motion; HDR scenes hold theirs, leave it out"
+    _refuse(f"is {what}", truth=truth)
+    _refuse("is for --motion; leave it out", change=change)
+    chosen = SENSORS[sensor or "davis"]
+    if video is not None:
+        _refuse("is for a scene or --objects; scale a video with --max-size", size=size)
+        given = {name.replace("-", "_"): v for name, v in of_video.items() if v is not None}
+        return _simulate_video(video, out, chosen, seed, speed, duration, given)
+    what = "--objects" if objects else "--scene"
+    _refuse(f"is for a video; leave it out with {what}", **of_video)
+    _simulate_frames(scene, out, chosen, seed, speed, duration, size)
+
+
+def _refuse(why: str, **given: Any) -> None:
+    """Raise `InputError` for the first of the options that was given."""
+    for name, value in given.items():
+        if value is not None:
+            raise InputError(f"--{name} {why}")
+
+
+def _simulate_video(
+    video: Path,
+    out: Path,
+    sensor: Any,
+    seed: int,
+    speed: str | None,
+    duration: float | int | None,
+    given: dict[str, Any],
+) -> None:
+    from jaxevent import simulate as sim
+    from jaxevent.io import save
+    from jaxevent.io.output import complete
+
+    try:
+        factor = float(speed or 1)
+    except ValueError:
+        raise InputError(
+            f"--speed {speed} is for a scene; give a video a number, such as 0.5"
+        ) from None
+    stop = None if duration is None else given.get("start", 0.0) + duration
     # Opened first, so that a place that cannot be written is told before the work.
     with complete(out) as partial:
-        if given and (scene is not None or objects):
-            option = next(iter(given)).replace("_", "-")
-            what = "--objects" if objects else "--scene"
-            raise InputError(f"--{option} is for a video; leave it out with {what}")
-        if objects:
-            pace = _pace(speed, "200")
-            moving = sim.Objects(size or (160, 120), duration or 1.0, pace or 90.0, seed=seed)
-            recording = sim.simulate(moving, sim.SENSORS[sensor], seed, "objects")
-        elif scene is not None:
+        recording = sim.from_video(video, sensor, speed=factor, stop=stop, seed=seed, **given)
+        save(recording, partial)
+    print_stored(recording, out)
+
+
+def _simulate_frames(
+    scene: str | None,
+    out: Path,
+    sensor: Any,
+    seed: int,
+    speed: str | None,
+    duration: float | int | None,
+    size: tuple[int, int] | None,
+) -> None:
+    """A camera over a scene, or without one moving objects."""
+    from jaxevent import simulate as sim
+    from jaxevent.io import save
+    from jaxevent.io.output import complete
+    from jaxevent.simulate.scenes import SPEEDS
+
+    with complete(out) as partial:
+        if scene is None:
+            pace = _pace(speed, "200") or 90.0
+            source = sim.Objects(size or (160, 120), duration or 1.0, pace, seed=seed)
+            name = "objects"
+        else:
             way: Any = speed or "slow"
             if way not in SPEEDS:
                 raise InputError(f"--speed {way} is not possible for a scene; give slow or fast")
             panorama = sim.scene(int(scene) if scene.isdecimal() else scene)
             source = sim.Pan(panorama, size or (128, 96), duration or 1.5, way, seed)
-            recording = sim.simulate(source, sim.SENSORS[sensor], seed, f"{scene}-{way}")
-        else:
-            assert video is not None
-            if size is not None:
-                raise InputError(
-                    "--size is for a scene or --objects; scale a video with --max-size"
-                )
-            try:
-                factor = float(speed or 1)
-            except ValueError:
-                raise InputError(
-                    f"--speed {speed} is for a scene; give a video a number, such as 0.5"
-                ) from None
-            stop = None if duration is None else (start or 0.0) + duration
-            recording = sim.from_video(
-                video, sim.SENSORS[sensor], speed=factor, stop=stop, seed=seed, **given
-            )
+            name = f"{scene}-{way}"
+        recording = sim.simulate(source, sensor, seed, name)
         save(recording, partial)
     print_stored(recording, out)
 

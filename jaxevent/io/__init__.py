@@ -223,15 +223,13 @@ def _hdf5_reader(
 ) -> Callable[[Path, tuple[int, int] | None], Recording]:
     import h5py
 
-    from jaxevent.io import hdf5
+    from jaxevent.io import hdf5, hdf5_files, hdf5_layouts
 
-    with hdf5.open_file(path) as opened, reading(str(path)):
+    with hdf5_files.open_file(path) as opened, reading(str(path)):
         file: Any = opened
         events = file.get("events")
         ours = isinstance(events, h5py.Group) and {"t", "x", "y", "p"} <= set(events)
-        ours |= str(hdf5.attribute(file, "format")) == "jaxevent"
-        from jaxevent.io import hdf5_layouts
-
+        ours |= str(hdf5_files.attribute(file, "format")) == "jaxevent"
         others = not ours and hdf5_layouts.knows(file)
         matlab = hdf5.is_matlab(path, file)
     if others:

@@ -31,17 +31,8 @@ from jaxevent.errors import InputError
 from jaxevent.io import check_unfolded, pinhole, reading, sensor_size, times, vectors, whole_number
 from jaxevent.io.columns import find, order_of
 from jaxevent.io.decoded import DecodedImages
-from jaxevent.io.hdf5 import (
-    Column,
-    Microseconds,
-    StoredEvents,
-    StoredImages,
-    array,
-    attribute,
-    dataset,
-    in_memory,
-    open_file,
-)
+from jaxevent.io.hdf5 import Column, Microseconds, StoredEvents, StoredImages, in_memory
+from jaxevent.io.hdf5_files import array, attribute, dataset, open_file
 from jaxevent.recording import Frames, Imu, Recording
 
 _GROUPS = ("events", "", "CD/events")

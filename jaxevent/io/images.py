@@ -74,7 +74,7 @@ def is_series(path: Path) -> bool:
     """Whether these are images with times, not a recording."""
     import h5py
 
-    from jaxevent.io import hdf5
+    from jaxevent.io import hdf5_files
 
     with reading(str(path)):
         if path.is_dir():
@@ -82,7 +82,7 @@ def is_series(path: Path) -> bool:
             return images and not (path / "events.txt").is_file()
         if not path.is_file() or not h5py.is_hdf5(path):
             return False
-        with hdf5.open_file(path) as file:
+        with hdf5_files.open_file(path) as file:
             return {"t", "image"} <= set(file)
 
 
@@ -159,15 +159,15 @@ def _series(
 
 
 def _of_hdf5(path: Path, scale: Scale) -> Series:
-    from jaxevent.io import hdf5
+    from jaxevent.io import hdf5_files
 
-    file = hdf5.open_file(path)
+    file = hdf5_files.open_file(path)
     if not {"t", "image"} <= set(file):
         raise InputError(
             f"{path}: has no datasets t and image; store t (images,) and image (images, "
             "height, width)"
         )
-    stored, t = (hdf5.dataset(file, name, str(path)) for name in ("image", "t"))
+    stored, t = (hdf5_files.dataset(file, name, str(path)) for name in ("image", "t"))
     if t.ndim != 1 or stored.ndim not in (3, 4) or len(t) != len(stored):
         raise InputError(
             f"{path}: image has the shape {stored.shape} and t {t.shape}; store one time for "

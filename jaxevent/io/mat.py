@@ -117,16 +117,16 @@ def read_v73(path: Path, size: tuple[int, int] | None) -> Recording:
     """Read a v7.3 file; `size` is (width, height). Raises `InputError` for bad input."""
     import h5py
 
-    from jaxevent.io import hdf5
+    from jaxevent.io import hdf5_files
 
     variables: dict[str, NDArray] = {}
-    with reading(str(path)), hdf5.open_file(path) as file:
+    with reading(str(path)), hdf5_files.open_file(path) as file:
         for name, dataset in file.items():
             if isinstance(dataset, h5py.Dataset) and dataset.dtype.kind in "biuf":
                 with reading(f"{path}: {name}"):
                     # MATLAB stores the shape of an empty array as its data, and all axes reversed.
-                    empty = hdf5.attribute(dataset, "MATLAB_empty")
-                    stored = hdf5.array(file, name, str(path))
+                    empty = hdf5_files.attribute(dataset, "MATLAB_empty")
+                    stored = hdf5_files.array(file, name, str(path))
                     if empty and stored.all():
                         raise InputError(f"{path}: {name} is said to be empty but has a size")
                     variables[name] = np.zeros(stored.astype(int)) if empty else stored.T

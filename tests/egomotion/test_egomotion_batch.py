@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import geometry
-from jaxevent.egomotion.batch_fit import photometric, starts
+from jaxevent.egomotion.batch_fit import photometric, sequence, starts
 from jaxevent.egomotion.batch_fit import windows as batch
 from jaxevent.egomotion.batch_fit.depths import depths as look_for_depths
 from jaxevent.egomotion.batch_fit.path import ROWS, Path, advanced, normalised, warp
@@ -436,21 +436,21 @@ def test_a_recording_from_end_to_end(monkeypatch):
     monkeypatch.setattr(batch, "ROUNDS", (batch.Stage(0.3, 4),))
     monkeypatch.setattr(batch, "FINAL", (batch.Stage(0.1, 3),))
     monkeypatch.setattr(batch, "GROWING", ())
-    motion = batch.batch.estimate(seen(), PARAMS)
+    motion = sequence.batch.estimate(seen(), PARAMS)
     mean, covariance, valid = motion(motion.t[len(motion) // 2 :][:1])
     assert valid[0] and covariance.shape == (1, 6, 6)
     assert np.linalg.norm(mean[0, :3]) == pytest.approx(1)
     assert np.degrees(np.arccos(mean[0, :3] @ T / np.linalg.norm(T))) < 15
-    again = batch.batch.estimate(seen(), PARAMS)
+    again = sequence.batch.estimate(seen(), PARAMS)
     np.testing.assert_array_equal(again.mean, motion.mean)
-    few = batch.batch.estimate(seen()[0.0:0.01], PARAMS)
+    few = sequence.batch.estimate(seen()[0.0:0.01], PARAMS)
     assert not few.valid.any() and np.isfinite(few.mean).all()
     at_once = seen().events[:3000]
     at_once = dataclasses.replace(at_once, t=np.full(3000, 150_000))
-    instant = batch.batch.estimate(dataclasses.replace(seen(), events=at_once), PARAMS)
+    instant = sequence.batch.estimate(dataclasses.replace(seen(), events=at_once), PARAMS)
     assert all(np.isfinite(part).all() for part in (instant.mean, instant.covariance))
     empty = dataclasses.replace(seen(), events=seen().events[:0])
-    assert len(batch.batch.estimate(empty, PARAMS)) == 0
+    assert len(sequence.batch.estimate(empty, PARAMS)) == 0
 
 
 def a_fit(path, cost):
@@ -483,7 +483,7 @@ def windows_that(monkeypatch, fit, follow):
 def test_a_path_that_is_lost_is_not_followed(monkeypatch):
     path = true_path(np.zeros(4))
     # The third window costs much more, what the sixth costs cannot be told.
-    costs = {2: 2 * batch.LOST * 1e-3, 5: np.nan}
+    costs = {2: 2 * sequence.LOST * 1e-3, 5: np.nan}
     asked = windows_that(
         monkeypatch,
         lambda centre, warm: (path, 1e-3),
@@ -492,7 +492,7 @@ def test_a_path_that_is_lost_is_not_followed(monkeypatch):
     recording = seen()
     first = int(recording.events.t[0]) + 20_000
     short = {"half_window": 0.02, "step": 0.02, "fresh": 100}
-    batch.batch.estimate(recording, batch.Params.of({**GIVEN, **short}))
+    sequence.batch.estimate(recording, batch.Params.of({**GIVEN, **short}))
     assert [(kind, (centre - first) // 20_000) for kind, centre in asked][:10] == [
         ("anew", 0),
         ("followed", 1),
@@ -519,7 +519,7 @@ def test_new_starts_that_agree_are_made_less_often(monkeypatch):
     recording = seen()
     first = int(recording.events.t[0]) + 10_000
     short = {"half_window": 0.01, "step": 0.01, "fewest": 1, "fresh": 2}
-    batch.batch.estimate(recording, batch.Params.of({**GIVEN, **short}))
+    sequence.batch.estimate(recording, batch.Params.of({**GIVEN, **short}))
     anew = [(centre - first) // 10_000 for kind, centre in asked if kind == "anew"]
     # 2 windows after the first, 4, 8, where they do not agree, again 2.
     assert anew == [0, 2, 6, 14, 16, 20]
@@ -545,7 +545,7 @@ def test_a_wrong_beginning_is_fitted_again(monkeypatch, cheaper):
         follow,
     )
     params = batch.Params.of({**GIVEN, "half_window": 0.05, "step": 0.05, "fresh": 3})
-    motion = batch.batch.estimate(recording, params)
+    motion = sequence.batch.estimate(recording, params)
     at = np.searchsorted(motion.t, first + 50_000 * np.arange(4))
     along = motion.mean[at, :3] @ right.twist(0.0)[0].ravel()
     assert (along > 0).tolist() == [cheaper == "all", *2 * [cheaper != "none"], True]
@@ -553,6 +553,6 @@ def test_a_wrong_beginning_is_fitted_again(monkeypatch, cheaper):
 
 def test_what_cannot_be_estimated_is_refused():
     with pytest.raises(InputError, match="calibration"):
-        batch.batch.estimate(dataclasses.replace(seen(), camera=None), PARAMS)
+        sequence.batch.estimate(dataclasses.replace(seen(), camera=None), PARAMS)
     with pytest.raises(InputError, match="general"):
-        batch.batch.estimate(seen(), PARAMS, model="generl")
+        sequence.batch.estimate(seen(), PARAMS, model="generl")

@@ -73,6 +73,7 @@ def gather(values: Array, near: Near, shape: tuple) -> list[Array]:
 
 
 def weigh(values: list[Array], share: Array) -> Array:
+    """The sum of values, one of each corner, by their shares."""
     return sum((value * part for value, part in zip(values, share, strict=True)), jnp.zeros(()))
 
 

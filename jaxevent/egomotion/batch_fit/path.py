@@ -131,6 +131,7 @@ def normalised(path: Path) -> Path:
 
 
 def rays_of(x: NDArray, y: NDArray, f: float) -> NDArray[np.float64]:
+    """Rays (N, 3) of depth 1 through pixels that lie x, y px from the principal point."""
     return np.stack([x / f, y / f, np.ones(len(x))], 1)
 
 

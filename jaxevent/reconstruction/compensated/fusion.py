@@ -89,21 +89,29 @@ def steepness(image: Array) -> Array:
     return total
 
 
-def compare(params: Params, L: Numeric, V: Numeric, along: Along, place: Place) -> Comparison:
-    """Images L with variances V (K, h, w), and the same along trajectories.
+class Agreement(NamedTuple):
+    """What all instants together tell along trajectories."""
+
+    M: Float[Array, "h w"]  # their robust mean
+    W: Float[Array, "k h w"]  # information of each instant
+    R: Float[Array, "k h w"]  # the same where the point is seen
+    seen: Float[Array, "k h w"]  # 0..1
+    scatter: Float[Array, "h w"]  # variance beyond what the instants' own explain
+
+
+def agree(params: Params, L: Float[Array, "h w"], along: Along, place: Place) -> Agreement:
+    """The robust mean along trajectories, begun from the target's own image L.
 
     An instant counts by its information, V and what warping adds to it; where it differs from the
     others by more than that the point is hidden there. Excess scatter tells failed motion.
     """
-    p, own = params, place.own
-    L, V = jnp.asarray(L), jnp.asarray(V)
-    along, place = jax.tree.map(jnp.asarray, (along, place))
+    p = params
     s = place.s[:, None, None]
-    here = (jnp.arange(len(place.s)) == own)[:, None, None]
+    here = (jnp.arange(len(place.s)) == place.own)[:, None, None]
     eta = p.information + (1 - p.information) * along.clear
     eta = eta * place.present[:, None, None]
     base = jnp.where(along.inside > 0, along.V + p.floor, OUTSIDE)
-    steep = steepness(blur(L[own], 1.0))
+    steep = steepness(blur(L, 1.0))
     variance, seen = base, jnp.exp(-2 * s**2)  # at first the near instants tell
     for turn in range(3):
         variance = base + jnp.where(here, 0, p.sigma_place**2 * steep + p.sigma_between**2)
@@ -116,15 +124,25 @@ def compare(params: Params, L: Numeric, V: Numeric, along: Along, place: Place) 
         seen = 1 / (1 + (misfit / p.tolerance) ** 2)
     W = eta / variance
     R = W * seen
-    total = R.sum(0)
-    M = (R * along.L).sum(0) / total
+    M = (R * along.L).sum(0) / R.sum(0)
     # Of all instants but the plainly hidden ones, whatever the tolerance.
     plain = place.present[:, None, None] / variance / (1 + (misfit / PLAIN) ** 2)
     excess = (plain * ((along.L - M) ** 2 - 0.6 * variance)).sum(0)
     scatter = jnp.maximum(blur(excess, 2.0) / blur((plain * eta).sum(0), 2.0), 0)
+    return Agreement(M, W, R, seen, scatter)
 
+
+def compare(params: Params, L: Numeric, V: Numeric, along: Along, place: Place) -> Comparison:
+    """Images L with variances V (K, h, w), and the same along trajectories: the ingredients.
+
+    Beside them the signs by which `decide` chooses, and where the mean along trajectories is from.
+    """
+    L, V = jnp.asarray(L), jnp.asarray(V)
+    along, place = jax.tree.map(jnp.asarray, (along, place))
+    own, a, b = place.own, place.before, place.after
+    M, W, R, seen, scatter = agree(params, L[own], along, place)
+    total = R.sum(0)
     smoothed = L[own]
-    a, b = place.before, place.after
     apart = jnp.where(a == b, 1, place.s[b] - place.s[a])
     w = jnp.where(a == b, 0, jnp.clip(-place.s[a] / apart, 0, 1))
     blend = (1 - w) * L[a] + w * L[b]
@@ -160,7 +178,7 @@ def compare(params: Params, L: Numeric, V: Numeric, along: Along, place: Place) 
     X = [signs[n] if n in as_they_are else jnp.log(signs[n] + TINY) for n in SIGNS]
     X = jnp.stack([*X, jnp.ones_like(M)])
     share = R / total
-    framed = place.framed[:, None, None]
+    framed, s = place.framed[:, None, None], place.s[:, None, None]
     parts = [
         (share * framed * (s < 0)).sum(0),
         (share * framed * (s > 0)).sum(0),

@@ -1,0 +1,196 @@
+"""HDF5 files that need not be trusted: opened, and their datasets checked, before they are read.
+
+Links to other files, datasets made of other files and heaps that libhdf5 would never leave are
+refused, and so is a dataset that claims more values than its bytes can hold.
+"""
+
+import math
+import re
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError, require
+from jaxevent.io import check_unfolded, most_unfolded, reading
+
+_MOST_COMPRESSED = 4096  # times smaller than in memory that any filter makes real events
+_ECF = 36559  # Prophesee's filter
+_HEAPS = 1 << 24
+_COPY = (
+    "only what a file itself holds is read, so copy all into one file: h5repack, or h5py's "
+    "create_dataset(name, data=dataset[()])"
+)
+# An attribute that is one string: its type, its space, then its length, heap and place in that.
+_STRING = re.compile(rb"\x19.[\x00\x01]\x00\x10\x00\x00\x00\x10.{15}\x01\x00{7}(.{16})", re.DOTALL)
+
+
+def open_file(path: Path) -> h5py.File:
+    """The open file, or `InputError`."""
+    with reading(str(path)):
+        check_heaps(path)
+        file = h5py.File(path)
+        links: Any = getattr(h5py, "h5l")  # noqa: B009  (its stubs lack it)
+        known = (links.TYPE_HARD, links.TYPE_SOFT)
+        link = file.id.links.visit(
+            lambda name, info: None if info.type in known else name, info=True
+        )
+        if link is not None:
+            file.close()
+            raise InputError(f"{path}: {link.decode()} is a link to another file; {_COPY}")
+        return file
+
+
+def attribute(of: Any, name: str) -> Any:
+    """An attribute of a file, group or dataset, None where it has none; text as str.
+
+    Only numbers and strings are read: of a damaged type HDF5 2.0 reads memory that is not there.
+    """
+    if name not in of.attrs:
+        return None
+    kind = of.attrs.get_id(name).get_type()
+    if not isinstance(kind, h5py.h5t.TypeIntegerID | h5py.h5t.TypeFloatID | h5py.h5t.TypeStringID):
+        raise ValueError(f"the attribute {name} is of an unknown type")
+    value = of.attrs[name]
+    return value.decode() if isinstance(value, bytes) else value
+
+
+def check_heaps(path: Path) -> None:
+    """Raise `InputError` for a global heap (of strings) whose end libhdf5 would never find.
+
+    HDF5 2.0 goes on by the size of each piece, and stays where that is 0 or overflows; for a heap
+    that an attribute puts past the end of the file it takes gigabytes of memory first. The heaps
+    of a file's attributes lie near its start or, if written late, its end: `_HEAPS` bytes of both
+    are searched, which takes 40 ms at most.
+    """
+    damaged = InputError(f"{path}: a string or its heap is damaged; fetch the file again")
+    with path.open("rb") as file:
+        pieces = [file.read(_HEAPS)]
+        length = file.seek(0, 2)
+        if length > _HEAPS:
+            file.seek(max(_HEAPS, length - _HEAPS))
+            pieces.append(file.read())
+        base = max(pieces[0].find(b"\x89HDF\r\n\x1a\n"), 0)
+        for count, heap, _ in (
+            struct.unpack("<IQI", match[1]) for piece in pieces for match in _STRING.finditer(piece)
+        ):
+            if count and heap < length:
+                file.seek(heap + base)
+            if count and (heap >= length or count > length or file.read(4) != b"GCOL"):
+                raise damaged
+    if not all(map(_heaps_end, pieces)):
+        raise damaged
+
+
+def _heaps_end(piece: bytes) -> bool:
+    """Whether each heap of strings in some bytes of a file comes to its end.
+
+    Every place is looked at once, as a file of 1 MB can hold 65,536 heaps one inside the other:
+    where one comes to a place of another, it goes on from where that one stopped.
+    """
+    walks: dict[int, int] = {}  # by place, which heap came by
+    ends: list[int] = []
+    at = -1
+    while (at := piece.find(b"GCOL\x01\0\0\0", at + 1)) >= 0:
+        if at + 16 > len(piece):
+            continue
+        (size,) = struct.unpack_from("<Q", piece, at + 8)
+        here, stop = at + 16, at + size
+        while here + 16 <= min(stop, len(piece)):
+            before = walks.setdefault(here, len(ends))
+            if before < len(ends):
+                here = ends[before]
+                continue
+            index, held = struct.unpack_from("<H6xQ", piece, here)
+            need = held if index == 0 else 16 + held + -held % 8
+            if not 16 <= need <= stop - here:
+                return False
+            here += need
+        ends.append(here)
+    return True
+
+
+def dataset(file: h5py.File, name: str, source: str) -> h5py.Dataset:
+    """The dataset of a name, which can be read and is not larger than its bytes allow."""
+    with reading(f"{source}: {name}"):
+        found = file.get(name)
+        if not isinstance(found, h5py.Dataset):
+            raise InputError(f"{source}: has no dataset {name}; add it or save the recording again")
+        if found.dtype.hasobject and h5py.check_string_dtype(found.dtype) is None:
+            raise InputError(f"{source}: {name} holds {found.dtype}; store numbers")
+        properties = found.id.get_create_plist()
+        layout = properties.get_layout()
+        if layout == h5py.h5d.VIRTUAL or properties.get_external_count():
+            raise InputError(f"{source}: {name} is made of other data sets or files; {_COPY}")
+        filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
+        stored = found.id.get_storage_size()
+        count = found.size or 0
+        for code in filters:
+            if not h5py.h5z.filter_avail(code):
+                _bring(code, f"{source}: {name}")
+        if filters:
+            chunk = math.prod(found.chunks or ())
+            size = max(count, chunk) * found.dtype.itemsize
+            check_unfolded(size, found.file.id.get_filesize(), f"{source}: {name}")
+            if h5py.h5z.FILTER_DEFLATE in filters:
+                _check_deflated(found, f"{source}: {name}")
+        held = stored * (_MOST_COMPRESSED if filters else 1)
+        if count * found.dtype.itemsize > held:
+            raise InputError(
+                f"{source}: {name} claims {count} values but holds {stored} bytes; the file is "
+                "damaged or incomplete, so fetch it again"
+            )
+    return found
+
+
+def _check_deflated(stored: h5py.Dataset, source: str) -> None:
+    """Raise `InputError` for a chunk of gzip that unfolds to more than a chunk.
+
+    libhdf5 unfolds all there is, up to 1032 times its bytes; so chunks that could exceed the
+    bound are tried here first.
+    """
+    whole = math.prod(stored.chunks or ()) * stored.dtype.itemsize
+    length = stored.file.id.get_filesize()
+    large: list[tuple[int, ...]] = []
+
+    def note(chunk: Any) -> None:
+        if 1032 * chunk.size > most_unfolded(length):
+            large.append(chunk.chunk_offset)
+
+    stored.id.chunk_iter(note)
+    for place in large:
+        _, data = stored.id.read_direct_chunk(place)
+        if len(zlib.decompressobj().decompress(data, whole + 1)) > whole:
+            raise InputError(
+                f"{source}: the chunk at {place} unfolds to more than a chunk; the file is "
+                "damaged, so fetch it again"
+            )
+
+
+def _bring(code: int, source: str) -> None:
+    """Make the filter of this number known to HDF5, or raise `InputError`."""
+    if code == _ECF:
+        raise InputError(
+            f"{source} is compressed with Prophesee's ECF, which only Metavision's tools read; "
+            "convert the recording to RAW with metavision_hdf5_to_raw, or ask for its RAW file"
+        )
+    try:
+        require("hdf5plugin", "dsec")
+    except InputError as error:
+        raise InputError(f"{source} is compressed with a filter of its own; {error}") from error
+    if not h5py.h5z.filter_avail(code):
+        raise InputError(
+            f"{source} is compressed with HDF5 filter {code}, which hdf5plugin does not have; "
+            "store it with gzip instead"
+        )
+
+
+def array(file: h5py.File, name: str, source: str) -> NDArray:
+    """A whole dataset in memory."""
+    found = dataset(file, name, source)
+    with reading(f"{source}: {name}"):
+        return np.asarray(found[()])
