@@ -8,6 +8,7 @@ import math
 import re
 import struct
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from jaxevent.errors import InputError, require
 from jaxevent.io import check_unfolded, most_unfolded, reading
 
 _MOST_COMPRESSED = 4096  # times smaller than in memory that any filter makes real events
-_ECF = 36559  # Prophesee's filter
 _HEAPS = 1 << 24
 _COPY = (
     "only what a file itself holds is read, so copy all into one file: h5repack, or h5py's "
@@ -114,8 +114,17 @@ def _heaps_end(piece: bytes) -> bool:
     return True
 
 
-def dataset(file: h5py.File, name: str, source: str) -> h5py.Dataset:
-    """The dataset of a name, which can be read and is not larger than its bytes allow."""
+def filters_of(stored: h5py.Dataset) -> list[int]:
+    """The numbers of the filters that the chunks of a dataset have gone through."""
+    properties = stored.id.get_create_plist()
+    return [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
+
+
+def dataset(file: h5py.File, name: str, source: str, undone: Sequence[int] = ()) -> h5py.Dataset:
+    """The dataset of a name, which can be read and is not larger than its bytes allow.
+
+    The caller undoes the filters `undone` itself, if those are all.
+    """
     with reading(f"{source}: {name}"):
         found = file.get(name)
         if not isinstance(found, h5py.Dataset):
@@ -126,11 +135,11 @@ def dataset(file: h5py.File, name: str, source: str) -> h5py.Dataset:
         layout = properties.get_layout()
         if layout == h5py.h5d.VIRTUAL or properties.get_external_count():
             raise InputError(f"{source}: {name} is made of other data sets or files; {_COPY}")
-        filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
+        filters = filters_of(found)
         stored = found.id.get_storage_size()
         count = found.size or 0
         for code in filters:
-            if not h5py.h5z.filter_avail(code):
+            if filters != list(undone) and not h5py.h5z.filter_avail(code):
                 _bring(code, f"{source}: {name}")
         if filters:
             chunk = math.prod(found.chunks or ())
@@ -173,11 +182,6 @@ def _check_deflated(stored: h5py.Dataset, source: str) -> None:
 
 def _bring(code: int, source: str) -> None:
     """Make the filter of this number known to HDF5, or raise `InputError`."""
-    if code == _ECF:
-        raise InputError(
-            f"{source} is compressed with Prophesee's ECF, which only Metavision's tools read; "
-            "convert the recording to RAW with metavision_hdf5_to_raw, or ask for its RAW file"
-        )
     try:
         require("hdf5plugin", "dsec")
     except InputError as error:

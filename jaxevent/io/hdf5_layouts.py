@@ -7,15 +7,15 @@
                                 acceleration, 3 of angular velocity, imu_ts in s
     M3ED                        /prophesee/{left, right}/{t, x, y, p}: t in us; ms_map_idx;
                                 calib/{intrinsics (fx fy cx cy), distortion_coeffs, resolution}
-    Metavision                  /CD/events, records with fields t, x, y, p; attribute geometry
+    Metavision                  /CD/events, records with fields t, x, y, p, also compressed by ECF
+                                (`ecf`); attribute geometry; /EXT_TRIGGER/events, records t, p, id
     v2e                         /events (N, 4): t in us, x, y, p; the order is told by the content
     others                      /events or the file itself with t, x, y and p, whole lists or
                                 records, under the names that `columns.NAMES` lists
 
 Integers are us, floats seconds. Exposures are unknown: 0. Where a file holds two cameras, left or
 right must be chosen. M3ED's frames come from cameras beside the event camera, with pixels of their
-own, and MVSEC's and M3ED's ground truth from further files: they are not read. Files compressed by
-Metavision's ECF are refused with a remedy, as no permissive package decodes it.
+own, and MVSEC's and M3ED's ground truth from further files: they are not read.
 """
 
 from collections.abc import Mapping
@@ -28,12 +28,21 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.io import check_unfolded, pinhole, reading, sensor_size, times, vectors, whole_number
+from jaxevent.io import (
+    check_unfolded,
+    ecf,
+    pinhole,
+    reading,
+    sensor_size,
+    times,
+    vectors,
+    whole_number,
+)
 from jaxevent.io.columns import find, order_of
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.hdf5 import Column, Microseconds, StoredEvents, StoredImages, in_memory
-from jaxevent.io.hdf5_files import array, attribute, dataset, open_file
-from jaxevent.recording import Frames, Imu, Recording
+from jaxevent.io.hdf5_files import array, attribute, dataset, filters_of, open_file
+from jaxevent.recording import Frames, Imu, Recording, Triggers
 
 _GROUPS = ("events", "", "CD/events")
 _SIDES = {"prophesee": "M3ED", "davis": "MVSEC"}
@@ -84,7 +93,21 @@ def _recording(
     otherwise = f"{path}: neither an attribute nor an image tells the sensor's size;"
     size = sensor_size(size, told, frames=frames, otherwise=otherwise)
     columns = columns or _plain_columns(file, size, source)
-    return Recording(path.stem, *size, StoredEvents(columns, size, source), frames)
+    stored = StoredEvents(columns, size, source)
+    return Recording(path.stem, *size, stored, frames, triggers=_triggers(file, source))
+
+
+def _triggers(file: Any, source: str) -> Triggers | None:
+    """The external triggers of Metavision."""
+    name = "EXT_TRIGGER/events"
+    found = file.get(name)
+    if not isinstance(found, h5py.Dataset) or not {"t", "p", "id"} <= set(found.dtype.names or ()):
+        return None
+    whole = array(file, name, source)
+    if not len(whole):
+        return None
+    t = times(whole["t"], f"{source}: {name}", "row")
+    return Triggers(t, whole["p"].astype(np.int8), whole["id"].astype(np.uint8))
 
 
 def _is_plain(file: Any) -> bool:
@@ -157,7 +180,7 @@ def _camera(file: Any, group: str, source: str) -> PinholeCamera | None:
 class _Part:
     """A column of (N, 4), or a field of records, as a list of its own."""
 
-    def __init__(self, whole: h5py.Dataset, key: int | str):
+    def __init__(self, whole: Any, key: int | str):
         self._whole, self._key = whole, key
         self.shape: tuple[int, ...] = whole.shape[:1]
         self.dtype: np.dtype = whole.dtype if isinstance(key, int) else whole.dtype[key]
@@ -211,7 +234,9 @@ def _columns(file: Any, name: str, source: str) -> dict[str, Column]:
     if fields is None:
         raise InputError(f"{source}: {name} has no t, x, y and p; add them")
     if isinstance(found, h5py.Dataset):
-        whole = dataset(file, name, source)
+        whole: Any = dataset(file, name, source, undone=[ecf.FILTER])
+        if filters_of(whole) == [ecf.FILTER]:
+            whole = ecf.Records(whole, f"{source}: {name}")
         columns: dict[str, Column] = {key: _Part(whole, fields[key]) for key in "txyp"}
     else:
         columns = {key: dataset(file, f"{name}/{fields[key]}", source) for key in "txyp"}
