@@ -27,6 +27,7 @@ from jaxevent.cli import (
     register,
     simulate,
     track,
+    view,
 )
 from jaxevent.cli.arguments import guarded
 from jaxevent.errors import InputError, require
@@ -34,6 +35,7 @@ from jaxevent.errors import InputError, require
 # In the order of `jaxevent --help`.
 COMMANDS = (
     demo, info, convert, filter, register, reconstruct, track, motion, evaluate, fit, simulate,
+    view,
 )  # fmt: skip
 
 

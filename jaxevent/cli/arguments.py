@@ -82,9 +82,11 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
 
         named = [path for name in outputs if (path := taken[name]) is not None]
         inputs = [
-            value
+            one
             for name, value in taken.items()
-            if isinstance(value, Path) and name not in outputs
+            if name not in outputs
+            for one in (value if isinstance(value, list) else [value])
+            if isinstance(one, Path)
         ]
         check(named, inputs, force=force)
         with into_folders(force), running(Command(words, inputs)):

@@ -4,9 +4,10 @@
 
     show.plot_events(recording)  # shown as it is in a notebook
     show.plot_image(video, 1.0).savefig("image.png")
+    show.view(recording, video, tracks)  # all on one timeline, in the Rerun viewer
 
-Every function returns a `matplotlib.figure.Figure` and raises `InputError` without the extra
-"plot". The other modules here write what the commands write.
+Every `plot_` function returns a `matplotlib.figure.Figure` and raises `InputError` without the
+extra "plot". The other modules here write what the commands write.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
         plot_motion,
         plot_tracks,
     )
+    from jaxevent.show.viewer import view
 
 __all__ = [
     "plot_events",
@@ -28,6 +30,7 @@ __all__ = [
     "plot_losses",
     "plot_motion",
     "plot_tracks",
+    "view",
 ]
 
 
@@ -35,9 +38,9 @@ def __getattr__(name: str) -> Any:
     """Load the figures when first used: they know all families, which commands need not."""
     if name not in __all__:
         raise AttributeError(f"module 'jaxevent.show' has no attribute {name!r}")
-    from jaxevent.show import figures
+    from jaxevent.show import figures, viewer
 
-    return getattr(figures, name)
+    return getattr(viewer if name == "view" else figures, name)
 
 
 def __dir__() -> list[str]:

@@ -1,0 +1,213 @@
+"""A recording and what was estimated from it, on one timeline of the Rerun viewer."""
+
+import contextlib
+import functools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from jaxevent.blob.tracks import Tracks
+from jaxevent.egomotion.motion import Motion
+from jaxevent.errors import InputError, require
+from jaxevent.io.images import is_series, read_series
+from jaxevent.io.output import complete
+from jaxevent.reconstruction.video import ImageSequence
+from jaxevent.recording import Recording
+from jaxevent.show.track_tables import COLUMNS
+
+ON, OFF = (200, 64, 30), (58, 120, 181)
+BLOCK = 1 << 20  # events sent at a time
+STEP = 5_000  # us between states of tracks and of motion
+TABLES = "tracks.csv", "motion.csv"  # of the folders that the commands write
+CIRCLE = np.linspace(0, 2 * np.pi, 25)
+
+Result = ImageSequence | Tracks | Motion | str | Path
+
+
+def view(
+    recording: Recording,
+    *results: Result,
+    out: str | Path | None = None,
+    window: float | int = 0.01,
+) -> None:
+    """Show events, frames and results in the Rerun viewer, or store them in a file for it.
+
+    A result is a reconstruction (shown at the frames' times), tracks, a motion, or a path: images
+    with times, as `jaxevent reconstruct` writes in HDF5, or the folder or table (CSV) of `jaxevent
+    track` and `jaxevent motion`. Events are shown in windows of `window` s. With `out`, a file
+    .rrd, no viewer is opened. Time begins with the recording.
+
+    Raises `MissingExtra` without the extra "view" and `InputError` for a result that is neither.
+    """
+    if not 0 < window < np.inf:
+        raise InputError(f"a window of {window:g} s is not possible; give seconds above 0")
+    layers = [_layer(result, recording) for result in results]
+    with _stream(None if out is None else Path(out)) as stream:
+        send = _Sender(stream, recording.start)
+        if recording.frames is not None:
+            frames = recording.frames
+            send.images("image/frames", frames.t, lambda row: frames[row : row + 1].intensity[0])
+        send.events(recording, round(window * 1e6))
+        for name, log in layers:
+            log(send, name)
+
+
+@contextlib.contextmanager
+def _stream(out: Path | None) -> Iterator[Any]:
+    """A stream to the viewer, or to a file that appears when complete."""
+    rerun: Any = require("rerun", "view")
+    stream = rerun.RecordingStream("jaxevent")
+    if out is None:
+        stream.spawn()
+        yield stream
+        stream.flush()
+        return
+    if out.suffix != ".rrd":
+        raise InputError(f"{out}: the viewer opens files that end in .rrd; rename it")
+    with complete(out) as partial:
+        stream.save(partial)
+        yield stream
+        stream.flush()
+        stream.disconnect()
+
+
+class _Sender:
+    """What is sent: each thing under a name, at times in us on the recording's clock."""
+
+    def __init__(self, stream: Any, start: int):
+        self._stream, self._start = stream, start
+        self._rerun: Any = require("rerun", "view")
+
+    def _times(self, t: NDArray[np.int64]) -> list[Any]:
+        return [self._rerun.TimeColumn("time", duration=(t - self._start) * 1e-6)]
+
+    def events(self, recording: Recording, window: int) -> None:
+        """Points, ON red and OFF blue, of one window after the other."""
+        source, rerun = recording.events, self._rerun
+        for first in range(0, len(source), BLOCK):
+            events = source[first : first + BLOCK]
+            number = (events.t - self._start) // window
+            begin = np.flatnonzero(np.diff(number, prepend=number[0] - 1))
+            lengths = np.diff(begin, append=len(events))
+            columns = rerun.Points2D.columns(
+                positions=np.stack([events.x + 0.5, events.y + 0.5], 1),
+                colors=np.where(events.p[:, None], ON, OFF).astype(np.uint8),
+                radii=np.full(len(events), 0.5, np.float32),
+            ).partition(lengths=lengths)
+            times = self._start + number[begin] * window
+            self._stream.send_columns("image/events", self._times(times), columns)
+
+    def images(self, name: str, t: NDArray[np.int64], image: Callable[[int], NDArray]) -> None:
+        """Grey images of linear intensity; brighter ones than 1 are scaled to the brightest."""
+        white = 1.0
+        for row, time in enumerate(t.tolist()):
+            values = np.asarray(image(row))
+            white = max(white, float(np.nanpercentile(values, 99.5)))
+            grey = np.clip(np.nan_to_num(values) / white, 0, 1)
+            self._stream.set_time("time", duration=(time - self._start) * 1e-6)
+            shown = self._rerun.Image(np.rint(255 * grey).astype(np.uint8))
+            self._stream.log(name, shown)
+
+    def tracks(self, table: pd.DataFrame) -> None:
+        """Ellipses of two standard deviations, until the track ends, and paths."""
+        rerun = self._rerun
+        for number, rows in table.groupby("id"):
+            x, y, along, across, angle = (
+                rows[name].to_numpy()[:, None] for name in ("x", "y", "lambda1", "lambda2", "theta")
+            )
+            u, v = 2 * along * np.cos(CIRCLE), 2 * across * np.sin(CIRCLE)
+            c, s = np.cos(angle), np.sin(angle)
+            outline = np.stack([x + c * u - s * v, y + s * u + c * v], 2) + 0.5
+            t = np.rint(rows["t"].to_numpy() * 1e6).astype(np.int64)
+            columns = rerun.LineStrips2D.columns(
+                strips=list(outline), labels=[str(number)] * len(rows)
+            )
+            self._stream.send_columns(f"image/tracks/{number}", self._times(t), columns)
+            self._stream.set_time("time", duration=(int(t[-1]) + 1 - self._start) * 1e-6)
+            self._stream.log(f"image/tracks/{number}", rerun.Clear(recursive=False))
+            path = rerun.LineStrips2D([np.concatenate([x, y], 1) + 0.5], colors=[(120, 120, 120)])
+            self._stream.log(f"image/paths/{number}", path, static=True)
+
+    def curves(self, table: pd.DataFrame) -> None:
+        """One curve for each column but t, those of sigmas aside; gaps where it is lost."""
+        names = [n for n in table.columns if n not in ("t", "lost") and not n.startswith("sigma_")]
+        for name in names:
+            values = table[name].to_numpy(np.float64)
+            known = np.isfinite(values)
+            t = np.rint(table["t"].to_numpy(np.float64)[known] * 1e6).astype(np.int64)
+            columns = self._rerun.Scalars.columns(scalars=values[known])
+            self._stream.send_columns(f"motion/{name}", self._times(t), columns)
+
+
+_Layer = tuple[str, Callable[[_Sender, str], None]]
+
+
+def _layer(result: Any, recording: Recording) -> _Layer:
+    """The name of a result and how it is sent."""
+    if isinstance(result, Tracks):
+        table = _table_of_tracks(result)
+        return "tracks", lambda send, _: send.tracks(table)
+    if isinstance(result, Motion):
+        table = _table_of_motion(result)
+        return "motion", lambda send, _: send.curves(table)
+    if isinstance(result, ImageSequence):
+        return result.estimator.name, functools.partial(_send_video, result, recording)
+    path = Path(result)
+    for name in TABLES:
+        if (path / name).exists():
+            return _layer_of_table(path / name)
+    if path.suffix.lower() == ".csv":
+        return _layer_of_table(path)
+    if path.exists() and is_series(path):
+        series = read_series(path)
+        return path.stem, lambda send, name: send.images(f"image/{name}", series.t, series.read)
+    raise InputError(
+        f"{path}: is no result that can be shown; give images with times (HDF5, folder), or the "
+        "folder or CSV of jaxevent track or jaxevent motion"
+    )
+
+
+def _layer_of_table(path: Path) -> _Layer:
+    try:
+        table = pd.read_csv(path)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: is no table ({error}); write it again") from error
+    if {"t", "id", *COLUMNS[:2], *COLUMNS[4:7]} <= set(table.columns):
+        return path.stem, lambda send, _: send.tracks(table)
+    if "t" in table.columns and len(table.columns) > 1 and "id" not in table.columns:
+        return path.stem, lambda send, _: send.curves(table)
+    raise InputError(
+        f"{path}: has the columns {', '.join(map(str, table.columns))}; give a table as of "
+        "jaxevent track or jaxevent motion"
+    )
+
+
+def _send_video(video: ImageSequence, recording: Recording, send: _Sender, name: str) -> None:
+    if recording.frames is None:
+        raise InputError(
+            f"{recording.name}: has no frames, whose times would be shown; store images"
+        )
+    t = recording.frames.t
+    send.images(f"image/{name}", t, lambda row: video(t[row]).mean[0])
+
+
+def _table_of_tracks(tracks: Tracks) -> pd.DataFrame:
+    times = np.arange(tracks.start, tracks.stop, STEP)
+    told = tracks(times)
+    row, column = np.nonzero(told.valid)
+    states = np.asarray(told.mean)[row, column]
+    known = {"t": times[row] / 1e6, "id": tracks.id[column]}
+    return pd.DataFrame(known | dict(zip(COLUMNS, states.T, strict=True)))
+
+
+def _table_of_motion(motion: Motion) -> pd.DataFrame:
+    times = np.arange(motion.t[0], motion.t[-1] + 1, STEP) if len(motion) else motion.t
+    told = motion(times)
+    values = np.where(told.valid[:, None], told.mean, np.nan)
+    return pd.DataFrame(
+        {"t": times / 1e6} | dict(zip(motion.model.components, values.T, strict=True))
+    )
