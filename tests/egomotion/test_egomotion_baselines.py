@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import contrast, frames, planes
-from jaxevent.egomotion.baselines import contrast_maximisation, local_planes
+from jaxevent.egomotion.baselines import contrast_maximisation, local_planes, tracked_points
+from jaxevent.egomotion.baselines.five_points import relative_motion
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Recording
 
@@ -265,6 +266,48 @@ def test_frames_that_show_nothing_are_lost():
     assert not motion.valid.any() and np.isfinite(motion.mean).all()
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_five_points_tell_heading_and_turn(noise):
+    """Against points of a known scene; with noise a fifth of them are wrong."""
+    cv2 = pytest.importorskip("cv2", reason="needs the extra 'vision'")
+    dt, f, n = 0.2, 300.0, 200
+    for seed, T in enumerate(([1.0, 0.2, 0.1], [-0.3, 0.9, -0.4], [0.1, 0.1, 1.0])):
+        rng, Omega = np.random.default_rng(seed), np.array([0.2, -0.3, 0.5])
+        P = np.stack([*rng.uniform(-1, 1, (2, n)), rng.uniform(1.5, 4, n)], 1)
+        # The camera's pose after dt, by many short steps of its constant twist.
+        R, at, steps = np.eye(3), np.zeros(3), 20_000
+        step = Rotation.from_rotvec(Omega * dt / steps).as_matrix()
+        for _ in range(steps):
+            at = at + R @ np.array(T) * dt / steps
+            R = R @ step
+        begin, later = f * P[:, :2] / P[:, 2:], (P - at) @ R
+        end = f * later[:, :2] / later[:, 2:]
+        begin, end = (xy + noise * rng.normal(size=xy.shape) for xy in (begin, end))
+        if noise:
+            wrong = rng.choice(n, n // 5, replace=False)
+            end[wrong] += rng.uniform(-30, 30, (len(wrong), 2))
+        fit = relative_motion(cv2, begin, end, np.arange(n), f, dt)
+        off = fit.mean - np.concatenate([np.array(T) / np.linalg.norm(T), Omega])
+        if not noise:
+            assert np.abs(off).max() < 1e-4  # the pose's steps
+        spread = np.sqrt(np.diag(fit.covariance))
+        assert (np.abs(off) < 5 * spread + 1e-3).all() and spread.max() < 0.1
+        assert np.abs(fit.covariance[:3] @ np.array([*fit.mean[:3], 0, 0, 0])).max() < 1e-9
+
+
+def test_five_points_without_a_motion_are_lost():
+    cv2 = pytest.importorskip("cv2", reason="needs the extra 'vision'")
+    few = np.random.default_rng(0).uniform(-50, 50, (7, 2))
+    assert relative_motion(cv2, few, few + 1, np.arange(7), 100.0, 0.1) is None
+
+
+def test_frames_of_a_span_are_paired():
+    kept = filmed([texture()] * 6).frames
+    assert tracked_points._pairs(kept, 0.0) == [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
+    assert tracked_points._pairs(kept, 0.1) == [(0, 3), (1, 4), (2, 5)]
+    assert tracked_points._pairs(kept, 9.0) == [(0, 5)]
+
+
 def windowed(model, number=150, seed=0, **settings):
     """A window of random events, and one of moderate size of a motion."""
     rng = np.random.default_rng(seed)
@@ -338,6 +381,17 @@ def test_contrast_finds_the_motion(straight, turning, model):
     assert (np.linalg.norm(off, axis=1) < 0.03 * np.linalg.norm(truth)).all()
     spread = np.einsum("ni,nij,nj->n", off, np.linalg.inv(motion.covariance), off)
     assert spread.mean() < 5 * len(truth)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("omega", [[3.0, -9.0, 12.0], [14.0, 8.0, -6.0]])
+def test_a_search_finds_fast_rotations(omega):
+    """Some ten times as fast as the window, at once, could be searched."""
+    recording = moved(turned(np.array(omega)), 0.024, 800, camera=CAMERA)
+    params = contrast.Params.of(dict(events=4000, duration=0.02, margin=8, starts=5))
+    windows = contrast_maximisation.Windows(recording, params, "rotation")
+    found = windows.search(*next(iter(windows)))
+    assert np.linalg.norm(found - omega) < 0.15 * np.linalg.norm(omega)
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ After Gallego, Rebecq & Scaramuzza, "A Unifying Contrast Maximization Framework 
 with t (s) from the middle, and are summed, by polarity, into an image J, bilinearly and blurred.
 The motion sought maximises the mean square or the variance of J: events of one point of the scene
 then fall together. It is found from coarse to fine, with much blur at first, from the motion of the
-window before; for the first window, and when it was lost, from the best of a grid of motions.
+window before; for the first window, and when it was lost, by a search of all motions (`search`).
 SciPy's BFGS around one compiled gradient, for all blurs, needs about 12 gradients a window. With
 optax.lbfgs as a program for each blur the first call took 2 to 10 times as long, to compile it.
 
@@ -50,8 +50,9 @@ from jaxevent.recording import Recording
 
 COARSE = 8  # times [1 2 1] in a search: 2 px
 MIDDLE = 2  # times, next
-SPACING = 2.0  # px at the end of the short window between motions of the grid
-TRIED = 4  # motions of the grid that are followed up
+SPACING = 2.0  # px at the end of a short window between motions of its grid
+NARROWER = 4.0  # factor between the grids of a search
+TRIED = 4  # motions of a grid that are followed up
 CELL = 24  # px, of the image's parts that err independently
 PROBE = 0.5  # px at the window's end, between which and the maximum the curvature is taken
 ENOUGH = 1e-3  # 1/px; a smaller slope, in shares of the objective, ends the ascent
@@ -76,13 +77,13 @@ class Params(Parameters):
     fewest = Count(300, "", "events that an estimate needs")
     blur = Count(1, "", "times [1 2 1] / 4 over the image, at last")
     steps = Count(20, "", "most steps of the ascent at each blur")
-    starts = Count(7, "", "motions of the search's grid in each component")
+    starts = Count(7, "", "motions of each of the search's grids in each component")
     margin = Count(16, "px", "of the image around the sensor")
 
     duration = Positive(0.1, "s", "length of a window; motion is taken to be constant in it")
     overlap = Share(0.5, "", "share of a window that the next one has too")
-    speed_max = Positive(600.0, "px/s", "planar: motions of the search are in +- this")
-    omega_max = Positive(4.0, "rad/s", "rotation: motions of the search are in +- this")
+    speed_max = Positive(4000.0, "px/s", "planar: motions of the search are in +- this")
+    omega_max = Positive(30.0, "rad/s", "rotation: motions of the search are in +- this")
     contrast = Positive(1.2, "", "lost where J's square is less than this, in chance's")
 
 
@@ -343,23 +344,25 @@ class Windows:
         ends = events[start : start + 1].t, events[stop - 1 : stop].t
         return 1e-6 * float(ends[1][0] - ends[0][0]) if len(ends[0]) and len(ends[1]) else 0.0
 
-    def cut(self, t: int, start: int, stop: int, short: bool = False) -> Window:
-        """The window of some rows about t (us); `short`: only its middle, for a search.
+    def half(self, t: int, start: int, stop: int) -> float:
+        """Half the length (s) of the window of some rows about t (us)."""
+        if self.params.window == "duration":
+            return self._length * 0.5e-6
+        events = self.recording.events[start:stop]
+        return max(np.abs(events.t - t).max(initial=0) * 1e-6, 1e-6)
 
-        That is so short that the motions of a search's grid differ by `SPACING` px at its end; it
-        has room for a quarter of the events.
+    def cut(self, t: int, start: int, stop: int, half: float | None = None) -> Window:
+        """The window of some rows about t (us); with `half` (s) only its middle, for a search.
+
+        That has room for a quarter of the events.
         """
         events = self.recording.events[start:stop]
         size = self.params.events
-        if self.params.window == "duration":
-            half = self._length * 0.5e-6
-        else:
-            half = max(np.abs(events.t - t).max(initial=0) * 1e-6, 1e-6)
         rows = np.arange(len(events))
-        if short:
+        if half is None:
+            half = self.half(t, start, stop)
+        else:
             size = -(-size // 4)
-            reach = SPACING * (self.params.starts - 1) / 2 / (self.extent * self.arms.max())
-            half = min(half, max(reach, 1e-6))
             rows = np.flatnonzero(np.abs(events.t - t) <= 1e6 * half)
         if len(rows) > size:
             rows = rows[np.linspace(0, len(rows) - 1, size).round().astype(int)]
@@ -383,21 +386,54 @@ class Windows:
         )  # fmt: skip
 
     def search(self, t: int, start: int, stop: int) -> NDArray[np.float64]:
-        """The motion of a window of which nothing is known."""
+        """The motion of a window of which nothing is known.
+
+        By grids of motions, each with a window so short that its motions differ by `SPACING` px at
+        the end: the widest grid, of all motions, over the shortest window, and then `NARROWER`
+        grids over windows that are as much longer, up to the whole one. The best of each grid and
+        of what the window before has found go on into the next window. So a motion is found however
+        fast it is, and where several explain a short window a longer one tells them apart.
+        """
+        params, whole = self.params, self.half(t, start, stop)
+        reach = SPACING * (params.starts - 1) / 2 / self.arms.max()  # px, in units of the motion s
+        extents = [self.extent]
+        while params.starts > 1 and reach / extents[-1] < whole:
+            extents.append(extents[-1] / NARROWER)
+        found: list[NDArray[np.float64]] = []
+        for extent in extents:
+            half = min(max(reach / extent, 1e-6), whole)
+            window = self.cut(t, start, stop, half)
+            if np.count_nonzero(window.weight) < params.fewest and extent != extents[-1]:
+                continue
+            starts = [*found, *self._peaks(window, extent)]
+            tried = [ascend(params, window, motion, COARSE) for motion in starts]
+            found = _different(tried, np.asarray(window.scale, np.float64))[:TRIED]
+        window = self.cut(t, start, stop)
+        tried = [ascend(params, window, motion, COARSE) for motion in found]
+        return max(tried, key=lambda one: one[1])[0]
+
+    def _peaks(self, window: Window, extent: float) -> list[NDArray[np.float64]]:
+        """The best of the local maxima of a grid of motions within +- extent."""
         dimension, number = self.model.dimension, self.params.starts
-        axis = np.linspace(-self.extent, self.extent, number) if number > 1 else np.zeros(1)
+        axis = np.linspace(-extent, extent, number) if number > 1 else np.zeros(1)
         motions = np.stack(np.meshgrid(*[axis] * dimension, indexing="ij"), -1)
-        short, whole = self.cut(t, start, stop, short=True), self.cut(t, start, stop)
-        steps = motions.reshape(-1, dimension) / np.asarray(short.scale, np.float64)
-        values = np.array([_value(self.params, short, z, COARSE)[0] for z in steps])
+        steps = motions.reshape(-1, dimension) / np.asarray(window.scale, np.float64)
+        values = np.array([_value(self.params, window, z, COARSE)[0] for z in steps])
         values = values.reshape(motions.shape[:-1])
         peaks = np.where(values == maximum_filter(values, 3), values, -np.inf).ravel()
         best = np.argsort(-peaks, kind="stable")[:TRIED]
-        tried = []
-        for motion in motions.reshape(-1, dimension)[best]:
-            motion, _ = ascend(self.params, short, motion, COARSE)
-            tried.append(ascend(self.params, whole, motion, COARSE))
-        return max(tried, key=lambda one: one[1])[0]
+        return [motions.reshape(-1, dimension)[row] for row in best if np.isfinite(peaks[row])]
+
+
+def _different(
+    tried: list[tuple[NDArray[np.float64], float]], scale: NDArray[np.float64]
+) -> list[NDArray[np.float64]]:
+    """Motions by their values, the best first, of those nearer than half `SPACING` px only one."""
+    kept: list[NDArray[np.float64]] = []
+    for motion, _ in sorted(tried, key=lambda one: -one[1]):
+        if all(np.abs((motion - other) / scale).max() > SPACING / 2 for other in kept):
+            kept.append(motion)
+    return kept
 
 
 def solve(params: Params, given: Given) -> Motion:

@@ -198,12 +198,20 @@ def robust_fit(
         if done:
             break
     H = (scaled * weight[:, None]).T @ scaled
+    covariance = sandwich(H, scaled * (weight * residual)[:, None], cells)
+    return Fit(m / size, covariance / np.outer(size, size))
+
+
+def sandwich(
+    H: NDArray[np.floating], scores: NDArray[np.floating], cells: NDArray[np.integer]
+) -> NDArray[np.float64]:
+    """H^-1 (sum_c g_c g_c') H^-1, g_c the sum of the scores (n, dimension) in a cell."""
+    dimension = len(H)
     which = np.unique(cells, return_inverse=True)[1]
-    scores = np.zeros((which.max() + 1, dimension))
-    np.add.at(scores, which, scaled * (weight * residual)[:, None])
-    half = np.linalg.solve(H, scores.T)
-    more = len(scores) / max(len(scores) - dimension, 1)
-    return Fit(m / size, more * (half @ half.T) / np.outer(size, size))
+    sums = np.zeros((which.max() + 1, dimension))
+    np.add.at(sums, which, scores)
+    half = np.linalg.solve(H, sums.T)
+    return len(sums) / max(len(sums) - dimension, 1) * (half @ half.T)
 
 
 def held(

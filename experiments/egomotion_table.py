@@ -1,0 +1,230 @@
+"""All methods of egomotion on the same sequences (the thesis' tables 5.1, 6.1 and 6.3).
+
+    python experiments/egomotion_table.py --out table [--data FOLDER] [--seeds 500 501]
+
+Simulated: an ideal camera of 240x180 pixels, f = 200 px, 25 frames/s, 0.6 s: planar motion,
+rotation and general motion, with motions that nothing was chosen on. With --data FOLDER, which
+holds slider_depth.zip and tubrip_*_rotation.npz, real ones: slider_depth from 1 to 2 s, as planar
+motion (against its poses at the one depth that fits the estimate best) and as general motion (a
+pure translation to the right), and two cuts of 13 and 99 ms of rotation, without frames.
+
+Parameters are those that suit the recording by themselves, those of `literal` are the thesis'
+(`Params.presets`). Every estimate counts for the time that what it saw shows (`centred`). Errors
+are those of `truth.motion_errors` from 0.2 s to 0.1 s before the end, where all methods tell
+something, means over seeds: `failed` counts sequences without any estimate there, which are not in
+the means.
+`CPU` is CPU seconds per second of recording, programs being compiled. What table.csv holds already
+is not computed again.
+"""
+
+import argparse
+import dataclasses
+import functools
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from bench import machine
+
+import jaxevent
+from jaxevent.egomotion import batch, contrast, find_model, frames, planes, voting
+from jaxevent.egomotion.comparison import FIGURES, compare
+from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.truth import Known
+from jaxevent.errors import InputError
+from jaxevent.io.output import complete
+from jaxevent.recording import Recording
+from jaxevent.show.motion import fitted_velocity
+from jaxevent.simulate import motion_scene
+
+DURATION, SETTLE, END = 0.6, 0.2, 0.1  # s
+WARM = 0.3  # s of a sequence, for programs to be compiled
+KEY = ("sequence", "model", "seed", "method")
+SLIDER = 1.0, 2.0  # s
+STEP = 5_000  # us between times that are compared
+LITERAL = {
+    "planar": {"preset": "literal"},
+    "rotation": {"preset": "literal_latest"},
+    # The parameters of `egomotion_voting.part_general`.
+    "general": {
+        "preset": "literal_latest", "particles": 500, "every": 32, "alpha_literal": 0.3,
+    },
+}  # fmt: skip
+SHOWN = {
+    "planar": ("AEE_rel", "AAE_U"),
+    "rotation": ("AAE_Omega", "AME", "AME_rel", "AME_N", "vector_error", "outliers"),
+    "general": ("AAE_T", "AAE_Omega", "AME", "AME_rel", "AME_N", "vector_error", "outliers"),
+}
+
+
+class Sequence(NamedTuple):
+    """`make()` gives a recording and what is known of its motion; None: its poses tell it."""
+
+    name: str
+    model: str
+    seed: str
+    make: Callable[[], tuple[Recording, Known | None]]
+
+
+def simulated(seed: int) -> Iterator[Sequence]:
+    kinds = [
+        ("planar", "planar", "constant"),
+        ("planar", "planar", "varying"),
+        ("rotation", "rotation", "constant"),
+        ("rotation", "rotation", "varying"),
+        *(("general", scene, "varying") for scene in ("wall", "shapes", "texture")),
+    ]
+    for model, scene, change in kinds:
+        make = functools.partial(simulate, model, scene, change, seed)
+        yield Sequence(f"{scene}, {change}", model, str(seed), make)
+
+
+def simulate(model: str, scene: str, change: str, seed: int) -> tuple[Recording, Known]:
+    recording, source = motion_scene(scene, change, seed, duration=DURATION)
+    t = np.arange(0, round(1e6 * DURATION) + 1, 1000)
+    kind = find_model(model)
+    return recording, Known(kind, t, kind.of_scene(source, t))
+
+
+def real(data: Path) -> Iterator[Sequence]:
+    def slider(model: str) -> tuple[Recording, Known | None]:
+        whole = jaxevent.load(data / "slider_depth.zip")
+        cut = dataclasses.replace(whole[SLIDER[0] : SLIDER[1]], poses=whole.poses)
+        if model == "planar":
+            return cut, None
+        along = np.tile([1.0, 0, 0, 0, 0, 0], (2, 1))
+        return cut, Known(find_model(model), np.array([cut.start, cut.stop]), along)
+
+    def tubrip(name: str) -> tuple[Recording, Known]:
+        cut = jaxevent.load(data / f"tubrip_{name}_rotation.npz")
+        t, omega = np.array([cut.start, cut.stop]), np.asarray(cut.extra["omega"])
+        return cut, Known(find_model("rotation"), t, np.tile(omega, (2, 1)))
+
+    for model in ("planar", "general"):
+        yield Sequence("slider_depth", model, "real", functools.partial(slider, model))
+    for name in ("boxes", "shapes"):
+        yield Sequence(f"tubrip {name}", "rotation", "real", functools.partial(tubrip, name))
+
+
+METHODS = {
+    "voting": (voting, None),
+    "voting, literal": (voting, LITERAL),
+    "contrast": (contrast, None),
+    "planes": (planes, None),
+    "frames": (frames, None),
+    "batch": (batch, None),
+}
+
+
+def estimated(label: str, model: str, recording: Recording) -> Motion:
+    method, given = METHODS[label]
+    params = None if given is None else method.Params.of(given[model])
+    return method.estimate(recording, params, model=model)
+
+
+def cpu() -> float:
+    """CPU seconds of this process, on all cores."""
+    used = os.times()
+    return used.user + used.system
+
+
+def measured(sequence: Sequence, label: str, warm: set[tuple[str, str]]) -> dict[str, Any]:
+    """A row of one method on one sequence."""
+    recording, known = made(sequence)
+    model, length = sequence.model, (recording.stop - recording.start) * 1e-6
+    METHODS[label][0].place(recording, model, None)
+    if (label, model) not in warm and label != "frames":
+        estimated(label, model, recording[: recording.start + round(1e6 * min(WARM, length))])
+        warm.add((label, model))
+    began = cpu()
+    motion = estimated(label, model, recording)
+    spent = cpu() - began
+    known = fitted_velocity(recording, motion) if known is None else known
+    # Of a cut that is shorter all times count.
+    settle, end = (SETTLE, END) if length > 2 * (SETTLE + END) - 0.01 else (0.0, 0.0)
+    first, last = recording.start + round(1e6 * settle), recording.stop - round(1e6 * end)
+    times = np.arange(first, last + 1, STEP if settle else 1000)
+    found = compare(motion, known, times, start=first, centred=True)
+    failed = not found.figures
+    # To no rotation there is no axis and no share.
+    figures = {name: value for name, value in found.figures.items() if np.isfinite(value)}
+    if "AME" in figures and "vector_error" not in figures:
+        del figures["AAE_Omega"]
+    return {
+        **figures,
+        "failed": float(failed),
+        "lost": np.nan if failed else 100 * found.lost,
+        "CPU": spent / length,
+    }
+
+
+@functools.lru_cache(maxsize=1)
+def made(sequence: Sequence) -> tuple[Recording, Known | None]:
+    return sequence.make()
+
+
+def shown(value: float) -> str:
+    return f"{value:.2g}" if abs(value) < 100 else f"{value:.0f}"
+
+
+def markdown(model: str, rows: list[dict[str, Any]]) -> str:
+    columns = [*SHOWN[model], "lost", "failed", "CPU"]
+    units = {**FIGURES, "lost": "%", "failed": "", "CPU": "s/s"}
+    heads = [f"{name} {units[name]}".strip() for name in columns]
+    lines = [
+        "| sequence | method | " + " | ".join(heads) + " |",
+        "|---|---|" + "---:|" * len(columns),
+    ]
+    rows = [row for row in rows if row["model"] == model]
+    for name, method in dict.fromkeys((row["sequence"], row["method"]) for row in rows):
+        part = [row for row in rows if (row["sequence"], row["method"]) == (name, method)]
+        each = {column: np.array([row.get(column, np.nan) for row in part]) for column in columns}
+        texts = [shown(values[~np.isnan(values)].mean()) if (~np.isnan(values)).any() else "-"
+                 for values in each.values()]  # fmt: skip
+        texts[columns.index("failed")] = f"{int(each['failed'].sum())} of {len(part)}"
+        lines.append(f"| {name} | {method} | " + " | ".join(texts) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--out", type=Path, required=True, help="folder for the tables")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[500, 501])
+    parser.add_argument("--data", type=Path, help="folder of real recordings")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    stored, warm = arguments.out / "table.csv", set()
+    rows: list[dict[str, Any]] = []
+    if stored.exists():
+        rows = pd.read_csv(stored, dtype={"seed": str}).to_dict("records")
+    done = {tuple(row[name] for name in KEY) for row in rows}
+    sequences = [*real(arguments.data)] if arguments.data else []
+    sequences += [one for seed in arguments.seeds for one in simulated(seed)]
+    for sequence in sequences:
+        for label in arguments.methods:
+            key = (sequence.name, sequence.model, sequence.seed, label)
+            if key in done or not METHODS[label][0].knows(find_model(sequence.model)):
+                continue
+            try:
+                row = measured(sequence, label, warm)
+            except InputError as error:  # no frames
+                print(error, file=sys.stderr)
+                continue
+            rows.append({**dict(zip(KEY, key, strict=True)), **row})
+            print(rows[-1], file=sys.stderr, flush=True)
+            with complete(stored) as path:
+                pd.DataFrame(rows).to_csv(path, index=False)
+    parts = [markdown(model, rows) for model in SHOWN]
+    text = "\n".join([*parts, f"{machine()}; {cpu():.0f} CPU s in all"]) + "\n"
+    with complete(arguments.out / "table.md") as path:
+        path.write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
