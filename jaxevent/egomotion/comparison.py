@@ -15,6 +15,21 @@ FIGURES = {  # of `motion_errors`: their units
     "AME": "deg/s", "AME_rel": "%", "AME_N": "%", "vector_error": "%", "outliers": "%",
 }  # fmt: skip
 
+MEANINGS = {  # likewise: what it is the mean of, over times
+    "AEE": "|U - U_true|",
+    "AEE_rel": "|U - U_true| / |U_true|",
+    "AAE_U": "angle between U and U_true",
+    "AAE_T": "angle between heading and true heading",
+    "AAE_Omega": "angle between Omega and Omega_true",
+    "AME": "difference of |Omega| and |Omega_true|",
+    "AME_rel": "difference of sizes / true size",
+    "AME_N": "difference of |Omega| and |Omega_true| / largest |Omega_true| of these times",
+    "vector_error": "size of the difference / true size",
+    "outliers": "times at which sizes differ by 5 % or more",
+    "lost": "later times without a motion",
+    "startup": "until the motion is first found",
+}
+
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
@@ -41,7 +56,10 @@ class Comparison:
         """Lines to print."""
         rows = [(name, f"{value:.4g}", unit) for name, value, unit in self.rows()]
         wide = [max(len(row[i]) for row in rows) for i in range(2)]
-        lines = [f"{name:{wide[0]}}  {value:>{wide[1]}} {unit}" for name, value, unit in rows[:-2]]
+        lines = [
+            f"{name:{wide[0]}}  {value:>{wide[1]}} {unit:4}  {MEANINGS[name]}"
+            for name, value, unit in rows[:-2]
+        ]
         lines += self.notes if lines else ()
         return [
             *(lines or ["the motion was never found where the truth is known"]),

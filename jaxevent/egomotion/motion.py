@@ -89,11 +89,18 @@ class Motion:
         change, bend = np.zeros_like(mean), np.zeros_like(mean)
         if found.sum() > 1:
             t = self.t[found].astype(float)
+            begins, ends = self.t - half < t[0], self.t + half > t[-1]
+            inner = ~(begins | ends)
             for i, column in enumerate(mean.T):
                 early, now, late = (
                     np.interp(self.t + k * half, t, column[found]) for k in (-1, 0, 1)
                 )
+                # Beyond one end it goes on as it comes, and bends as it did nearby.
+                early = np.where(begins & ~ends, 2 * now - late, early)
+                late = np.where(ends & ~begins, 2 * now - early, late)
                 change[:, i], bend[:, i] = late - early, late + early - 2 * now
+                if inner.any():
+                    bend[:, i] = np.interp(self.t, self.t[inner], bend[inner, i])
         covariance = by.factor * self.covariance
         for d in (change, bend):
             covariance = covariance + by.change**2 * d[:, :, None] * d[:, None, :]
@@ -129,6 +136,13 @@ class Motion:
             span = recording.start, recording.stop
         return dataclasses.replace(self, recording=recording.name, span=span)
 
+    def _change(self) -> NDArray[np.float64]:
+        """The mean square (d, d) of changes from an estimate to the next, per us^2."""
+        found = np.flatnonzero(self.valid & np.isfinite(self.mean).all(1))
+        dt = np.diff(self.t[found]).astype(float)
+        rates = np.diff(self.mean[found], axis=0)[dt > 0] / dt[dt > 0, None]
+        return rates.T @ rates / max(len(rates), 1)
+
     def __len__(self) -> int:
         return len(self.t)
 
@@ -142,7 +156,8 @@ class Motion:
         """The motion at `times`: integers (us) or floats (s).
 
         Means and covariances are interpolated linearly between the estimates before and after the
-        time, and held before the first and after the last one; directions are made unit vectors.
+        time; directions are made unit vectors. Before the first and after the last estimate the
+        mean is held, and the covariance grows by how much the motion usually changes in that time.
         With `centred` an estimate counts for the time that what it saw shows, `lag` before its own:
         a fixed-lag estimate, which needs the events up to that much later. `valid` is false where
         either estimate is not valid, before the first, and outside the recording. Raises
@@ -169,6 +184,9 @@ class Motion:
         mean = self.model.between(self.mean[before], self.mean[after], share)
         share = share[:, None, None]
         covariance = (1 - share) * self.covariance[before] + share * self.covariance[after]
+        beyond = np.maximum(at[0] - times, 0) + np.maximum(times - at[-1], 0)
+        if beyond.any():
+            covariance = covariance + beyond[:, None, None] ** 2 * self._change()
         valid = self.valid[before] & self.valid[after] & (times >= at[0]) & inside
         valid &= np.isfinite(mean).all(1) & np.isfinite(covariance).all((1, 2))
         return Estimate(mean, covariance, valid)

@@ -173,18 +173,26 @@ def constant_between(
 
 
 def nearest_axes(estimate: NDArray[np.floating], measured: NDArray[np.floating]) -> str | None:
-    """The name of `AXES` in which measured rates (n, 3) are like the estimate, but for a constant.
+    """The axes, as `imu_rotation` reads them, in which measured rates (n, 3) are like the estimate.
 
-    None where the axes as they are fit about as well.
+    All 24 ways in which axes can lie along the camera's are tried; a constant between the rates
+    does not count. One of `AXES` is preferred: others have to fit twice as well. None where the
+    axes as they are fit about as well.
     """
-    off = {}
-    for name, R in AXES.items():
+
+    def off(R: NDArray[np.floating]) -> float:
         turned = measured @ R.T
         left = turned - estimate - constant_between(estimate, turned)
         # The rates themselves tell axes apart that their changes do not, as of a roll.
-        off[name] = float(np.sqrt((left**2).mean() + ((turned - estimate) ** 2).mean() / 10))
-    best = min(off, key=lambda name: off[name])
-    return best if off[best] < off["camera"] / 2 else None
+        return float(np.sqrt((left**2).mean() + ((turned - estimate) ** 2).mean() / 10))
+
+    named = {name: off(R) for name, R in AXES.items()}
+    best = min(named, key=lambda name: named[name])
+    found, least = best, named[best]
+    for R in np.rint(Rotation.create_group("O").as_matrix()):
+        if off(R) < min(named[best] / 2, least):
+            found, least = ",".join(f"{v:.0f}" for v in R.ravel()), off(R)
+    return found if least < named["camera"] / 2 else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,8 +267,10 @@ def known(
         return Known(model, twists.t, model.at_depth(twists, float(np.sqrt(f)), float(depth)))
     if not model.known_from:
         raise InputError(
-            f"{recording.name}: {parts} is known neither from poses nor from a gyro; give a table "
+            f"{recording.name}: {parts} is known neither from poses nor from a gyro"
+            f"{' unless a depth is given' if model.fits_depth else ''}; give a table "
             f"with the columns {', '.join(('t', *model.components))}"
+            f"{', or the depth' if model.fits_depth else ''}"
         )
     poses, imu = recording.poses, recording.imu
     by_gyro = imu is not None and len(imu) > 0 and "gyro" in model.known_from

@@ -9,6 +9,8 @@ Settings of a method of egomotion in a configuration of `jaxevent.runs.fit`:
     runs = 4                            # of every window, with different random numbers
     settle = 0.05                       # s of every window before errors count
     gyro_bias = [0.0, 0.0, 0.0]         # rad/s, taken off the gyro first
+    imu_rotation = "y-up"               # its axes, as --imu-rotation of `jaxevent motion`
+    depth = 2.0                         # m, of the scene: poses then tell a planar motion too
 
 A table of the true motion has the columns t (s) and the components of the model, as `jaxevent
 motion` writes them (vx, vy in px/s; wx, wy, wz in rad/s; tx, ty, tz before them).
@@ -94,7 +96,7 @@ class Goal(FamilyGoal):
     truth: str
     runs: int
     settle: float | int
-    gyro_bias: tuple[float, ...]
+    of_truth: Mapping[str, Any]  # gyro_bias, imu_rotation, depth
     # Forwards: in reverse every candidate's vote would be kept.
     forward = True
 
@@ -173,7 +175,7 @@ class Goal(FamilyGoal):
 
     def known(self, recording: Recording) -> Known:
         """What is true of the motion of a recording, whose name is its path."""
-        settings = {"model": self.model, "truth": self.truth, "gyro_bias": self.gyro_bias}
+        settings = {"model": self.model, "truth": self.truth, **self.of_truth}
         return scores.true_motion(recording, settings)
 
     def _stretches(
@@ -218,7 +220,7 @@ class Egomotion(Family):
     fit_settings = {
         **{
             name: scores.SETTINGS[name]
-            for name in ("model", "truth", "centred", "settle", "gyro_bias")
+            for name in ("model", "truth", "centred", "settle", *scores.OF_TRUTH)
         },
         "runs": NATURAL,
     }
@@ -241,7 +243,7 @@ class Egomotion(Family):
             settings["truth"],
             settings.get("runs", 4),
             settings.get("settle", 0.05),
-            tuple(map(float, settings.get("gyro_bias", (0.0, 0.0, 0.0)))),
+            {name: settings[name] for name in scores.OF_TRUTH if name in settings},
         )
 
 

@@ -6,6 +6,7 @@ Settings beside `protocol = "motion"`:
     truth = "*.csv"                     # beside each recording, * being its name without suffix;
                                         # or "poses", "gyro" of the recording itself
     gyro_bias = [0.0, 0.0, 0.0]         # rad/s, taken off the gyro first
+    imu_rotation = "y-up"               # its axes, as --imu-rotation of `jaxevent motion`
     depth = 2.0                         # m, of the scene: poses then tell a planar motion too
     settle = 0.0                        # s after the first event before errors count
     centred = false                     # compare with the motion that candidates show, `lag` ago
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 from jaxevent.egomotion.comparison import by_part, compare
 from jaxevent.egomotion.estimator import RATE, MotionEstimator
 from jaxevent.egomotion.models import Model, find_model
-from jaxevent.egomotion.truth import Known, from_gyro, known
+from jaxevent.egomotion.truth import Known, from_gyro, imu_rotation, known
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
@@ -57,6 +58,10 @@ SETTINGS: dict[str, Check] = {
         'the name of tables beside the recordings, as "*.csv", or "poses", "gyro"',
     ),
     "gyro_bias": (_vector, "three numbers, rad/s"),
+    "imu_rotation": (
+        lambda value: isinstance(value, str),
+        'the gyro\'s axes, as "camera", "y-up", or nine numbers, row by row, in a text',
+    ),
     "depth": POSITIVE,
     "settle": (NOT_NEGATIVE[0], "a number of seconds, 0 or more"),
     "centred": (_flag, "true or false"),
@@ -64,6 +69,9 @@ SETTINGS: dict[str, Check] = {
     "gyro": (_flag, "true or false"),
     "seed": (lambda value: type(value) is int and value >= 0, "a whole number, 0 or more"),
 }
+
+
+OF_TRUTH = ("gyro_bias", "imu_rotation", "depth")  # settings that say what is true
 
 
 def model_of(options: Mapping[str, Any]) -> type[Model]:
@@ -74,6 +82,7 @@ def model_of(options: Mapping[str, Any]) -> type[Model]:
 def check(options: Mapping[str, Any]) -> None:
     """Raise `InputError` for settings that are missing or not possible together."""
     model_of(options)
+    _rotation(options)
     if "truth" not in options:
         raise InputError(
             'the true motion is not given; add truth = "*.csv" (tables beside the recordings), '
@@ -92,8 +101,19 @@ def files(path: Path, options: Mapping[str, Any]) -> list[Path]:
 def true_motion(recording: Recording, options: Mapping[str, Any]) -> Known:
     """What is true of the motion of a recording, whose name is its path."""
     source = (files(Path(recording.name), options) or [options["truth"]])[0]
-    depth = options.get("depth")
-    return known(recording, model_of(options), source, _bias(options), depth=depth)
+    return known(
+        recording,
+        model_of(options),
+        source,
+        _bias(options),
+        rotation=_rotation(options),
+        depth=options.get("depth"),
+    )
+
+
+def _rotation(options: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    axes = options.get("imu_rotation")
+    return None if axes is None else imu_rotation(axes)
 
 
 def _bias(options: Mapping[str, Any]) -> NDArray[np.float64]:
@@ -133,7 +153,7 @@ class MotionProtocol(Protocol):
         if options.get("gyro", False) and "gyro" in method.options:
             if recording.imu is None:
                 raise InputError(f"{recording.name}: holds no IMU; leave out gyro = true")
-            settings["gyro"] = from_gyro(recording.imu, bias)
+            settings["gyro"] = from_gyro(recording.imu, bias, _rotation(options))
         clock = time.perf_counter()
         motion = method.estimate(
             recording,

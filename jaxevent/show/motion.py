@@ -14,7 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from jaxevent.egomotion import flow as event_flow
-from jaxevent.egomotion.comparison import Comparison, compare
+from jaxevent.egomotion.comparison import MEANINGS, Comparison, compare
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.truth import Known, constant_between, from_poses, known, nearest_axes
@@ -110,7 +110,10 @@ def write_errors(folder: Path, found: Comparison) -> None:
     rows = found.rows()
     _write_csv(folder / "errors.csv", dict(zip(("figure", "value", "unit"), zip(*rows, strict=True),
                                                strict=True)))  # fmt: skip
-    table = {name: {"value": _plain(value), "unit": unit} for name, value, unit in rows}
+    table = {
+        name: {"value": _plain(value), "unit": unit, "meaning": MEANINGS[name]}
+        for name, value, unit in rows
+    }
     about = {"times": found.count, "truth": found.truth}
     with complete(folder / "errors.json") as partial:
         partial.write_text(json.dumps({"figures": table, **about}, indent=2) + "\n")

@@ -126,6 +126,13 @@ def test_errors_are_made_of_three():
     told = motion.calibrated(Calibration(factor=4, share=0.5, change=0.2), 0.1)
     expected = 4 + 0.25 * 4 + 0.04 * 1.0**2  # the motion changes by 1 in 0.1 s, and is straight
     np.testing.assert_allclose(told.covariance[1], np.diag([expected, 5]))
+    # At the ends it is taken to change as it comes, and later it is known less and less.
+    np.testing.assert_allclose(
+        told.covariance[:, 0, 0], [4 + 0.25 + 0.04, expected, 4 + 2.25 + 0.04]
+    )
+    later = told(np.array([200_000, 250_000, 300_000]), extrapolate=True)
+    grown = later.covariance - told.covariance[2]
+    np.testing.assert_allclose(grown, [[[v, 0], [0, 0]] for v in (0, 0.25, 1)], atol=1e-12)
     lost = Motion.of("planar", t, mean, np.full((3, 2, 2), np.nan))
     assert not lost(t).valid.any()  # without a sigma
 
@@ -142,6 +149,11 @@ def test_a_gyro_in_other_axes_and_with_a_bias():
         assert found == (None if name == "camera" else name)
         imu = Imu(np.rint(1e6 * t).astype(np.int64), measured, np.zeros_like(measured))
         np.testing.assert_allclose(truth.from_gyro(imu, rotation=R).Omega, Omega + bias)
+    # Axes without a name are told as `imu_rotation` reads them.
+    R = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    found = truth.nearest_axes(Omega, (Omega + bias) @ R)
+    assert found is not None
+    np.testing.assert_array_equal(truth.imu_rotation(found), R)
     np.testing.assert_array_equal(truth.imu_rotation("y-up"), np.diag([1.0, -1, -1]))
     np.testing.assert_array_equal(truth.imu_rotation("0,1,0,0,0,1,1,0,0")[0], [0, 1, 0])
     for wrong in ("y_up", "1,2", "1,0,0,0,1,0,0,0,-1"):

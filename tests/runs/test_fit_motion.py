@@ -15,9 +15,12 @@ from points import moved
 import jaxevent
 import jaxevent.runs.fit
 from jaxevent import cli
+from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import voting
 from jaxevent.egomotion.particle_filter import filtering
 from jaxevent.errors import InputError
+from jaxevent.recording import Events, Imu, Poses, Recording
+from jaxevent.runs import egomotion_scores
 from jaxevent.runs.egomotion import FAMILY, Loss
 
 VELOCITIES = ((150.0, 80.0), (-90.0, 60.0), (40.0, -170.0))
@@ -142,3 +145,24 @@ def test_loss_of_a_perfect_filter_is_small():
     assert goal.loss == Loss(False) and "tau_max" in params.without_gradient()
     with pytest.raises(InputError, match="true motion"):
         FAMILY.goal(voting, params, {})
+
+
+def test_settings_say_what_is_true():
+    """Poses at a depth against the closed form, and a gyro in its own axes."""
+    t = np.arange(0, 1_000_001, 50_000)
+    camera = PinholeCamera(90.0, 90.0, 9.5, 7.5)
+    position = np.stack([0.4e-6 * t, -0.1e-6 * t, 0 * t], 1)
+    poses = Poses(t, position, np.tile([0.0, 0, 0, 1], (len(t), 1)))
+    imu = Imu(t, np.tile([0.1, 0.2, 0.3], (len(t), 1)), np.zeros((len(t), 3)))
+    recording = Recording("r", 20, 16, Events.empty(), camera=camera, poses=poses, imu=imu)
+    planar = {"model": "planar", "truth": "poses", "depth": 3.0}
+    found = egomotion_scores.true_motion(recording, planar)
+    np.testing.assert_allclose(found.values, np.tile([-12.0, 3.0], (len(found.t), 1)))
+    turned = {"model": "rotation", "truth": "gyro", "imu_rotation": "y-up"}
+    turned["gyro_bias"] = [0.1, 0.0, 0.0]
+    found = egomotion_scores.true_motion(recording, turned)
+    np.testing.assert_allclose(found.values, np.tile([0.0, -0.2, -0.3], (len(t), 1)), atol=1e-12)
+    with pytest.raises(InputError, match="imu-rotation 'up'"):
+        egomotion_scores.check({**turned, "imu_rotation": "up"})
+    with pytest.raises(InputError, match="or the depth"):
+        egomotion_scores.true_motion(recording, {"model": "planar", "truth": "poses"})

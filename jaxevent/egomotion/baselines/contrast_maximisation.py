@@ -19,6 +19,11 @@ keeps their cut tracks together as well. So J only counts where a point is in vi
 window, which is found from the motion that an ascent starts with and then held fixed; and events
 count less towards the window's ends. Simulated, 0.1 s: errors of 1.6 and 1.1 % become 1.0 and 0.5 %
 (noise, shapes).
+
+An event tells its pixel, not where in it. Were all at the pixels' middles, an image along whose
+rows or columns things about move would become sharper by the grid alone: before a wall that moves
+by (-20, -1.1) px in 0.1 s the motion across was 0.45 px too large, whatever the blur and the number
+of events. Events that are spread over their pixels do not see the grid: 0.01 px.
 """
 
 import dataclasses
@@ -72,6 +77,7 @@ class Params(Parameters):
     measure = Choice(("mean square", "variance"), "of the image of warped events")
     taper = Choice((True, False), "events count cos(pi t / length) as much; or all alike")
     whole = Choice((True, False), "only points that are in view all the time count; or all")
+    dither = Choice((True, False), "events are anywhere in their pixels, by chance; or at middles")
 
     events = Count(20000, "", "events of a window; of more within `duration`, these many evenly")
     fewest = Count(300, "", "events that an estimate needs")
@@ -373,6 +379,8 @@ class Windows:
             np.zeros(size, real),
         )
         xi[:n] = self.xi[events.y[rows].astype(int), events.x[rows].astype(int)]
+        if self.params.dither:
+            xi[:n] += self._rng.uniform(-0.5, 0.5, (n, 2))
         times[:, :n] = (events.t[rows] - t) * 1e-6
         weight[:n] = np.where(events.p[rows], 1, -1)
         if self.params.taper:
