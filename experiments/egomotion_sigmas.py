@@ -1,6 +1,7 @@
 """Predicted errors of egomotion against the errors that are made.
 
     python experiments/egomotion_sigmas.py --out sigmas [--seeds 300 301 302] [--data FOLDER]
+        [--methods contrast planes]
 
 For every method and scene: the mean squared standardised error of each component, (estimate -
 truth)^2 / variance, over estimates and seeds, 1 where sigmas are right; and the mean relative
@@ -12,7 +13,7 @@ Constants were chosen on seeds 300 and 301 of the simulated scenes.
 
 import argparse
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,10 +56,11 @@ def scenes(seed: int) -> Iterator[tuple[str, str, Any, Any]]:
         yield f"rotation {motion}", "rotation", *motion_scene("rotation", motion, seed, **size)
 
 
-def real(data: Path) -> Iterator[dict[str, Any]]:
+def real(data: Path, methods: Sequence[str]) -> Iterator[dict[str, Any]]:
     recording = jaxevent.load(data / "slider_depth.zip")
     t = np.arange(recording.start + 400_000, 3_100_000, 20_000)
-    for name, method in METHODS.items():
+    for name in methods:
+        method = METHODS[name]
         motion, _ = method.estimate(recording, model="planar").with_layers(recording)
         true = fitted_velocity(recording, motion)
         yield {"method": name, **standardised("slider_depth, planar", motion, t, true(t))}
@@ -71,7 +73,8 @@ def real(data: Path) -> Iterator[dict[str, Any]]:
     # y-up axes; wx and wy, which the unknown lens makes, are not compared.
     near = [(imu.t >= at - 15_000) & (imu.t < at + 15_000) for at in t]
     roll = np.array([[0, 0, -imu.gyro[rows, 2].mean()] for rows in near])
-    for name, method in METHODS.items():
+    for name in methods:
+        method = METHODS[name]
         motion = method.estimate(disk, model="rotation")
         yield {"method": name, **standardised("disk", motion, t, roll)}
 
@@ -81,6 +84,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for the table")
     parser.add_argument("--seeds", type=int, nargs="+", default=[300, 301, 302])
     parser.add_argument("--data", type=Path, help="folder of real recordings")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     rows = []
@@ -88,11 +92,12 @@ def main() -> None:
         for scene, model, recording, source in scenes(seed):
             t = np.arange(SETTLE, 450_001, 10_000)
             true = source.velocity(t) if model == "planar" else source.twist(t)[1]
-            for name, method in METHODS.items():
+            for name in arguments.methods:
+                method = METHODS[name]
                 motion, _ = method.estimate(recording, model=model).with_layers(recording)
                 rows.append({"method": name, **standardised(scene, motion, t, true)})
     if arguments.data:
-        rows += list(real(arguments.data))
+        rows += list(real(arguments.data, arguments.methods))
     told = pd.DataFrame(rows)
     table = pd.DataFrame(told.groupby(["method", "scene"], sort=False).mean())
     table.to_csv(arguments.out / "sigmas.csv")

@@ -3,7 +3,8 @@
     python experiments/egomotion_table.py --out table [--data FOLDER] [--seeds 500 501]
 
 Simulated: an ideal camera of 240x180 pixels, f = 200 px, 25 frames/s, 0.6 s: planar motion,
-rotation and general motion, with motions that nothing was chosen on. With --data FOLDER, which
+rotation and general motion, with motions that nothing was chosen on; and fast rotations, 0.06 s of
+160x120 pixels, of which all times count. With --data FOLDER, which
 holds slider_depth.zip and tubrip_*_rotation.npz, real ones: slider_depth from 1 to 2 s, as planar
 motion (against its poses at the one depth that fits the estimate best) and as general motion (a
 pure translation to the right), and two cuts of 13 and 99 ms of rotation, without frames.
@@ -41,6 +42,7 @@ from jaxevent.recording import Recording
 from jaxevent.show.motion import fitted_velocity
 from jaxevent.simulate import motion_scene
 
+FAST = 6.0, 12.0, 24.0  # rad/s
 DURATION, SETTLE, END = 0.6, 0.2, 0.1  # s
 WARM = 0.3  # s of a sequence, for programs to be compiled
 KEY = ("sequence", "model", "seed", "method")
@@ -78,9 +80,19 @@ def simulated(seed: int) -> Iterator[Sequence]:
         ("rotation", "rotation", "varying"),
         *(("general", scene, "varying") for scene in ("wall", "shapes", "texture")),
     ]
+    for speed in FAST:
+        make = functools.partial(fast, speed, seed)
+        yield Sequence(f"rotation, {speed:g} rad/s", "rotation", str(seed), make)
     for model, scene, change in kinds:
         make = functools.partial(simulate, model, scene, change, seed)
         yield Sequence(f"{scene}, {change}", model, str(seed), make)
+
+
+def fast(speed: float, seed: int) -> tuple[Recording, Known]:
+    size: dict[str, Any] = {"size": (160, 120), "duration": 0.06, "speed": speed}
+    recording, source = motion_scene("rotation", "constant", seed, **size)
+    t = np.arange(0, 60_001, 1000)
+    return recording, Known(find_model("rotation"), t, source.twist(t)[1])
 
 
 def simulate(model: str, scene: str, change: str, seed: int) -> tuple[Recording, Known]:

@@ -1,7 +1,7 @@
 """Motion by voting on simulated sequences with known motion, the thesis' literal likelihood beside.
 
     python experiments/egomotion_voting.py --out egomotion_voting [--seeds 10] [--first 100]
-        [--only planar,frames,figures,rotation,general]
+        [--only planar,frames,figures,limits,edges,rotation,penalty,general]
 
 An ideal event camera of 160 x 120 pixels, f = 200 px, and the thesis' generator of frames 50 us
 apart on 32 x 32 pixels. Parameters are the defaults and the presets of `voting.Params`, which were
@@ -239,12 +239,52 @@ def part_figures(seeds: range) -> list[Table]:
         density.append(row)
     print("figures: texture", file=sys.stderr)
     return [
-        ("penalty of time r_t (figures 5.7, 5.8): smoothed relative AEE (%)", penalty),
+        ("penalty of time r_t (figure 5.7): smoothed relative AEE (%)", penalty),
         ("particles N, 200 +- 100 px/s at 2 Hz: relative AEE (%)", number),
-        ("speed, ideal camera (figures 5.12, 5.13): relative AEE (%)", speed[:5]),
-        ("speed, frame generator (figures 5.12, 5.13): relative AEE (%)", speed[5:]),
+        ("speed, ideal camera (figure 5.13): relative AEE (%)", speed[:5]),
+        ("speed, frame generator (figure 5.13): relative AEE (%)", speed[5:]),
         ("texture, frame generator, (0.8, 0) px/frame (figure 5.15): relative AEE (%)", density),
     ]
+
+
+def part_limits(seeds: range) -> list[Table]:
+    """Figures 5.12 and 5.13, in the thesis' generator."""
+    k = np.arange(FRAMES)
+    change, speed = [], []
+    for p in (0.25, 0.5, 1.0, 1.4):
+        flow = np.stack([1.5 + p * np.cos(2 * np.pi * k / 100), np.zeros(FRAMES)], 1)
+        row: Row = {"p, px/frame": p, "most, px/frame^2": p * 2 * np.pi / 100}
+        row |= in_frames(flow, seeds, {"preset": "frames"}, SHORT)
+        change.append(row | in_frames(flow, seeds, LITERAL_FRAMES, SHORT))
+    print("limits: amplitude", file=sys.stderr)
+    for u in (1.0, 3.0, 5.0, 8.0, 12.0):
+        flow = np.tile([u, 0.0], (FRAMES, 1))
+        row = {"u, px/frame": u}
+        # Without faster first particles a search would end at 2.5 px/frame.
+        wide: Row = {"speed_max": 3e5}
+        row |= in_frames(flow, seeds, {"preset": "frames", **wide}, SHORT)
+        row |= in_frames(flow, seeds, {**LITERAL_FRAMES, **wide}, SHORT)
+        far: Row = {**LITERAL_FRAMES, **wide, "radius": 13, "candidates": 729}
+        told = in_frames(flow, seeds, far, SHORT)
+        row |= {f"{name}, radius 13": value for name, value in told.items() if name != "fill, %"}
+        speed.append(row)
+    return [
+        ("(1.5 + p cos(2 pi k / 100), 0) px/frame (figure 5.12): relative AEE (%)", change),
+        ("(u, 0) px/frame (figure 5.13): relative AEE (%)", speed),
+    ]
+
+
+def part_edges(seeds: range) -> list[Table]:
+    """Edges left out of the literal vote's candidates (section 6.6.5)."""
+    rows = []
+    for texture in TEXTURES:
+        made = [planar("constant", seed, texture) for seed in seeds]
+        for edge in (0.0, 1e-3, 3e-3, 1e-2):
+            row: Row = {"texture": texture, "edge, ms": 1e3 * edge}
+            row |= both(made, seeds[0], None, {**LITERAL, "edge": edge})
+            rows.append(row)
+        print(f"edges {texture}", file=sys.stderr)
+    return [("edges across the motion left out (section 6.6.5): relative AEE (%)", rows)]
 
 
 def part_rotation(seeds: range) -> list[Table]:
@@ -271,6 +311,22 @@ def part_rotation(seeds: range) -> list[Table]:
                 row |= {title: told[key], f"{title}, worst": told[f"{key}, worst"]}
             rows.append(row | summary(scores, ("lost", "start-up")))
     return [("rotation, 2 rad/s", rows)]
+
+
+def part_penalty(seeds: range) -> list[Table]:
+    """Table 6.2, of rotation: general motion by one particle filter finds no heading."""
+    weights = (0.0, 1e4, 1.5e4, 2e4, 2.5e4)  # px/s
+    runs: dict[float, list[dict[str, float]]] = {r_t: [] for r_t in weights}
+    for seed in seeds:
+        recording, source = motion_scene("rotation", "constant", seed, size=SIZE, duration=0.3)
+        times = np.arange(SETTLE, source.duration - 1e-6, 0.005)
+        for r_t in weights:
+            params = Params.of({**LATEST, "r_t": r_t})
+            motion = voting.estimate(recording, params, model="rotation", seed=seed)
+            runs[r_t].append(errors(motion, params, lambda t, s=source: s.twist(t)[1], times))
+    names = ("AAE smoothed", "AME_rel smoothed", "smoothed", "lost")
+    rows = [{"r_t, px/s": r_t, **summary(found, names)} for r_t, found in runs.items()]
+    return [("rotation, 2 rad/s, the literal likelihood (table 6.2): AAE (deg), others %", rows)]
 
 
 def part_general(seeds: range) -> list[Table]:
@@ -310,7 +366,10 @@ PARTS: dict[str, Callable[[range], list[Table]]] = {
     "planar": part_planar,
     "frames": part_frames,
     "figures": part_figures,
+    "limits": part_limits,
+    "edges": part_edges,
     "rotation": part_rotation,
+    "penalty": part_penalty,
     "general": part_general,
 }
 

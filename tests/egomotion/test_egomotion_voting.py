@@ -14,7 +14,7 @@ from jaxevent.egomotion import candidates, voting
 from jaxevent.egomotion.models import MODELS, General, Planar
 from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.particle_filter import filtering
-from jaxevent.egomotion.particle_filter.likelihood import score
+from jaxevent.egomotion.particle_filter.likelihood import along_edge, score
 from jaxevent.egomotion.particle_filter.smoothing import smoothed
 from jaxevent.errors import InputError
 from jaxevent.recording import Events
@@ -571,3 +571,21 @@ def test_what_cannot_be_estimated_is_refused():
             voting.estimate(recording, FAST, model=model)
     with pytest.raises(InputError, match="planar"):
         voting.estimate(recording, FAST, model="planer")
+
+
+def test_candidates_along_an_edge_against_a_loop():
+    """Thesis 6.6.5: young ones whose pixel fired before when the event's own did."""
+    rng, edge = np.random.default_rng(5), 0.002
+    d = rng.integers(-1, 2, (2, 40)).astype(float)
+    age = rng.choice([0.0, 0.001, 0.0015, 0.003, 0.02, 0.021, 0.03], 40) * (
+        1 + 1e-3 * rng.random(40)
+    )
+    own = [age[c] for c in range(40) if age[c] > 0 and not d[:, c].any()]
+    last, expected = min(own), []
+    for c in range(40):
+        earlier = [a for a, e in zip(age, d.T, strict=True) if (e == d[:, c]).all() and a > age[c]]
+        near = bool(earlier) and abs(min(earlier) - last) <= edge
+        expected.append(0 < age[c] <= edge and near)
+    params = voting.Params(edge=edge)
+    found = along_edge(params, jnp.asarray(d), jnp.asarray(age), jnp.asarray(last))
+    assert np.array_equal(found, expected) and 0 < sum(expected) < (age > 0).sum()

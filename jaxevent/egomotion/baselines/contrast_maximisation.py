@@ -63,7 +63,7 @@ PROBE = 0.5  # px at the window's end, between which and the maximum the curvatu
 ENOUGH = 1e-3  # 1/px; a smaller slope, in shares of the objective, ends the ascent
 WAY, WAYS = 10.0, (5.0, 60.0)  # px in a window: at best, and with which the default is kept
 SHORTEST, LONGEST = 0.002, 2.0  # s
-CALIBRATION, SHARE = Calibration(change=0.33), 0.012  # the share is planar motion's
+CALIBRATION = Calibration(factor=0.5, change=0.09)
 SPREAD = 2.0  # px^2; the inverse curvature, in the same unit, that an ascent begins with
 
 Numeric = Array | np.ndarray
@@ -262,7 +262,7 @@ def covariance(
     H is the objective's curvature at its maximum, from differences of gradients, and g_c the
     gradient of what cell c of the image (24 px) has of it. The sum of these is 0, and their scatter
     tells how far chance has moved the maximum, if cells err independently. There is no other scale.
-    Systematic errors are not in it: simulated, squared errors are 2 to 14 times what it tells.
+    Changes of the motion within the window are not in it; see `Calibration`.
     A direction with less than 1 % of the largest curvature is taken to have that much.
     """
     scale = np.asarray(window.scale, np.float64)
@@ -473,8 +473,7 @@ def solve(params: Params, given: Given) -> Motion:
         fits.append(fit)
         contrasts.append(told.contrast)
     found = held(given.model, np.array(t), fits, np.array(contrasts))
-    by = CALIBRATION._replace(share=SHARE if windows.model.uniform else 0.0)
-    return found.calibrated(by, np.array(spans))
+    return found.calibrated(CALIBRATION, np.array(spans))
 
 
 def lengths(params: Params, speed: Speed) -> dict[str, float]:

@@ -262,6 +262,24 @@ def miss(
     return jnp.sqrt(ex**2 + ey**2 + 1e-12) + params.r_t * jnp.abs(late)
 
 
+def along_edge(
+    params: Params,
+    d: Float[Array, "2 C"],
+    age: Float[Array, " C"],
+    last: Float[Array, ""],
+) -> Bool[Array, " C"]:
+    """Which candidates of an event fired along one edge with it, across the motion (6.6.5).
+
+    Such a one is younger than `params.edge`, and the event before it at its pixel is as near in
+    time to the one before at the event's own pixel, of age `last`. In the thesis' words both lie
+    "within a very small time window", which it does not tell.
+    """
+    same = (d[:, :, None] == d[:, None, :]).all(0)
+    before = jnp.where(same & (age[None] > age[:, None]), age[None], jnp.inf).min(1)
+    together = jnp.isfinite(before) & (jnp.abs(before - last) <= params.edge)
+    return (age > 0) & (age <= params.edge) & together
+
+
 def _literal(
     params: Params,
     model: Model,
@@ -277,9 +295,12 @@ def _literal(
     """
     d, age = jnp.asarray(batch.d), jnp.asarray(batch.age)
     there, before, most = age > 0, jnp.full_like(age[0], jnp.inf), params.d_max
+    own = there & (d == 0).all(0)
+    last = jnp.where(own, age, jnp.inf).min(0)
+    edge = jax.vmap(functools.partial(along_edge, params), -1, -1)
+    there &= ~lax.cond(params.edge > 0, edge, lambda d, age, last: age < 0, d, age, last)
     if not model.uniform:
-        own = there & (d == 0).all(0)
-        before, there, most = jnp.where(own, age, jnp.inf).min(0), there & ~own, params.V_max
+        before, there, most = last, there & ~own, params.V_max
     misses = each(functools.partial(miss, params, model), EVENT, EVENT, EVENT, BOTH, BOTH, BOTH)
     over = jax.vmap(lambda d, age: misses(d, age, before, U, line, speed), (1, 0))
     least = jnp.where(there[..., None], over(d, age), jnp.inf).min(0)

@@ -104,6 +104,13 @@ class Params(Parameters):
         "literal, planar: the predecessor was when the hypothesis was 1 px back, or at `past`",
     )
     past = Positive(50e-6, "s", "literal, planar: age of the predecessor, if fixed")
+    edge = Number(
+        0.0,
+        "s",
+        "literal: candidates so young, whose pixel's event before was as near to the one before at "
+        "the event's pixel, are of one edge with it and do not count (6.6.5); 0: all do",
+        gradient=False,
+    )
 
     def without_gradient(self) -> dict[str, str]:
         """Those of the other likelihood too."""
