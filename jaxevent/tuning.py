@@ -209,11 +209,7 @@ def optimise(
     Raises:
         InputError: A name does not exist, or the loss is not finite at the start.
     """
-    if callable(batches):
-        prepare = batches
-    else:
-        shares = devices.shared_out(batches), devices.shared_out(validation)
-        prepare = lambda _: shares  # noqa: E731
+    prepare = Prepared.of(batches, validation, settings.batch)
     fresh = run is None
     run = begin(params, names, settings, search) if run is None else run
     loop = _Loop(loss, params, prepare, settings, search or {}, run, save or (lambda *_: None))
@@ -236,7 +232,8 @@ ADAM = optax.apply_if_finite(optax.scale_by_adam(), max_consecutive_errors=2**31
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _value(loss: Loss, params: Parameters, batch: Any) -> Array:
+def loss_of(loss: Loss, params: Parameters, batch: Any) -> Array:
+    """The loss of a batch, compiled."""
     return loss(params, batch)
 
 
@@ -253,7 +250,7 @@ def _values(loss: Loss, params: Parameters, raw: dict[str, Array], batch: Any) -
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _slopes(
+def slopes(
     loss: Loss, forward: bool, params: Parameters, raw: dict[str, Array], batch: Any
 ) -> tuple[Array, dict[str, Array]]:
     """The loss of each start, (starts,), and its derivatives in the shape of `raw`."""
@@ -308,26 +305,28 @@ def _judge(
     return position, (i - best_at < patience).any()
 
 
+def each_of(function: Callable[[Any], Any], batches: Sequence[Any]) -> list[tuple[float, Any]]:
+    """The weight of every batch and what a function gives for it, of all processes' batches."""
+    if devices.alone():
+        return [(_weight(batch), function(batch)) for batch in batches]
+    own = ((k, batch) for k, batch in enumerate(batches) if batch is not devices.ELSEWHERE)
+    mine = {k: (batch, function(batch)) for k, batch in own}  # before any is waited for
+    said = {k: (_weight(batch), jax.device_get(part)) for k, (batch, part) in mine.items()}
+    told = {k: v for some in devices.gathered(said) for k, v in some.items()}
+    return [(told[k][0], jax.tree.map(jnp.asarray, told[k][1])) for k in range(len(batches))]
+
+
 def _mean(function: Callable[[Any], Any], batches: Sequence[Any]) -> Any:
     """The mean of a function of batches (a pytree), weighted by the batches' `weight`.
 
     On several devices or in several processes the results are added in the same order as on one.
     """
-    if devices.alone():
-        weights = [_weight(batch) for batch in batches]
-        parts = map(function, batches)
-    else:
-        own = ((k, batch) for k, batch in enumerate(batches) if batch is not devices.ELSEWHERE)
-        mine = {k: (batch, function(batch)) for k, batch in own}  # before any is waited for
-        said = {k: (_weight(batch), jax.device_get(part)) for k, (batch, part) in mine.items()}
-        told = {k: v for some in devices.gathered(said) for k, v in some.items()}
-        weights = [told[k][0] for k in range(len(batches))]
-        parts = (jax.tree.map(jnp.asarray, told[k][1]) for k in range(len(batches)))
+    found = each_of(function, batches)
     if len(batches) == 1:
-        return next(iter(parts))
-    total = None
-    for part, weight in zip(parts, weights, strict=True):
-        share = weight / sum(weights)
+        return found[0][1]
+    whole, total = sum(weight for weight, _ in found), None
+    for weight, part in found:
+        share = weight / whole
         part = jax.tree.map(lambda leaf, share=share: share * leaf, part)
         total = part if total is None else jax.tree.map(jnp.add, total, part)
     return total
@@ -335,6 +334,37 @@ def _mean(function: Callable[[Any], Any], batches: Sequence[Any]) -> Any:
 
 def _weight(batch: Any) -> float:
     return float(batch.weight) if isinstance(batch, Weighted) else 1.0
+
+
+class Prepared:
+    """The batches to fit to and to validate on, on the devices that compute with them.
+
+    `prepare` is as `optimise` has it; `batch` batches make a step, None: all.
+    """
+
+    def __init__(self, prepare: Callable[[Any], Batches], batch: int | None):
+        self._prepare = prepare
+        self._places = devices.Places(batch), devices.Places(None)
+
+    @classmethod
+    def of(
+        cls,
+        batches: Sequence[Any] | Callable[[Any], Batches],
+        validation: Sequence[Any],
+        batch: int | None,
+    ) -> "Prepared":
+        """From what `optimise` is given."""
+        if callable(batches):
+            return cls(batches, batch)
+        shares = devices.shared_out(batches), devices.shared_out(validation)
+        return cls(lambda _: shares, batch)
+
+    def __call__(self, params: Any) -> Batches:
+        if devices.alone():
+            return self._prepare(params)
+        with devices.on_host():
+            fit, validation = devices.in_step(lambda: self._prepare(params))
+        return self._places[0](fit), self._places[1](validation)
 
 
 class _Loop:
@@ -346,26 +376,17 @@ class _Loop:
         self,
         loss: Loss,
         params: Parameters,
-        prepare: Callable[[Any], Batches],
+        prepare: Prepared,
         settings: Settings,
         intervals: Mapping[str, Interval],
         run: Run,
         save: Callable[[Run, bool], None],
     ):
         self.function, self.params, self.settings = loss, params, settings
-        self._prepare = prepare
-        self._places = devices.Places(settings.batch), devices.Places(None)
+        self.prepare = prepare
         self.intervals, self.run, self.save = intervals, run, save
         numbers = sum(leaf[0].size for leaf in run.position.raw.values())
         self.forward = numbers <= FORWARD if settings.forward is None else settings.forward
-
-    def prepare(self, params: Any) -> Batches:
-        """The batches to fit to and to validate on, on the devices that compute with them."""
-        if devices.alone():
-            return self._prepare(params)
-        with devices.on_host():
-            fit, validation = devices.in_step(lambda: self._prepare(params))
-        return self._places[0](fit), self._places[1](validation)
 
     def leader(self) -> Any:
         """The parameters of the best start."""
@@ -379,7 +400,7 @@ class _Loop:
         return validation or fit
 
     def loss(self, params: Any, batches: Sequence[Any]) -> float:
-        return float(_mean(lambda batch: _value(self.function, params, batch), batches))
+        return float(_mean(lambda batch: loss_of(self.function, params, batch), batches))
 
     def check(self) -> None:
         """Raise `InputError` unless the losses of the given parameters are finite."""
@@ -441,8 +462,8 @@ class _Loop:
                 if i == settings.iterations or not bool(going):
                     self._record(turn, i, None, seen)
                     break
-            slopes = functools.partial(_slopes, self.function, self.forward, params, position.raw)
-            losses, slope = _mean(slopes, [fit[k] for k in self._drawn(len(fit))])
+            look = functools.partial(slopes, self.function, self.forward, params, position.raw)
+            losses, slope = _mean(look, [fit[k] for k in self._drawn(len(fit))])
             fall = 0.55 + 0.45 * math.cos(math.pi * i / settings.iterations)
             position = _step(position, slope, settings.learning_rate / 2**turn * fall)
             self._record(turn, i, losses, seen)
