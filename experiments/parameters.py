@@ -3,6 +3,7 @@
 from typing import Any
 
 import jaxevent
+from jaxevent.estimator import Estimator
 from jaxevent.methods import HOMES
 from jaxevent.parameters import Choice, Parameters, Share, shown
 
@@ -14,10 +15,13 @@ def cell(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else shown(value).replace("'", '"')
 
 
-def rows(kind: type[Parameters]) -> list[str]:
-    """A row for each setting of a class: name, default, unit, gradient, meaning."""
+def rows(method: Estimator) -> list[str]:
+    """A row for each setting of a method: name, default, unit, gradient, meaning."""
+    kind = method.Params
     lines = ["| parameter | default | unit | gradient | |", "|---|---|---|---|---|"]
     fixed = {**kind.choices, **kind().without_gradient()}
+    if not method.differentiable:
+        fixed = kind.settings()
     for name, setting in kind.settings().items():
         meaning = setting.meaning
         if isinstance(setting, Share):
@@ -43,15 +47,17 @@ def page() -> str:
     parts = [
         "# Parameters",
         "Made by `python experiments/parameters.py`. Numbers with a gradient can be named under "
-        "`fit` in a fit's configuration, the others under `search`. A positive number that is 0 "
+        "`fit` in a fit's configuration, other numbers under `search`. A method without any "
+        "gradient computes on the host: its numbers are searched. A positive number that is 0 "
         "stays 0: give it a value first. The column of gradients holds as the other parameters "
         "stand by default.",
     ]
     for family, homes in HOMES.items():
         parts.append(f"## {TITLES[family]}")
         for name in homes:
-            kind = jaxevent.METHODS[name].Params
-            parts += [f"### {name}", "\n".join(rows(kind))]
+            method = jaxevent.METHODS[name]
+            kind = method.Params
+            parts += [f"### {name}", "\n".join(rows(method))]
             if kind.presets:
                 parts.append("\n".join(presets(kind)))
     return "\n\n".join(parts) + "\n"

@@ -53,8 +53,16 @@ def test_table_of_parameters_is_that_of_the_code():
     assert (DOCS / "parameters.md").read_text() == text
     for name, method in jaxevent.METHODS.items():
         own = text.split(f"### {name}\n")[1].split("\n### ")[0].split("\n## ")[0]
-        for setting in method.Params.settings():
-            assert f"| `{setting}` |" in own
+        values = method.Params().values()
+        told = {}
+        for row in re.findall(r"^\| `(\w+)` \| (.*?) \| .*? \| (.*?) \|", own, re.MULTILINE):
+            setting, default, gradient = row
+            told[setting] = tomllib.loads(f"value = {default}")["value"]
+            assert not gradient or method.differentiable
+        assert list(told) == list(method.Params.settings())
+        for setting, value in values.items():  # numbers are shown to four digits
+            number = isinstance(value, float | list)
+            assert told[setting] == (pytest.approx(value, rel=1e-3) if number else value), setting
 
 
 def test_toml_is_toml():

@@ -219,6 +219,25 @@ class Stacked(Batch):
         return jax.device_put(self, devices[0])
 
 
+class Told(Batch):
+    """A stretch whose motion was told when it was prepared, by a method on the host."""
+
+    time: Float[Array | np.ndarray, " T"]
+    grid: Float[Array | np.ndarray, " G"]
+    truth: Float[Array | np.ndarray, "G d"]
+    counted: Float[Array | np.ndarray, " T"]
+    weight: Float[Array | np.ndarray, ""]
+    model: Model
+    mean: Float[Array | np.ndarray, "runs T d"]
+
+    def estimates(self, params: Any) -> tuple[Array, Array]:
+        mean = jnp.asarray(self.mean)
+        return mean, jnp.zeros(mean.shape[:2], mean.dtype)
+
+    def over(self, devices: Sequence[Any]) -> "Told":
+        return jax.device_put(self, devices[0])
+
+
 class Given(NamedTuple):
     """What a method that computes on the host is given."""
 
@@ -257,6 +276,33 @@ class OnHost(MotionEstimator[P]):
             check_times(times, recording.start, recording.stop, recording.name)
         given = Given(recording, found, camera, seed, progress, more)
         return given, np.atleast_1d(microseconds(times))
+
+    def follow(
+        self,
+        stretches: Sequence[Stretch],
+        params: P,
+        model: type[Model],
+        runs: int,
+        settle: float | int,
+    ) -> list[Batch]:
+        """Stretches with the motion that these parameters tell; rest where they tell none."""
+        batches: list[Batch] = []
+        for number, stretch in enumerate(stretches):
+            recording = stretch.cut()
+            times = np.arange(recording.start, recording.stop + 1, round(1e6 / RATE))
+            means = []
+            for k in range(runs):
+                seed = number * runs + k
+                told = self.estimate(recording, params, model=model, seed=seed, progress=False)
+                mean, _, valid = told(times, extrapolate=True)
+                means.append(np.where(valid[:, None], mean, 0.0))
+            time = (times - stretch.start) * 1e-6
+            counted = ((time >= settle) & stretch.known.within(times)).astype(float)
+            weight = np.asarray(max(counted.sum(), 1e-9))
+            batches.append(
+                Told(time, *truth_of(stretch), counted, weight, model(), np.stack(means))
+            )
+        return batches
 
     def run(self, params: P, features: Given, state: None = None) -> tuple[Motion, None]:
         """The motion, computed on the host."""

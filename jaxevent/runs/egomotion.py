@@ -24,7 +24,8 @@ of angular velocity are added. Random numbers stay the same during the fit.
 With "voting" in every window particles start around the true motion, so that no search is fitted.
 The gradient goes through weights, particles and, by the carried score, resampling; ages of
 candidates are held fixed. Any other method that is differentiable, as one of your own, is run
-over every window from its beginning.
+over every window from its beginning. The numbers of a method that computes on the host are
+searched: every candidate is computed anew, and a window counts as at rest where it tells no motion.
 
 Results: `error`, the mean relative error of the whole filter (search included) over the windows, %;
 of a direction, as the `heading` of general motion, degrees; `lost`, the share of times at which it
@@ -99,6 +100,7 @@ class Goal(FamilyGoal):
     of_truth: Mapping[str, Any]  # gyro_bias, imu_rotation, depth
     # Forwards: in reverse every candidate's vote would be kept.
     forward = True
+    measure = "error"
 
     @property
     def kind(self) -> type[Model]:
@@ -115,7 +117,8 @@ class Goal(FamilyGoal):
 
         def batches(params: Any) -> tuple[list[Batch], list[Batch]]:
             nonlocal prepared
-            fixed = {name: float(getattr(params, name)) for name in params.without_gradient()}
+            acts = params.without_gradient() if self.method.differentiable else params.numbers
+            fixed = {name: float(getattr(params, name)) for name in acts}
             if prepared[0] != fixed:
                 prepared = (None, None)  # so that two are never held at once
                 made = self.method.follow(found, params, self.kind, self.runs, self.settle)
@@ -231,11 +234,6 @@ class Egomotion(Family):
     ) -> Goal:
         scores.check(settings)
         method.find_model(scores.model_of(settings))
-        if not method.differentiable:
-            raise InputError(
-                f"the method {method.name!r} computes on the host and has no gradient to follow; "
-                "fit another one, such as voting"
-            )
         return Goal(
             method,
             Loss(settings.get("centred", False)),

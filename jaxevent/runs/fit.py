@@ -52,6 +52,7 @@ from jaxevent import devices
 from jaxevent.errors import InputError, require
 from jaxevent.io import load, toml
 from jaxevent.recording import Recording
+from jaxevent.runs import findings
 from jaxevent.runs.checkpoint import finished_rows, restore, save
 from jaxevent.runs.family import Sources
 from jaxevent.runs.fit_config import Plan, Task, read_plan
@@ -80,11 +81,13 @@ def fit(
     """Run a fit that a TOML file describes; its layout is in the text of this module.
 
     Writes the folder `out`, made if missing: params.toml (a table of physical values for each
-    method), results.json ({"rows": [...]}), results.md (the table of the test images), loss.csv,
-    loss.png and config.toml. While it runs, `out` holds a checkpoint at most a few seconds old, by
-    which an interrupted run goes on and ends with the same parameters, to the bit. Of several
-    processes (`devices.join`) all read the recordings and return the rows, and the first reads and
-    writes `out`.
+    method), results.json ({"rows": [...], "found": [...], "gains": [...]}), results.md, loss.csv,
+    loss.png and config.toml. results.md has the table of the test images, then every number that
+    was fitted with its start and its interval (`jaxevent.confidence`), what ran to a bound or away,
+    and the gain. While it runs, `out` holds a checkpoint at most a few seconds old, by which an
+    interrupted run goes on and ends with the same parameters, to the bit. Of several processes
+    (`devices.join`) all read the recordings and return the rows, and the first reads and writes
+    `out`.
 
     Args:
         config: The TOML file.
@@ -120,14 +123,21 @@ def fit(
                 f"{config}: the processes see different configurations or recordings; give all the "
                 "same"
             )
-        done, write = _fit_tasks(plan, sources, digest, out, progress, held)
+        done, found, write = _fit_tasks(plan, sources, digest, out, progress, held)
         rows = _score(plan, done, sources, progress)
         if not devices.first():
             return rows
+        gained = findings.gains(plan.tasks, unseen(rows))
         write("config.toml", plan.text)
         write("loss.csv", _losses(plan.tasks, done).encode())
         write("loss.png", _curves(plan.tasks, done))
-        write_rows(rows, write, lambda rows: _results(plan.tasks, unseen(rows)))
+        write_rows(
+            rows,
+            write,
+            lambda rows: _results(plan.tasks, unseen(rows)) + findings.text(found, gained),
+            found=found,
+            gains=gained,
+        )
         write("params.toml", _tables(plan.tasks, done).encode())
         (out / CHECKPOINT).unlink()
     return rows
@@ -161,14 +171,17 @@ def _fit_tasks(
     out: Path,
     progress: bool | None,
     held: contextlib.ExitStack,
-) -> tuple[list[Fitted], Any]:
-    """Fit all methods, from the checkpoint in the folder on; and the function that writes there.
+) -> tuple[list[Fitted], list[dict[str, Any]], Any]:
+    """Fit all methods, from the checkpoint in the folder on.
+
+    Gives the fits, rows about what they found, and the function that writes to the folder.
 
     The folder is made if missing, and then held until the stack is closed. Raises `InputError`
     naming the method.
     """
     checkpoint, saved = out / CHECKPOINT, -math.inf
     done: list[Fitted] = []
+    found: list[dict[str, Any]] = []
     run: Run | None = None
     write: Any = None
     with contextlib.ExitStack() as new:
@@ -198,21 +211,23 @@ def _fit_tasks(
                 saved = time.monotonic()
             new.close()
 
-        for task in plan.tasks[len(done) :]:
+        for number, task in enumerate(plan.tasks):
             try:
-                one = optimise(
-                    task.goal.loss, task.params, task.names,
-                    task.goal.problem(sources, plan.split, plan.window), (),
-                    task.settings, task.search,
-                    run=run, save=keep, progress=progress, title=task.label,
-                )  # fmt: skip
+                problem = task.goal.problem(sources, plan.split, plan.window)
+                if number == len(done):
+                    one = optimise(
+                        task.goal.loss, task.params, task.names, problem, (),
+                        task.settings, task.search,
+                        run=run, save=keep, progress=progress, title=task.label,
+                    )  # fmt: skip
+                    run = None
+                    done.append(one)
+                    keep(None, True)
             except InputError as error:
                 raise InputError(f"{plan.config}: {task.label}: {error}") from None
-            run = None
-            done.append(one)
-            keep(None, True)
+            found += findings.find(task, done[number], problem)
         new.close()
-    return done, write
+    return done, found, write
 
 
 def _score(

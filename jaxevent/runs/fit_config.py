@@ -210,6 +210,11 @@ def _task(entry: Mapping[str, Any], table: Mapping[str, Any], folder: Path) -> T
     names, search = tuple(entry.get("fit", ())), entry.get("search", {})
     if not names and not search:
         raise InputError('nothing is to be fitted; give names, as fit = ["c_on", "c_off"]')
+    if names and not method.differentiable:
+        raise InputError(
+            f"the method {method.name!r} computes on the host and has no gradient to follow; "
+            f"search its numbers: search = {{ {names[0]} = [from, to, number of points] }}"
+        )
     given = {name: both[name] for name in _SETTINGS if name in both}
     settings = Settings(**given, forward=goal.forward)
     intervals = {name: (low, high, count) for name, (low, high, count) in search.items()}

@@ -100,7 +100,31 @@ class Objective:
 
     def __call__(self, params: FrameParams, batch: Any) -> Float[Array, ""]:
         if self.error is None:
-            return -self.method.log_likelihood(params, batch.features) / batch.weight  # type: ignore[reportAttributeAccessIssue]
+            return self._of_frames(params, batch)
+        counted, each = self._counted(params, batch)
+        return counted.sum() / (batch.weights.sum() * each)
+
+    @property
+    def likelihood(self) -> bool:
+        """Whether it is the mean of -ln p over what is measured."""
+        return self.error in (None, "nll")
+
+    def parts(
+        self, params: FrameParams, batch: Any
+    ) -> tuple[Float[Array, " parts"], Float[Array, " parts"]]:
+        """The loss of every image and its weight; of a likelihood, of all frames in one."""
+        if self.error is None:
+            return self._of_frames(params, batch)[None], jnp.ones(1)
+        counted, each = self._counted(params, batch)
+        weights = batch.weights.sum(1) * each
+        return counted.sum(1) / jnp.where(weights > 0, weights, 1), weights
+
+    def _of_frames(self, params: FrameParams, batch: Window) -> Array:
+        """-ln p of the frames given, per frame and pixel."""
+        return -self.method.log_likelihood(params, batch.features) / batch.weight  # type: ignore[reportAttributeAccessIssue]
+
+    def _counted(self, params: FrameParams, batch: Images) -> tuple[Array, int]:
+        """Weighted errors (times, pixels), and how many pixels share a weight."""
         trajectory, _ = self.method.run(params, batch.features)
         image, variance, _ = self.method.read(params, trajectory, batch.out)
         if self.error == "nll":
@@ -108,8 +132,7 @@ class Objective:
         else:
             errors = self._difference(image, batch) ** 2
         counted = jnp.where(batch.weights > 0, batch.weights * errors, 0)
-        each = batch.truth.shape[1] // batch.weights.shape[1]  # pixels that share a weight
-        return counted.sum() / (batch.weights.sum() * each)
+        return counted, batch.truth.shape[1] // batch.weights.shape[1]
 
     def _difference(self, image: Array, batch: Images) -> Array:
         """Image minus truth, linear or logarithmic.
@@ -308,6 +331,14 @@ class ImageGoal(Goal):
     warm_up: float | int
     weights: Mapping[str, float | int] | None
     gap: int = GAP
+
+    @property
+    def part(self) -> str:
+        return "window" if self.loss.error is None else "image"
+
+    @property
+    def measure(self) -> str:
+        return "log_mse" if self.loss.error == "log" and self.protocol == "reference" else "mse"
 
     def problem(self, sources: Sources, split: Shares, window: float | int | None) -> Problem:
         cut = functools.partial(

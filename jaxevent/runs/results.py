@@ -37,10 +37,11 @@ def write_rows(
     rows: Iterable[dict[str, Any]],
     write: Write,
     table: Callable[[list[dict[str, Any]]], str] = markdown_table,
+    **more: Any,
 ) -> None:
-    """Write results.json and results.md by a function that `results` gives."""
+    """Write results.json, which holds `more` too, and results.md by a function of `results`."""
     rows = list(rows)
-    text = json.dumps({"rows": rows}, indent=1, allow_nan=False) + "\n"
+    text = json.dumps({"rows": rows, **more}, indent=1, allow_nan=False) + "\n"
     write("results.json", text.encode())
     write("results.md", table(rows).encode())
 

@@ -8,7 +8,7 @@ import json
 import math
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -353,22 +353,27 @@ def aligned(rows: Iterable[Mapping[str, Any]], columns: Sequence[Column]) -> str
     shown. A number that is None, NaN or absent appears as "-".
     """
 
-    def text(value: str) -> str:
-        return " ".join(value.split()).replace("|", r"\|")
-
     table = [["recording", "method", *(title for title, _, _, _ in columns)]]
     for row in rows:
-        cells = [text(row["recording"]), text(row["method"])]
+        cells = [row["recording"], row["method"]]
         for _, place, factor, digits in columns:
             cells.append(number(row, place, factor, digits))
         table.append(cells)
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    left = 2  # the names; numbers are aligned to the right
-    rule = ["-" * w if i < left else "-" * (w - 1) + ":" for i, w in enumerate(widths)]
-    table.insert(1, rule)
+    return lay_out(table, (0, 1))
+
+
+def lay_out(table: Sequence[Sequence[str]], left: Collection[int]) -> str:
+    """Cells as a Markdown table whose first row are titles; aligned as plain text too.
+
+    Columns in `left` hold words, the others numbers, which are aligned to the right.
+    """
+    cells = [[" ".join(cell.split()).replace("|", r"\|") for cell in line] for line in table]
+    widths = [max(3, *map(len, column)) for column in zip(*cells, strict=True)]
+    rule = ["-" * w if i in left else "-" * (w - 1) + ":" for i, w in enumerate(widths)]
+    cells.insert(1, rule)
     lines = (
-        [cell.ljust(w) if i < left else cell.rjust(w) for i, (cell, w) in cells]
-        for cells in (enumerate(zip(line, widths, strict=True)) for line in table)
+        [cell.ljust(w) if i in left else cell.rjust(w) for i, (cell, w) in pairs]
+        for pairs in (enumerate(zip(line, widths, strict=True)) for line in cells)
     )
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 

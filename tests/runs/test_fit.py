@@ -517,7 +517,7 @@ def test_thresholds_and_clock_are_recovered(fitted):
 
     def loss(offset: float) -> float:
         shifted = edi.Params(**{**params.values(), "clock_offset": offset})
-        return float(jaxevent.tuning._value(problem.objective, shifted, problem(shifted)[0][0]))
+        return float(jaxevent.tuning.loss_of(problem.objective, shifted, problem(shifted)[0][0]))
 
     scan = [float(offset) for offset in np.arange(0.003, 0.008, 0.00025)]
     losses = [loss(offset) for offset in scan]
@@ -531,7 +531,8 @@ def test_what_a_fit_writes(fitted):
     names = ["config.toml", "loss.csv", "loss.png", "params.toml", "results.json", "results.md"]
     assert sorted(path.name for path in out.iterdir()) == names
     assert (out / "config.toml").read_text() == EDI
-    assert json.loads((out / "results.json").read_text()) == {"rows": rows}
+    written = json.loads((out / "results.json").read_text())
+    assert written["rows"] == rows and list(written) == ["rows", "found", "gains"]
     counts = {"fit": 5, "validation": 3, "test": 2}
     assert [(row["method"], row["split"], row["frames"]) for row in rows] == [
         (method, split, count)
@@ -545,8 +546,20 @@ def test_what_a_fit_writes(fitted):
     stamps = np.sort(np.concatenate([row["per_frame"]["t"] for row in rows[:3]]))
     assert stamps.tolist() == held_out(moving())[1].t.tolist()
     table = (out / "results.md").read_text().splitlines()
-    assert len(table) == 4 and "edi, before" in table[2]
+    assert table[4] == "" and "edi, before" in table[2]
     assert f"{100 * rows[5]['mse']:.3f}" in table[3]
+    told = {row["parameter"]: row for row in written["found"]}
+    assert list(told) == ["c_on", "c_off", "clock_offset"]
+    for name, true in (("c_on", C_ON), ("c_off", C_OFF)):
+        assert told[name]["low"] < told[name]["found"] < told[name]["high"] < 1.5 * true
+        assert told[name]["of"] == "5 images" and told[name]["unit"] == "ln I"
+        assert told[name]["start"] == pytest.approx(0.1)
+    assert [cell.strip() for cell in table[7].split("|")[1:5]] == [
+        "edi", "c_on", "0.1", f"{told['c_on']['found']:.4g}"
+    ]  # fmt: skip
+    gain = {"method": "edi", "measure": "mse", "split": "test", "before": rows[2]["mse"],
+            "after": rows[5]["mse"]}  # fmt: skip
+    assert written["gains"] == [gain]
     values = tomllib.loads((out / "params.toml").read_text())
     assert list(values) == ["edi"]
     assert METHODS["edi"].Params.of(values["edi"]).values() == values["edi"]
@@ -566,7 +579,7 @@ def test_gradients_of_a_reconstruction_agree():
     params = edi.Params(clock_offset=0.004)
     batch = problem(params)[0][0]
     raw = {name: params.raw[name] + jnp.array([0, 0.1]) for name in ("c_on", "I0")}
-    slopes = functools.partial(jaxevent.tuning._slopes, problem.objective)
+    slopes = functools.partial(jaxevent.tuning.slopes, problem.objective)
     forward, reverse = (slopes(mode, params, raw, batch) for mode in (True, False))
     np.testing.assert_allclose(forward[0], reverse[0], rtol=1e-12)
     for name in raw:
@@ -706,7 +719,7 @@ def test_a_fit_that_is_killed_ends_as_if_it_had_not_been(folder, capsys, float32
     kill_at(begin_fit(out, "--resume"), out, 1, 40)
     for argv in (["--out", str(whole)], ["--out", str(out), "--resume"]):
         assert cli.main(["fit", str(config), *argv]) == 0
-        assert capsys.readouterr().out.count("edi") == 2
+        assert capsys.readouterr().out.count("edi, before") == 1
     assert not (out / "checkpoint").exists()
     for name in ("params.toml", "loss.csv"):
         assert (out / name).read_bytes() == (whole / name).read_bytes()
