@@ -10,9 +10,7 @@ q = d - dt B Omega, what the rotation leaves of the displacement d from an earli
 
 over those that U moves by b/2 to b, is looked at on a grid of speeds; the largest one is refined by
 least squares over the candidates that voted for it. The candidate nearest to the half-line alone
-(thesis, chapter 6) tells less: an edge's burst of events offers many. With the true motion, the
-median error of flow is 9 to 18 % by votes and 15 to 30 % by the nearest candidate (simulated walls,
-shapes and textures, 160x120).
+(thesis, chapter 6) tells less: an edge's burst of events offers many.
 """
 
 from collections.abc import Iterator

@@ -11,19 +11,17 @@ with t (s) from the middle, and are summed, by polarity, into an image J, biline
 The motion sought maximises the mean square or the variance of J: events of one point of the scene
 then fall together. It is found from coarse to fine, with much blur at first, from the motion of the
 window before; for the first window, and when it was lost, by a search of all motions (`search`).
-SciPy's BFGS around one compiled gradient, for all blurs, needs about 12 gradients a window. With
-optax.lbfgs as a program for each blur the first call took 2 to 10 times as long, to compile it.
+SciPy's BFGS goes around one compiled gradient, for all blurs.
 
 Points that enter or leave the sensor within the window pull the motion towards 0, for a slower one
 keeps their cut tracks together as well. So J only counts where a point is in view for the whole
 window, which is found from the motion that an ascent starts with and then held fixed; and events
-count less towards the window's ends. Simulated, 0.1 s: errors of 1.6 and 1.1 % become 1.0 and 0.5 %
-(noise, shapes).
+count less towards the window's ends.
 
 An event tells its pixel, not where in it. Were all at the pixels' middles, an image along whose
-rows or columns things about move would become sharper by the grid alone: before a wall that moves
-by (-20, -1.1) px in 0.1 s the motion across was 0.45 px too large, whatever the blur and the number
-of events. Events that are spread over their pixels do not see the grid: 0.01 px.
+rows or columns things about move would become sharper by the grid alone, and the motion across too
+large, whatever the blur and the number of events. Events that are spread over their pixels do not
+see the grid.
 """
 
 import dataclasses

@@ -14,9 +14,9 @@ again. All planes of a window then tell the motion, with n = u_n / |u_n|:
 
 which is linear in a planar motion and in the camera's rotation, U = B(x) Omega. Constraints are
 weighted by 1 / |u_n|, for errors in proportion to it: unweighted, planes that are too flat make the
-motion 3 to 5 % too fast, and by 1 / |u_n|^2, which asks grad t . U = 1, up to 6 % too slow (on
-simulated scenes). An edge makes a burst of events at every pixel, and the surface keeps the first:
-of the latest, which have come at some pixels and not yet at others, motion is 30 % too fast.
+motion too fast, and by 1 / |u_n|^2, which asks grad t . U = 1, it is too slow. An edge makes a
+burst of events at every pixel, and the surface keeps the first: of the latest, which have come at
+some pixels and not yet at others, motion is too fast.
 """
 
 import dataclasses
@@ -174,11 +174,10 @@ def robust_fit(
     By iteratively reweighted least squares, with the scale from the median of the absolute
     residuals. The covariance is the sandwich H^-1 (sum_c g_c g_c') H^-1, where H is the weighted
     normal matrix and g_c the sum of the scores of a cell: errors within a cell may be anyhow
-    correlated, those of different cells are independent. Systematic errors are not in it: on
-    simulated scenes squared errors of motions by planes are 10 to 20 times what it tells, whatever
-    the cells' size. None where a direction of m is not told: its information is less than
-    `LEAST_NORMALS` of the best told one's, of components in units of 1 / `size` (dimension,); see
-    `Model.arms`.
+    correlated, those of different cells are independent. Systematic errors are not in it:
+    squared errors are larger than it tells, whatever the cells' size. None where a direction of m
+    is not told: its information is less than `LEAST_NORMALS` of the best told one's, of components
+    in units of 1 / `size` (dimension,); see `Model.arms`.
     """
     dimension = rows.shape[1]
     if len(rows) <= dimension:

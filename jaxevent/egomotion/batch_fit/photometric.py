@@ -10,17 +10,15 @@ of the contrast threshold,
 is linear in L and b_u. Minimised over L, b_u, path and depths is the sum of the squared
 differences, robustly (Geman & McClure, 3 sigma), with weak priors on differences of L and of log
 depth between neighbours and on changes of the twist. L is a quadratic B-spline of 1 px: with
-bilinear interpolation the cost at the true motion is twice as high and more. b_u is
+bilinear interpolation the cost at the true motion is higher. b_u is
 eliminated exactly (differences less their mean over the pixel's events), all else is one linear
 system a step, solved by conjugate gradients, without the matrix: the map's diagonal, and path with
 lumped depths exactly, precondition it. Steps extrapolate (Nesterov): reweighting alone is slow. A
-step that costs more is taken back and damped (Levenberg & Marquardt): beside sharp edges, linear
-within 0.3 px, the cost grew to six times what it was in 100 steps without.
+step that costs more is taken back and damped (Levenberg & Marquardt): beside sharp edges misfits
+are linear within a fraction of a pixel only, and the cost would grow.
 Where an outline passes before another, their crossing moves as neither and the levels beside them
-change; without the events there, plain shapes' errors are a third to a half. Single misfits do not
-stand out there, but all of them are larger (three simulated scenes: the area under the ROC curve is
-0.67 to 0.89 for the mean within `PLACE`, 0.59 to 0.69 for single ones): where misfits are large on
-average, all events count less.
+change, so that events there mislead. Single misfits do not stand out there, but all of them are
+larger: where misfits are large on average, within `PLACE`, all events count less.
 Nothing is gained by squeezing events together, which biases contrast, and no event is compared that
 tells only the gradient along the flow. An ON threshold C (1 + skew) and an OFF one of C (1 - skew)
 are allowed for.
@@ -28,8 +26,8 @@ are allowed for.
 Depth is interpolated between nodes 4 px apart, and an event lies on the nearest surface that its
 ray meets: what is behind is hidden. `depths` gives every node the depth at which the events around
 it have the highest contrast, the path held fixed: beside an edge of depth that is the nearer
-surface's, whose outline made the events. Adjusted from smooth depths instead, the path ends some 5
-degrees beside the truth. Or all depths are those of a plane.
+surface's, whose outline made the events. Adjusted from smooth depths instead, the path ends beside
+the truth. Or all depths are those of a plane.
 """
 
 from typing import NamedTuple
@@ -230,9 +228,8 @@ def spread(equations: Equations, seen: Seen) -> Float[Array, "6 6"]:
     Of cells of 24 and of 48 px those that tell more.
 
     H counts the weights w of misfits e, the curvature of their robust cost is less: the mean of
-    d(w e)/de = w (1 - 3 u) / (1 + u), u = (e / 3 sigma)^2 (Huber). Errors are then 1 to 3 times
-    sigma before walls and textures, but 7 to 35 times before plain shapes, where they are alike
-    everywhere.
+    d(w e)/de = w (1 - 3 u) / (1 + u), u = (e / 3 sigma)^2 (Huber). Errors are
+    then larger than sigma before plain shapes, where they are alike everywhere: see `inflation`.
     """
     tracks, weight, left = equations.problem.tracks, seen.weight, equations.left
     u = left**2 / equations.problem.limit

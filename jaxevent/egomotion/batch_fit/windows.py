@@ -140,7 +140,7 @@ def inflation(inliers: float) -> float:
     """By how much errors squared are larger than the covariance of independent cells tells.
 
     Where many events are not explained, as before plain shapes that pass before each other, the
-    model errs. Simulated, ratios of errors are 2 at 95 % of inliers and 13 at 58 %.
+    model errs.
     """
     return (RATIO * np.exp(GROWTH * max(0.95 - inliers, 0.0))) ** 2
 

@@ -8,9 +8,9 @@ By default all candidates vote, softly, over a baseline of several pixels:
     S = sum_c exp(-r_c^2 / (2 sigma_x^2)),  dt_c in [0.7 tau, tau],  tau = b / |U_mean|
     r_c = |d_c - U dt_c|,  log w += alpha log(1 + S / s0)
 
-Candidates of that narrow range tell as much as those from tau/2 on, with 60 % of the work. An event
+Candidates of that narrow range tell about as much as those from tau/2 on, with less work. An event
 that would have come from outside the sensor is not asked: it lacks the candidates of fast
-hypotheses, and that made motion 1.1 % too slow on 160 x 120 pixels instead of 0.3 %.
+hypotheses, and that would make the motion too slow.
 
 A common tau serves only a motion that is about known. To find it, at the start and when it is lost,
 every hypothesis is given the ages in which it crosses the baseline itself ("band"):

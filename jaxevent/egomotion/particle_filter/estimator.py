@@ -367,8 +367,7 @@ def _corners(model: Model, gatherer: Gatherer) -> NDArray[np.floating]:
 def lengths(params: Params, speed: Speed) -> dict[str, float]:
     """The oldest candidates, so old that a quarter of the image has moved by the baseline.
 
-    They stay where they are half as old at least: with 0.18 s instead of 0.09 s errors of a roll
-    before a disk grew from 3.3 to 5.0 %.
+    They stay where they are half as old at least: a motion that changes is told worse by old ones.
     """
     if params.likelihood == "literal":
         return {}
