@@ -18,5 +18,16 @@ def recovery():
 
 @pytest.mark.slow
 def test_the_likelihood_finds_what_the_data_were_drawn_with(recovery):
-    for name, (true, found) in recovery.model_recovery(100).items():
-        assert abs(found / true - 1) < 0.1, (name, true, found)
+    true, told = recovery.model_recovery(100)
+    for name, value in true.items():
+        assert abs(told[name].value / value - 1) < 0.1, (name, value, told[name])
+
+
+@pytest.mark.slow
+def test_the_noises_of_the_akf_are_within_their_intervals(recovery):
+    true, told = recovery.akf_recovery(60)
+    assert {"sigma_proc", "sigma_iso", "sigma_ref"} < set(true)
+    for name, value in true.items():
+        one = told[name]
+        assert one.holds(value) and not one.holds(one.start), (name, value, one)
+        assert 0.5 * value < one.low < one.high < 2 * value
