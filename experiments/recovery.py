@@ -28,24 +28,24 @@ from jaxevent.tuning import Settings, optimise
 TRUE = {
     "c_on": 0.12,
     "c_off": 0.09,
-    "sigma_event": 0.2,
-    "sigma_bg": 0.3,
-    "sigma_frame": 0.005,
+    "sigma_event": 0.12,
+    "sigma_bg": 0.15,
+    "sigma_frame": 0.008,
 }
 
 
 def from_model(seed: int = 0, size: tuple[int, int] = (40, 32), frames: int = 20) -> Recording:
     """Draw a recording from the smoother's model with the true values; I0 = 0.2.
 
-    Events come at random; their polarity pulls their own sum back to the middle, so that frames are
-    rarely near black or white. (It must not depend on the noise: the likelihood is of the frames,
-    given the events.)
+    Events come at random; their polarity pulls their own sum back to the middle, so that frames do
+    not reach black or white, where their likelihood is approximate. (It must not depend on the
+    noise: the likelihood is of the frames, given the events.)
     """
     rng = np.random.default_rng(seed)
     width, height = size
     pixels, gap = width * height, 20_000
     I0, middle = 0.2, np.log(0.3 + 0.2)
-    x = middle + rng.normal(0, 0.2, pixels)
+    x = middle + rng.normal(0, 0.1, pixels)
     total = np.zeros(pixels)
     t, where, up, images = [], [], [], []
     for k in range(frames):
@@ -99,7 +99,7 @@ Recovered = tuple[dict[str, float], Findings]
 def model_recovery(iterations: int = 100, seed: int = 0) -> Recovered:
     """Of the smoother, from a start that is wrong by a factor of 2 or so."""
     start = jaxevent.aks.Params(
-        c_on=0.2, c_off=0.2, I0=0.2, sigma_event=0.1, sigma_bg=0.1, sigma_frame=0.03,
+        c_on=0.2, c_off=0.2, I0=0.2, sigma_event=0.3, sigma_bg=0.4, sigma_frame=0.03,
         sigma_floor=1e-4, w_min=1.0, share=0.0,
     )  # fmt: skip
     return TRUE, by_frames(from_model(seed), start, list(TRUE), None, iterations)
