@@ -35,7 +35,7 @@ from jaxevent.simulate import motion_scene
 from jaxevent.tuning import Settings, loss_of, optimise
 
 GRID = 10.0 ** np.arange(1, 6.1, 0.5)  # px/s
-RUNS, SETTLE = 4, 0.05
+RUNS, SETTLE, ITERATIONS = 2, 0.05, 20
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Problem:
         return goal.loss, *goal.problem(self.sources, None, None)(params)
 
 
-SMALL: dict[str, Any] = {"particles": 100, "batch": 32}
+SMALL: dict[str, Any] = {"particles": 64, "batch": 32}
 WAYS: dict[str, tuple[Callable, str, dict[str, Any]]] = {
     "planar, crossing": (points, "planar", {"likelihood": "literal"}),
     "planar, fixed": (
@@ -165,9 +165,6 @@ def fitted(problem: Problem, label: str, given: dict[str, Any], names: list[str]
         one = told[name]
         cells = (f"`{name}` {one.start:.3g}", f"{one.value:.3g}", one.interval, one.remark)
         print(f"| {label} | {' | '.join(cells)} | {before:.1f} | {after:.1f} |", flush=True)
-
-
-ITERATIONS = 30
 
 
 def curve(problem: Problem, given: dict[str, Any]) -> tuple[list[float], list[float]]:

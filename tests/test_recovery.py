@@ -19,7 +19,7 @@ def recovery():
 @pytest.mark.slow
 @pytest.mark.parametrize("part", ["smoother", "akf"])
 def test_intervals_hold_what_the_data_were_drawn_with(recovery, part):
-    true, told = recovery.PARTS[part]()
+    true, told = recovery.PARTS[part](0)
     for name, value in true.items():
         one = told[name]
         assert one.holds(value) and not one.holds(one.start), (name, value, one)
