@@ -6,7 +6,8 @@ Six simulated scenes, each panned slowly and fast before a sensor that shows som
 each other, 32x32 pixels each. Each pair of scenes is held out in turn; configs/fit_noises.toml is
 fitted to the next pair, on two paths each, and to the other four scenes. Errors are log MSEs, means
 over the folds: of what was fitted to, and of the scenes held out, after +- the standard deviation
-over the seeds of their paths, in per cent. Fits that are done are kept in the folder.
+over the seeds of their paths, in per cent; and path by path as parts of the error with thresholds
+alone, the least, the mean and the largest. Fits that are done are kept in the folder.
 """
 
 import argparse
@@ -29,7 +30,7 @@ CONFIG = Path(__file__).parents[1] / "configs" / "fit_noises.toml"
 PAIRS = (("room", "forest"), ("mountain", "lake"), ("night", "tunnel"))
 SIZE, SECONDS = (32, 32), 0.7
 NOISES = ("sigma_proc", "sigma_iso", "sigma_ref", "rho_width")
-PRESET = "preset hdr, nothing fitted"
+PRESET, BASE = "preset hdr, nothing fitted", "thresholds"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,6 +101,10 @@ def table(runs: Sequence[dict[str, list[dict]]]) -> str:
         means = [mean([r for r in held if Path(r["recording"]).name == name]) for name in names]
         spread = 100 * np.std(means, ddof=1) / np.mean(means) if len(means) > 1 else 0.0
         cells = [f"{mean(used):.3g}", f"{mean(held):.3g} ± {spread:.0f}"]
+        alone = {row["recording"]: row["log_mse"] for row in rows if row["method"] == BASE}
+        ratios = [row["log_mse"] / alone[row["recording"]] for row in held]
+        middle = np.exp(np.mean(np.log(ratios)))
+        cells.append(f"{min(ratios):.2f}, {middle:.2f}, {max(ratios):.2f}")
         for name in NOISES:
             values = [o["found"] for o in found if (o["method"], o["parameter"]) == (method, name)]
             cells.append(f"{min(values):.2g} to {max(values):.2g}" if values else "")
@@ -117,8 +122,8 @@ def main() -> None:
     for number in arguments.scenes:
         runs = [fitted(out, held, number, arguments.seeds) for held in range(len(PAIRS))]
         titles = " | ".join(f"`{name}`" for name in NOISES)
-        part = f"| {number} scenes | fitted to | held out | {titles} |\n"
-        part += "|---|" + "---:|" * (2 + len(NOISES)) + "\n" + table(runs)
+        part = f"| {number} scenes | fitted to | held out | of thresholds' | {titles} |\n"
+        part += "|---|" + "---:|" * (3 + len(NOISES)) + "\n" + table(runs)
         print(part, flush=True)
         text += part + "\n"
     (out / "table.md").write_text(text)

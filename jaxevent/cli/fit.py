@@ -15,9 +15,9 @@ def add(commands: Any) -> None:
         "Fit parameters of methods to recordings. It writes them with tables of the errors before "
         "and after, and prints the errors of images that it did not use, every number that it "
         "found with its start and a confidence interval, and what ran to a bound or away. An "
-        "interrupted fit goes on with --resume. Where steps lead away, it writes the best parameters seen; the exit "
-        "status is 2 then. Several processes, on one machine or many, fit together: each is given "
-        "the same arguments and its number.",
+        "interrupted fit goes on with --resume. Where steps lead away, it writes the best "
+        "parameters seen; the exit status is 2 then. Several processes, on one machine or many, "
+        "fit together: each is given the same arguments and its number.",
         "configs/fit_slider_depth.toml --out fitted",
         "configs/fit_slider_depth.toml --recording mine.h5 --out mine --resume",
         "mine.toml --out fitted --coordinator host1:4321 --processes 2 --process 0",
