@@ -2,18 +2,16 @@
 
     python experiments/blob_finding.py --out finding --first 10 [--scenes NAME ...] [--data DIR]
 
-Every scene is tracked as a new user does it, `moment.estimate(recording)`. Beside it: the targets
-that `find` alone gives; `clusters`, connected components of event images, each linked to the
+Every scene is tracked as a new user does it, `moment.estimate(recording)`, whose states rest on all
+events. Beside it: `filter`, the same tracks from the events up to each time; the targets that
+`find` alone gives; `clusters`, connected components of event images, each linked to the
 nearest of the image before; and `kalman`, a tracker of constant velocity on the same centroids with
 optimal assignment, births after three and deaths after five images, as norfair and motpy do it.
 Both baselines get the window and cell that `find` chose. Makes table.md and results.json. With
 --data, a folder that holds spinning_dot.npz and davis346_street.npz, these are tracked too.
 
-Scores are taken at 200 times: a track and a target are one where they are nearer than 2 sizes and
-3 px. `idf1` is that of Ristani et al. 2016 (identities assigned once for the whole recording),
-`mota` that of the CLEAR metrics. A target is found if one track has it for half its time. `false`
-tracks are near no target for half of their time. `cover` is the share of the targets' time that is
-matched, `rms` the distance in px where it is.
+Scores are those of `jaxevent.blob.scores` at 200 times: a track and a target are one where they are
+nearer than 2 sizes and 3 px.
 """
 
 import argparse
@@ -32,6 +30,7 @@ from jaxevent.blob import Found, find, moment
 from jaxevent.blob.finding.background import measure_background
 from jaxevent.blob.finding.detection import detect, measure_blobs
 from jaxevent.blob.finding.stream import Stream
+from jaxevent.blob.scores import score_tracks
 from jaxevent.io import load
 from jaxevent.recording import Recording
 from jaxevent.simulate.blobs import (
@@ -204,12 +203,15 @@ def found_paths(found: Found, times: NDArray[np.int64]) -> Answer:
     return Answer(out)
 
 
-def tracked(recording: Recording, found: Found, times: NDArray[np.int64]) -> Answer:
-    """Positions of what a new user gets."""
+def tracked(recording: Recording, found: Found, times: NDArray[np.int64]) -> tuple[Answer, Answer]:
+    """Positions of what a new user gets, smoothed, and of the filter."""
     params = moment.Params(**found.settings())
     tracks = moment.estimate(recording, params, found=found, progress=False)
-    states = tracks(times)
-    return Answer(np.where(states.valid[..., None], states.mean[..., :2], np.nan))
+    smoothed, filtered = (
+        Answer(np.where(states.valid[..., None], states.mean[..., :2], np.nan))
+        for states in (tracks(times), tracks.filtered(times))
+    )
+    return smoothed, filtered
 
 
 def _centroids(recording: Recording, found: Found) -> Iterator[tuple[int, NDArray]]:
@@ -297,46 +299,13 @@ def _of_lines(lines: list[_Line], times: NDArray[np.int64]) -> Answer:
 def score(answer: Answer, truth: Truth, times: NDArray[np.int64], size: tuple[int, int]) -> dict:
     """See the module's docstring."""
     states = truth(times)
-    there = truth.visible(times) & (states[..., 4] > 0.5)
-    there &= ((states[..., :2] >= 0) & (states[..., :2] < size)).all(-1)
-    wanted = np.flatnonzero((states[..., 4] > 0.5).any(0))
-    states, there = states[:, wanted], there[:, wanted]
-    tracks = answer.positions
-    d = np.linalg.norm(tracks[:, None] - states[:, :, None, :2], axis=-1)
-    near = d < 2 * states[:, :, None, 4] + 3
-    same = near & there[:, :, None]
-    # Where a target is hidden, a track that waits for it is no error.
-    hidden = (near & ~there[:, :, None]).any(1)
-    alive = np.isfinite(tracks[..., 0]) & ~hidden
-    shared = same.sum(0)
-    i, j = linear_sum_assignment(-shared) if shared.size else ([], [])
-    idtp = shared[i, j].sum() if shared.size else 0
-    total = there.sum() + alive.sum()
-    matched, errors, switches = 0, [], 0
-    last = np.full(len(wanted), -1)
-    for k in range(len(times)):
-        cost = np.where(same[k], d[k], 1e6)
-        for target, one in zip(*linear_sum_assignment(cost), strict=True) if cost.size else ():
-            if cost[target, one] < 1e6:
-                matched += 1
-                errors.append(d[k, target, one])
-                switches += last[target] not in (-1, one)
-                last[target] = one
-    false = np.isfinite(tracks[..., 0]).any(0) & (
-        same.any(1).sum(0) + hidden.sum(0) < 0.5 * np.isfinite(tracks[..., 0]).sum(0)
-    )
-    most = shared.max(1, initial=0) if shared.size else np.zeros(len(wanted))
-    misses = there.sum() - matched
-    return {
-        "targets": int((there.sum(0) > 0).sum()),
-        "found": int((most >= 0.5 * np.maximum(there.sum(0), 1)).sum()),
-        "tracks": int(np.isfinite(tracks[..., 0]).any(0).sum()),
-        "false": int(false.sum()),
-        "cover": float(matched / max(there.sum(), 1)),
-        "rms": float(np.sqrt(np.mean(np.square(errors)))) if errors else math.nan,
-        "idf1": float(2 * idtp / total) if total else 1.0,
-        "mota": float(1 - (misses + alive.sum() - matched + switches) / max(there.sum(), 1)),
-    }
+    states = states[:, (states[..., 4] > 0.5).any(0)]  # the others are hot pixels
+    visible = truth.visible(times)[:, (truth(times)[..., 4] > 0.5).any(0)]
+    inside = np.asarray(((states[..., :2] >= 0) & (states[..., :2] < size)).all(-1))
+    paths = np.where(inside[..., None], states[..., :2], np.nan)
+    told = score_tracks(paths, answer.positions, 2 * states[..., 4] + 3, hidden=~visible)
+    names = ("targets", "found", "tracks", "false", "covered", "rms", "idf1", "mota", "hota")
+    return {name: getattr(told, name) for name in names}
 
 
 def main() -> None:
@@ -357,8 +326,10 @@ def main() -> None:
             clock = time.process_time()
             found = find(recording, progress=False)
             seconds = time.process_time() - clock
+            smoothed, filtered = tracked(recording, found, times)
             answers = {
-                "moment": tracked(recording, found, times),
+                "moment": smoothed,
+                "filter": filtered,
                 "find": found_paths(found, times),
                 "clusters": clusters(recording, found, times),
                 "kalman": kalman(recording, found, times),

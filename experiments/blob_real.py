@@ -160,7 +160,9 @@ def spinning_dot(recording: Recording, out: Path) -> tuple[dict, str]:
     shown = None
     for label, (tracker, values) in {**DOT_ROWS, "detected, M = 32": (moment, DOT_FOUND)}.items():
         params, detected = tracker.Params(preset="fast", **values), values is DOT_FOUND
-        tracks = tracker.estimate(recording, params, seeds=None if detected else seeds)
+        tracks = tracker.estimate(
+            recording, params, seeds=None if detected else seeds, smooth=False
+        )
         row: dict[str, Any] = {n: score_dot(tracks, path, s) for n, s in DOT_PARTS.items()}
         row["tracks"] = len(tracks)
         results[label] = row
@@ -327,7 +329,7 @@ def street(recording: Recording, out: Path) -> tuple[dict, str]:
     shown = None
     for label, values in rows.items():
         params = moment.Params(**{**STREET, **values})
-        tracks = moment.estimate(recording.with_frames(slice(0)), params)
+        tracks = moment.estimate(recording.with_frames(slice(0)), params, smooth=False)
         shown = shown or tracks
         for part, span in STREET_PARTS.items():
             row = score_cars(tracks, cars, times, span)
@@ -546,7 +548,7 @@ def sky(recording: Recording, out: Path) -> tuple[dict, str]:
         plain = {"preset": "slow", "events_per_step": 16, "max_targets": 128}
         rows = {"for stars": SKY} | ({"slow preset": plain} if part == "reported" else {})
         for label, values in rows.items():
-            tracks = moment.estimate(cut, moment.Params(**values))
+            tracks = moment.estimate(cut, moment.Params(**values), smooth=False)
             row = results[f"{label}, {part}"] = score_sky(tracks, cut)
             life = ", ".join(f"{one:.1f}" for one in row["life"])
             lines.append(

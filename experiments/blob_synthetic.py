@@ -6,6 +6,7 @@
 time to contact, (d) background noise, (e) a disc's edges, (f) crossings, (g) drop-outs, (h) bias
 and consistency on paths drawn from the filter's own model. Each track is begun by a seed 5 px (one
 standard deviation along each axis) beside the truth, of about twice the true size and at rest.
+States rest on the events up to each time; experiments/blob_finding.py smooths them.
 Writes table.md, results.json and figure.png. Done parts are kept in the folder and not repeated.
 """
 
@@ -81,7 +82,7 @@ def followed(
     size = 8.0 if tracker is constant_velocity else size
     xy = at[:, :2] + SHIFT * rng.normal(size=(len(at), 2))
     seeds = [(*p, size) for p in xy]
-    return tracker.estimate(recording, params, seeds=seeds, start=start, stop=stop)
+    return tracker.estimate(recording, params, seeds=seeds, start=start, stop=stop, smooth=False)
 
 
 def nees(error: np.ndarray, covariance: np.ndarray) -> float:

@@ -56,6 +56,9 @@ class Filter:
         halt: `halt(params, state, known)` is the state of a target that stands still: its velocity
             is 0, and is either known or as uncertain as at the start. By default the state as it
             is.
+        transition: `transition(params, dt, still)` is the matrix (8, 8) by which `predict` moves
+            the mean of `moments` in dt seconds, or, where `still`, moves it between two halts. The
+            smoother needs it; None: the filter's states cannot be smoothed.
         gate: `gate(params, expected, radius, e)` says whether a residual (2,) is a possible event
             of the target.
         log_likelihood: `log_likelihood(params, expected, e)` is ln(2 pi p) of that residual.
@@ -69,6 +72,7 @@ class Filter:
     expected: Callable[[Any, Any], Expected]
     moments: Callable[[Any, Any], tuple[Array, Array]]
     halt: Callable[[Any, Any, bool], Any] = _go_on
+    transition: Callable[[Any, Array, Array], Array] | None = None
     gate: Callable[[Any, Expected, Array, Array], Array] = association.gate
     log_likelihood: Callable[[Any, Expected, Array], Array] = association.log_likelihood
     share: Callable[[Any, Array, Array], Array] = association.share

@@ -124,12 +124,20 @@ def silence_limits(params: TrackerParams, slots: Slots) -> Int[Array, " targets"
     return jnp.where(slots.id >= 0, us, -4 * LONGEST)
 
 
-def predict(filter: Filter, params: TrackerParams, state: Any, dt: Array) -> Any:
+def stands_still(params: TrackerParams, dt: Array) -> Array:
+    """Whether a target without events for dt (s) stands still."""
+    return (params.t_still > 0) & (dt > params.t_still)
+
+
+def predict(
+    filter: Filter, params: TrackerParams, state: Any, dt: Array, still: Array | None = None
+) -> Any:
     """One target's state dt (s) later, without events.
 
     After `t_still` it stands still, and when it goes on its velocity is as unknown as at the start.
+    `still` says so instead where the silence is known to last longer.
     """
-    still = (params.t_still > 0) & (dt > params.t_still)
+    still = stands_still(params, dt) if still is None else still
     state = choose(still, filter.halt(params, state, True), state)
     state = filter.predict(params, state, dt)
     return choose(still, filter.halt(params, state, False), state)

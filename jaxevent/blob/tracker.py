@@ -8,16 +8,20 @@ from typing import Any, ClassVar, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
+from jaxtyping import Array
 
 from jaxevent.blob.finding import Found, find
 from jaxevent.blob.lifecycle import State, shift
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Packing, ReadOut
 from jaxevent.blob.run import run
+from jaxevent.blob.smoother import Smoothed, at_end, look_back, nothing_later, tell_smoothed
 from jaxevent.blob.states import TrackStates, tell
 from jaxevent.blob.steps import Filter
 from jaxevent.blob.targets import Slots, silence_limits
 from jaxevent.blob.tracks import Tracks
+from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
 from jaxevent.recording import Recording, Times, microseconds
 
@@ -36,7 +40,7 @@ class Tracker(Estimator[P]):
     filter: Filter
     family: ClassVar[str] = "blob"
     options: frozenset[str] = dataclasses.field(
-        default=frozenset({"seeds", "start", "stop", "detect", "found"}), kw_only=True
+        default=frozenset({"seeds", "start", "stop", "detect", "found", "smooth"}), kw_only=True
     )
 
     def prepare(
@@ -72,23 +76,49 @@ class Tracker(Estimator[P]):
 
         The trajectory's arrays begin with (chunks, steps + 1, targets). `state` is what the run
         before returned, of features that end where these start; omitted, the recording starts here.
-        For losses, which need less memory, see `jaxevent.blob.losses`.
+        `smooth` adds what later events say. For losses, which need less memory, see
+        `jaxevent.blob.losses`.
         """
         state, told = run(self.filter, params, state, features, "states")
         assert told.slots is not None
         last = jnp.max(jnp.where(features.cycle, jnp.arange(len(features.cycle)), 0))
         return told.slots, shift(state, jnp.asarray(features.stop)[last])
 
-    def read(self, params: P, trajectory: Slots, out: ReadOut) -> TrackStates:
+    def smooth(self, params: P, features: Features, trajectory: Slots) -> Smoothed:
+        """A trajectory of `run`, to be read with all events of the features; pure.
+
+        Raises `InputError` where the filter's states cannot be smoothed.
+        """
+        self._check_smoothing()
+        elapsed = jnp.asarray(features.elapsed)
+
+        def one(carry: Any, chunk: Array) -> Any:
+            path = jax.tree.map(lambda a: a[chunk], trajectory)
+            later = at_end(carry[0], jax.tree.map(lambda a: a[-1], path), carry[1])
+            later = look_back(self.filter, params, path, later)
+            return (jax.tree.map(lambda a: a[0], later), elapsed[chunk]), later
+
+        after = nothing_later(jax.tree.map(lambda a: a[-1, -1], trajectory))
+        chunks = jnp.arange(len(elapsed), dtype=jnp.int32)
+        _, later = lax.scan(one, (after, jnp.zeros_like(elapsed[0])), chunks, reverse=True)
+        return Smoothed(trajectory, later)
+
+    def read(self, params: P, trajectory: Slots | Smoothed, out: ReadOut) -> TrackStates:
         """The targets at the times prepared: first the seeds' in the order given.
 
-        Those found follow, as many as may be held at a time. Valid are confirmed targets; unlike
-        `Tracks`, which knows what follows, this leaves out the time before they were confirmed.
+        Those found follow, as many as may be held at a time. States rest on the events up to each
+        time, those of what `smooth` returned on all. Valid are confirmed targets; unlike `Tracks`,
+        which knows what follows, this leaves out the time before they were confirmed.
         """
-        slots = jax.tree.map(lambda a: a[out.chunk, out.step], trajectory)
+        now = jax.tree.map(lambda a: a[out.chunk, out.step], trajectory)
         time = jnp.asarray(out.time)
-        of_one = functools.partial(tell, self.filter, params)
-        mean, covariance, idle = jax.vmap(jax.vmap(of_one, (0, None)))(slots, time)
+        if isinstance(now, Smoothed):
+            slots, of_one = now.slots, functools.partial(tell_smoothed, self.filter, params)
+            told = jax.vmap(jax.vmap(of_one, (0, 0, None)))(slots, now.later, time)
+        else:
+            slots, of_one = now, functools.partial(tell, self.filter, params)
+            told = jax.vmap(jax.vmap(of_one, (0, None)))(slots, time)
+        mean, covariance, idle = told
         limits = jax.vmap(silence_limits, (None, 0))(params, slots)
         valid = (slots.id >= 0) & slots.confirmed & (time[:, None] - slots.heard < limits)
         valid &= jnp.asarray(out.inside)[:, None]
@@ -120,6 +150,7 @@ class Tracker(Estimator[P]):
         stop: int | float | None = None,
         detect: bool | None = None,
         found: Found | None = None,
+        smooth: bool | None = None,
         progress: bool | None = None,
     ) -> Tracks:
         """Track the blobs of a recording.
@@ -139,15 +170,28 @@ class Tracker(Estimator[P]):
                 parameters and without seeds.
             found: Targets found before, by `find`. Tracks begin and end with them, and take events
                 that are near them only.
+            smooth: Whether states rest on all events, those after a time included. False: on those
+                up to it, as they are known while events come. None: on all, where the filter can.
             progress: Whether a bar is shown; None: where somebody looks on.
 
         Raises:
-            InputError: A seed is outside the sensor or the time, or there is no time to track.
+            InputError: A seed is outside the sensor or the time, there is no time to track, or the
+                filter's states cannot be smoothed.
         """
         self.check(recording)
+        if smooth:
+            self._check_smoothing()
+        smooth = self.filter.transition is not None if smooth is None else smooth
         if params is None and seeds is None and detect is None and found is None:
             found = find(recording, start, stop, progress=progress)
         if params is None:
             params = self.Params(**found.settings()) if found is not None else self.Params()
         packing = Packing(recording, params, seeds, start, stop, detect, found=found)
-        return Tracks(self.filter, packing, params, progress)
+        return Tracks(self.filter, packing, params, progress, smooth)
+
+    def _check_smoothing(self) -> None:
+        if self.filter.transition is None:
+            raise InputError(
+                f"the states of the method {self.name!r} cannot be smoothed, its filter has no "
+                "`transition`; leave out smooth"
+            )

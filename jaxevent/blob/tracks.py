@@ -1,8 +1,9 @@
 """Tracks of many blobs in one stream of events, as a function of time."""
 
+import copy
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +16,14 @@ from jaxevent.blob.lifecycle import ENDS, Log, begin
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Mark, Packing, Stretch, count_steps
 from jaxevent.blob.run import run
+from jaxevent.blob.smoother import (
+    Later,
+    Smoothed,
+    at_end,
+    look_back,
+    nothing_later,
+    tell_smoothed,
+)
 from jaxevent.blob.states import TrackStates, tell
 from jaxevent.blob.steps import Filter
 from jaxevent.blob.targets import Slots, scan_steps
@@ -27,6 +36,7 @@ READS = 64  # times read per call
 
 _begin = jax.jit(begin, static_argnames="filter")
 _run = jax.jit(run, static_argnames=("filter", "wanted"))
+_nothing_later = jax.jit(lambda begins: nothing_later(jax.tree.map(lambda a: a[-1], begins)))
 
 
 @functools.partial(jax.jit, static_argnames="filter")
@@ -44,15 +54,55 @@ def _read(
 
     The chunk is run again from the targets at its start; a time is after `step` of its steps.
     """
+    path = _path_of(filter, params, features, begins, chunk)
+    slots = jax.tree.map(lambda a: a[step[:, None], slot], path)
+    of_one = functools.partial(tell, filter, params)
+    return jax.vmap(jax.vmap(of_one, (0, None)))(slots, time)
+
+
+class _Following(NamedTuple):
+    """What later events say at the start of the chunk that follows, and its us since this one's."""
+
+    later: Later
+    elapsed: Any
+
+
+@functools.partial(jax.jit, static_argnames="filter")
+def _smooth(
+    filter: Filter,
+    params: TrackerParams,
+    features: Features,
+    begins: Slots,
+    chunk: Array,
+    following: _Following,
+) -> tuple[Smoothed, Later]:
+    """A chunk's path, run again, with what later events say; and what they say at its start."""
+    path = _path_of(filter, params, features, begins, chunk)
+    end = jax.tree.map(lambda a: a[-1], path)
+    later = look_back(filter, params, path, at_end(following.later, end, following.elapsed))
+    return Smoothed(path, later), jax.tree.map(lambda a: a[0], later)
+
+
+@functools.partial(jax.jit, static_argnames="filter")
+def _read_smoothed(
+    filter: Filter, params: TrackerParams, smoothed: Smoothed, step: Array, time: Array, slot: Array
+) -> tuple[Array, Array, Array]:
+    """As `_read`, of a chunk that is smoothed."""
+    now = jax.tree.map(lambda a: a[step[:, None], slot], smoothed)
+    of_one = functools.partial(tell_smoothed, filter, params)
+    return jax.vmap(jax.vmap(of_one, (0, 0, None)))(now.slots, now.later, time)
+
+
+def _path_of(
+    filter: Filter, params: TrackerParams, features: Features, begins: Slots, chunk: Array
+) -> Slots:
+    """All targets (steps + 1, targets) of a chunk: at its start and after each of its steps."""
     f = features
     before = jax.tree.map(lambda a: a[chunk], begins)
     events = f.t[chunk], f.xi[chunk], f.polarity[chunk], f.valid[chunk]
     events = *events, None if f.owner is None else f.owner[chunk]
     _, steps = scan_steps(filter, params, "states", f.frame, before, events)
-    path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), before, steps.slots)
-    slots = jax.tree.map(lambda a: a[step[:, None], slot], path)
-    of_one = functools.partial(tell, filter, params)
-    return jax.vmap(jax.vmap(of_one, (0, None)))(slots, time)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), before, steps.slots)
 
 
 class Events(NamedTuple):
@@ -96,8 +146,13 @@ class Tracks:
     were never confirmed are left out. `ended` says why: "end" of the events, "idle", "left" the
     image, "size" beyond limits, "uncertain" position, "merged" with an older one, "not finite".
 
-    Only the targets at the start of some stretches are kept. Reading tracks the stretches again
-    that hold the times asked for, so that memory does not grow with the recording's length.
+    `smooth` says whether states rest on all events of the recording, those after the time
+    included, as `jaxevent.blob.smoother` finds them; `filtered` are the same tracks with states
+    that rest on the events up to the time. Births, deaths and whose an event is are the filter's.
+
+    Only the targets at the start of some stretches are kept, and what later events say of them.
+    Reading tracks the stretches again that hold the times asked for, so that memory hardly grows
+    with the recording's length.
     """
 
     def __init__(
@@ -106,8 +161,9 @@ class Tracks:
         packing: Packing,
         params: TrackerParams,
         progress: bool | None = None,
+        smooth: bool = False,
     ):
-        self.recording, self.params = packing.recording, params
+        self.recording, self.params, self.smooth = packing.recording, params, smooth
         self.start, self.stop = packing.start, packing.stop
         self._filter, self._packing, self._progress = filter, packing, progress
         self._begins: list[tuple[Mark, int, Any]] = []
@@ -115,6 +171,13 @@ class Tracks:
 
     def __len__(self) -> int:
         return len(self.id)
+
+    @property
+    def filtered(self) -> "Tracks":
+        """The same tracks with states that rest on the events up to each time."""
+        other = copy.copy(self)
+        other.smooth = False
+        return other
 
     def __repr__(self) -> str:
         return f"Tracks({len(self)} of {self.recording.name}, {self.start} to {self.stop} us)"
@@ -128,7 +191,7 @@ class Tracks:
     ) -> TrackStates:
         """States at `times`: integers (us) or floats (s), in any order.
 
-        What is told of a time is the prediction from the last step at or before it; with
+        Filtered, what is told of a time is the prediction from the last step at or before it; with
         `events_per_step` above 1, a step has the time of its last event. `ids` chooses tracks, by
         default all. Raises `InputError` for times that are not finite or, unless told to
         `extrapolate`, outside the recording (where no track is valid), and for ids that do not
@@ -168,7 +231,7 @@ class Tracks:
         if not len(self) and end > first:
             yield times[first:end], self._nothing(times[first:end], chosen)
             first = end
-        for stretch, slots in self._again(times[first:end]):
+        for stretch, slots, following in self._again(times[first:end]):
             features, id = jax.device_put(stretch.features), np.asarray(slots.id)
             upto = end
             if stretch.next is not None:
@@ -179,7 +242,10 @@ class Tracks:
                 if chunk + 1 < len(stretch.start):
                     stop = min(stop, int(np.searchsorted(times, stretch.start[chunk + 1])))
                 batch = times[first:stop]
-                yield batch, self._in_chunk(stretch, features, slots, id, chunk, batch, chosen)
+                yield (
+                    batch,
+                    self._in_chunk(stretch, features, slots, following, id, chunk, batch, chosen),
+                )
                 first = stop
         if first < len(times):
             yield times[first:], self._nothing(times[first:], chosen)
@@ -241,6 +307,7 @@ class Tracks:
         stretch: Stretch,
         features: Features,
         slots: Slots,
+        following: list[_Following] | None,
         id: NDArray,
         chunk: int,
         times: NDArray[np.int64],
@@ -256,29 +323,33 @@ class Tracks:
         since = times - stretch.start[chunk]
         step = count_steps(stretch.features, np.full(len(times), chunk), since)
         mask = alive[:, some]
+        parts = self._filter, self.params
+        if following is None:
+            read = functools.partial(_read, *parts, features, slots, np.int32(chunk))
+        else:
+            at = np.int32(chunk), following[chunk]
+            smoothed, _ = _smooth(*parts, features, slots, *at)
+            read = functools.partial(_read_smoothed, *parts, smoothed)
         for first in range(0, len(times), READS):
             part = slice(first, first + READS)
             fill = (0, READS - len(times[part]))
-            read = _read(
-                self._filter,
-                self.params,
-                features,
-                slots,
-                np.int32(chunk),
-                np.pad(step[part], fill),
-                np.pad(since[part], fill).astype(np.int32),
-                slot,
-            )
+            padded = np.pad(step[part], fill), np.pad(since[part], fill).astype(np.int32)
+            told = read(*padded, slot)
             now = mask[part]
-            for out, value in zip((states.mean, states.covariance, states.idle), read, strict=True):
+            for out, value in zip((states.mean, states.covariance, states.idle), told, strict=True):
                 value = np.asarray(value)[: len(now), : len(some)]
                 seen = now.reshape(*now.shape, *[1] * (value.ndim - 2))
                 out[part, some] = np.where(seen, value, np.nan)
         states.valid[:] = alive
         return states
 
-    def _again(self, times: NDArray[np.int64]) -> Iterator[tuple[Stretch, Any]]:
-        """The stretches that hold some of the sorted times, with the targets at chunks' starts."""
+    def _again(
+        self, times: NDArray[np.int64]
+    ) -> Iterator[tuple[Stretch, Any, list[_Following] | None]]:
+        """The stretches that hold some of the sorted times, with the targets at chunks' starts.
+
+        Smoothed, also what later events say after each chunk.
+        """
         if not len(times):
             return
         mark, state = self._begin_of(int(times[0]))
@@ -290,7 +361,10 @@ class Tracks:
             upto = len(times) if mark is None else int(np.searchsorted(times, mark.start))
             state, told = _run(self._filter, self.params, state, stretch.features, wanted="begins")
             if upto > done:
-                yield stretch, told.slots
+                following = None
+                if self.smooth:
+                    following, _ = self._look_back(stretch, told.slots, self._later)
+                yield stretch, told.slots, following
             done = upto
             if done < len(times) and mark is not None:
                 later, known = self._begin_of(int(times[done]))
@@ -300,6 +374,57 @@ class Tracks:
     def _begin_of(self, time: int) -> tuple[Mark | None, Any]:
         known = [(mark, state) for mark, _, state in self._begins if mark.start <= time]
         return known[-1]
+
+    def _look_back(
+        self, stretch: Stretch, begins: Slots, known: Mapping[Mark, Later]
+    ) -> tuple[list[_Following], Later]:
+        """What later events say after each chunk of a stretch, and at the stretch's start.
+
+        `known` is what they say at the start of the next one.
+        """
+        later, elapsed = _nothing_later(begins), 0
+        if stretch.next is not None:
+            later, elapsed = known[stretch.next], stretch.next.start - stretch.next.previous
+        features, found = jax.device_put(stretch.features), []
+        used = int((stretch.start < np.iinfo(np.int64).max).sum())
+        for chunk in reversed(range(used)):
+            found.append(_Following(later, np.int32(elapsed)))
+            at = np.int32(chunk), found[-1]
+            _, later = _smooth(self._filter, self.params, features, begins, *at)
+            elapsed = stretch.features.elapsed[chunk]
+        return found[::-1], later
+
+    @functools.cached_property
+    def _later(self) -> dict[Mark, Later]:
+        """What later events say at the starts of all stretches, found from the last one on."""
+        found: dict[Mark, Later] = {}
+        rows = self._packing.rows
+        with bar(
+            total=rows[1] - rows[0], unit="event", unit_scale=True, desc="smooth",
+            progress=self._progress,
+        ) as shown:  # fmt: skip
+            for mark, state in self._backwards():
+                stretch = self._packing.pack(mark)
+                _, told = _run(self._filter, self.params, state, stretch.features, wanted="begins")
+                _, first = self._look_back(stretch, told.slots, found)
+                found[mark] = jax.device_get(first)
+                shown.update(int(np.count_nonzero(stretch.features.valid)))
+        return found
+
+    def _backwards(self) -> Iterator[tuple[Mark, Any]]:
+        """All stretches with the targets at their starts, from the last one to the first."""
+        end = None
+        for first, _, state in reversed(self._begins):
+            mark, starts = first, []
+            while mark is not None and mark != end:
+                starts.append((mark, state))
+                stretch = self._packing.pack(mark)
+                mark = stretch.next
+                if mark is not None and mark != end:
+                    features = stretch.features
+                    state, _ = _run(self._filter, self.params, state, features, wanted="begins")
+            yield from reversed(starts)
+            end = first
 
     def _follow(self) -> _History:
         """The first pass: all births and deaths, and some targets on the way."""

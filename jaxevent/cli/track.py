@@ -53,6 +53,12 @@ def add(commands: Any) -> None:
         help="tracks begin where events are many on a grid, as --params says, instead of the "
         "search through the whole recording; with seeds: further ones",
     )
+    one.add_argument(
+        "--filtered",
+        action="store_true",
+        help="states rest on the events up to each time, as they are known while events come; "
+        "default: on all, where the method can",
+    )
     when = one.add_mutually_exclusive_group()
     when.add_argument(
         "--rate", metavar="HZ", type=float, default=1000.0, help="rows per second; default: 1000"
@@ -93,6 +99,7 @@ def run(
     params: Path | None,
     seeds: list[tuple[float, ...]] | None,
     detect: bool,
+    filtered: bool,
     rate: float | int,
     at: str | None,
     start: float | int | None,
@@ -129,7 +136,8 @@ def run(
         if params is not None:
             given = tracker.Params.load(params, method, settings)
         options = {"found": found, **span}
-    tracks = tracker.estimate(recording, given, **options, progress=show_progress())
+    smooth = False if filtered else None
+    tracks = tracker.estimate(recording, given, **options, smooth=smooth, progress=show_progress())
     seconds = time.perf_counter() - clock
     texts = {"params.toml": toml.parameters(tracks.params) + "\n"}
     written = output.write(tracks, show_progress(), texts, tracker.name)

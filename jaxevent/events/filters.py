@@ -38,6 +38,11 @@ def is_hot(
     A hot pixel fired more than `ratio` times as often as the busiest of its neighbours, and at
     least `least` times. An edge that passes has busy neighbours.
     """
+    return (counts >= least) & (counts > ratio * busiest_neighbour(counts))
+
+
+def busiest_neighbour(counts: NDArray[np.integer]) -> NDArray[np.integer]:
+    """The most events (H, W) that one of the 8 pixels around each fired, by counts (H, W)."""
     height, width = counts.shape
     around = np.pad(counts, 1)
     busiest = np.zeros_like(counts)
@@ -45,7 +50,7 @@ def is_hot(
         for dx in range(3):
             if (dy, dx) != (1, 1):
                 np.maximum(busiest, around[dy : dy + height, dx : dx + width], out=busiest)
-    return (counts >= least) & (counts > ratio * busiest)
+    return busiest
 
 
 def find_hot_pixels(part: Events | Recording, *, size: Size | None = None) -> NDArray[np.bool_]:

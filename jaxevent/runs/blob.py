@@ -226,7 +226,7 @@ class TrackGoal(Goal):
         else:
             assert self.targets.seeds is not None
             tracks = self.tracker.estimate(
-                recording, self.start, seeds=list(self.targets.seeds), progress=False
+                recording, self.start, seeds=list(self.targets.seeds), smooth=False, progress=False
             )
             means = tracks(begins).mean.tolist()
             cuts = [

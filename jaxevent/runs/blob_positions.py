@@ -1,8 +1,9 @@
 """Known positions of targets, and tracks compared with them.
 
 Positions are a table with the columns t (s), x, y (px) and, of more than one target, id, as
-`jaxevent track` and `jaxevent simulate --truth` write them; further columns are left out. Targets
-by rising id are those of the seeds in their order.
+`jaxevent track` and `jaxevent simulate --truth` write them. The columns vx, vy (px/s), lambda1,
+lambda2 (px), theta (rad), inverse_ttc (1/s) and range (m) may be added, empty where nothing is
+known; further ones are left out. Targets by rising id are those of the seeds in their order.
 """
 
 import dataclasses
@@ -41,12 +42,20 @@ SETTINGS: Mapping[str, Check] = {
 }
 
 
+MORE = ("vx", "vy", "lambda1", "lambda2", "theta", "inverse_ttc", "range")  # columns beside x, y
+
+
 @dataclasses.dataclass(frozen=True)
 class Known:
-    """Given positions: times (T,) us, xi (T, targets, 2) in px, NaN where not known."""
+    """Given positions: times (T,) us, xi (T, targets, 2) in px, NaN where not known.
+
+    `more` are further columns, of `MORE`, (T, targets) each, and `id` the targets' numbers.
+    """
 
     t: NDArray[np.int64]
     xi: NDArray[np.float64]
+    more: Mapping[str, NDArray[np.float64]] = dataclasses.field(default_factory=dict)
+    id: NDArray[Any] = dataclasses.field(default_factory=lambda: np.zeros(1, np.int64))
 
 
 def read_positions(path: str | Path) -> Known:
@@ -64,10 +73,14 @@ def read_positions(path: str | Path) -> Known:
     missing = [name for name in ("t", "x", "y") if name not in table.columns]
     if missing:
         raise InputError(f"{path}: has no column {missing[0]!r}; give the columns t (s), x, y (px)")
-    for name in ("t", "x", "y", *(["id"] if "id" in table.columns else [])):
+    more = [name for name in MORE if name in table.columns]
+    for name in ("t", "x", "y", *(["id"] if "id" in table.columns else []), *more):
         numbers = np.asarray(pd.to_numeric(table[name], errors="coerce"), np.float64)
-        if not np.isfinite(numbers).all():
-            row = int(np.argmin(np.isfinite(numbers)))
+        good = np.isfinite(numbers)
+        if name in more:
+            good |= np.asarray(table[name].isna())
+        if not good.all():
+            row = int(np.argmin(good))
             raise InputError(
                 f"{path}: {name} is {str(table[name][row])[:40]!r} in line {row + 2}; give a "
                 "number, or leave the line out"
@@ -80,7 +93,10 @@ def read_positions(path: str | Path) -> Known:
     targets, column = np.unique(number, return_inverse=True)
     xi = np.full((len(t), len(targets), 2), np.nan)
     xi[row, column] = table[["x", "y"]].to_numpy(np.float64)
-    return Known(t, xi)
+    values = {name: np.full((len(t), len(targets)), np.nan) for name in more}
+    for name, value in values.items():
+        value[row, column] = table[name].to_numpy(np.float64)
+    return Known(t, xi, values, targets)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +137,8 @@ class Targets:
                     f"{path}: no position is within {first * 1e-6:g} to {stop * 1e-6:g} s, the "
                     f"events' time in {recording.name}; times are seconds on its clock"
                 )
-            return Known(known.t[inside], known.xi[inside])
+            more = {name: value[inside] for name, value in known.more.items()}
+            return Known(known.t[inside], known.xi[inside], more, known.id)
         return None
 
     def first_seeds(self, known: Known | None, params: TrackerParams) -> list[Any] | None:
@@ -146,7 +163,7 @@ class Targets:
         if known is None:
             return None
         seeds = self.first_seeds(known, params)
-        tracks = tracker.estimate(recording, params, seeds=seeds, progress=progress)
+        tracks = tracker.estimate(recording, params, seeds=seeds, smooth=False, progress=progress)
         found = [states.mean[..., :2] for _, states in tracks.batches(known.t)]
         distance = np.linalg.norm(np.concatenate(found) - known.xi, axis=2)
         given = np.isfinite(known.xi).all(2)

@@ -25,7 +25,9 @@ POINTS = 300  # of a curve over time, means of so many parts of it
 UNCERTAIN = 0.1  # a standard deviation of log intensity that is shown as bright as can be
 # Errors shown in full colour: of intensity, and of ln(I + 0.003) against an HDR reference.
 FULL = {False: 0.1, True: 1.0}
-HIGHER = {"ssim", "log_ssim", "global_ssim", "hdr_quality", "covered"}  # of these more is better
+HIGHER = {
+    "ssim", "log_ssim", "global_ssim", "hdr_quality", "covered", "mota", "idf1", "hota",
+}  # of these more is better  # fmt: skip
 
 MEANINGS = {
     "MSE x 1e-2": "mean square error of intensity, times 100; 0 is best",
@@ -50,6 +52,17 @@ MEANINGS = {
     "start-up s": "time until the first estimate",
     "RMSE px": "root mean square distance of positions",
     "covered": "share of time at which the truth is tracked",
+    "missed": "targets that no track follows for half of their time",
+    "false": "tracks that follow no target for half of their time",
+    "switches": "times at which a target's track becomes another one",
+    "MOTA": "1 - (misses, false positives and switches) / truth; 1 is best",
+    "IDF1": "share for which one pairing of whole tracks holds; 1 is best",
+    "HOTA": "higher order tracking accuracy; 1 is best",
+    "velocity px/s": "root mean square error of the velocity",
+    "size %": "root mean square error of the sizes' logarithms",
+    "theta deg": "root mean square error of the orientation",
+    "1/TTC 1/s": "root mean square error of the inverse time to contact",
+    "range %": "root mean square error of the range, of its size",
     "seconds": "of computing",
 }
 

@@ -108,7 +108,10 @@ def test_a_fit_improves_what_it_has_not_seen(folder, capsys):
     recording, path = simulated(1)
     times = np.rint(1e6 * path[:, 0]).astype(np.int64)
     seed = (*path[0, 1:], float(params.lambda0), int(times[0]))
-    error = tracker.estimate(recording, params, seeds=[seed])(times).mean[:, 0, :2] - path[:, 1:]
+    error = (
+        tracker.estimate(recording, params, seeds=[seed]).filtered(times).mean[:, 0, :2]
+        - path[:, 1:]
+    )
     assert after["rmse"] == pytest.approx(np.sqrt((error**2).sum(1).mean()), rel=1e-6)
 
 
@@ -174,7 +177,9 @@ def test_windows_are_shared_out_and_begin_where_tracks_are():
     recording, _ = simulated(0)
     sources = {"fit": [("a", recording)], "validation": [], "test": []}
     mine = goal(seeds=[[85.0, 45.0, 6.0]])
-    tracks = tracker.estimate(recording, tracker.Params(**START), seeds=[(85.0, 45.0, 6.0)])
+    tracks = tracker.estimate(
+        recording, tracker.Params(**START), seeds=[(85.0, 45.0, 6.0)]
+    ).filtered
     parts = mine._parts(sources, (2, 1, 1), None)
     assert [part.split for part in parts] == [0, 1, 0, 2, 0, 1, 0, 2]
     assert parts[0].start == recording.start and parts[-1].stop == recording.stop + 1

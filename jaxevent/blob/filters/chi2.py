@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxevent.blob.association import Expected
 from jaxevent.blob.filters.ellipse import spread, truncation, wrap
-from jaxevent.blob.filters.motion import decay
+from jaxevent.blob.filters.motion import decay, transition
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.steps import Batch, Filter, choose
 from jaxevent.blob.tracker import Tracker
@@ -384,7 +384,7 @@ def _update_split(params: WindowParams, state: State, batch: Batch, weight: Arra
 chi2 = Tracker(
     "chi2",
     Params,
-    Filter(start, predict, update, expected, moments, halt),
+    Filter(start, predict, update, expected, moments, halt, transition),
     about="The asynchronous event-blob tracker (Wang et al. 2023), equations corrected.",
 )
 chi2_split = Tracker(
@@ -397,6 +397,7 @@ chi2_split = Tracker(
         expected,
         moments,
         halt,
+        transition,
     ),
     about="The asynchronous event-blob tracker with one sum of squares per axis of the blob.",
 )

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxevent.blob.association import Expected
-from jaxevent.blob.filters.motion import Motion, expected_of, moments_of
+from jaxevent.blob.filters.motion import Motion, expected_of, moments_of, transition
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.steps import Batch, Filter, choose
 from jaxevent.blob.tracker import Tracker
@@ -53,6 +53,6 @@ def moments(params: TrackerParams, state: State) -> tuple[Array, Array]:
 constant_velocity = Tracker(
     "constant_velocity",
     Params,
-    Filter(start, predict, update, expected, moments, halt),
+    Filter(start, predict, update, expected, moments, halt, transition),
     about="A Kalman filter of position and velocity of round blobs; a baseline.",
 )

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxevent.blob.association import Expected
 from jaxevent.blob.filters.ellipse import geometric_step, spread, truncation, wrap
-from jaxevent.blob.filters.motion import Motion, decay, expected_of, moments_of
+from jaxevent.blob.filters.motion import Motion, decay, expected_of, moments_of, transition
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.steps import Batch, Filter, choose
 from jaxevent.blob.tracker import Tracker
@@ -168,6 +168,6 @@ def moments(params: TrackerParams, state: State) -> tuple[Array, Array]:
 moment = Tracker(
     "moment",
     Params,
-    Filter(start, predict, update, expected, moments, halt),
+    Filter(start, predict, update, expected, moments, halt, transition),
     about="Tracking of blobs by second moments of the events' residuals; the default.",
 )

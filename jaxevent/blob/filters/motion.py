@@ -160,3 +160,13 @@ def decay(params: TrackerParams, dt: Array) -> tuple[Array, ...]:
         Q * (dt * once) ** 2 / 2,
         Q * dt * twice,
     )
+
+
+def transition(params: TrackerParams, dt: Array, still: Array) -> Float[Array, "8 8"]:
+    """Of (px, py, vx, vy, lambda1, lambda2, theta, q) over dt; at rest where `still`."""
+    to_theta, to_q, *_ = decay(params, dt)
+    pairs = jnp.array([0, 1, 6, 7]), jnp.array([2, 3, 7, 7])
+    F = jnp.eye(8, dtype=dt.dtype).at[pairs].set(jnp.stack([dt, dt, to_theta, to_q]))
+    moving = jnp.zeros(8, bool).at[jnp.array([2, 3, 7])].set(True)
+    keep = jnp.where(still & moving, 0.0, 1.0).astype(dt.dtype)
+    return keep[:, None] * F * keep

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.blob.finding.stream import Stream
+from jaxevent.events.filters import busiest_neighbour
 
 SLICES = 64  # of the recording's time
 CELL = 16  # px
@@ -49,19 +50,26 @@ class Background:
         return self.rate[row, column] * self.activity[self.slice(t)]
 
 
+def evidence(
+    n: ArrayLike | float | int, mu: ArrayLike | float | int, dispersion: float | int
+) -> Any:
+    """Nats against n events of background, of which mu are expected; 0 if there are no more.
+
+    Chernoff's bound of the Poisson distribution's tail, over the dispersion.
+    """
+    n, mu = np.asarray(n, np.float64), np.maximum(np.asarray(mu, np.float64), 1e-300)
+    told = n * np.log(np.maximum(n / mu, 1)) - n + mu
+    return np.where(n > mu, told, 0) / dispersion
+
+
 def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
     """Pixels that fire far more often than all of their eight neighbours.
 
     `counts` (rows, columns) are their events. A pixel is hot if it has four times the events of its
     strongest neighbour, and more than chance gives to one of all pixels in a thousand recordings.
     """
-    rows, columns = counts.shape
-    around = np.pad(counts.astype(np.float64), 1, mode="edge")
-    shifts = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
-    most = np.max([around[i : i + rows, j : j + columns] for i, j in shifts], axis=0)
-    mu = np.maximum(most, 1.0)
-    evidence = counts * np.log(np.maximum(counts, 1) / mu) - counts + mu
-    return (counts > 4 * mu) & (evidence > np.log(counts.size) + 7)
+    mu = np.maximum(busiest_neighbour(counts), 1.0)
+    return (counts > 4 * mu) & (evidence(counts, mu, 1) > np.log(counts.size) + 7)
 
 
 def measure_background(stream: Stream) -> Background:

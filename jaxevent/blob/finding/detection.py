@@ -1,12 +1,12 @@
 """Blobs of events in one window that background does not make, at a stated false-alarm rate."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import ndimage
 
-from jaxevent.blob.finding.background import Background
+from jaxevent.blob.finding.background import Background, evidence
 from jaxevent.blob.finding.stream import Part
 
 FALSE_ALARMS = 0.1  # per recording
@@ -27,18 +27,6 @@ class Blobs(NamedTuple):
     n: NDArray[np.float64]
     p: NDArray[np.float64]  # (blobs, 2) px
     C: NDArray[np.float64]  # (blobs, 2, 2) px^2
-
-
-def evidence(
-    n: ArrayLike | float | int, mu: ArrayLike | float | int, dispersion: float | int
-) -> Any:
-    """Nats against n events of background, of which mu are expected; 0 if there are no more.
-
-    Chernoff's bound of the Poisson distribution's tail, over the dispersion.
-    """
-    n, mu = np.asarray(n, np.float64), np.maximum(np.asarray(mu, np.float64), 1e-300)
-    told = n * np.log(np.maximum(n / mu, 1)) - n + mu
-    return np.where(n > mu, told, 0) / dispersion
 
 
 def detect(

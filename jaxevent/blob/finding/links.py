@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob.finding.agility import fit_agility
-from jaxevent.blob.finding.background import Background
-from jaxevent.blob.finding.detection import FALSE_ALARMS, Scale, detect, evidence, measure_blobs
+from jaxevent.blob.finding.background import Background, evidence
+from jaxevent.blob.finding.detection import FALSE_ALARMS, Scale, detect, measure_blobs
 from jaxevent.blob.finding.paths import STILL, Path
 from jaxevent.blob.finding.scale import CONTACT
 from jaxevent.blob.finding.stream import Part, Stream

@@ -9,8 +9,8 @@ import dataclasses
 
 import numpy as np
 
-from jaxevent.blob.finding.background import CELL, Background, measure_background
-from jaxevent.blob.finding.detection import Scale, evidence
+from jaxevent.blob.finding.background import CELL, Background, evidence, measure_background
+from jaxevent.blob.finding.detection import Scale
 from jaxevent.blob.finding.found import Found, Pass
 from jaxevent.blob.finding.links import FAINT, GATE, HOLD, SEEN, Links, touching
 from jaxevent.blob.finding.paths import Path
