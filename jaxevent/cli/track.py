@@ -75,12 +75,17 @@ def add(commands: Any) -> None:
         help="behind the tracks in the video; default: events",
     )
     arguments.add_size(one)
-    group = one.add_argument_group("time to contact and range, in quantities.csv and the plot")
+    group = one.add_argument_group(
+        "time to contact and range, in quantities.csv, the plot and, with --at events, for each "
+        "event in quantities.h5"
+    )
     group.add_argument(
         "--pair",
         metavar="ID,ID",
+        dest="pairs",
         type=arguments.pair,
-        help="two tracks whose distance tells 1 / TTC",
+        action="append",
+        help="two tracks whose distance tells 1 / TTC; may be repeated",
     )
     group.add_argument("--extent", metavar="M", type=float, help="the target's size in m")
     group.add_argument("--focal", metavar="PX", type=float, help="focal length in px")
@@ -106,7 +111,7 @@ def run(
     stop: float | int | None,
     background: str,
     size: tuple[int, int] | None,
-    pair: tuple[int, int] | None,
+    pairs: list[tuple[int, int]] | None,
     extent: float | int | None,
     focal: float | int | None,
     size_factor: float | int | None,
@@ -120,7 +125,7 @@ def run(
     tracker = methods.find(method, "blob")
     given = None if params is None else tracker.Params.load(params, method)  # told before the work
     each = None if at == "events" else rate
-    output = Output(out, each, background, pair, extent, focal, size_factor)
+    output = Output(out, each, background, pairs or (), extent, focal, size_factor)
     recording = load(path, size, in_memory=False, progress=show_progress())
     recording = dataclasses.replace(recording, name=str(path))  # for messages
     if not len(recording.events):

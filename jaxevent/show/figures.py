@@ -16,6 +16,7 @@ from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Events, EventSource, Recording, Times, microseconds
 from jaxevent.show.canvas import new_figure
 from jaxevent.show.motion_pictures import motion_figure
+from jaxevent.show.track_plots import draw_paths
 from jaxevent.tuning import Fitted
 
 ON, OFF = "#c8401e", "#3a78b5"
@@ -99,28 +100,18 @@ def plot_image(video: ImageSequence, time: Times) -> Any:
 def plot_tracks(tracks: Tracks, ids: Sequence[int] | None = None, *, most: int = 40) -> Any:
     """Draw the paths of tracks in the image plane over the events of their whole time.
 
-    A path ends in the ellipse of two standard deviations of the blob and the track's id. `ids`
-    chooses tracks; by default the `most` that live longest. Behind is how many events each pixel
-    fired, of at most a million in the middle.
+    Time is colour; ellipses of two standard deviations stand along a path, and its id at its end.
+    `ids` chooses tracks; by default the `most` that live longest. Behind is how many events each
+    pixel fired, of at most a million in the middle. `jaxevent track` draws the same.
     """
     recording = tracks.recording
     figure, axis = _image_figure(recording.width, recording.height)
-    middle = _middle(recording[tracks.start : tracks.stop], 1_000_000)
-    counts = np.abs(event_image(middle, size=(recording.width, recording.height)))
-    axis.imshow(np.log1p(counts), "Greys", vmax=1.6 * np.log1p(counts.max(initial=1)))
     if ids is None:
         longest = np.argsort(tracks.birth - tracks.death, kind="stable")[:most]
         ids = sorted(tracks.id[longest].tolist())
     times = np.linspace(tracks.start, tracks.stop - 1, PATH_TIMES).round().astype(np.int64)
     told = tracks(times, ids)
-    for k, one in enumerate(ids):
-        alive = told.valid[:, k]
-        if not alive.any():  # lived between two of the times
-            continue
-        path = np.where(alive[:, None], told.mean[:, k, :2], np.nan)
-        (line,) = axis.plot(*path.T, lw=1.3)
-        _draw_blob(axis, told.mean[alive, k][-1], line.get_color(), str(one))
-    axis.set(xlim=(-0.5, recording.width - 0.5), ylim=(recording.height - 0.5, -0.5))
+    draw_paths(axis, recording, times, list(ids), told.mean, told.valid)
     span = f"{tracks.start * 1e-6:.6g} to {tracks.stop * 1e-6:.6g} s"
     axis.set_title(f"{recording.name}: {len(ids)} of {len(tracks)} tracks, {span}", fontsize=10)
     return figure
@@ -220,13 +211,3 @@ def _bright(values: NDArray, least: float) -> float:
 
 def _rgb(colour: str) -> tuple[float, ...]:
     return tuple(int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))
-
-
-def _draw_blob(axis: Any, state: NDArray, colour: Any, label: str) -> None:
-    from matplotlib.patches import Ellipse
-
-    x, y, along, across, angle = (float(state[i]) for i in (0, 1, 4, 5, 6))
-    axis.add_patch(
-        Ellipse((x, y), 4 * along, 4 * across, angle=math.degrees(angle), fill=False, color=colour)
-    )
-    axis.annotate(label, (x, y), (4, 4), textcoords="offset points", color=colour, fontsize=8)

@@ -3,7 +3,8 @@
 Arrays as in `jaxevent.show.track_tables`.
 """
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_range
 from jaxevent.errors import InputError, require
+from jaxevent.events import count_events
 from jaxevent.io.output import complete
 from jaxevent.recording import Recording, Times
 from jaxevent.show.track_pictures import outline, track_colour
@@ -29,9 +31,10 @@ _TELLS, _OFTEN = (
 _SIZE, _TTC, _RANGE = "lambda (px)", "1 / TTC (1/s)", "range (m)"
 _FAINT = 0.2  # of bands
 _LEGEND = 16  # most tracks that a legend lists
+_PAIRS = ("-", "--", ":", "-.")  # lines of pairs
 
 
-def plot_tracks(
+def write_track_plot(
     path: str | Path,
     recording: Recording,
     times: Times,
@@ -40,7 +43,7 @@ def plot_tracks(
     covariance: ArrayLike,
     valid: ArrayLike,
     *,
-    pair: tuple[int, int] | None = None,
+    pairs: Sequence[tuple[int, int]] = (),
     extent: float | int | None = None,
     focal: float | int | None = None,
     size_factor: float | int = SIZE_FACTORS["ring"],
@@ -51,7 +54,7 @@ def plot_tracks(
 
     Paths are drawn over the events, coloured by time, with ellipses of two standard deviations at
     intervals. 1 / TTC is that of each track's growth (`quantities.growth`, smoothed, with Q and
-    Q_lambda), where it differs from 0, and, given the ids of a `pair`, that of the two blobs. Range
+    Q_lambda), where it differs from 0, and, of `pairs` of ids, that of the two blobs. Range
     is drawn where `extent` (m) and `focal` (px) are given. Time counts from the recording's start.
     The suffix of `path` chooses the format (PNG, PDF, SVG). Raises `InputError` without the extra
     "plot", for unknown ids and suffixes and for arrays that do not fit.
@@ -62,8 +65,9 @@ def plot_tracks(
 
     t, number, mean, covariance, valid = check_tracks(path, times, ids, mean, covariance, valid)
     known = number.tolist()
-    if pair is not None and not (len(set(pair)) == 2 and set(pair) <= set(known)):
-        raise InputError(f"{path}: the pair {pair} is not two of the tracks {known}")
+    for pair in pairs:
+        if not (len(set(pair)) == 2 and set(pair) <= set(known)):
+            raise InputError(f"{path}: the pair {pair} is not two of the tracks {known}")
     if (extent is None) != (focal is None):
         raise InputError(f"{path}: range needs both the extent (m) and the focal length (px)")
     filled = np.where(valid[..., None], mean, 1.0)
@@ -71,9 +75,7 @@ def plot_tracks(
     m, P = jnp.asarray(filled), jnp.asarray(filled_P)
     grown, spread, grows = _growths(t, m, P, valid, Q, Q_lambda)
 
-    names = (
-        [_SIZE] + [_TTC] * bool(grows.any() or pair is not None) + [_RANGE] * (extent is not None)
-    )
+    names = [_SIZE] + [_TTC] * bool(grows.any() or len(pairs)) + [_RANGE] * (extent is not None)
     high = 7.0 * min(recording.height / recording.width, 1.2)
     figure = Figure(figsize=(8, high + 2.2 * len(names)), layout="constrained")
     suffix = Path(path).suffix.lstrip(".").lower()
@@ -84,7 +86,7 @@ def plot_tracks(
         )
     grid = figure.add_gridspec(1 + len(names), 1, height_ratios=[high, *([2.2] * len(names))])
     seconds = (t - recording.start) * 1e-6
-    _draw_paths(figure, figure.add_subplot(grid[0]), recording, t, seconds, known, mean, valid)
+    draw_paths(figure.add_subplot(grid[0]), recording, t, known, mean, valid)
     bands = _Bands({name: figure.add_subplot(grid[k + 1]) for k, name in enumerate(names)}, seconds)
     ranges = None
     if extent is not None and focal is not None:
@@ -101,11 +103,11 @@ def plot_tracks(
         if ranges is not None:
             value, variance = ranges
             bands.add(_RANGE, value[:, i], variance[:, i], seen, **line, label=label)
-    if pair is not None:
+    for pair, ls in zip(pairs, itertools.cycle(_PAIRS)):
         a, b = (known.index(one) for one in pair)
         value, variance = jax.jit(inverse_ttc)(m[:, a], P[:, a], m[:, b], P[:, b])
-        label = f"{pair[0]} and {pair[1]}"
-        bands.add(_TTC, value, variance, valid[:, a] & valid[:, b], color="black", label=label)
+        line = {"color": "black", "ls": ls, "label": f"{pair[0]} and {pair[1]}"}
+        bands.add(_TTC, value, variance, valid[:, a] & valid[:, b], **line)
     bands.finish(legend=0 < len(known) <= _LEGEND)
     with complete(Path(path)) as temporary:
         figure.savefig(temporary, format=suffix, dpi=150)
@@ -164,25 +166,27 @@ class _Bands:
         list(self.axes.values())[-1].set_xlabel("t (s) from the recording's start")
 
 
-def _draw_paths(
-    figure: Any,
+def draw_paths(
     axis: Any,
     recording: Recording,
     t: NDArray[np.int64],
-    seconds: NDArray[np.float64],
-    known: list[int],
+    known: Sequence[int],
     mean: NDArray,
     valid: NDArray[np.bool_],
 ) -> None:
-    """Paths in the image plane over the number of events of each pixel; time is colour."""
+    """Draw paths in the image plane over the number of events of each pixel; time is colour.
+
+    `mean` (T, N, 8) and `valid` (T, N) at sorted times (us) of the tracks `known`. Ellipses of two
+    standard deviations stand at intervals, a track's number where it ends. Behind are the events of
+    that time, at most a million in its middle.
+    """
     from matplotlib.collections import LineCollection
 
+    seconds = (t - recording.start) * 1e-6
     first, last = (recording.events.index(int(at)) for at in (t[0], t[-1] + 1))
     middle = max(first, (first + last - _BEHIND) // 2)
     events = recording.events[middle : min(last, middle + _BEHIND)]
-    counts = np.zeros((recording.height, recording.width))
-    np.add.at(counts, (events.y, events.x), 1)
-    behind = np.log1p(counts)
+    behind = np.log1p(count_events(events, size=(recording.width, recording.height)))
     axis.imshow(behind, "Greys", vmin=0, vmax=2 * max(float(np.percentile(behind, 99.9)), 0.5))
     lines = None
     for i, one in enumerate(known):
@@ -204,7 +208,7 @@ def _draw_paths(
             weight="bold",
         )  # fmt: skip
     if lines is not None:
-        figure.colorbar(lines, ax=axis, fraction=0.03, pad=0.01, label="t (s)")
+        axis.figure.colorbar(lines, ax=axis, fraction=0.03, pad=0.01, label="t (s)")
     axis.set(xlim=(-0.5, recording.width - 0.5), ylim=(recording.height - 0.5, -0.5))
     axis.set(xlabel="x (px)", ylabel="y (px)")
     axis.set_title("paths, ellipses of 2 standard deviations, numbers where they end", fontsize=9)

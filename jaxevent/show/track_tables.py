@@ -7,7 +7,7 @@ rad; valid (T, N), False where a track does not exist and its numbers may be any
 
 import contextlib
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import h5py
@@ -22,6 +22,9 @@ from jaxevent.parameters import Parameters
 from jaxevent.recording import Times, microseconds
 
 COLUMNS = ("x", "y", "vx", "vy", "lambda1", "lambda2", "theta", "q")
+QUANTITIES = (
+    "t", "id", "other", "inverse_ttc", "sigma_inverse_ttc", "range", "sigma_range"
+)  # fmt: skip
 UNITS = ("px", "px", "px/s", "px/s", "px", "px", "rad", "rad/s")
 
 
@@ -101,22 +104,9 @@ def _hdf5_writer(
 ) -> Iterator[Callable[..., None]]:
     with complete_hdf5(path, method, params) as (file, check):
         file.attrs["format"] = "jaxevent tracks"
-        row = 0
 
         def append(*arrays: NDArray) -> None:
-            nonlocal row
-            names = ("t", "id", "mean", "covariance")
-            for name, array in zip(names, arrays, strict=True):
-                if name not in file:
-                    file.create_dataset(
-                        name, (0, *array.shape[1:]), array.dtype, maxshape=(None, *array.shape[1:]),
-                        chunks=(4096, *array.shape[1:]),
-                    )  # fmt: skip
-                stored = file[name]
-                assert isinstance(stored, h5py.Dataset)
-                stored.resize(row + len(array), axis=0)
-                stored[row:] = array
-            row += len(arrays[0])
+            _append_rows(file, zip(("t", "id", "mean", "covariance"), arrays, strict=True))
             check()
 
         yield append
@@ -127,6 +117,45 @@ def _hdf5_writer(
         for name, unit in (("mean", "units"), ("covariance", "units[i] units[j]")):
             file[name].attrs["columns"], file[name].attrs["units"] = COLUMNS, UNITS
             file[name].attrs["unit"] = unit
+
+
+@contextlib.contextmanager
+def quantity_writer(
+    path: str | Path, method: str | None = None, params: Parameters | None = None
+) -> Iterator[Callable[..., None]]:
+    """Open an HDF5 file of time to contact and range, and give the function that appends rows.
+
+    It takes the columns `QUANTITIES`, (rows,) each: t int64 us, id and other (-1: no other track)
+    whole numbers, the others floats, NaN where not asked for.
+    """
+    with complete_hdf5(Path(path), method, params) as (file, check):
+        file.attrs["format"] = "jaxevent quantities"
+
+        def append(*columns: NDArray) -> None:
+            _append_rows(file, zip(QUANTITIES, columns, strict=True))
+            check()
+
+        none = np.empty(0, np.int64)
+        append(none, none, none, *[np.empty(0)] * 4)
+        yield append
+        units = (CLOCK, "1", "1", "1/s", "1/s", "m", "m")
+        for name, unit in zip(QUANTITIES, units, strict=True):
+            file[name].attrs["unit"] = unit
+
+
+def _append_rows(file: h5py.File, columns: Iterable[tuple[str, NDArray]]) -> None:
+    """Append arrays of as many rows each to data sets, which are made where they are not there."""
+    for name, array in columns:
+        if name not in file:
+            file.create_dataset(
+                name, (0, *array.shape[1:]), array.dtype, maxshape=(None, *array.shape[1:]),
+                chunks=(4096, *array.shape[1:]),
+            )  # fmt: skip
+        stored = file[name]
+        assert isinstance(stored, h5py.Dataset)
+        row = len(stored)
+        stored.resize(row + len(array), axis=0)
+        stored[row:] = array
 
 
 def no_rows() -> tuple[NDArray, NDArray, NDArray, NDArray]:

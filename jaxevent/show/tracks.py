@@ -4,9 +4,9 @@ import contextlib
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_range
+from jaxevent.blob.states import TrackStates
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.io.output import complete
@@ -22,8 +23,8 @@ from jaxevent.progress import bar
 from jaxevent.recording import Recording
 from jaxevent.show.report import video_writer
 from jaxevent.show.track_pictures import draw_frames
-from jaxevent.show.track_plots import plot_tracks
-from jaxevent.show.track_tables import no_rows, track_writer
+from jaxevent.show.track_plots import write_track_plot
+from jaxevent.show.track_tables import QUANTITIES, no_rows, quantity_writer, track_writer
 
 _PLOTS = (".png", ".pdf", ".svg")
 _EXTRAS = {".mp4": ("imageio_ffmpeg", "video")} | {kind: ("matplotlib", "plot") for kind in _PLOTS}
@@ -33,13 +34,14 @@ _STRETCH = 2_000_000  # events of which rows are written at a time
 
 _ranges = jax.jit(size_range)
 _closing = jax.jit(inverse_ttc)
+_LEAST = 64  # rows that a compiled function takes at least; more come in powers of two
 
 
 @dataclasses.dataclass(frozen=True)
 class Output:
     """What is written of `Tracks`: `output.write(tracks)`.
 
-    `path` is a folder for tracks.csv, tracks.h5, tracks.mp4, tracks.png and, given a pair or an
+    `path` is a folder for tracks.csv, tracks.h5, tracks.mp4, tracks.png and, given pairs or an
     extent, quantities.csv; or one file by its suffix (.csv, .h5, .mp4, .png, .pdf, .svg). Tables
     hold a row per track and time, `rate` times per second, or with None a row for each event that
     is in the gate of a track, of its likeliest one. Behind the video are "events" or the
@@ -49,16 +51,18 @@ class Output:
 
     quantities.csv has the columns t (s), id, other, inverse_ttc (1/s), range (m) and their standard
     deviations; where `other` is empty, inverse_ttc is that of the growth of one blob, see
-    `quantities`. `extent` (m), `focal` (px) and `size_factor` are those of `size_range`. A folder
-    goes without tracks.mp4 or tracks.png where the extra "video" or "plot" is missing. Raises
-    `InputError` for settings that do not fit each other, a place that cannot be written and a
-    video or plot as the one file without its extra.
+    `quantities`. With a row for each event quantities.h5 has those columns at event rate: 1 / TTC
+    of each of the `pairs` at the events of both, and range at those of each track; t in us, other
+    -1 where there is none. `extent` (m), `focal` (px) and `size_factor` are those of `size_range`.
+    A folder goes without tracks.mp4 or tracks.png where the extra "video" or "plot" is missing.
+    Raises `InputError` for settings that do not fit each other, a place that cannot be written and
+    a video or plot as the one file without its extra.
     """
 
     path: Path
     rate: float | int | None = 1000.0
     background: str = "events"
-    pair: tuple[int, int] | None = None
+    pairs: Sequence[tuple[int, int]] = ()
     extent: float | int | None = None
     focal: float | int | None = None
     size_factor: float | int | None = None
@@ -84,10 +88,10 @@ class Output:
             if value is not None and not 0 < value < math.inf:
                 option = name.replace("_", "-")
                 raise InputError(f"--{option} {value:g} is not possible; give a number above 0")
-        if self.pair is not None and self.pair[0] == self.pair[1]:
-            raise InputError(f"--pair {self.pair[0]},{self.pair[1]} is one track; give two")
-        asked = self.pair is not None or self.extent is not None
-        if asked and suffix not in ("", *_PLOTS):
+        for one, other in self.pairs:
+            if one == other:
+                raise InputError(f"--pair {one},{other} is one track; give two")
+        if self._asked and suffix not in ("", *_PLOTS):
             raise InputError(
                 f"{path}: --pair and --extent are for a folder or a plot; leave them out"
             )
@@ -98,6 +102,11 @@ class Output:
         # A place that cannot be written is told before the work.
         with contextlib.suppress(_Tried), complete(path, directory=not suffix):
             raise _Tried
+
+    @property
+    def _asked(self) -> bool:
+        """Whether time to contact or range are."""
+        return bool(len(self.pairs)) or self.extent is not None
 
     def write(
         self,
@@ -111,11 +120,12 @@ class Output:
         `texts` are further files of a folder, by name; `method` made the tracks, as HDF5 says.
         """
         known = tracks.id.tolist()
-        if self.pair is not None and not set(self.pair) <= set(known):
-            raise InputError(
-                f"{tracks.recording.name}: --pair {self.pair[0]},{self.pair[1]} is not two of the "
-                f"tracks found, {', '.join(map(str, known[:20])) or 'none'}"
-            )
+        for one, other in self.pairs:
+            if not {one, other} <= set(known):
+                raise InputError(
+                    f"{tracks.recording.name}: --pair {one},{other} is not two of the tracks "
+                    f"found, {', '.join(map(str, known[:20])) or 'none'}"
+                )
         if self.path.suffix:
             return self._all(tracks, {self.path.suffix.lower(): self.path}, progress, method)
         with complete(self.path, directory=True) as folder:
@@ -126,8 +136,10 @@ class Output:
                     require(*_EXTRAS[kind])
                 except MissingExtra as missing:
                     left_out.append(f"{places.pop(kind).name} is left out: {missing}")
-            if self.pair is not None or self.extent is not None:
+            if self._asked:
                 places["quantities"] = folder / "quantities.csv"
+                if self.rate is None:
+                    places["per event"] = folder / "quantities.h5"
             for name, text in (texts or {}).items():
                 (folder / name).write_text(text, encoding="utf-8")
             written = self._all(tracks, places, progress, method)
@@ -185,15 +197,23 @@ class Output:
                 for _ in states():
                     pass
             if self.rate is None and writers:
-                for table in _per_event(tracks, progress):
-                    write(*table)
+                put = None
+                if "per event" in places:
+                    put = stack.enter_context(
+                        quantity_writer(places["per event"], method, tracks.params)
+                    )
+                for one in _per_event(tracks, progress):
+                    write(*one.table)
+                    if put is not None:
+                        for columns in self._event_quantities(one):
+                            put(*columns)
         if "quantities" in places:
             self._write_quantities(places["quantities"], rows, tracks)
         for kind in set(places) & set(_PLOTS):
-            chosen = rows.longest(_PLOTTED, self.pair or ())
-            plot_tracks(
+            chosen = rows.longest(_PLOTTED, [one for pair in self.pairs for one in pair])
+            write_track_plot(
                 places[kind], tracks.recording, coarse, tracks.id[chosen], *rows.dense(chosen),
-                pair=self.pair, extent=self.extent, focal=self.focal, size_factor=self._factor(),
+                pairs=self.pairs, extent=self.extent, focal=self.focal, size_factor=self._factor(),
                 Q_lambda=float(tracks.params.Q_lambda),
             )  # fmt: skip
         slow = min(often, _FPS) / often if ".mp4" in places else None
@@ -201,6 +221,30 @@ class Output:
 
     def _factor(self) -> float | int:
         return SIZE_FACTORS["ring"] if self.size_factor is None else self.size_factor
+
+    def _event_quantities(self, now: "_AtEvents") -> Iterator[tuple[NDArray, ...]]:
+        """Columns `QUANTITIES` of the events of some times."""
+        states = now.states
+
+        def columns(row: NDArray, one: Any, other: int, *values: NDArray) -> tuple[NDArray, ...]:
+            ids = np.broadcast_to(one, row.shape), np.full(row.shape, other)
+            return now.t[row], *ids, *values
+
+        if self.extent is not None:
+            k, i = now.row, now.place
+            told = states.mean[k, i], states.covariance[k, i]
+            scale = self.extent, self.focal, self._factor()
+            value, deviation = _computed(lambda m, P: _ranges(m, P, *scale), *told)
+            nothing = np.full(len(k), np.nan)
+            yield columns(k, states.id[i], -1, nothing, nothing, value, deviation)
+        for pair in self.pairs:
+            a, b = (int(np.flatnonzero(states.id == one)[0]) for one in pair)
+            k = now.row[np.isin(now.place, [a, b])]
+            k = k[states.valid[k, a] & states.valid[k, b]]
+            told = (array[k, i] for i in (a, b) for array in (states.mean, states.covariance))
+            value, deviation = _computed(_closing, *told)
+            nothing = np.full(len(k), np.nan)
+            yield columns(k, pair[0], pair[1], value, deviation, nothing, nothing)
 
     def _write_quantities(self, path: Path, rows: "_Rows", tracks: Tracks) -> None:
         tables = []
@@ -223,13 +267,12 @@ class Output:
             if self.extent is not None and self.focal is not None:
                 span = _ranges(mean, covariance, self.extent, self.focal, self._factor())
             add(one, None, valid, *value, *span)
-        if self.pair is not None:
-            mean, covariance, valid = rows.dense([tracks.id.tolist().index(i) for i in self.pair])
+        for pair in self.pairs:
+            mean, covariance, valid = rows.dense([tracks.id.tolist().index(i) for i in pair])
             (a, b), (P_a, P_b) = np.moveaxis(mean, 1, 0), np.moveaxis(covariance, 1, 0)
             value = _closing(a, P_a, b, P_b)
-            add(*self.pair, np.asarray(valid.all(1)), *value, nothing, nothing)
-        names = ["t", "id", "other", "inverse_ttc", "sigma_inverse_ttc", "range", "sigma_range"]
-        table = pd.DataFrame(columns=names)
+            add(*pair, np.asarray(valid.all(1)), *value, nothing, nothing)
+        table = pd.DataFrame(columns=list(QUANTITIES))
         if tables:
             table = pd.concat([part.astype({"other": "Int64"}) for part in tables])
             table = table.sort_values(["t", "id"], kind="stable")
@@ -270,6 +313,30 @@ class Written:
         if len(tracks) > most:
             lines.append(f"and {len(tracks) - most} shorter ones")
         return lines
+
+
+class _AtEvents(NamedTuple):
+    """States at the times of some events, and whose these are."""
+
+    t: NDArray[np.int64]  # (times,) us
+    states: TrackStates
+    row: NDArray[np.intp]  # of each event, in t
+    place: NDArray[np.intp]  # of each event, in `states.id`
+
+    @property
+    def table(self) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Time, id, mean and covariance of each event."""
+        k, i = self.row, self.place
+        return self.t[k], self.states.id[i], self.states.mean[k, i], self.states.covariance[k, i]
+
+
+def _computed(quantity: Callable[..., Any], *arrays: NDArray) -> tuple[NDArray, NDArray]:
+    """A quantity of rows and its standard deviation, compiled for few numbers of rows."""
+    count = len(arrays[0])
+    fill = max(_LEAST, 1 << (count - 1).bit_length()) - count if count else _LEAST
+    filled = [np.pad(a, [(0, fill)] + [(0, 0)] * (a.ndim - 1), mode="empty") for a in arrays]
+    value, variance = (np.asarray(part, np.float64)[:count] for part in quantity(*filled))
+    return value, np.sqrt(np.maximum(variance, 0))
 
 
 class _Tried(Exception):
@@ -347,10 +414,8 @@ def _high_pass(recording: Recording, times: NDArray[np.int64]) -> Iterator[NDArr
     return (image for _, image in shown(video, times, "percentile"))
 
 
-def _per_event(
-    tracks: Tracks, progress: bool | None
-) -> Iterator[tuple[NDArray, NDArray, NDArray, NDArray]]:
-    """Time, id, mean and covariance, a row for each event that a track holds."""
+def _per_event(tracks: Tracks, progress: bool | None) -> Iterator[_AtEvents]:
+    """The events that tracks hold, with the states at their times."""
     events, end = tracks.recording.events, tracks.stop
     row, last = events.index(tracks.start), events.index(end)
     with bar(
@@ -369,8 +434,7 @@ def _per_event(
                 a, b = np.searchsorted(t, [now[0], now[-1] + 1])
                 k, i = np.searchsorted(now, t[a:b]), np.searchsorted(tracks.id, number[a:b])
                 seen = states.valid[k, i]
-                k, i = k[seen], i[seen]
-                yield now[k], tracks.id[i], states.mean[k, i], states.covariance[k, i]
+                yield _AtEvents(now, states, k[seen], i[seen])
             next_row = events.index(stop)
             shown.update(next_row - row)
             row = next_row

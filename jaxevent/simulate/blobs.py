@@ -442,6 +442,15 @@ def _ttc(rate: float | int = 5e4, ratio: float | int = 0.1) -> Scene:
     return [Target(light, rate) for light in lights], _WIDE, 3.45, float(2 * rate * ratio)
 
 
+def _cars(rate: float | int = 2e4, ratio: float | int = 0.1) -> Scene:
+    targets = []
+    for lane, distance, speed, acceleration in CARS:
+        for x in (lane - 0.7, lane + 0.7):
+            light = Approach((x, 0.8), distance, speed, (0.2, 0.15), acceleration=acceleration)
+            targets.append(Target(light, rate))
+    return targets, _WIDE, 2.0, float(6 * rate * ratio)
+
+
 def _disc(rate: float | int = 1e5, radius: float | int = 12.0) -> Scene:
     spread = radius * math.sqrt(2 / 3)
     return [
@@ -486,11 +495,15 @@ def _walk(
     return [Target(walk, rate)], (2000, 2000), float(duration), 0.0
 
 
+# Of `_cars`, to the left, in front and to the right: m from the middle, m, m/s and m/s^2.
+CARS = ((-3.2, 22.0, 2.0, 2.0), (0.0, 18.0, 0.5, 0.0), (3.0, 14.0, 3.5, 0.0))
+
 _SCENES: dict[str, Callable[..., Scene]] = {
     "lissajous": _lissajous,
     "noise": _noise,
     "growing": _growing,
     "ttc": _ttc,
+    "cars": _cars,
     "disc": _disc,
     "crossing": _crossing,
     "dropout": _dropout,
@@ -511,6 +524,9 @@ def blob_scene(name: str, seed: int = 0, **settings: Any) -> tuple[Recording, Tr
       that lambda1 grows from 3.5 to 12 px (rate);
     - ttc: two lights 1.4 m apart from 20 m to 8 m in 3.45 s, 1 / TTC from 0.08 to 0.67 1/s (rate,
       ratio of background events);
+    - cars: the two lights each, 1.4 m apart and 0.2 m wide, of three cars in lanes side by side for
+      2 s, 0 and 1 of the left, 2 and 3 of the middle, 4 and 5 of the right one; 1 / TTC from 0.09
+      to 0.43, from 0.028 to 0.029 and from 0.25 to 0.5 1/s (rate, ratio of background events);
     - disc: leading and trailing edges on the path of lissajous (rate, radius);
     - crossing: two blobs that pass each other at 0.3 s, 1200 px/s relative, `offset` px apart
       (offset, rate, speed of each);

@@ -8,12 +8,13 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from jaxevent import simulate
+from jaxevent import blob, simulate
 from jaxevent.blob import quantities
 from jaxevent.errors import InputError
 from jaxevent.show import track_pictures as pictures
-from jaxevent.show.track_plots import plot_tracks
+from jaxevent.show.track_plots import write_track_plot
 from jaxevent.show.track_tables import COLUMNS, write_tracks
+from jaxevent.simulate.blobs import CARS, blob_scene
 
 RNG = np.random.default_rng
 INVERSE_TTC = jax.jit(quantities.inverse_ttc)
@@ -83,6 +84,34 @@ def test_variance_of_inverse_ttc_is_that_of_samples():
     # The variance of 20,000 draws is known to 1 % (one standard deviation).
     assert abs(np.var(values) / float(variance) - 1) < 0.04
     assert abs(np.mean(values) - float(value)) < 5 * np.sqrt(float(variance) / 20000)
+
+
+@pytest.mark.slow
+def test_three_cars_tell_their_times_to_contact():
+    """Six lights at once; of each event of a car its inverse time to contact."""
+    recording, truth = blob_scene("cars", 2, rate=2e3)
+    seeds = [(*state[:2], 6.0) for state in truth(0.0)[0]]
+    params = blob.constant_velocity.Params(
+        preset="ttc", lambda0=6.0, events_per_step=8, P0_p=1.0, P0_v=1e4
+    )
+    tracks = blob.constant_velocity.estimate(recording, params, seeds=seeds, progress=False)
+    whose = np.concatenate([one.id for one in tracks.events()])
+    t = np.concatenate([one.t for one in tracks.events()])
+    for car, (_, distance, speed, acceleration) in enumerate(CARS):
+        pair = 2 * car, 2 * car + 1
+        times = t[np.isin(whose, pair)]
+        assert len(times) > 0.95 * 2 * 2e3 * truth.duration
+        times = times[(times > 300_000) & (times < 1_700_000)][::20]
+        states = tracks(times, pair)
+        assert states.valid.all()
+        parts = states.mean, states.covariance
+        told = (jnp.asarray(part[:, k]) for k in (0, 1) for part in parts)
+        value, variance = (np.asarray(part) for part in INVERSE_TTC(*told))
+        s = times * 1e-6
+        true = (speed + acceleration * s) / (distance - speed * s - acceleration * s**2 / 2)
+        assert np.abs(value - true).max() < 0.06
+        assert np.sqrt(((value - true) ** 2).mean()) < 0.025
+        assert ((value - true) ** 2 / variance).mean() < 2
 
 
 def test_blobs_in_one_place_say_nothing_of_contact():
@@ -389,11 +418,11 @@ def test_tracks_that_cannot_be_written_are_named(tmp_path):
     with pytest.raises(InputError, match="do not fit"):
         write_tracks(tmp_path / "tracks.csv", times, ids * 1.0, mean, P, valid)
     with pytest.raises(InputError, match="not two of the tracks"):
-        plot_tracks(tmp_path / "a.png", still(), times, ids, mean, P, valid, pair=(3, 4))
+        write_track_plot(tmp_path / "a.png", still(), times, ids, mean, P, valid, pairs=[(3, 4)])
     with pytest.raises(InputError, match="both the extent"):
-        plot_tracks(tmp_path / "a.png", still(), times, ids, mean, P, valid, extent=1.0)
+        write_track_plot(tmp_path / "a.png", still(), times, ids, mean, P, valid, extent=1.0)
     with pytest.raises(InputError, match="file without suffix"):
-        plot_tracks(tmp_path / "a", still(), times, ids, mean, P, valid)
+        write_track_plot(tmp_path / "a", still(), times, ids, mean, P, valid)
     with pytest.raises(InputError, match="not sorted"):
         list(pictures.track_frames(still(), times[::-1], ids, mean, valid))
     with pytest.raises(InputError, match="image 0 of 12 .* shape"):
@@ -492,9 +521,9 @@ def test_plots_are_written(tmp_path):
     pytest.importorskip("matplotlib")
     times, ids, mean, P, valid = tracks(T=12)
     given = still(), times, ids, mean, P
-    plot_tracks(tmp_path / "both.png", *given, valid, pair=(3, 17), extent=0.2, focal=500.0)
+    write_track_plot(tmp_path / "both.png", *given, valid, pairs=[(3, 17)], extent=0.2, focal=500.0)
     # None is valid, and neither time to contact nor range is asked for.
-    plot_tracks(tmp_path / "none.png", *given, np.zeros_like(valid))
+    write_track_plot(tmp_path / "none.png", *given, np.zeros_like(valid))
     sizes = []
     for name in ("both.png", "none.png"):
         with Image.open(tmp_path / name) as image:

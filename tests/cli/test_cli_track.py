@@ -154,6 +154,42 @@ def test_a_row_for_each_event(folder, capsys, monkeypatch):
 
 
 @pytest.mark.slow
+def test_quantities_at_event_rate(folder, capsys, monkeypatch):
+    """Two pairs and a range, stretch by stretch, against all events at once."""
+    monkeypatch.setattr(written, "_STRETCH", 300)
+    out = folder / "out"
+    argv = [
+        *("track", folder / "two.h5", *METHOD, "--params", folder / "mine.toml", "--at", "events"),
+        *("--pair", "0,1", "--pair", "1,0", "--extent", 0.3, "--focal", 200, "--stop", 0.02),
+    ]
+    assert cli.main([*map(str, argv), *seeded("--out", out)]) == 0
+    assert "quantities.h5" in capsys.readouterr().out
+    tracks = followed(stop=0.02)
+    told = list(tracks.events())
+    t, whose = (np.concatenate([getattr(one, name) for one in told]) for name in ("t", "id"))
+    t, whose = t[whose >= 0], whose[whose >= 0]
+    states = tracks(t)
+    mean, P = (jnp.asarray(part) for part in (states.mean, states.covariance))
+    with h5py.File(out / "quantities.h5") as file:
+        columns = {name: np.array(file[name]) for name in file}
+        assert file["t"].attrs["unit"].startswith("us") and file["range"].attrs["unit"] == "m"
+    for one, other in ((0, 1), (1, 0)):
+        rows = (columns["id"] == one) & (columns["other"] == other)
+        np.testing.assert_array_equal(columns["t"][rows], t)
+        value, variance = inverse_ttc(mean[:, one], P[:, one], mean[:, other], P[:, other])
+        np.testing.assert_allclose(columns["inverse_ttc"][rows], value, rtol=1e-9)
+        np.testing.assert_allclose(columns["sigma_inverse_ttc"][rows] ** 2, variance, rtol=1e-9)
+        assert np.isnan(columns["range"][rows]).all()
+    rows = columns["other"] == -1
+    np.testing.assert_array_equal(columns["t"][rows], t)
+    np.testing.assert_array_equal(columns["id"][rows], whose)
+    at = np.arange(len(t)), whose
+    value, variance = size_range(mean[at], P[at], 0.3, 200)
+    np.testing.assert_allclose(columns["range"][rows], value, rtol=1e-9)
+    np.testing.assert_allclose(columns["sigma_range"][rows] ** 2, variance, rtol=1e-9)
+
+
+@pytest.mark.slow
 def test_one_file_of_each_kind(folder, capsys):
     # The frames, which nobody looks at, begin before the events and end after.
     stamps = np.array([-5_000, 90_000])

@@ -93,12 +93,19 @@ def test_an_image_and_its_uncertainty():
 def test_tracks_are_lines_over_events():
     tracks = Tracks()
     axis = show.plot_tracks(tracks).axes[0]
-    x = [np.asarray(line.get_xdata()) for line in axis.lines]
-    assert np.nanmin(x[0]) == pytest.approx(2.1) and np.nanmax(x[0]) == pytest.approx(7.0, 1e-3)
-    assert np.nanmin(x[1]) == pytest.approx(4.0, 0.01)
-    assert [(e.width, e.height) for e in axis.patches] == [(8, 4), (8, 4)]
+    x = [np.array(path.get_segments())[..., 0] for path in axis.collections]
+    assert x[0].min() == pytest.approx(2.1) and x[0].max() == pytest.approx(7.0, 1e-3)
+    assert x[1].min() == pytest.approx(4.0, 0.01)
+    since = np.asarray(axis.collections[1].get_array())  # time is colour
+    np.testing.assert_allclose(
+        x[1][:, 0], 2 + 100 * (since + tracks.recording.start * 1e-6), atol=1e-4
+    )
+    ellipses = [line.get_xydata() for line in axis.lines]
+    assert len(ellipses) == 12
+    for ellipse in ellipses:
+        np.testing.assert_allclose(np.ptp(ellipse, axis=0), (8, 4), rtol=0.02)
     assert [text.get_text() for text in axis.texts] == ["3", "5"]
-    assert len(show.plot_tracks(tracks, [5]).axes[0].lines) == 1
+    assert len(show.plot_tracks(tracks, [5]).axes[0].collections) == 1
 
 
 def test_a_motion_and_the_losses_of_a_fit():
