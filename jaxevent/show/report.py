@@ -111,7 +111,9 @@ def write_png(path: str | Path, image: NDArray) -> None:
 
 
 @contextlib.contextmanager
-def video_writer(path: str | Path, fps: float | int) -> Iterator[Callable[[NDArray], None]]:
+def video_writer(
+    path: str | Path, fps: float | int, preset: str = "medium"
+) -> Iterator[Callable[[NDArray], None]]:
     """Open an MP4 file (H.264, yuv420p) and give the function that appends a frame to it.
 
         with video_writer("flight.mp4", fps=30) as write:
@@ -120,7 +122,7 @@ def video_writer(path: str | Path, fps: float | int) -> Iterator[Callable[[NDArr
 
     Frames are uint8, grey (height, width) or colour (height, width, 3), all of one size; an odd
     size is padded to even, as the format demands, by repeating the last row or column. `fps` is in
-    frames per second. The file appears at the end, complete; an exception leaves none. Raises
+    frames per second; `preset` is x264's, how much time it takes for a smaller file. The file appears at the end, complete; an exception leaves none. Raises
     `InputError` without the extra "video", for unfit frames, for none and if encoding fails.
     """
     program = require("imageio_ffmpeg", "video").get_ffmpeg_exe()
@@ -136,7 +138,8 @@ def video_writer(path: str | Path, fps: float | int) -> Iterator[Callable[[NDArr
             pixels = "gray" if len(shape) == 2 else "rgb24"
             given = f"-f rawvideo -pix_fmt {pixels} -s {width}x{height} -r {fps} -i pipe:0"
             # Constant rate factor 16 is visually lossless; faststart puts the index first.
-            wanted = "-c:v libx264 -crf 16 -pix_fmt yuv420p -movflags +faststart -f mp4"
+            wanted = f"-c:v libx264 -preset {preset} -crf 16 -pix_fmt yuv420p"
+            wanted += " -movflags +faststart -f mp4"
             return subprocess.Popen(
                 [program, "-y", "-v", "error", *given.split(), *wanted.split(), str(temporary)],
                 stdin=subprocess.PIPE,

@@ -29,7 +29,7 @@ from jaxevent.show.track_tables import QUANTITIES, no_rows, quantity_writer, tra
 _PLOTS = (".png", ".pdf", ".svg")
 _EXTRAS = {".mp4": ("imageio_ffmpeg", "video")} | {kind: ("matplotlib", "plot") for kind in _PLOTS}
 _COARSE, _PLOTTED = 4096, 16  # most times of the plot and of quantities, most tracks plotted
-_FPS, _PICTURES = 60.0, 300  # of a video: most pictures per second, and least in all
+_FPS, _PICTURES = 30.0, 150  # of a video: most pictures per second, and least in all
 _STRETCH = 2_000_000  # events of which rows are written at a time
 
 _ranges = jax.jit(size_range)
@@ -45,7 +45,7 @@ class Output:
     extent, quantities.csv; or one file by its suffix (.csv, .h5, .mp4, .png, .pdf, .svg). Tables
     hold a row per track and time, `rate` times per second, or with None a row for each event that
     is in the gate of a track, of its likeliest one. Behind the video are "events" or the
-    "high-pass" reconstruction; it plays at 60 pictures per second, slower than real time if that
+    "high-pass" reconstruction; it plays at 30 pictures per second, slower than real time if that
     would be less than 5 s. quantities.csv and the plot have at most 4096 times, evenly spaced; the
     plot shows the 16 longest tracks. Memory does not grow with the recording's length.
 
@@ -190,7 +190,7 @@ class Output:
                 recording = tracks.recording
                 behind = _high_pass(recording, pictures) if self.background != "events" else None
                 fps = min(often, _FPS)
-                with video_writer(places[".mp4"], fps) as show:
+                with video_writer(places[".mp4"], fps, "veryfast") as show:
                     for image in draw_frames(recording, pictures, tracks.id, states(), behind):
                         show(image)
             else:

@@ -102,8 +102,8 @@ def test_a_folder_of_everything(folder, capsys):
 
     scale = 6  # 80 rows become 480
     images, about = decoded(out / "tracks.mp4", scale * HEIGHT, scale * WIDTH, "rgb24")
-    # 300 pictures would be 6000 a second, of which the rate allows 500.
-    assert len(images) == 25 and " 60 fps" in about
+    # 150 pictures would be 3000 a second, of which the rate allows 500.
+    assert len(images) == 25 and " 30 fps" in about
     for one, place in enumerate(states.mean[-1, :, :2]):
         x, y = np.rint((place + 0.5) * scale).astype(int)
         near = images[-1][max(y - 60, 0) : y + 60, max(x - 60, 0) : x + 60].astype(int)

@@ -20,6 +20,7 @@ from jaxevent.runs.scores import Sample
 from jaxevent.show.page import _names, page, picture
 from jaxevent.show.report import markdown_table
 from jaxevent.simulate import blob_scene, motion_scene
+from jaxevent.simulate.blobs import Approach, Target, simulate_blobs
 
 
 @pytest.fixture(scope="module")
@@ -123,9 +124,66 @@ def test_tracks(folder):
         assert row["covered"] == alive.mean() and row["times"] == len(known.t)
 
 
+LIGHTS = """
+recordings = ["cars.h5"]
+protocol = "tracks"
+positions = "cars.csv"
+pairs = [[0, 1]]
+extent = 0.2
+focal = 1000.0
+size_factor = 0.25
+smooth = SMOOTH
+begin = "BEGIN"
+[[method]]
+name = "moment"
+params = { preset = "ttc", lambda0 = 6.0, events_per_step = 16, n_confirm = 60.0 }
+"""
+
+
+@pytest.fixture(scope="module")
+def cars(tmp_path_factory):
+    """Two lights of one car, and all that is known of them."""
+    folder = tmp_path_factory.mktemp("cars")
+    lights = [
+        Target(Approach((x, 0.3), 14.0, 3.5, (0.2, 0.15), centre=(160, 100)), 1e4)
+        for x in (-0.7, 0.7)
+    ]
+    recording, truth = simulate_blobs(lights, (320, 240), 0.4, 4e3, 3)
+    jaxevent.save(recording, folder / "cars.h5")
+    t = np.arange(0.05, 0.4, 0.005)
+    depth = 14.0 - 3.5 * t
+    tables = []
+    for k in (0, 1):
+        names = ["x", "y", "vx", "vy", "lambda1", "lambda2", "theta", "q"]
+        table = pd.DataFrame(truth(t)[:, k], columns=names)
+        tables.append(table.assign(t=t, id=k, range=depth, inverse_ttc=3.5 / depth))
+    pd.concat(tables).to_csv(folder / "cars.csv", index=False)
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("begin", ["positions", "found", "born"])
+def test_what_is_known_beside_positions(cars, begin):
+    rows = {}
+    for smooth in ("true", "false"):
+        text = LIGHTS.replace("SMOOTH", smooth).replace("BEGIN", begin)
+        (rows[smooth],) = evaluate.evaluate(configured(cars, f"{begin}-{smooth}", text))
+    row = rows["true"]
+    assert (row["tracks"], row["missed"], row["false"], row["switches"]) == (2, 0, 0, 0)
+    assert min(row["mota"], row["idf1"], row["hota"]) > 0.8 and row["covered"] > 0.9
+    assert row["rmse"] < 1 and row["velocity"] < 20 and row["size"] < 0.1 and row["range"] < 0.15
+    assert row["theta"] < 10 and row["inverse_ttc"] < 0.15
+    assert row["velocity"] < rows["false"]["velocity"]
+    said = markdown_table([row])
+    assert all(name in said for name in ("HOTA", "switches", "1/TTC 1/s", "range %"))
+
+
 @pytest.mark.parametrize(
     ("text", "named"),
     [
+        (TRACKS.replace('"*.csv"', '"*.csv"\nbegin = "truth"'), '"found"'),
+        (TRACKS.replace('"*.csv"', '"*.csv"\nextent = 0.2'), "focal"),
+        (TRACKS.replace('"*.csv"', '"*.csv"\npairs = [[1, 1]]'), "id, id"),
         (MOTION.replace('truth = "*.csv"', ""), "true motion is not given"),
         (MOTION.replace('truth = "*.csv"', 'truth = "*.csv"\nmodel = "planer"'), "planar"),
         (MOTION.replace("settle = 0.1", "settle = -1"), "settle is '-1'"),
