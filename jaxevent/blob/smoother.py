@@ -19,10 +19,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxevent.blob.filters.ellipse import wrap
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import LONGEST
-from jaxevent.blob.states import canonical
+from jaxevent.blob.states import canonical, wrap
 from jaxevent.blob.steps import Filter, choose
 from jaxevent.blob.targets import Slots, own_params, predict, seconds, stands_still
 

@@ -52,6 +52,11 @@ def canonical(
     return mean, jnp.where(swap, covariance[order][:, order], covariance)
 
 
+def wrap(theta: Array) -> Array:
+    """The same angle in [-pi, pi]."""
+    return theta - 2 * jnp.pi * jnp.round(theta / (2 * jnp.pi))
+
+
 def tell(
     filter: Filter, params: TrackerParams, slot: Slots, time: Array
 ) -> tuple[Array, Array, Array]:

@@ -122,8 +122,9 @@ def video_writer(
 
     Frames are uint8, grey (height, width) or colour (height, width, 3), all of one size; an odd
     size is padded to even, as the format demands, by repeating the last row or column. `fps` is in
-    frames per second; `preset` is x264's, how much time it takes for a smaller file. The file appears at the end, complete; an exception leaves none. Raises
-    `InputError` without the extra "video", for unfit frames, for none and if encoding fails.
+    frames per second; `preset` is x264's, how much time it takes for a smaller file. The file
+    appears at the end, complete; an exception leaves none. Raises `InputError` without the extra
+    "video", for unfit frames, for none and if encoding fails.
     """
     program = require("imageio_ffmpeg", "video").get_ffmpeg_exe()
     if not 0 < fps < math.inf:

@@ -21,9 +21,10 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxevent.blob.association import Expected
-from jaxevent.blob.filters.ellipse import spread, truncation, wrap
+from jaxevent.blob.filters.ellipse import spread, truncation
 from jaxevent.blob.filters.motion import decay, transition
 from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.states import wrap
 from jaxevent.blob.steps import Batch, Filter, choose
 from jaxevent.blob.tracker import Tracker
 from jaxevent.parameters import Choice, Count, Positive

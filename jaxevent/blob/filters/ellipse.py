@@ -26,11 +26,6 @@ def axes(spread: Float[Array, "2 2"]) -> tuple[Array, Array, Array]:
     return theta, variances, jnp.sqrt(variances)
 
 
-def wrap(theta: Array) -> Array:
-    """The same angle in [-pi, pi]."""
-    return theta - 2 * jnp.pi * jnp.round(theta / (2 * jnp.pi))
-
-
 def truncation(params: TrackerParams) -> tuple[Array | float, Array | float]:
     """E[u1^2] and E[u1^2 u2^2] of standard normal u that an elliptical gate lets pass.
 

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxevent.blob.association import Expected
-from jaxevent.blob.filters.ellipse import geometric_step, spread, truncation, wrap
+from jaxevent.blob.filters.ellipse import geometric_step, spread, truncation
 from jaxevent.blob.filters.motion import Motion, decay, expected_of, moments_of, transition
 from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.states import wrap
 from jaxevent.blob.steps import Batch, Filter, choose
 from jaxevent.blob.tracker import Tracker
 
