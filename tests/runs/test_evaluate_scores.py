@@ -136,7 +136,7 @@ smooth = SMOOTH
 begin = "BEGIN"
 [[method]]
 name = "moment"
-params = { preset = "ttc", lambda0 = 6.0, events_per_step = 16, n_confirm = 60.0 }
+params = { preset = "ttc", lambda0 = 6.0, events_per_step = 16, n_confirm = 60, tau_birth = 0.01 }
 """
 
 
