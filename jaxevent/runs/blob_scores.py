@@ -237,7 +237,8 @@ def _closing(
             )
         a, b = (ids.index(one) for one in pair)
         value, _ = inverse_ttc(x[:, a], P[:, a], x[:, b], P[:, b])
-        errors.append(np.asarray(value) - truth[:, [a, b]].mean(1))
+        seen = np.isfinite(mean[:, [a, b], 0]).all(1)
+        errors.append(np.where(seen, np.asarray(value), np.nan) - truth[:, [a, b]].mean(1))
         paired |= {a, b}
     since = jnp.asarray((known.t - known.t[0]) * 1e-6)
     noise = float(tracks.params.Q_lambda)

@@ -162,7 +162,7 @@ def cars(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("begin", ["positions", "found", "born"])
+@pytest.mark.parametrize("begin", ["positions", "born"])
 def test_what_is_known_beside_positions(cars, begin):
     rows = {}
     for smooth in ("true", "false"):
@@ -176,6 +176,17 @@ def test_what_is_known_beside_positions(cars, begin):
     assert row["velocity"] < rows["false"]["velocity"]
     said = markdown_table([row])
     assert all(name in said for name in ("HOTA", "switches", "1/TTC 1/s", "range %"))
+
+
+@pytest.mark.slow
+def test_targets_are_searched_for(cars):
+    """The search takes one of the two lights: of a pair without a track no contact is told."""
+    text = LIGHTS.replace("SMOOTH", "false").replace("BEGIN", "found")
+    (row,) = evaluate.evaluate(configured(cars, "found", text))
+    assert (row["tracks"], row["missed"], row["false"]) == (1, 1, 0)
+    assert row["covered"] == 0.5 and row["mota"] == 0.5
+    assert row["idf1"] == pytest.approx(2 / 3)
+    assert row["rmse"] < 0.5 and row["inverse_ttc"] is None
 
 
 @pytest.mark.parametrize(
