@@ -1,16 +1,15 @@
 """Blobs of events in one window that background does not make, at a stated false-alarm rate."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from jaxevent.blob.finding.background import Background, evidence
 from jaxevent.blob.finding.stream import Part
+from jaxevent.kernels import compiled
 
 FALSE_ALARMS = 0.1  # per recording
-_EIGHT = np.ones((3, 3), bool)
 
 
 class Scale(NamedTuple):
@@ -39,36 +38,93 @@ def detect(
     """
     g = scale.cell
     rows, columns = -(-size[0] // g), -(-size[1] // g)
-    place = part.y // g * columns + part.x // g
-    n = np.bincount(place, minlength=rows * columns).reshape(rows, columns)
-    around = np.pad(n, 1)
-    around = around[:-2] + around[1:-1] + around[2:]
-    around = around[:, :-2] + around[:, 1:-1] + around[:, 2:]
-    filled = np.flatnonzero(n.ravel())  # four times faster than np.nonzero of two axes
+    place, filled, around = _count(part.x, part.y, g, rows, columns)
     y, x = np.divmod(filled, columns)
     mu = background.at(x * g + g // 2, y * g + g // 2, t) * scale.window * 9 * g * g
     tests = rows * columns * background.duration / scale.window
-    hit = evidence(around.ravel()[filled], mu, scale.dispersion) > np.log(tests / FALSE_ALARMS)
-    if not hit.any():
-        return np.zeros(len(part), np.int32), 0
-    cells = np.zeros(rows * columns, bool)
-    cells[filled[hit]] = True
-    labels = np.zeros((rows, columns), np.int32)
-    number = ndimage.label(cells.reshape(rows, columns), _EIGHT, output=labels)
-    return labels.ravel()[place], int(number)  # type: ignore[arg-type]
+    hit = evidence(around, mu, scale.dispersion) > np.log(tests / FALSE_ALARMS)
+    return _label(place, filled[hit], rows, columns)
+
+
+# Windows hold far fewer events than there are cells: only those that are not empty are touched.
+
+
+@compiled
+def _count(x: Any, y: Any, g: int, rows: int, columns: int) -> Any:
+    """The cell of each event, the cells that are not empty, and the events in their 3x3."""
+    n, place = np.zeros((rows + 2, columns + 2), np.int32), np.empty(len(x), np.int64)
+    filled, number = np.empty(len(x), np.int64), 0
+    for i in range(len(x)):
+        row, column = np.int64(y[i]) // g, np.int64(x[i]) // g
+        place[i] = row * columns + column
+        if n[row + 1, column + 1] == 0:
+            filled[number] = place[i]
+            number += 1
+        n[row + 1, column + 1] += 1
+    filled = np.sort(filled[:number])
+    around = np.zeros(number, np.int64)
+    for k in range(number):
+        row, column = filled[k] // columns, filled[k] % columns
+        for down in range(3):
+            for right in range(3):
+                around[k] += n[row + down, column + right]
+    return place, filled, around
+
+
+@compiled
+def _label(place: Any, hit: Any, rows: int, columns: int) -> Any:
+    """The blob of each event, and how many there are: neighbours, also across corners."""
+    labels, waiting = np.zeros((rows + 2, columns + 2), np.int32), np.empty(len(hit), np.int64)
+    for cell in hit:
+        labels[cell // columns + 1, cell % columns + 1] = -1
+    number = 0
+    for cell in hit:
+        if labels[cell // columns + 1, cell % columns + 1] > 0:
+            continue
+        number += 1
+        labels[cell // columns + 1, cell % columns + 1] = number
+        waiting[0], count = cell, 1
+        while count > 0:
+            count -= 1
+            row, column = waiting[count] // columns, waiting[count] % columns
+            for down in range(3):
+                for right in range(3):
+                    if labels[row + down, column + right] == -1:
+                        labels[row + down, column + right] = number
+                        waiting[count] = (row + down - 1) * columns + column + right - 1
+                        count += 1
+    of_event = np.zeros(len(place), np.int32)
+    for i in range(len(place)):
+        of_event[i] = labels[place[i] // columns + 1, place[i] % columns + 1]
+    return of_event, number
 
 
 def measure_blobs(part: Part, labels: NDArray[np.int32], number: int) -> Blobs:
     """Moments of all blobs. A pixel's own extent is added to the covariance."""
 
-    def mean(values: NDArray) -> NDArray:
-        return np.bincount(labels, values, number + 1) / np.maximum(n, 1)
+    n, p, C = _moments(part.x, part.y, labels, number)
+    return Blobs(n, p, C + np.eye(2) / 12)
 
-    some = np.flatnonzero(labels)
-    labels, in_x, in_y = labels[some], part.x[some], part.y[some]
-    n = np.bincount(labels, minlength=number + 1).astype(np.float64)
-    x, y = mean(in_x), mean(in_y)
-    ex, ey = in_x - x[labels], in_y - y[labels]
-    xx, xy, yy = mean(ex**2), mean(ex * ey), mean(ey**2)
-    C = np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2) + np.eye(2) / 12
-    return Blobs(n[1:], np.stack([x, y], 1)[1:], C[1:])
+
+@compiled
+def _moments(x: Any, y: Any, labels: Any, number: int) -> Any:
+    n, p, C = np.zeros(number), np.zeros((number, 2)), np.zeros((number, 2, 2))
+    for i in range(len(labels)):
+        k = labels[i] - 1
+        if k >= 0:
+            n[k] += 1
+            p[k, 0] += x[i]
+            p[k, 1] += y[i]
+    for k in range(number):
+        p[k] /= max(n[k], 1.0)
+    for i in range(len(labels)):
+        k = labels[i] - 1
+        if k >= 0:
+            ex, ey = x[i] - p[k, 0], y[i] - p[k, 1]
+            C[k, 0, 0] += ex * ex
+            C[k, 0, 1] += ex * ey
+            C[k, 1, 1] += ey * ey
+    for k in range(number):
+        C[k] /= max(n[k], 1.0)
+        C[k, 1, 0] = C[k, 0, 1]
+    return n, p, C
