@@ -68,7 +68,6 @@ def run(
 ) -> None:
     from jaxevent.io import load
     from jaxevent.methods import find
-    from jaxevent.reconstruction.colour import colour_video
     from jaxevent.runs.protocols import frame_times
     from jaxevent.show.export import evenly, write_hdf5, writer
 
@@ -88,7 +87,11 @@ def run(
         times = evenly(recording, 100.0 if rate is None else rate)
     clock = time.perf_counter()
     video = estimator.estimate(recording, values, progress=show_progress())
-    colours = colour_video(video, recording) if colour else None
+    colours = None
+    if colour:
+        from jaxevent.reconstruction.colour import colour_video
+
+        colours = colour_video(video, recording)
     how = write(video, times, out, tone or "linear", name, colours)
     seconds = time.perf_counter() - clock
     print(
