@@ -33,14 +33,17 @@ import numpy as np
 from bench_motion import motion_bench
 
 import jaxevent
-from jaxevent.blob import moment
+from jaxevent.blob import find, moment
 from jaxevent.blob.filters.ellipse import truncation
+from jaxevent.blob.fused.tracking import FusedRun
+from jaxevent.blob.lifecycle import begin as begin_state
+from jaxevent.blob.prepare import Packing
 from jaxevent.blob.steps import Batch
 from jaxevent.io import load, save
 from jaxevent.reconstruction.filtering import Observation, Observer, State, Trajectory
 from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import Events, Frames, Recording
-from jaxevent.simulate import blob_scene
+from jaxevent.simulate import Line, Target, blob_scene, simulate_blobs
 
 WIDTH, HEIGHT = 346, 260
 BASELINE = Path(__file__).with_name("bench_baseline.json")
@@ -566,6 +569,67 @@ def blob_steps(recording: Recording, M: int) -> tuple[np.ndarray, Batch]:
     return dt.astype(np.float32), Batch(*arrays)
 
 
+def blob_numbers() -> tuple:
+    """What `blob_loop` takes of the parameters of `moment`."""
+    p = moment.Params()
+    numbers = ("p", "v", "lambda", "theta", "q")
+    Q = np.array([float(getattr(p, f"Q_{name}")) for name in numbers])
+    P0 = np.array([float(getattr(p, f"P0_{name}")) for name in numbers])
+    P0[2] /= float(p.lambda0) ** 2
+    limits = np.array([float(v) for v in (p.lambda_min, p.lambda_max, p.P_theta_max)])
+    kappa, fourth = (float(v) for v in truncation(p))
+    return 20.0, Q, P0, kappa, fourth, limits
+
+
+def tracker_bench() -> tuple[dict[str, float], dict[str, float]]:
+    """The tracker by both compilers, in CPU seconds, which other work on the machine spares.
+
+    One target, from a seed. The loop over packed events, and `estimate` in all. Interleaved, the
+    least of each, beside `blob_loop`, which neither gates nor tells of births and deaths.
+    """
+    speed, tasks, events = {}, {}, {}
+    recording, truth = blob_scene("lissajous", 0)
+    start, e = truth(0.0)[0, 0, :2] + (3.0, -3.0), recording.events[:24_576]
+    loop, numbers = "blob filter as a numba loop", blob_numbers()
+    tasks[loop] = lambda: blob_loop(e.t, e.x, e.y, start, *numbers)
+    events[loop] = len(e)
+    for M in (1, 32):
+        params, seeds = moment.Params(events_per_step=M), [(*start, 20.0)]
+        many, _ = blob_scene("lissajous", 0, rate=3e6 if M > 1 else 3e5)
+        packing = Packing(many, params, seeds)
+        stretch = packing.pack(packing.first)
+        state = begin_state(moment.filter, params, stretch.features)
+        kernel = FusedRun(moment.filter, params, packing)
+        name = f"tracker, M = {M}, loop over packed events"
+        tasks[name] = functools.partial(kernel, state, stretch.features)
+        events[name] = int(np.count_nonzero(stretch.features.valid))
+        for compiler in ("numba", "xla"):
+            name = f"tracker, M = {M}, `estimate` by {compiler}"
+            tasks[name] = functools.partial(
+                moment.estimate, many, params, seeds=seeds, compiler=compiler, progress=False
+            )
+            events[name] = len(many.events)
+    paths = ((200, 300), (600, 50)), ((900, 400), (-500, 100)), ((600, 150), (0, 300))
+    lines = [Line(at, velocity, size=(8.0, 8.0)) for at, velocity in paths]
+    scene, _ = simulate_blobs([Target(line, 2.5e5) for line in lines], (1280, 720), 0.6, 2.5e5)
+    found = "`find` at 1280x720"
+    tasks[found] = functools.partial(find, scene, progress=False)
+    events[found] = len(scene.events)
+    least: dict[str, float] = {}
+    for repeat in range(4):
+        for name, task in tasks.items():
+            clock = time.process_time()
+            task()
+            if repeat:  # the first compiles
+                least[name] = min(least.get(name, np.inf), time.process_time() - clock)
+    speed = {f"{name}, per CPU second": events[name] / 1e6 / least[name] for name in tasks}
+    base = speed[f"{loop}, per CPU second"]
+    ratio = {
+        f"{name} / numba loop": v / base for name, v in speed.items() if name.startswith("tracker")
+    }
+    return speed, ratio
+
+
 def blob_bench() -> tuple[dict[str, float], dict[str, float]]:
     """Filters alone and the tracker, on a blob of 100,000 events/s at up to 2014 px/s."""
     recording, truth = blob_scene("lissajous", 0)
@@ -627,14 +691,7 @@ def blob_bench() -> tuple[dict[str, float], dict[str, float]]:
     given = jax.device_put((moment.Params(), start + shift[:, None], dt[:2048], batch))
     many = 64 * 2048 / 1e6 / seconds(targets[256], given, 40)
 
-    p = moment.Params()
-    numbers = ("p", "v", "lambda", "theta", "q")
-    Q = np.array([float(getattr(p, f"Q_{name}")) for name in numbers])
-    P0 = np.array([float(getattr(p, f"P0_{name}")) for name in numbers])
-    P0[2] /= float(p.lambda0) ** 2
-    limits = np.array([float(v) for v in (p.lambda_min, p.lambda_max, p.P_theta_max)])
-    kappa, fourth = (float(v) for v in truncation(p))
-    arguments = start, 20.0, Q, P0, kappa, fourth, limits
+    arguments = start, *blob_numbers()
     same = blob_loop(e.t, e.x, e.y, *arguments)
     # But for rounding to single precision.
     assert np.abs(same - by_event).max() < 0.05, "the loop is another filter"
@@ -692,6 +749,7 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write all numbers")
     parser.add_argument("--skip-memory", action="store_true", help="leave out the 100 M events")
     parser.add_argument("--blob", action="store_true", help="the tracker of blobs alone")
+    parser.add_argument("--tracker", action="store_true", help="it by both compilers, CPU seconds")
     parser.add_argument("--motion", action="store_true", help="egomotion alone")
     parser.add_argument("--video", action="store_true", help="the complete path alone, CPU seconds")
     parser.add_argument("--long", help=argparse.SUPPRESS)
@@ -702,6 +760,8 @@ def main() -> int:
 
     if arguments.blob:
         return finish(arguments, *blob_bench())
+    if arguments.tracker:
+        return finish(arguments, *tracker_bench())
     if arguments.motion:
         return finish(arguments, *motion_bench())
     recording = stream(5_000_000, 2.0, 0)
@@ -750,7 +810,7 @@ def main() -> int:
             "complete path / dv-processing Accumulator": n / whole / accumulator,
             "compilations for a second recording": compilations(),
         }
-        blob_speed, blob_ratio = blob_bench()
+        blob_speed, blob_ratio = (a | b for a, b in zip(blob_bench(), tracker_bench(), strict=True))
         speed |= cpu_speed | blob_speed
         ratio |= cpu_ratio | blob_ratio
         if not arguments.skip_memory:
@@ -773,7 +833,9 @@ def finish(arguments: argparse.Namespace, speed: dict[str, float], ratio: dict[s
         arguments.json.write_text(text + "\n")
     if arguments.bless:
         old = (
-            json.loads(BASELINE.read_text())["ratios"] if arguments.blob or arguments.motion else {}
+            json.loads(BASELINE.read_text())["ratios"]
+            if arguments.blob or arguments.tracker or arguments.motion
+            else {}
         )
         kept = {**old, **{k: round(v, 3) for k, v in ratio.items()}}
         BASELINE.write_text(json.dumps({"machine": machine(), "ratios": kept}, indent=1) + "\n")

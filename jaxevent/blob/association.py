@@ -90,8 +90,10 @@ def share(
         first = jnp.arange(len(density)) == jnp.argmax(density)
         return (inside & first).astype(density.dtype)
     clutter = params.raw["clutter"] + math.log(2 * math.pi)  # the logarithm: -inf for none
-    top = lax.stop_gradient(jnp.maximum(density.max(), clutter))
+    cluttered = clutter > -jnp.inf
+    top = density.max()
+    top = lax.stop_gradient(jnp.where(cluttered, jnp.maximum(top, clutter), top))
     top = jnp.where(jnp.isfinite(top), top, 0)
     parts = jnp.where(inside, jnp.exp(jnp.where(inside, density, top) - top), 0)
-    total = parts.sum() + jnp.exp(clutter - top)
+    total = parts.sum() + jnp.where(cluttered, jnp.exp(clutter - top), 0)
     return parts / jnp.where(total > 0, total, 1)

@@ -4,6 +4,7 @@ At the end of every cycle tracks are confirmed, end and merge, and new ones begi
 events were many. After jAER's RectangularClusterTracker.
 """
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -14,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxevent.blob.association import Expected, largest_eigenvalue
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.prepare import LONGEST, Features
+from jaxevent.blob.prepare import LONGEST, Features, Numeric
 from jaxevent.blob.steps import Filter, choose
 from jaxevent.blob.targets import (
     Slots,
@@ -46,13 +47,13 @@ class State(eqx.Module):
 
 
 class Log(eqx.Module):
-    """Births and deaths of one chunk, by slot; -1 where no track."""
+    """Births and deaths of a chunk, or of several, by slot; -1 where no track."""
 
-    before: Int[Array, " targets"]
-    after: Int[Array, " targets"]
-    confirmed: Bool[Array, " targets"]
-    ended: Int[Array, " targets"]  # why, see ENDS; 0: it goes on
-    death: Int[Array, " targets"]  # us since the chunk's start
+    before: Int[Numeric, "*chunks targets"]
+    after: Int[Numeric, "*chunks targets"]
+    confirmed: Bool[Numeric, "*chunks targets"]
+    ended: Int[Numeric, "*chunks targets"]  # why, see ENDS; 0: it goes on
+    death: Int[Numeric, "*chunks targets"]  # us since the chunk's start
 
 
 def begin(filter: Filter, params: TrackerParams, features: Features) -> State:
@@ -159,55 +160,82 @@ def _find_births(
     return which, xi, ids, sums, next_id + which.sum().astype(jnp.int32)
 
 
-def _judge(
-    filter: Filter, params: TrackerParams, features: Features, stop: Array, slots: Slots
-) -> tuple[Log, Array]:
-    """Which tracks are confirmed and which end at a chunk's end; and when each was last apart."""
-    alive = slots.id >= 0
-    dt = jnp.where(alive, seconds(jnp.maximum(stop - slots.last, 0), slots.gate), 0)
-    state = lax.stop_gradient(slots.state)
+def expect(filter: Filter, params: TrackerParams, slot: Slots, stop: Array) -> Expected:
+    """What one target expects at a chunk's end."""
+    params = own_params(params, slot.own)
+    dt = jnp.where(slot.id >= 0, seconds(jnp.maximum(stop - slot.last, 0), slot.gate), 0)
+    return filter.expected(params, predict(filter, params, lax.stop_gradient(slot.state), dt))
 
-    def expect(own: dict[str, Array], state: Any, dt: Array) -> Expected:
-        mine = own_params(params, own)
-        return filter.expected(mine, predict(filter, mine, state, dt))
 
-    now = jax.vmap(expect)(slots.own, state, dt)
-    age = seconds(stop - slots.born, slots.gate)
-    enough = (slots.hits >= params.n_confirm) & (age >= params.t_confirm)
+class Verdict(eqx.Module):
+    """What becomes of a target at a chunk's end."""
 
+    confirmed: Bool[Array, "*targets"]
+    ended: Int[Array, "*targets"]  # why, see ENDS; 0: it goes on
+    death: Int[Array, "*targets"]  # us since the chunk's start
+    apart: Int[Array, "*targets"]
+
+
+def judge(
+    params: TrackerParams,
+    frame: Array,
+    slot: Slots,
+    now: Expected,
+    inside: Array,
+    found: Array,
+    stop: Array,
+) -> Verdict:
+    """Whether one target is confirmed and whether it ends.
+
+    `now` is what it expects, `inside` whether it is within one lambda of an older one, `found`
+    whether it is no seed.
+    """
+    alive = slot.id >= 0
+    age = seconds(stop - slot.born, slot.gate)
+    enough = (slot.hits >= params.n_confirm) & (age >= params.t_confirm)
     finite = jnp.ones_like(alive)
-    for leaf in jax.tree.leaves((now, slots.state)):
-        finite &= jnp.isfinite(leaf.reshape(len(alive), -1)).all(1)
-    long, short = now.size.max(-1), now.size.min(-1)
-    limits = silence_limits(params, slots)
-    apart = ((now.p[:, None] - now.p) ** 2).sum(-1) > long**2  # of target i from target j
-    older = alive & (slots.id < slots.id[:, None])
-    inside = (older & ~apart).any(1)
-    confirmed = slots.confirmed | (alive & enough & ~inside)
-    since = jnp.where(inside, slots.apart, stop)
+    for leaf in jax.tree.leaves((now, slot.state)):
+        finite &= jnp.isfinite(leaf).all()
+    long, short = now.size.max(), now.size.min()
+    limit = silence_limits(params, slot)
+    confirmed = slot.confirmed | (alive & enough & ~inside)
+    since = jnp.where(inside, slot.apart, stop)
     patience = jnp.where(confirmed, params.t_merge, params.t_tentative / 2)
     merged = jnp.where(
-        confirmed, seconds(stop - since, slots.gate) >= patience, inside & (age >= patience)
+        confirmed, seconds(stop - since, slot.gate) >= patience, inside & (age >= patience)
     )
-    found = jnp.arange(len(alive)) >= len(features.seed)
     one_pixel = found & (long <= 1.01 * params.lambda_min)  # a hot one, no blob
-    outside = ((now.p < -0.5) | (now.p > features.frame - 0.5)).any(-1)
+    outside = ((now.p < -0.5) | (now.p > frame - 0.5)).any()
     ended = jnp.select(
         [
             ~alive,
             ~finite,
-            stop - slots.heard > limits,
+            stop - slot.heard > limit,
             ~confirmed & (age >= 2 * params.t_tentative),
             outside,
             one_pixel | (long >= 0.999 * params.lambda_max) | (long > params.aspect_max * short),
-            jax.vmap(largest_eigenvalue)(now.P_p) > params.sigma_max**2,
+            largest_eigenvalue(now.P_p) > params.sigma_max**2,
             inside & merged,
         ],
         [0, 7, 1, 2, 3, 4, 5, 6],
         0,
     ).astype(jnp.int32)
-    death = jnp.where(ended == 1, slots.heard + limits, stop)
-    return Log(slots.id, slots.id, confirmed, ended, death), since
+    return Verdict(confirmed, ended, jnp.where(ended == 1, slot.heard + limit, stop), since)
+
+
+def _judge(
+    filter: Filter, params: TrackerParams, features: Features, stop: Array, slots: Slots
+) -> tuple[Log, Array]:
+    """Which tracks are confirmed and which end at a chunk's end; and when each was last apart."""
+    now = jax.vmap(functools.partial(expect, filter, params), (0, None))(slots, stop)
+    apart = ((now.p[:, None] - now.p) ** 2).sum(-1) > now.size.max(-1) ** 2  # target i from j
+    older = (slots.id >= 0) & (slots.id < slots.id[:, None])
+    inside = (older & ~apart).any(1)
+    found = jnp.arange(len(slots.id)) >= len(features.seed)
+    frame = jnp.asarray(features.frame)
+    of_one = jax.vmap(functools.partial(judge, params, frame), (0, 0, 0, 0, None))
+    told = of_one(slots, now, inside, found, stop)
+    return Log(slots.id, slots.id, told.confirmed, told.ended, told.death), told.apart
 
 
 def end_cycle(
@@ -216,7 +244,7 @@ def end_cycle(
     """Confirmations, deaths, mergers and births at a chunk's end."""
     fixed = lax.stop_gradient(params)
     log, since = _judge(filter, fixed, features, stop, state.slots)
-    dead = log.ended > 0
+    dead = jnp.asarray(log.ended) > 0
     slots: Any = eqx.tree_at(
         lambda s: (s.id, s.confirmed, s.apart),
         state.slots,

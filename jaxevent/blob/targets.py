@@ -51,7 +51,7 @@ class Step(eqx.Module):
     count: Any = None
 
 
-class _Ahead(eqx.Module):
+class Ahead(eqx.Module):
     """One target at a step's time, before its events; or all of them."""
 
     state: Any
@@ -87,13 +87,18 @@ def begin_slots(
 ) -> Slots:
     """Tracks begin in some slots, `which` (targets,), at rest at the positions given."""
     state = start_states(filter, params, slots.own, xi, size)
-    gate = jnp.clip(params.gate * size, params.gate_min, params.gate_max).astype(xi.dtype)
+    gate = start_gate(params, size).astype(xi.dtype)
     at = jnp.broadcast_to(time, which.shape)
     new = Slots(
         state, gate, jnp.zeros_like(gate), at, at, at, at, ids, jnp.full_like(which, confirmed),
         slots.own,
     )  # fmt: skip
     return jax.vmap(choose)(which, new, slots)
+
+
+def start_gate(params: TrackerParams, size: Array) -> Array:
+    """Radius (px) of the gate of a target of a size (px)."""
+    return jnp.clip(params.gate * size, params.gate_min, params.gate_max)
 
 
 def start_states(
@@ -117,7 +122,7 @@ def shift_slots(slots: Slots, elapsed: Array) -> Slots:
     return eqx.tree_at(times, slots, tuple(shift(t) for t in times(slots)))
 
 
-def silence_limits(params: TrackerParams, slots: Slots) -> Int[Array, " targets"]:
+def silence_limits(params: TrackerParams, slots: Slots) -> Int[Array, "*targets"]:
     """Us of silence that end each track."""
     limit = jnp.where(slots.confirmed, params.t_coast, params.t_tentative)
     us = jnp.minimum(jnp.round(lax.stop_gradient(limit) * 1e6), 2 * LONGEST).astype(jnp.int32)
@@ -150,7 +155,7 @@ def place(filter: Filter, params: TrackerParams, slots: Slots) -> tuple[Array, A
     return now.p, now.v, slots.last
 
 
-def _look_ahead(
+def look_ahead(
     filter: Filter,
     params: TrackerParams,
     slot: Slots,
@@ -159,7 +164,7 @@ def _look_ahead(
     batch: Batch,
     valid: Array,
     owner: Array | None,
-) -> _Ahead:
+) -> Ahead:
     """One target and what it expects of the events; `limit`: us of silence that end its track."""
     params = own_params(params, slot.own)
     alive = time - slot.heard <= limit
@@ -178,14 +183,14 @@ def _look_ahead(
         inside = jnp.where(owner == ANYBODY, inside, owner == slot.id)
     inside &= alive & valid
     near = gates(fixed, now, jnp.maximum(fixed.surround, 1) * radius, residual) & alive
-    return _Ahead(state, alive, radius, inside, near, density)
+    return Ahead(state, alive, radius, inside, near, density)
 
 
-def _update_slot(
+def update_slot(
     filter: Filter,
     params: TrackerParams,
     slot: Slots,
-    ahead: _Ahead,
+    ahead: Ahead,
     time: Array,
     batch: Batch,
     weight: Array,
@@ -224,11 +229,11 @@ def step(
     # A single event's is 0 for the compiler too, which leaves out what it would multiply.
     age = seconds(time - times, xi) if len(times) > 1 else jnp.zeros_like(xi[:, 0])
     batch = Batch(xi, age, polarity)
-    look = functools.partial(_look_ahead, filter, params)
+    look = functools.partial(look_ahead, filter, params)
     ahead = jax.vmap(look, (0, 0, None, None, None, None))(slots, limit, time, batch, valid, owner)
     shares = jax.vmap(functools.partial(filter.share, params), 1, 1)
     weight = shares(ahead.inside, ahead.density)
-    update = functools.partial(_update_slot, filter, params)
+    update = functools.partial(update_slot, filter, params)
     slots = jax.vmap(update, (0, 0, None, None, 0))(slots, ahead, time, batch, weight)
 
     told: dict[str, Any] = {}
@@ -246,7 +251,7 @@ def step(
 
 
 def _loss(
-    params: TrackerParams, events: str, frame: Any, ahead: _Ahead, valid: Array
+    params: TrackerParams, events: str, frame: Any, ahead: Ahead, valid: Array
 ) -> tuple[Array, Array]:
     """Sum of -ln p over the events that count, see `losses`, and their number."""
     density = ahead.density - math.log(2 * math.pi)

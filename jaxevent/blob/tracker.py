@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array
 
 from jaxevent.blob.finding import Found, find
+from jaxevent.blob.fused.tracking import FusedRun
 from jaxevent.blob.lifecycle import State, shift
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Packing, ReadOut
@@ -23,9 +24,11 @@ from jaxevent.blob.targets import Slots, silence_limits
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
+from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.recording import Recording, Times, microseconds
 
 P = TypeVar("P", bound=TrackerParams)
+KERNEL_STEPS = 200_000  # from which on a kernel is compiled
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -40,7 +43,8 @@ class Tracker(Estimator[P]):
     filter: Filter
     family: ClassVar[str] = "blob"
     options: frozenset[str] = dataclasses.field(
-        default=frozenset({"seeds", "start", "stop", "detect", "found", "smooth"}), kw_only=True
+        default=frozenset({"seeds", "start", "stop", "detect", "found", "smooth", "compiler"}),
+        kw_only=True,
     )
 
     def prepare(
@@ -151,6 +155,7 @@ class Tracker(Estimator[P]):
         detect: bool | None = None,
         found: Found | None = None,
         smooth: bool | None = None,
+        compiler: str | None = None,
         progress: bool | None = None,
     ) -> Tracks:
         """Track the blobs of a recording.
@@ -172,13 +177,19 @@ class Tracker(Estimator[P]):
                 that are near them only.
             smooth: Whether states rest on all events, those after a time included. False: on those
                 up to it, as they are known while events come. None: on all, where the filter can.
+            compiler: "numba" follows targets by a kernel made of the filter's own functions, "xla"
+                by the `run` that is differentiated; both to rounding the same. None: on CPUs, in
+                single precision and from 200,000 steps on, numba, where it has a kernel; fewer are
+                done before one is compiled. What is read of tracks is compiled by XLA.
             progress: Whether a bar is shown; None: where somebody looks on.
 
         Raises:
-            InputError: A seed is outside the sensor or the time, there is no time to track, or the
-                filter's states cannot be smoothed.
+            InputError: A seed is outside the sensor or the time, there is no time to track, the
+                filter's states cannot be smoothed, or numba is asked for and has no kernel.
         """
         self.check(recording)
+        if compiler not in (None, "numba", "xla"):
+            raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
         if smooth:
             self._check_smoothing()
         smooth = self.filter.transition is not None if smooth is None else smooth
@@ -187,7 +198,8 @@ class Tracker(Estimator[P]):
         if params is None:
             params = self.Params(**found.settings()) if found is not None else self.Params()
         packing = Packing(recording, params, seeds, start, stop, detect, found=found)
-        return Tracks(self.filter, packing, params, progress, smooth)
+        fused = self._fused(packing, params, compiler)
+        return Tracks(self.filter, packing, params, progress, smooth, fused)
 
     def _check_smoothing(self) -> None:
         if self.filter.transition is None:
@@ -195,3 +207,19 @@ class Tracker(Estimator[P]):
                 f"the states of the method {self.name!r} cannot be smoothed, its filter has no "
                 "`transition`; leave out smooth"
             )
+
+    def _fused(self, packing: Packing, params: P, compiler: str | None) -> FusedRun | None:
+        """The kernel that follows targets; None where XLA does."""
+        on_host = jnp.result_type(float) == np.float32 and jax.default_backend() == "cpu"
+        steps = (packing.rows[1] - packing.rows[0]) // packing.events
+        if compiler == "xla" or (compiler is None and not (on_host and steps >= KERNEL_STEPS)):
+            return None
+        try:
+            return FusedRun(self.filter, params, packing)
+        except Untranslatable as reason:
+            if compiler == "numba":
+                raise InputError(
+                    f"numba has no kernel for the method {self.name!r} ({reason}); leave out the "
+                    "compiler"
+                ) from reason
+            return None

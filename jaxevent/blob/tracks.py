@@ -12,10 +12,11 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
+from jaxevent.blob.fused.tracking import FusedRun
 from jaxevent.blob.lifecycle import ENDS, Log, begin
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Mark, Packing, Stretch, count_steps
-from jaxevent.blob.run import run
+from jaxevent.blob.run import Told, run
 from jaxevent.blob.smoother import (
     Later,
     Smoothed,
@@ -162,8 +163,10 @@ class Tracks:
         params: TrackerParams,
         progress: bool | None = None,
         smooth: bool = False,
+        fused: FusedRun | None = None,
     ):
         self.recording, self.params, self.smooth = packing.recording, params, smooth
+        self._fused = fused
         self.start, self.stop = packing.start, packing.stop
         self._filter, self._packing, self._progress = filter, packing, progress
         self._begins: list[tuple[Mark, int, Any]] = []
@@ -359,7 +362,7 @@ class Tracks:
             stretch = self._packing.pack(mark)
             mark = stretch.next
             upto = len(times) if mark is None else int(np.searchsorted(times, mark.start))
-            state, told = _run(self._filter, self.params, state, stretch.features, wanted="begins")
+            state, told = self._run(state, stretch.features)
             if upto > done:
                 following = None
                 if self.smooth:
@@ -370,6 +373,12 @@ class Tracks:
                 later, known = self._begin_of(int(times[done]))
                 if later is not None and later.start > mark.start:
                     mark, state = later, known
+
+    def _run(self, state: Any, features: Features, begins: bool = True) -> tuple[Any, Told]:
+        """Track through a stretch, by the kernel if there is one."""
+        if self._fused is not None:
+            return self._fused(state, features, begins)
+        return _run(self._filter, self.params, state, features, wanted="begins")
 
     def _begin_of(self, time: int) -> tuple[Mark | None, Any]:
         known = [(mark, state) for mark, _, state in self._begins if mark.start <= time]
@@ -405,7 +414,7 @@ class Tracks:
         ) as shown:  # fmt: skip
             for mark, state in self._backwards():
                 stretch = self._packing.pack(mark)
-                _, told = _run(self._filter, self.params, state, stretch.features, wanted="begins")
+                _, told = self._run(state, stretch.features)
                 _, first = self._look_back(stretch, told.slots, found)
                 found[mark] = jax.device_get(first)
                 shown.update(int(np.count_nonzero(stretch.features.valid)))
@@ -421,8 +430,7 @@ class Tracks:
                 stretch = self._packing.pack(mark)
                 mark = stretch.next
                 if mark is not None and mark != end:
-                    features = stretch.features
-                    state, _ = _run(self._filter, self.params, state, features, wanted="begins")
+                    state, _ = self._run(state, stretch.features, begins=False)
             yield from reversed(starts)
             end = first
 
@@ -447,9 +455,7 @@ class Tracks:
                     if len(self._begins) > BEGINS:
                         every *= 2
                         self._begins = [one for one in self._begins if one[1] % every == 0]
-                state, told = _run(
-                    self._filter, self.params, state, stretch.features, wanted="begins"
-                )
+                state, told = self._run(state, stretch.features, begins=False)
                 logs.append((stretch, told.log))
                 if len(logs) > 1:  # while this stretch is on the device
                     history.add(*logs.pop(0))

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxevent.errors import InputError
 from jaxevent.estimator import Described, Estimate
+from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import P, PixelEstimator
 from jaxevent.reconstruction.features import (
@@ -30,7 +31,6 @@ from jaxevent.reconstruction.features import (
     ReadOut,
     Tiles,
 )
-from jaxevent.reconstruction.fused.expressions import Untranslatable
 from jaxevent.reconstruction.fused.video import FusedVideo
 from jaxevent.reconstruction.layout import SHAPES, SLOTS
 from jaxevent.reconstruction.video import ImageSequence, Video

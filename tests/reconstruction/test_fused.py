@@ -24,8 +24,9 @@ from test_reconstruction import (
 
 import jaxevent
 from jaxevent import kernels
-from jaxevent.reconstruction.fused import bands, numeric
-from jaxevent.reconstruction.fused.host import HostProgram, run
+from jaxevent.kernels import numeric
+from jaxevent.kernels.host import HostProgram, run
+from jaxevent.reconstruction.fused import bands
 from jaxevent.reconstruction.fused.video import FusedVideo
 from jaxevent.reconstruction.video import Video
 

@@ -1,23 +1,14 @@
 """Kernels: a method's text compiled by numba, kept in the user's cache folder, with its numbers."""
 
 import dataclasses
-import functools
-import hashlib
-import importlib.util
-import os
-import sys
-import tempfile
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import jax
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent import cache
-from jaxevent.reconstruction.fused import numeric
+from jaxevent.kernels.modules import module_of
 from jaxevent.reconstruction.fused.loop import Functions
 from jaxevent.reconstruction.fused.pixel import (
     FilterMethod,
@@ -87,37 +78,8 @@ def kernel_of(
     (program, modules), values = found
     if stride not in modules:
         source = write(program, stride)
-        modules[stride] = source, _module(source.text)
+        modules[stride] = source, module_of(source.text)
     source, module = modules[stride]
     functions = Functions(module.events, module.images, module.tables, module.excess)
-    numbers = source.numbers_of(values, dtype)
+    numbers = source.numbers.of(values, dtype)
     return Kernel(functions, program, source, values, numbers)
-
-
-def _module(text: str) -> ModuleType:
-    """The module of a text, from a file that numba keeps compiled functions beside."""
-    about = f"{numba.__version__} {_shared()}\n{text}"
-    name = f"kernel_{hashlib.blake2b(about.encode(), digest_size=8).hexdigest()}"
-    folder = cache.folder_for_compiled() or Path(_own_folder().name)
-    path = folder / f"{name}.py"
-    if not path.exists():  # numba looks at its time: it is written once
-        with tempfile.NamedTemporaryFile("w", dir=folder, suffix=".py", delete=False) as file:
-            file.write(text)
-        os.replace(file.name, path)
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-@functools.cache
-def _shared() -> str:
-    """What kernels are made of beside their text."""
-    return hashlib.blake2b(Path(numeric.__file__).read_bytes()).hexdigest()
-
-
-@functools.cache
-def _own_folder() -> "tempfile.TemporaryDirectory[str]":
-    return tempfile.TemporaryDirectory(prefix="jaxevent")

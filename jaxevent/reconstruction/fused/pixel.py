@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.kernels.expressions import Graph, Level, Node, Untranslatable, needed
+from jaxevent.kernels.host import HostProgram
+from jaxevent.kernels.translate import Known, OfParameters, Translation, Value
 from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Segments
-from jaxevent.reconstruction.fused.expressions import Graph, Level, Node, Untranslatable, needed
-from jaxevent.reconstruction.fused.host import HostProgram
-from jaxevent.reconstruction.fused.translate import Known, OfParameters, Translation, Value
 
 ROWS = 3
 NO_WIDTH = 104_729  # one pixel is no image: a function that makes one of it fails
@@ -177,6 +177,43 @@ class PixelProgram:
     excess: Node | None  # what a segment of an exposure adds to the frame's total
 
 
+class PixelTranslation(Translation):
+    """Translates what is said of one pixel.
+
+    Look-ups of tables at a place become nodes "slot", numbered in order; what they hold is
+    collected in `slots`. Sums over segments (`segment_cells`) become inputs "total".
+    """
+
+    def __init__(self, graph: Graph, host: HostProgram):
+        super().__init__(graph, host)
+        self.slots: list[Node] = []
+        self.excess: Node | None = None  # what a segment adds to the sum
+
+    def special(self, eqn: Any, values: list[Value]) -> NDArray | None:
+        return self._sum_over_segments(values) if eqn.primitive.name == "scatter-add" else None
+
+    def placed(self, found: NDArray, kind: str) -> NDArray:
+        """What is looked up where points lie: known when the piece begins."""
+        out = np.empty(found.shape, object)
+        for place in np.ndindex(*found.shape):
+            out[place] = self.graph.node("slot", (len(self.slots),), kind, Level.TABLE)
+            node: Any = found[place]
+            self.slots.append(node)
+        return out
+
+    def _sum_over_segments(self, values: list[Value]) -> NDArray:
+        start, cells, updates = values
+        zero = isinstance(start, Known) and start.value.ndim == 1 and not start.value.any()
+        index, added = np.ravel(self.nodes(cells)), np.ravel(self.nodes(updates))
+        ours = len(index) == len(added) == 1 and index[0].args == ("segment_cell",)
+        if not (zero and ours) or self.excess not in (None, added[0]):
+            raise Untranslatable("a sum other than that over an exposure's segments")
+        self.excess = added[0]
+        assert isinstance(start, Known)
+        rows = [self.graph.input(f"total{r}", "f", Level.TABLE) for r in range(len(start.value))]
+        return np.array(rows, object)
+
+
 def _unfolded(results: list[Node], table: list[Node], graph: Graph) -> list[Node]:
     """The same results with what slots hold in place of the slots."""
     while any(node.op == "slot" for node in needed(results)):
@@ -200,7 +237,7 @@ def translated(traced: Traced, params: Any, response: NDArray, present: float) -
     fixed["present"] = OfParameters(host.add_input(np.asarray(present, traced.dtype)))
     tables, starts, outs, translation = [], [], None, None
     for variant in variants(traced.exposed):
-        translation = Translation(graph, host)
+        translation = PixelTranslation(graph, host)
         inputs = _inputs(graph, traced, variant, fixed)
         made = translation.run(traced.closed, inputs)
         results = [translation.nodes(v).item() for v in made]

@@ -7,35 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.reconstruction.fused.expressions import Level, Node, Untranslatable, needed, value_of
-from jaxevent.reconstruction.fused.host import ELEMENTWISE
+from jaxevent.kernels.expressions import ELEMENTWISE, Level, Node, Untranslatable, needed, value_of
+from jaxevent.kernels.text import FUNCTIONS, Numbers, Writer
 from jaxevent.reconstruction.fused.loop import Places
 from jaxevent.reconstruction.fused.pixel import ROWS, PixelProgram, pieces
 
 IMAGE_FIELDS = ("grey", "intensity", "certainty", "total")
 COUNT_FIELDS = ("span_on", "span_off", "head_on", "head_off", "tail_on", "tail_off")
-
-INFIX = {
-    "add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "gt": ">", "ge": ">=",
-    "eq": "==", "ne": "!=", "and": "&", "or": "|",
-}  # fmt: skip
-FORMS = {
-    "neg": "-{0}",
-    "not": "(not {0})",
-    "max": "{0} if {0} > {1} else {1}",
-    "min": "{0} if {0} < {1} else {1}",
-    "select_n": "{2} if {0} else {1}",
-    "to_f": "REAL(1) if {0} else REAL(0)",
-    "to_i": "int({0})",
-    "to_b": "{0} != 0",
-    "pow": "{0} ** {1}",
-    "rem": "np.fmod({0}, {1})",
-    "rsqrt": "REAL(1) / np.sqrt({0})",
-    "is_finite": "np.isfinite({0})",
-    "sign": "np.sign({0})",
-}
-FUNCTIONS = ("exp", "log", "log1p", "logistic")  # of `numeric`, or the header
-LIBRARY = ("expm1", "sqrt", "tanh", "sin", "cos", "floor", "ceil", "abs")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,61 +103,20 @@ def _inputs(nodes: list[Node]) -> set[str]:
     return {n.args[0] for n in needed(nodes) if n.op == "input"}
 
 
-class Writer:
-    """Writes expressions as lines of Python."""
+class PixelWriter(Writer):
+    """Writes expressions of a pixel whose numbers lie in `loop.Memory`."""
 
     def __init__(self, fields: Fields):
+        super().__init__()
         self.fields = fields
-        self.constants: dict[str, str] = {}
-        self.numbers: dict[tuple[int, int], int] = {}  # place of numbers of the host program
-        self.entries: dict[int, str] = {}  # names of the arrays that are looked up
-        self.arrays: list[tuple[int, int]] = []  # the numbers in order of their places
 
-    def lines(self, nodes: list[Node], indent: int, stop: set[Node] | None = None) -> list[str]:
-        """Assignments to a variable for each node that the nodes rest on."""
-        out = []
-        for node in needed(nodes, stop):
-            if node.op != "constant":
-                out.append(f"{' ' * indent}{self.name(node)} = {self._expression(node)}")
-        return out
-
-    def name(self, node: Node) -> str:
-        if node.op != "constant":
-            return f"v{node.number}"
-        text = node.args[0]
-        if node.kind != "f":
-            return text
-        if text not in self.constants:
-            self.constants[text] = f"K{len(self.constants)}"
-        return self.constants[text]
-
-    def _expression(self, node: Node) -> str:
-        op = node.op
-        if op == "input":
-            return self._input(node)
-        if op == "slot":
-            return self._cell(self.fields.slots[node.args[0]])
-        if op == "number":
-            return self._number(node.args, node.kind)
-        if op == "entry":
-            return self._entry(node)
-        names = [self.name(a) for a in node.args]
-        if op in INFIX:
-            return f"{names[0]} {INFIX[op]} {names[1]}"
-        if op == "to_f" and node.args[0].kind == "i":
-            return f"REAL({names[0]})"
-        if op in FORMS:
-            return FORMS[op].format(*names)
-        if op in FUNCTIONS:
-            return f"{op}({names[0]})"
-        if op in LIBRARY:
-            return f"np.{op}({names[0]})"
-        raise Untranslatable(f"the operation {op!r}")
+    def special(self, node: Node) -> str | None:
+        return self._cell(self.fields.slots[node.args[0]]) if node.op == "slot" else None
 
     def _cell(self, field: str) -> str:
         return f"cells[{self.fields.cells[field]} * STRIDE + z]"
 
-    def _input(self, node: Node) -> str:
+    def input(self, node: Node) -> str:
         name = node.args[0]
         if name in self.fields.whole:
             text = f"whole[{self.fields.whole[name]} * STRIDE + z]"
@@ -194,20 +131,6 @@ class Writer:
             return name.removeprefix("segment_")
         raise Untranslatable(f"the use of {name!r}")
 
-    def _number(self, key: tuple[int, int], kind: str) -> str:
-        if key not in self.numbers:
-            self.numbers[key] = len(self.arrays)
-            self.arrays.append(key)
-        text = f"numbers[{self.numbers[key]}]"
-        return f"int({text})" if kind == "i" else text
-
-    def _entry(self, node: Node) -> str:
-        array, index = node.args
-        if array not in self.entries:
-            self.entries[array] = f"ENTRIES{len(self.entries)}"
-        name, at = self.entries[array], self.name(index)
-        return f"numbers[{name}[0] + min(max({at}, 0), {name}[1])]"
-
 
 @dataclasses.dataclass(frozen=True)
 class Source:
@@ -215,17 +138,7 @@ class Source:
 
     text: str
     fields: Fields
-    numbers: list[tuple[int, int]]  # value of the host program, and place in it
-    entries: list[tuple[int, int]]  # arrays that are looked up: value, and where it begins
-    size: int
-
-    def numbers_of(self, values: list[NDArray], dtype: np.dtype) -> NDArray:
-        """The numbers that the kernel's functions take, from the values of a host program."""
-        out = np.zeros(self.size, dtype)
-        out[: len(self.numbers)] = [np.ravel(values[n])[k] for n, k in self.numbers]
-        for n, at in self.entries:
-            out[at : at + len(values[n])] = values[n]
-        return out
+    numbers: Numbers
 
 
 HEAD = '''"""The functions of a kernel (`jaxevent.reconstruction.fused`)."""
@@ -322,7 +235,7 @@ def write(program: PixelProgram, stride: int) -> Source:
     if any(n.level == Level.PIECE for n in needed(results(program))):
         raise Untranslatable("a number of the piece that is not looked up at a point")
     fields = Fields.of(program, stride)
-    writer = Writer(fields)
+    writer = PixelWriter(fields)
     cells = fields.cells
     parts = [
         EVENTS.format(step=_step(program, writer), on=cells["on"], off=cells["off"]),
@@ -335,33 +248,23 @@ def write(program: PixelProgram, stride: int) -> Source:
         _excess(program, writer),
     ]
     single = program.traced.dtype == np.float32
-    module = "jaxevent.reconstruction.fused.numeric"
+    module = "jaxevent.kernels.numeric"
     names = ", ".join(f"{n}{32 if single else 64} as {n}" for n in FUNCTIONS)
-    constants = [f"{name} = REAL({_literal(text)})" for text, name in writer.constants.items()]
-    at, entries = len(writer.arrays), []
-    for array, name in writer.entries.items():
-        entries.append((array, at))
-        size = len(program.host.values[array])
-        constants.append(f"{name} = {at}, {size - 1}")
-        at += size
+    numbers, constants = writer.finish(program.host.values)
     head = HEAD.format(
         imports=f"from {module} import {names}",
         real=program.traced.dtype.name,
         stride=stride,
         constants=_text(constants),
     )
-    return Source("\n".join([head.rstrip(), "", *parts]), fields, writer.arrays, entries, at)
+    return Source("\n".join([head.rstrip(), "", *parts]), fields, numbers)
 
 
 def _text(lines: list[str]) -> str:
     return "\n".join(lines)
 
 
-def _literal(text: str) -> str:
-    return text if text not in ("inf", "-inf", "nan") else f"float('{text}')"
-
-
-def _step(program: PixelProgram, writer: Writer) -> str:
+def _step(program: PixelProgram, writer: PixelWriter) -> str:
     """The state of the pixel at z after an event."""
     fields, out = writer.fields, writer.lines(program.after, 12)
     for k, node in enumerate(program.after):
@@ -373,7 +276,7 @@ def _step(program: PixelProgram, writer: Writer) -> str:
     return _text(out)
 
 
-def _tables(program: PixelProgram, writer: Writer) -> str:
+def _tables(program: PixelProgram, writer: PixelWriter) -> str:
     """What a piece says, for the pixels from begin to end."""
     fields = writer.fields
     kept = [k for k, name in fields.slots.items() if name == f"slot{k}"]
@@ -389,7 +292,7 @@ def _tables(program: PixelProgram, writer: Writer) -> str:
     return _text([*out, ""])
 
 
-def _excess(program: PixelProgram, writer: Writer) -> str:
+def _excess(program: PixelProgram, writer: PixelWriter) -> str:
     if program.excess is None:
         return EXCESS.format(lines="", result="share")
     node = program.excess

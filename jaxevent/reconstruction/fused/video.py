@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from jaxevent.estimator import Estimate
 from jaxevent.kernels import over_rows
+from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.reconstruction.fused.bands import BandLayout
-from jaxevent.reconstruction.fused.expressions import Untranslatable
 from jaxevent.reconstruction.fused.kernel import kernel_of
 from jaxevent.reconstruction.fused.loop import Bands, FrameRows, Given, Images, Memory, run
 from jaxevent.reconstruction.fused.timeline import NEVER, make_line

@@ -107,6 +107,58 @@ def logistic32(x):
 
 
 @part
+def _reduced(x):
+    """x less whole quarter turns, and their number."""
+    n = np.floor(x * F(0.636619772) + F(0.5))
+    r = x - n * F(1.5703125) - n * F(4.837512969e-4) - n * F(7.549790126e-8)
+    return r, np.int32(n)
+
+
+@part
+def _sine(r):
+    z = r * r
+    p = F(-1.9515295891e-4) * z + F(8.3321608736e-3)
+    p = p * z - F(1.6666654611e-1)
+    return p * z * r + r
+
+
+@part
+def _cosine(r):
+    z = r * r
+    p = F(2.443315711809948e-5) * z - F(1.388731625493765e-3)
+    p = p * z + F(4.166664568298827e-2)
+    return p * z * z - F(0.5) * z + F(1)
+
+
+@part
+def sin32(x):
+    if not abs(x) < F(8000):  # the reduction loses digits
+        return np.sin(x)
+    r, n = _reduced(x)
+    value = _cosine(r) if n & 1 else _sine(r)
+    return -value if n & 2 else value
+
+
+@part
+def cos32(x):
+    if not abs(x) < F(8000):
+        return np.cos(x)
+    r, n = _reduced(x)
+    value = _sine(r) if n & 1 else _cosine(r)
+    return -value if (n + 1) & 2 else value
+
+
+@part
+def sin64(x):
+    return np.sin(x)
+
+
+@part
+def cos64(x):
+    return np.cos(x)
+
+
+@part
 def exp64(x):
     return np.exp(x)
 

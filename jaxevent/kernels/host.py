@@ -4,57 +4,14 @@ A few hundred operations on single numbers: XLA would compile longer than they t
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 from numpy.typing import NDArray
 
-from jaxevent.reconstruction.fused.expressions import Untranslatable
+from jaxevent.kernels.expressions import ELEMENTWISE, Untranslatable
 
-# What a primitive computes, by its name: of any arrays, element by element.
-ELEMENTWISE: dict[str, Callable[..., Any]] = {
-    "add": np.add,
-    "add_any": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "max": np.maximum,
-    "min": np.minimum,
-    "pow": np.power,
-    "rem": np.fmod,
-    "neg": np.negative,
-    "abs": np.abs,
-    "sign": np.sign,
-    "exp": np.exp,
-    "log": np.log,
-    "log1p": np.log1p,
-    "expm1": np.expm1,
-    "sqrt": np.sqrt,
-    "rsqrt": lambda x: 1 / np.sqrt(x),
-    "logistic": lambda x: 1 / (1 + np.exp(-x)),
-    "tanh": np.tanh,
-    "sin": np.sin,
-    "cos": np.cos,
-    "floor": np.floor,
-    "ceil": np.ceil,
-    "square": np.square,
-    "is_finite": np.isfinite,
-    "lt": np.less,
-    "le": np.less_equal,
-    "gt": np.greater,
-    "ge": np.greater_equal,
-    "eq": np.equal,
-    "ne": np.not_equal,
-    "lt_to": np.less,
-    "le_to": np.less_equal,
-    "and": np.logical_and,
-    "or": np.logical_or,
-    "not": np.logical_not,
-    "stop_gradient": lambda x: x,
-    "copy": lambda x: x,
-    "copy_p": lambda x: x,
-}
 CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 
 

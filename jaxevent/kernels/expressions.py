@@ -6,9 +6,63 @@ and what does not reach a result is never written. Constants are folded as they 
 
 import dataclasses
 import enum
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+
+# What a primitive computes, by its name: of any arrays, element by element.
+ELEMENTWISE: dict[str, Callable[..., Any]] = {
+    "add": np.add,
+    "add_any": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "max": np.maximum,
+    "min": np.minimum,
+    "pow": np.power,
+    "rem": np.fmod,
+    "neg": np.negative,
+    "abs": np.abs,
+    "sign": np.sign,
+    "exp": np.exp,
+    "log": np.log,
+    "log1p": np.log1p,
+    "expm1": np.expm1,
+    "sqrt": np.sqrt,
+    "rsqrt": lambda x: 1 / np.sqrt(x),
+    "logistic": lambda x: 1 / (1 + np.exp(-x)),
+    "tanh": np.tanh,
+    "sin": np.sin,
+    "cos": np.cos,
+    "floor": np.floor,
+    "ceil": np.ceil,
+    "round": np.rint,
+    "atan2": np.arctan2,
+    "square": np.square,
+    "is_finite": np.isfinite,
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "lt_to": np.less,
+    "le_to": np.less_equal,
+    "and": np.logical_and,
+    "or": np.logical_or,
+    "not": np.logical_not,
+    "stop_gradient": lambda x: x,
+    "copy": lambda x: x,
+    "copy_p": lambda x: x,
+}
+# Of what is made of constants alone.
+COMPUTED = {
+    **ELEMENTWISE,
+    "div": lambda a, b: np.float64(a) / b,
+    "to_f": float,
+    "to_i": int,
+    "to_b": bool,
+}
 
 
 class Untranslatable(Exception):
@@ -23,6 +77,7 @@ class Level(enum.IntEnum):
     PIECE = 2  # when a piece begins, equal for all pixels
     TABLE = 3  # when a piece begins, for each pixel
     POINT = 4  # at an event or image
+    ELEMENT = 5  # for each element of the axis that a loop passes over
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -43,7 +98,7 @@ class Graph:
         self._known: dict[Any, Node] = {}
 
     def node(self, op: str, args: tuple[Any, ...], kind: str, level: Level) -> Node:
-        key = (op, kind, *(a.number if isinstance(a, Node) else ("", a) for a in args))
+        key = (op, kind, level, *(a.number if isinstance(a, Node) else ("", a) for a in args))
         if key not in self._known:
             self._known[key] = Node(op, args, kind, level, len(self._known))
         return self._known[key]
@@ -70,6 +125,9 @@ class Graph:
     def _folded(self, op: str, args: tuple[Any, ...]) -> Node | None:
         """The same in simpler form. Tables and parameters are taken to be finite."""
         value = [value_of(a) for a in args]
+        if op in COMPUTED and all(v is not None for v in value):
+            with np.errstate(all="ignore"):
+                return self.constant(COMPUTED[op](*value))
         if op == "mul":
             for k in (0, 1):
                 if value[k] == 1:

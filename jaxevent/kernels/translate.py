@@ -11,15 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.reconstruction.fused.expressions import Graph, Level, Node, Untranslatable
-from jaxevent.reconstruction.fused.host import (
-    ELEMENTWISE,
+from jaxevent.kernels.expressions import ELEMENTWISE, Graph, Level, Node, Untranslatable
+from jaxevent.kernels.host import (
     HostProgram,
     evaluate,
     inner,
     rearranged,
 )
 
+FOLDS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_or": "or",
+         "reduce_and": "and"}  # fmt: skip
 KINDS = {"f": "f", "i": "i", "u": "i", "b": "b"}
 
 
@@ -42,16 +43,18 @@ Value = Known | OfParameters | NDArray  # an array of nodes
 
 
 class Translation:
-    """Translates jaxprs into one graph.
-
-    Look-ups of tables at a place (`Known.placed`) become nodes "slot", numbered in order; what they
-    hold is collected in `slots`. Sums over segments (`segment_cells`) become inputs "total".
-    """
+    """Translates jaxprs into one graph. Families add what is their own (`special`, `placed`)."""
 
     def __init__(self, graph: Graph, host: HostProgram):
         self.graph, self.host = graph, host
-        self.slots: list[Node] = []
-        self.excess: Node | None = None  # what a segment adds to the sum
+
+    def special(self, eqn: Any, values: list[Value]) -> NDArray | None:
+        """What an equation of a family's own makes; None for all others."""
+        return None
+
+    def placed(self, found: NDArray, kind: str) -> NDArray:
+        """What is looked up where points lie (`Known.placed`)."""
+        raise Untranslatable("a look-up at a place")
 
     def run(self, closed: Any, values: list[Value]) -> list[Value]:
         jaxpr = closed.jaxpr
@@ -112,15 +115,22 @@ class Translation:
         kind = KINDS.get(eqn.outvars[0].aval.dtype.kind)
         if kind is None or len(eqn.outvars) > 1:
             raise Untranslatable(f"the operation {name!r}")
-        if name == "scatter-add":
-            return self._sum_over_segments(values)
+        own = self.special(eqn, values)
+        if own is not None:
+            return own
         if name in ("gather", "dynamic_slice"):
             return self._look_up(eqn, values, kind)
+        if name == "scatter":
+            return self._set(eqn, values)
         moved = rearranged(eqn, [self.nodes(v) for v in values])
         if moved is not None:
             return moved
-        if name == "reduce_sum":
-            return self._sum(eqn, self.nodes(values[0]))
+        if name in FOLDS:
+            return self.fold(FOLDS[name], self.nodes(values[0]), list(map(int, eqn.params["axes"])))
+        if name == "argmax":
+            return self._first_largest(self.nodes(values[0]), int(eqn.params["axes"][0]))
+        if name == "dot_general":
+            return self._dot(eqn, self.nodes(values[0]), self.nodes(values[1]))
         arrays = np.broadcast_arrays(*(self.nodes(v) for v in values))
         out = np.empty(arrays[0].shape, object)
         for place in np.ndindex(*out.shape):
@@ -140,8 +150,8 @@ class Translation:
             return self._power(args[0], eqn.params["y"])
         if name == "clamp":
             return apply("min", (apply("max", (args[1], args[0]), kind), args[2]), kind)
-        if name == "select_n" and len(args) == 3 and args[0].kind == "b":
-            return apply(name, tuple(args), kind)
+        if name == "select_n":
+            return self._select(args, kind)
         if name == "div" and kind == "f":
             return apply(name, tuple(args), kind)
         if name in ELEMENTWISE:
@@ -156,16 +166,75 @@ class Translation:
             power = self.graph.apply("div", (self.graph.constant(1.0), power), "f")
         return power if exponent else self.graph.constant(1.0)
 
-    def _sum(self, eqn: Any, array: NDArray) -> NDArray:
-        for axis in sorted(eqn.params["axes"], reverse=True):
+    def fold(self, op: str, array: NDArray, axes: list[int]) -> NDArray:
+        """An array folded by an operation, along axes."""
+        for axis in sorted(axes, reverse=True):
             parts = np.moveaxis(array, axis, 0)
             total = parts[0]
             for part in parts[1:]:
                 pairs = zip(np.ravel(total), np.ravel(part), strict=True)
-                added = [self.graph.apply("add", pair, pair[0].kind) for pair in pairs]
-                total = np.array(added, object).reshape(np.shape(part))
+                folded = [self.graph.apply(op, pair, pair[0].kind) for pair in pairs]
+                total = np.array(folded, object).reshape(np.shape(part))
             array = np.asarray(total, object)
         return array
+
+    def _first_largest(self, array: NDArray, axis: int) -> NDArray:
+        """The place of the largest along an axis, the first of equal ones."""
+        apply, parts = self.graph.apply, np.moveaxis(array, axis, 0)
+        out = np.empty(parts.shape[1:], object)
+        for place in np.ndindex(*out.shape):
+            best, at = parts[(0, *place)], self.graph.constant(0)
+            for k in range(1, len(parts)):
+                one = parts[(k, *place)]
+                if one.kind == "b":
+                    larger = apply("and", (one, apply("not", (best,), "b")), "b")
+                else:
+                    larger = apply("gt", (one, best), "b")
+                at = apply("select_n", (larger, at, self.graph.constant(k)), "i")
+                best = apply("select_n", (larger, best, one), one.kind)
+            out[place] = at
+        return out
+
+    def _select(self, args: list[Node], kind: str) -> Node:
+        which, *cases = args
+        if which.kind == "b":
+            return self.graph.apply("select_n", tuple(args), kind)
+        out = cases[-1]
+        for k in reversed(range(len(cases) - 1)):
+            here = self.graph.apply("eq", (which, self.graph.constant(k)), "b")
+            out = self.graph.apply("select_n", (here, out, cases[k]), kind)
+        return out
+
+    def _dot(self, eqn: Any, left: NDArray, right: NDArray) -> NDArray:
+        """Products summed over the axes that both arrays share."""
+        ((of_left, of_right), (batch_left, batch_right)) = eqn.params["dimension_numbers"]
+        if batch_left or batch_right:
+            raise Untranslatable("a product of batches of matrices")
+        left = np.moveaxis(left, of_left, range(len(of_left)))
+        right = np.moveaxis(right, of_right, range(len(of_right)))
+        shared = left.shape[: len(of_left)]
+        free = left.shape[len(shared) :], right.shape[len(shared) :]
+        left = left.reshape(*shared, *free[0], *[1] * len(free[1]))
+        right = right.reshape(*shared, *[1] * len(free[0]), *free[1])
+        pairs = np.broadcast_arrays(left, right)
+        out = np.empty(pairs[0].shape, object)
+        for place in np.ndindex(*out.shape):
+            args: Any = (pairs[0][place], pairs[1][place])
+            out[place] = self.graph.apply("mul", args, args[0].kind)
+        return self.fold("add", out, list(range(len(shared))))
+
+    def _set(self, eqn: Any, values: list[Value]) -> NDArray:
+        """An array with single elements replaced, at known places."""
+        numbers, places = eqn.params["dimension_numbers"], values[1]
+        if not isinstance(places, Known) or numbers.update_window_dims or places.placed:
+            raise Untranslatable("elements set at places of data")
+        out, new = self.nodes(values[0]).copy(), self.nodes(values[2])
+        order = numbers.scatter_dims_to_operand_dims
+        for place in np.ndindex(*new.shape):
+            out[tuple(int(places.value[place][order.index(k)]) for k in range(out.ndim))] = new[
+                place
+            ]
+        return out
 
     def _look_up(self, eqn: Any, values: list[Value], kind: str) -> NDArray:
         table, *places = values
@@ -175,7 +244,7 @@ class Translation:
             assert found is not None
             if not any(p.placed for p in places if isinstance(p, Known)):
                 return found
-            return self._cut(found, kind)
+            return self.placed(found, kind)
         if eqn.primitive.name == "gather" and isinstance(table, OfParameters):
             index = self.nodes(places[0])
             one = self.host.values[table.number].ndim == 1 and index.shape[-1:] == (1,)
@@ -186,24 +255,3 @@ class Translation:
                     out[place] = self.graph.apply("entry", arguments, kind)
                 return out
         raise Untranslatable("a look-up with an index of data")
-
-    def _cut(self, found: NDArray, kind: str) -> NDArray:
-        """What is looked up where points lie: known when the piece begins."""
-        out = np.empty(found.shape, object)
-        for place in np.ndindex(*found.shape):
-            out[place] = self.graph.node("slot", (len(self.slots),), kind, Level.TABLE)
-            node: Any = found[place]
-            self.slots.append(node)
-        return out
-
-    def _sum_over_segments(self, values: list[Value]) -> NDArray:
-        start, cells, updates = values
-        zero = isinstance(start, Known) and start.value.ndim == 1 and not start.value.any()
-        index, added = np.ravel(self.nodes(cells)), np.ravel(self.nodes(updates))
-        ours = len(index) == len(added) == 1 and index[0].args == ("segment_cell",)
-        if not (zero and ours) or self.excess not in (None, added[0]):
-            raise Untranslatable("a sum other than that over an exposure's segments")
-        self.excess = added[0]
-        assert isinstance(start, Known)
-        rows = [self.graph.input(f"total{r}", "f", Level.TABLE) for r in range(len(start.value))]
-        return np.array(rows, object)

@@ -1,0 +1,325 @@
+"""The loop that all trackers' kernels share: over chunks, steps and targets, as `run` has it.
+
+A target's numbers are a row of `cells` and a row of `whole`; the driver's own come first, in the
+order of `CELLS` and `WHOLE`. What differs from filter to filter are the functions of `Functions`,
+which `target` writes; so this module is compiled once.
+"""
+
+import warnings
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.blob.prepare import LONGEST
+from jaxevent.kernels import compiled, part
+
+# Functions that are passed as arguments are called through their address.
+warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
+
+CELLS = (
+    "slot.gate.0", "slot.hits.0", "p.0", "p.1", "long.0", "xi.0", "xi.1", "size.0", "frame.0",
+    "frame.1",
+)  # fmt: skip
+GATE, HITS, P, _, LONG, XI, _, SIZE, FRAME, _ = range(10)
+WHOLE = (
+    "slot.last.0", "slot.heard.0", "slot.born.0", "slot.apart.0", "slot.id.0", "slot.confirmed.0",
+    "limit.0", "time.0", "stop.0", "inside.0", "found.0", "verdict.confirmed.0", "verdict.ended.0",
+    "verdict.death.0", "verdict.apart.0",
+)  # fmt: skip
+LAST, HEARD, BORN, APART, ID, CONFIRMED, LIMIT, TIME, STOP, INSIDE = range(10)
+FOUND, NOW_CONFIRMED, ENDED, DEATH, NOW_APART = range(10, 15)
+
+# Rows of a step's `work`: the events', then four for each target that is alive.
+X, Y, AGE, POLARITY, VALID, TARGETS = range(6)
+HELD, NEAR, DENSITY, WEIGHT, ROWS = range(5)
+
+
+class Functions(NamedTuple):
+    """What is a filter's own."""
+
+    start: Any
+    solo: Any
+    ahead: Any
+    alone: Any
+    share: Any
+    update: Any
+    limit: Any
+    expected: Any
+    verdict: Any
+
+
+class Chunks(NamedTuple):
+    """The arrays of `prepare.Features` that the loop reads."""
+
+    t: NDArray[np.int32]
+    xi: NDArray
+    polarity: NDArray
+    valid: NDArray[np.bool_]
+    owner: NDArray[np.int32]  # or empty
+    elapsed: NDArray[np.int32]
+    stop: NDArray[np.int32]
+    cycle: NDArray[np.bool_]
+    seed: NDArray[np.int32]
+    seed_xi: NDArray
+    seed_size: NDArray
+
+
+class Settings(NamedTuple):
+    """Numbers of the life cycle that are not of one target."""
+
+    size: float  # px, of targets that are born
+    births: bool
+    tau: float  # s, in which the grid forgets
+    cell: float  # px
+    least: float  # events in 3x3 cells that begin a track
+    apart: bool  # whether an event that one gate alone holds is that target's alone to weigh
+
+
+class Memory(NamedTuple):
+    """The targets and the grid of unassociated events."""
+
+    cells: NDArray  # [targets, ...]
+    whole: NDArray[np.int64]  # [targets, ...]
+    sums: NDArray  # [3, rows, columns]
+    at: NDArray[np.int64]  # the grid's time, and the next id
+
+
+class Told(NamedTuple):
+    """What a run tells of each chunk: targets before its first step, births and deaths."""
+
+    cells: NDArray
+    whole: NDArray[np.int64]
+    before: NDArray[np.int32]
+    after: NDArray[np.int32]
+    confirmed: NDArray[np.bool_]
+    ended: NDArray[np.int32]
+    death: NDArray[np.int32]
+
+
+@compiled
+def run(functions, numbers, settings, chunks, memory, told, work, marks):
+    """Track through chunks; the memory is that at their end.
+
+    Targets at chunks' starts are told of only where `told` has room for them.
+    """
+    cells, whole = memory.cells, memory.whole
+    given = cells.ctypes, whole.ctypes, work.ctypes, marks.ctypes, numbers.ctypes
+    for chunk in range(len(chunks.t)):
+        _begin_chunk(functions, given, settings, chunks, memory, chunk)
+        if len(told.cells):
+            told.cells[chunk] = cells
+            told.whole[chunk] = whole
+        for k in range(len(cells)):
+            functions.limit(*given, k, 0, 0, 1)
+        _run_steps(functions, given, settings, chunks, memory, chunk, work, marks)
+        for k in range(len(cells)):
+            told.before[chunk, k] = told.after[chunk, k] = whole[k, ID]
+            told.confirmed[chunk, k] = whole[k, CONFIRMED] != 0
+            told.ended[chunk, k] = told.death[chunk, k] = 0
+        if chunks.cycle[chunk]:
+            _end_cycle(functions, given, settings, chunks, memory, chunk, told)
+
+
+@part
+def _begin_chunk(functions, given, settings, chunks, memory, chunk):
+    """Count times from the chunk's start, and begin the tracks of its seeds."""
+    cells, whole, elapsed = memory.cells, memory.whole, np.int64(chunks.elapsed[chunk])
+    for k in range(len(cells)):
+        for field in (LAST, HEARD, BORN, APART):
+            whole[k, field] = max(whole[k, field] - elapsed, -2 * LONGEST)
+    memory.at[0] = max(memory.at[0] - elapsed, -2 * LONGEST)
+    for k in range(len(chunks.seed)):
+        if chunks.seed[k] == chunk:
+            size = chunks.seed_size[k]
+            size = size if size > 0 else cells.dtype.type(settings.size)
+            x, y = chunks.seed_xi[k, 0], chunks.seed_xi[k, 1]
+            _begin_track(functions, given, cells, whole, k, x, y, size, 0, k, 1)
+
+
+@part
+def _begin_track(functions, given, cells, whole, k, x, y, size, time, serial, confirmed):
+    """A track begins at rest."""
+    cells[k, XI], cells[k, XI + 1], cells[k, SIZE] = x, y, size
+    functions.start(*given, k, 0, 0, 1)
+    cells[k, HITS] = 0
+    whole[k, LAST] = whole[k, HEARD] = whole[k, BORN] = whole[k, APART] = time
+    whole[k, ID], whole[k, CONFIRMED] = serial, confirmed
+
+
+@part
+def _run_steps(functions, given, settings, chunks, memory, chunk, work, marks):
+    """The steps of a chunk; the grid counts the events that are near no target."""
+    cells, whole, sums = memory.cells, memory.whole, memory.sums
+    steps, room = chunks.t.shape[1], chunks.t.shape[2]
+    owned, micro = len(chunks.owner) > 0, work.dtype.type(1e-6)
+    targets = np.empty(len(cells), np.int64)
+    stop, faded = np.int64(chunks.stop[chunk]), False
+    for step in range(steps):
+        if not chunks.valid[chunk, step, 0]:
+            break  # the rest fills up
+        time = np.int64(chunks.t[chunk, step, room - 1])
+        for i in range(room):
+            work[X, i] = chunks.xi[chunk, step, i, 0]
+            work[Y, i] = chunks.xi[chunk, step, i, 1]
+            work[AGE, i] = work.dtype.type(time - chunks.t[chunk, step, i]) * micro
+            work[POLARITY, i] = chunks.polarity[chunk, step, i]
+            work[VALID, i] = chunks.valid[chunk, step, i]
+        if owned:
+            for i in range(room):
+                marks[i] = chunks.owner[chunk, step, i]
+        alive = 0
+        for k in range(len(cells)):
+            if time - whole[k, HEARD] <= whole[k, LIMIT]:
+                targets[alive] = k
+                whole[k, TIME] = time
+                alive += 1
+        if alive == 1 and room == 1:
+            functions.solo(*given, targets[0], TARGETS, room, room)
+        elif alive > 0:
+            for a in range(alive):
+                functions.ahead(*given, targets[a], TARGETS + ROWS * a, room, room)
+            _share_out(functions, given, settings, alive, room, work)
+            for a in range(alive):
+                k, row = targets[a], TARGETS + ROWS * a
+                some = False
+                for i in range(room):
+                    some |= work[row + WEIGHT, i] > 0
+                if some:
+                    functions.update(*given, k, row, room, room)
+        if settings.births:
+            faded = _count_strays(
+                settings, sums, memory.at, chunks.t[chunk, step], stop, alive, work, faded
+            )
+
+
+@part
+def _share_out(functions, given, settings, alive, room, work):
+    """The weight of each event for each target."""
+    apart = settings.apart
+    if apart:
+        for i in range(room):
+            held = 0.0
+            for a in range(alive):
+                held += work[TARGETS + ROWS * a + HELD, i]
+            if held > 1:
+                apart = False
+                break
+    if apart:
+        for a in range(alive):
+            functions.alone(*given, 0, TARGETS + ROWS * a, room, room)
+    else:
+        for i in range(room):
+            functions.share(*given, 0, i, room, alive)
+
+
+@part
+def _count_strays(settings, sums, at, t, stop, alive, work, faded):
+    """Add a step's unassociated events to the grid, as `lifecycle.count_strays` does."""
+    rows, columns = sums.shape[1:]
+    micro, tau = sums.dtype.type(1e-6), sums.dtype.type(settings.tau)
+    cell = sums.dtype.type(settings.cell)
+    for i in range(work.shape[1]):
+        near = 1 - work[VALID, i]
+        for a in range(alive):
+            near += work[TARGETS + ROWS * a + NEAR, i]
+        if near > 0:
+            continue
+        if not faded:
+            sums *= np.exp(-(sums.dtype.type(stop - at[0]) * micro) / tau)
+            at[0], faded = stop, True
+        weight = np.exp(-(sums.dtype.type(stop - t[i]) * micro) / tau)
+        x, y = work[X, i], work[Y, i]
+        column = min(max(np.int64(x / cell), 0), columns - 1)
+        row = min(max(np.int64(y / cell), 0), rows - 1)
+        sums[0, row, column] += weight
+        sums[1, row, column] += weight * x
+        sums[2, row, column] += weight * y
+    return faded
+
+
+@part
+def _end_cycle(functions, given, settings, chunks, memory, chunk, told):
+    """Confirmations, deaths, mergers and births at a chunk's end; see `lifecycle.end_cycle`."""
+    cells, whole, seeds = memory.cells, memory.whole, len(chunks.seed)
+    stop, number = np.int64(chunks.stop[chunk]), len(cells)
+    for k in range(number):
+        whole[k, STOP] = stop
+        functions.expected(*given, k, 0, 0, 1)
+    for k in range(number):
+        inside = False
+        for j in range(number):
+            if whole[j, ID] >= 0 and whole[j, ID] < whole[k, ID]:
+                x, y = cells[k, P] - cells[j, P], cells[k, P + 1] - cells[j, P + 1]
+                inside |= not x * x + y * y > cells[j, LONG] * cells[j, LONG]
+        whole[k, INSIDE], whole[k, FOUND] = inside, k >= seeds
+        functions.verdict(*given, k, 0, 0, 1)
+    for k in range(number):
+        ended = whole[k, ENDED] > 0
+        told.confirmed[chunk, k] = whole[k, NOW_CONFIRMED] != 0
+        told.ended[chunk, k], told.death[chunk, k] = whole[k, ENDED], whole[k, DEATH]
+        whole[k, APART] = whole[k, NOW_APART]
+        whole[k, CONFIRMED] = 0 if ended else whole[k, NOW_CONFIRMED]
+        if ended:
+            whole[k, ID] = -1
+            gate = cells[k, GATE]
+            cells[k, XI] = cells[k, XI + 1] = 0
+            cells[k, SIZE] = settings.size
+            functions.start(*given, k, 0, 0, 1)
+            cells[k, GATE] = gate
+    if settings.births:
+        _bear(functions, given, settings, memory, stop, seeds)
+    for k in range(number):
+        told.after[chunk, k] = whole[k, ID]
+
+
+@part
+def _bear(functions, given, settings, memory, stop, seeds):
+    """Tracks are born where the grid's 3x3 sums are largest, which empties 5x5 cells."""
+    cells, whole, sums, at = memory.cells, memory.whole, memory.sums, memory.at
+    elapsed = sums.dtype.type(stop - at[0]) * sums.dtype.type(1e-6)
+    sums *= np.exp(-elapsed / sums.dtype.type(settings.tau))
+    at[0] = stop
+    rows, columns = sums.shape[1:]
+    around, above = np.empty((rows, columns), sums.dtype), np.empty(columns + 2, sums.dtype)
+    free = seeds
+    while True:
+        while free < len(cells) and whole[free, ID] >= 0:
+            free += 1
+        if free == len(cells):
+            return
+        _sum_around(sums[0], above, around)
+        top, row, column = sums.dtype.type(0), 0, 0
+        for r in range(rows):
+            for c in range(columns):
+                if around[r, c] > top:
+                    top, row, column = around[r, c], r, c
+        if not top > settings.least:
+            return
+        near = np.zeros(3, sums.dtype)
+        for kind in range(3):
+            for r in range(max(row - 1, 0), min(row + 2, rows)):
+                for c in range(max(column - 1, 0), min(column + 2, columns)):
+                    near[kind] += sums[kind, r, c]
+        x, y, size = near[1] / near[0], near[2] / near[0], cells.dtype.type(settings.size)
+        _begin_track(functions, given, cells, whole, free, x, y, size, stop, at[1], 0)
+        at[1] += 1
+        sums[:, max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = 0
+
+
+@part
+def _sum_around(counts, above, around):
+    """Sums over 3x3 cells."""
+    rows, columns = counts.shape
+    above[0] = above[columns + 1] = 0
+    for r in range(rows):
+        for c in range(columns):
+            total = counts[r, c]
+            if r > 0:
+                total = counts[r - 1, c] + total
+            if r + 1 < rows:
+                total += counts[r + 1, c]
+            above[c + 1] = total
+        for c in range(columns):
+            around[r, c] = above[c] + above[c + 1] + above[c + 2]

@@ -1,0 +1,366 @@
+"""The functions of one target, as expressions and as the text of a module."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.blob.association import share
+from jaxevent.blob.fused.loop import (
+    AGE,
+    CELLS,
+    DENSITY,
+    HELD,
+    NEAR,
+    POLARITY,
+    ROWS,
+    TARGETS,
+    VALID,
+    WEIGHT,
+    WHOLE,
+    Functions,
+    X,
+    Y,
+)
+from jaxevent.blob.lifecycle import expect, judge
+from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.steps import Batch, Filter
+from jaxevent.blob.targets import (
+    Slots,
+    look_ahead,
+    own_params,
+    silence_limits,
+    start_gate,
+    update_slot,
+)
+from jaxevent.kernels.expressions import Graph, Untranslatable, needed
+from jaxevent.kernels.host import HostProgram
+from jaxevent.kernels.loops import (
+    MARK,
+    Function,
+    Loop,
+    LoopWriter,
+    leaves_of,
+    numbers_of,
+    translate,
+)
+from jaxevent.kernels.modules import module_of
+from jaxevent.kernels.text import FUNCTIONS, Numbers
+
+MOST_NODES = 4000  # of a program: beyond, numba compiles longer than the scan takes
+
+HEAD = '''"""The functions of one target (`jaxevent.blob.fused`)."""
+
+import numba
+import numpy as np
+from numba import types
+
+from jaxevent.kernels.numeric import {imports}
+
+REAL = np.{real}
+I, F = types.int64, types.{real}
+CELLS, WHOLE, NUMBERS = types.CPointer(F), types.CPointer(I), types.CPointer(types.float64)
+HOW = {{"cache": True, "error_model": "numpy", "fastmath": {{"contract"}}}}
+LOOP = {{"error_model": "numpy", "fastmath": {{"contract", "reassoc", "nsz"}}}}
+{constants}
+
+
+'''
+
+FUNCTION = """@numba.cfunc(types.void(CELLS, WHOLE, CELLS, WHOLE, NUMBERS, I, I, I, I), **HOW)
+def {name}(cells, whole, work, marks, numbers, target, row, room, count):
+    of_cells, of_whole = target * {width}, target * {whole_width}
+{body}
+
+
+"""
+ALONE = """@numba.njit(**LOOP)
+def alone_0(work, numbers, row, room, count):
+    for i in range(count):
+{body}
+
+
+"""
+EVENTS = Loop("i", "count", ("work", "marks", "row", "room", "count"))
+TARGETS_OF_EVENT = Loop("k", "count", ("work", "marks", "row", "room", "count"))
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Where a target's numbers lie in its rows of `cells` and `whole`, by name."""
+
+    cells: dict[str, int]
+    whole: dict[str, int]
+    truths: frozenset[str]  # which of `whole` are truth values
+
+    def places(self) -> dict[str, str]:
+        """Texts that read the numbers."""
+        places = {name: f"cells[of_cells + {at}]" for name, at in self.cells.items()}
+        for name, at in self.whole.items():
+            places[name] = f"whole[of_whole + {at}]" + (" != 0" if name in self.truths else "")
+        return places
+
+    def stores(self) -> dict[str, str]:
+        """Texts that write them."""
+        stores = {name: f"cells[of_cells + {at}] = {{}}" for name, at in self.cells.items()}
+        return stores | {name: f"whole[of_whole + {at}] = {{}}" for name, at in self.whole.items()}
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """The functions of a filter's target: expressions, and what their numbers are."""
+
+    functions: dict[str, Function]
+    host: HostProgram
+    layout: Layout
+    slot: Any  # the shapes of one target
+    single: bool
+    dtype: np.dtype
+
+
+def program_of(
+    filter: Filter, params: TrackerParams, own: dict[str, Any], owned: bool, dtype: np.dtype
+) -> Program:
+    """The functions of one target, translated; raises `Untranslatable`.
+
+    `own` are a target's own numbers, `owned` says whether events have owners.
+    """
+    single = params.events_per_step == 1
+    host, graph = HostProgram(), Graph()
+    for leaf in jax.tree.leaves(params):
+        host.add_input(np.asarray(leaf))
+
+    def shape(*size: int, kind: Any = dtype) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(size, kind)
+
+    owns = {name: shape() for name in own}
+
+    def begin(params: Any, own: Any, xi: Any, size: Any) -> Any:
+        return filter.start(own_params(params, own), xi, size)
+
+    def start(params: Any, slot: Any, xi: Any, size: Any) -> dict[str, Any]:
+        gate = start_gate(params, size).astype(xi.dtype)
+        return {"slot.state": begin(params, slot.own, xi, size), "slot.gate": gate}
+
+    def slot_of(params: Any, own: Any, xi: Any, size: Any, time: Any, known: Any) -> Slots:
+        state = begin(params, own, xi, size)
+        return Slots(state, size, size, time, time, time, time, time, known, own)
+
+    times, flag = shape(kind=np.int32), shape(kind=bool)
+    slot = jax.eval_shape(slot_of, params, owns, shape(2), shape(), times, flag)
+    events = MARK if not single else 1
+    batch = jax.eval_shape(Batch, shape(events, 2), shape(events), shape(events))
+
+    def ahead(params, slot, limit, time, batch, valid, owner):
+        seen = look_ahead(filter, params, slot, limit, time, _aged(batch, single), valid, owner)
+        return {"ahead": seen}
+
+    def update(params, slot, ahead, time, batch, weight):
+        slot = update_slot(filter, params, slot, ahead, time, _aged(batch, single), weight)
+        return {"slot": slot}
+
+    def solo(params, slot, limit, time, batch, valid, owner):
+        """A step of one event and of the one target that is alive."""
+        batch = _aged(batch, single)
+        seen = look_ahead(filter, params, slot, limit, time, batch, valid, owner)
+        shares = jax.vmap(functools.partial(filter.share, params), 1, 1)
+        weight = shares(seen.inside[None], seen.density[None])[0]
+        return {
+            "slot": update_slot(filter, params, slot, seen, time, batch, weight),
+            "ahead.near": seen.near,
+        }
+
+    def limit(params, slot):
+        return {"limit": silence_limits(params, slot)}
+
+    def expected(params, slot, stop):
+        now = expect(filter, params, slot, stop)
+        return {"now": now, "p": now.p, "long": now.size.max()}
+
+    def verdict(params, frame, slot, now, inside, found, stop):
+        return {"verdict": judge(params, frame, slot, now, inside, found, stop)}
+
+    def shared(params, held, density):
+        return {"weight": filter.share(params, held, density)}
+
+    owner = shape(events, kind=np.int32) if owned else None
+    valid = shape(events, kind=bool)
+    given = {"slot": slot, "time": times, "batch": batch}
+    seen = {**given, "limit": times, "valid": valid, "owner": owner}
+    looked = jax.eval_shape(lambda p, v: ahead(p, **v)["ahead"], params, seen)
+    now = jax.eval_shape(lambda p, v: expected(p, **v)["now"], params,
+        {"slot": slot, "stop": times})  # fmt: skip
+    functions = {
+        "start": (start, {"slot": slot, "xi": shape(2), "size": shape()}, True),
+        "solo": (solo, seen, single),
+        "ahead": (ahead, seen, single),
+        "alone": (shared, {"held": shape(MARK, kind=bool), "density": shape(MARK)}, True),
+        "share": (shared, {"held": shape(MARK, kind=bool), "density": shape(MARK)}, False),
+        "update": (update, {**given, "ahead": looked, "weight": shape(events)}, single),
+        "limit": (limit, {"slot": slot}, True),
+        "expected": (expected, {"slot": slot, "stop": times}, True),
+        "verdict": (
+            verdict,
+            {"frame": shape(2), "slot": slot, "now": now, "inside": flag, "found": flag,
+             "stop": times},
+            True,
+        ),
+    }  # fmt: skip
+    made = {
+        name: translate(function, params, values, graph, host, alone)
+        for name, (function, values, alone) in functions.items()
+    }
+    layout = _layout({"slot": slot, "ahead": looked, "now": now})
+    return Program(made, host, layout, slot, single, dtype)
+
+
+def _aged(batch: Batch, single: bool) -> Batch:
+    """A single event's age is 0 for the compiler too, as in `targets.step`."""
+    return Batch(batch.xi, jnp.zeros_like(batch.xi[:, 0]), batch.polarity) if single else batch
+
+
+def _layout(trees: dict[str, Any]) -> Layout:
+    """The driver's own numbers first, then all others of one target."""
+    cells, whole = ({name: k for k, name in enumerate(names)} for names in (CELLS, WHOLE))
+    truths = {"slot.confirmed.0", "inside.0", "found.0", "verdict.confirmed.0"}
+    for name, tree in trees.items():
+        for leaf_name, leaf in leaves_of(name, tree).items():
+            if MARK in leaf.shape:
+                continue
+            real = leaf.dtype.kind == "f"
+            for number in numbers_of(leaf_name, leaf):
+                (cells if real else whole).setdefault(number, len(cells if real else whole))
+                if leaf.dtype.kind == "b":
+                    truths.add(number)
+    return Layout(cells, whole, frozenset(truths))
+
+
+def _elements(single: bool) -> tuple[dict[str, str], dict[str, str]]:
+    """Texts that read and write the numbers of an event, in the loop over a step's events."""
+    i = "0" if single else "i"
+    read = {
+        "batch.xi.0": f"work[{X} * room + {i}]",
+        "batch.xi.1": f"work[{Y} * room + {i}]",
+        "batch.age.0": f"work[{AGE} * room + {i}]",
+        "batch.polarity.0": f"work[{POLARITY} * room + {i}]",
+        "valid.0": f"work[{VALID} * room + {i}] != 0",
+        "owner.0": f"marks[{i}]",
+        "ahead.inside.0": f"work[(row + {HELD}) * room + {i}] != 0",
+        "ahead.near.0": f"work[(row + {NEAR}) * room + {i}] != 0",
+        "ahead.density.0": f"work[(row + {DENSITY}) * room + {i}]",
+        "weight.0": f"work[(row + {WEIGHT}) * room + {i}]",
+    }
+    truth = "work[(row + {at}) * room + {i}] = REAL(1) if {{}} else REAL(0)"
+    write = {
+        "ahead.inside.0": truth.format(at=HELD, i=i),
+        "ahead.near.0": truth.format(at=NEAR, i=i),
+        "ahead.density.0": f"work[(row + {DENSITY}) * room + {i}] = {{}}",
+    }
+    return read, write
+
+
+def _of_targets(row: str, i: str) -> tuple[dict[str, str], dict[str, str]]:
+    """The same for what targets say of an event."""
+    read = {
+        "held.0": f"work[({row} + {HELD}) * room + {i}] != 0",
+        "density.0": f"work[({row} + {DENSITY}) * room + {i}]",
+        "element": "k",
+    }
+    return read, {"weight.0": f"work[({row} + {WEIGHT}) * room + {i}] = {{}}"}
+
+
+class TargetWriter(LoopWriter):
+    """Writes a target's functions; numbers of parameters are in double precision."""
+
+    def _number(self, key: tuple[int, int], kind: str) -> str:
+        text = super()._number(key, kind)
+        return f"REAL({text})" if kind == "f" else text
+
+
+def write(program: Program) -> tuple[str, Numbers]:
+    """The text of a program's module."""
+    read, store = _elements(program.single)
+    places, stores = program.layout.places(), program.layout.stores()
+    writer = TargetWriter(places | read)
+    out = []
+    for name, function in program.functions.items():
+        if name == "alone":
+            writer.places, to = _of_targets("row", "i")
+            lines = writer.lines([*function.results.values()], 8)
+            for key, node in function.results.items():
+                lines.append(f"        {to[key].format(writer.name(node))}")
+            writer.loops.append(ALONE.format(body="\n".join(lines)))
+            lines = ["    alone_0(work, numbers, row, room, count)"]
+        elif name == "share":
+            writer.places, to = _of_targets(f"{TARGETS} + {ROWS} * k", "row")
+            lines = writer.body(name, function, to, TARGETS_OF_EVENT)
+        else:
+            writer.places = places | read
+            changed = {
+                key: text
+                for key, text in (stores | store).items()
+                if key in function.results and function.results[key].args != (key,)
+            }
+            lines = writer.body(name, function, changed, EVENTS)
+        out.append(
+            FUNCTION.format(
+                name=name,
+                body="\n".join(lines),
+                width=len(program.layout.cells),
+                whole_width=len(program.layout.whole),
+            )
+        )
+    numbers, constants = writer.finish(program.host.values)
+    single = program.dtype == np.float32
+    imports = ", ".join(f"{n}{32 if single else 64} as {n}" for n in FUNCTIONS)
+    head = HEAD.format(imports=imports, real=program.dtype.name, constants="\n".join(constants))
+    return head + "".join([*writer.loops, *out]), numbers
+
+
+@dataclasses.dataclass(frozen=True)
+class Kernel:
+    """A filter compiled for the host, with the numbers of its parameters."""
+
+    functions: Functions
+    layout: Layout
+    numbers: NDArray[np.float64]
+    slot: Any  # the shapes of one target
+
+
+# What has been made of a filter: programs, each for a way that conditions on parameters chose.
+_made: dict[Any, list[tuple[Program, Numbers, Functions]]] = {}
+
+
+def kernel_of(
+    filter: Filter, params: TrackerParams, own: dict[str, Any], owned: bool, dtype: np.dtype
+) -> Kernel:
+    """The kernel of a filter with its parameters; raises `Untranslatable`."""
+    leaves, tree = jax.tree.flatten(params)
+    key = filter, tree, tuple(np.shape(leaf) for leaf in leaves), tuple(own), owned, dtype
+    made = _made.setdefault(key, [])
+    given = [np.asarray(leaf) for leaf in leaves]
+    for program, numbers, functions in made:
+        values = program.host.again(given)
+        if values is not None:
+            return Kernel(
+                functions, program.layout, numbers.of(values, np.dtype(float)), program.slot
+            )
+    program = program_of(filter, params, own, owned, dtype)
+    nodes = needed([n for f in program.functions.values() for n in f.results.values()])
+    if len(nodes) > MOST_NODES:
+        raise Untranslatable(f"more than {MOST_NODES} operations")
+    text, numbers = write(program)
+    module = module_of(text)
+    functions = Functions(*(getattr(module, name) for name in Functions._fields))
+    made.append((program, numbers, functions))
+    values = numbers.of(program.host.values, np.dtype(float))
+    return Kernel(functions, program.layout, values, program.slot)
+
+
+def shares_apart(filter: Filter) -> bool:
+    """Whether an event that one gate alone holds is weighed by that target alone."""
+    return filter.share is share

@@ -1,0 +1,343 @@
+"""Functions of scalars and of one axis of elements, compiled as loops over that axis.
+
+A function is traced with `MARK` elements, whatever their number will be. What is computed element
+by element becomes the body of a loop; sums and greatest values over the axis are gathered in it.
+What rests on such a sum comes after the loop, and its elements are computed in a loop of their own,
+from the inputs: that costs less than keeping them.
+"""
+
+import dataclasses
+import types
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.kernels.expressions import Graph, Level, Node, Untranslatable, needed
+from jaxevent.kernels.host import HostProgram
+from jaxevent.kernels.text import Writer
+from jaxevent.kernels.translate import FOLDS, KINDS, Known, OfParameters, Translation, Value
+
+MARK = 7919  # elements in a trace: a prime that no other axis has
+GATHERED = ("total", "largest", "place")  # operations over the axis
+SHAPES = ("shape", "new_sizes", "sizes", "limit_indices", "slice_sizes")
+
+
+class LoopTranslation(Translation):
+    """Translates functions with one axis of elements; with `single`, of one element only."""
+
+    def __init__(self, graph: Graph, host: HostProgram, single: bool):
+        super().__init__(graph, host)
+        self.single = single
+
+    def _equation(self, eqn: Any, values: list[Value]) -> list[Value]:
+        name = eqn.primitive.name
+        if any(isinstance(v, Known) and MARK in v.value.shape for v in values):
+            raise Untranslatable("a table of elements")
+        if name == "split":
+            return self._split(eqn, values[0])
+        marked = [MARK in np.shape(v.aval) for v in (*eqn.invars, *eqn.outvars)]
+        if name == "iota" and any(marked) and not self.single:
+            return [self._numbers(eqn)]
+        return super()._equation(_without_mark(eqn) if any(marked) else eqn, values)
+
+    def _numbers(self, eqn: Any) -> NDArray:
+        """The elements' own numbers, from 0 on."""
+        shape, along = eqn.params["shape"], eqn.params["dimension"]
+        if shape[along] != MARK:
+            raise Untranslatable("a table of elements")
+        number = self.graph.input("element", "i", Level.ELEMENT)
+        return np.full([1 if size == MARK else size for size in shape], number, object)
+
+    def _split(self, eqn: Any, value: Value) -> list[Value]:
+        if MARK in eqn.invars[0].aval.shape:
+            raise Untranslatable("a split of elements")
+        ends = np.cumsum(eqn.params["sizes"])[:-1]
+        return [*np.split(self.nodes(value), ends, eqn.params["axis"])]
+
+    def special(self, eqn: Any, values: list[Value]) -> NDArray | None:
+        name = eqn.primitive.name
+        along = getattr(eqn, "along", ())
+        if not along:
+            return None
+        if name not in (*FOLDS, "argmax"):
+            raise Untranslatable(f"the operation {name!r} over elements")
+        array = self.nodes(values[0])
+        if not self.single:
+            out = np.empty(array.shape, object)
+            for place in np.ndindex(*array.shape):
+                out[place] = self._gather(name, array[place])  # pyright: ignore
+            array = out
+        elif name == "argmax":
+            array = np.full(array.shape, self.graph.constant(0), object)
+        axes = [int(a) for a in eqn.params["axes"] if a not in along]
+        if axes:
+            array = self.fold(FOLDS[name], array, axes)
+            along = [a - sum(b < a for b in axes) for a in along]
+        return array.squeeze(tuple(along))
+
+    def _gather(self, name: str, node: Node) -> Node:
+        """A node that says something of all elements."""
+        apply = self.graph.apply
+        if name == "reduce_sum":
+            factor, rest = self._factors(node)
+            if rest is None:
+                factor, rest = None, node
+            total = self._reduced("total", rest)
+            return total if factor is None else apply("mul", (factor, total), node.kind)
+        if name == "reduce_max":
+            return self._reduced("largest", node)
+        if name == "reduce_min":
+            return apply("neg", (self._reduced("largest", apply("neg", (node,), node.kind)),), "f")
+        if name == "argmax":
+            return self._reduced("place", node)
+        one = node if name == "reduce_or" else apply("not", (node,), "b")
+        count = self._reduced("total", apply("to_f", (one,), "f"))
+        how = "ne" if name == "reduce_or" else "eq"
+        return apply(how, (count, self.graph.constant(0.0)), "b")
+
+    def _reduced(self, op: str, node: Node) -> Node:
+        kind = "i" if op == "place" else node.kind
+        return self.graph.node(op, (node,), kind, Level.POINT)
+
+    def _factors(self, node: Node) -> tuple[Node | None, Node | None]:
+        """A product as that of its scalar factors and that of the others, which are summed."""
+        apply = self.graph.apply
+        if node.level < Level.ELEMENT:
+            return node, None
+        if node.op == "mul":
+            (a, left), (b, right) = (self._factors(part) for part in node.args)
+            return self._times(a, b), self._times(left, right)
+        if node.op == "div" and node.args[1].level < Level.ELEMENT:
+            factor, rest = self._factors(node.args[0])
+            one = self.graph.constant(1.0) if factor is None else factor
+            return apply("div", (one, node.args[1]), "f"), rest
+        return None, node
+
+    def _times(self, a: Node | None, b: Node | None) -> Node | None:
+        if a is None or b is None:
+            return b if a is None else a
+        return self.graph.apply("mul", (a, b), a.kind)
+
+
+def _without_mark(eqn: Any) -> Any:
+    """The equation with one element in place of `MARK`; `along` are the axes it folds them on."""
+    name, p = eqn.primitive.name, dict(eqn.params)
+    shapes = [np.shape(v.aval) for v in eqn.invars]
+    if name == "slice":
+        for axis, size in enumerate(shapes[0]):
+            given = p["start_indices"][axis], p["limit_indices"][axis]
+            if size == MARK and (given != (0, MARK) or (p["strides"] or [1] * 9)[axis] != 1):
+                raise Untranslatable("single elements")
+    if name == "concatenate" and any(shape[p["dimension"]] == MARK for shape in shapes):
+        raise Untranslatable("elements joined to others")
+    if name in ("gather", "scatter", "dynamic_slice", "rev", "pad", "sort", "dot_general"):
+        if name != "dot_general" and any(MARK in shape for shape in shapes[1:]):
+            raise Untranslatable(f"the operation {name!r} over elements")
+        if name != "gather" and MARK in shapes[0]:
+            raise Untranslatable(f"the operation {name!r} over elements")
+        if name == "dot_general" and any(MARK in shape for shape in shapes):
+            raise Untranslatable("a matrix product over elements")
+    for key in SHAPES:
+        if key in p and p[key] is not None:
+            p[key] = tuple(1 if size == MARK else size for size in p[key])
+    along = [int(a) for a in p.get("axes", ()) if shapes and shapes[0][a] == MARK]
+    outs = [
+        types.SimpleNamespace(
+            aval=types.SimpleNamespace(
+                shape=tuple(1 if size == MARK else size for size in v.aval.shape),
+                dtype=v.aval.dtype,
+            )
+        )
+        for v in eqn.outvars
+    ]
+    return types.SimpleNamespace(
+        primitive=eqn.primitive, params=p, invars=eqn.invars, outvars=outs, along=along
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Function:
+    """A function as expressions: its results by name."""
+
+    results: dict[str, Node]
+
+    def phases(self) -> dict[Node, int]:
+        """After how many loops each node is known."""
+        found: dict[Node, int] = {}
+        for node in needed([*self.results.values()]):
+            arguments = [found[a] for a in node.args if isinstance(a, Node)]
+            found[node] = max(arguments, default=0) + (node.op in GATHERED)
+        return found
+
+
+def leaves_of(name: str, tree: Any) -> dict[str, Any]:
+    """The leaves of a tree of arrays or shapes, by the names that kernels know them by."""
+    found = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {name + jax.tree_util.keystr(path): leaf for path, leaf in found}
+
+
+def numbers_of(name: str, leaf: Any, elements: bool = True) -> list[str]:
+    """The names of a leaf's single numbers; an axis of elements counts once."""
+    shape = [1 if size == MARK and elements else size for size in np.shape(leaf)]
+    return [f"{name}.{k}" for k in range(int(np.prod(shape)))]
+
+
+def translate(
+    function: Callable,
+    params: Any,
+    given: Mapping[str, Any],
+    graph: Graph,
+    host: HostProgram,
+    single: bool = False,
+) -> Function:
+    """`function(params, **given)`, which returns a dict; raises `Untranslatable`.
+
+    `given` are trees of shapes by name. Arrays with an axis of `MARK` are elements. `host` has the
+    leaves of the parameters as its inputs.
+    """
+    try:
+        call = lambda p, v: function(p, **v)  # noqa: E731
+        closed, shape = jax.make_jaxpr(call, return_shape=True)(params, dict(given))
+    except Exception as error:  # whatever a function raises
+        about = f"its functions fail in a trace: {error}"
+        raise Untranslatable(about.partition("\n")[0]) from error
+    values: list[Value] = [OfParameters(k) for k in range(len(jax.tree.leaves(params)))]
+    for name in sorted(given):
+        for leaf_name, leaf in leaves_of(name, given[name]).items():
+            values.append(_inputs(graph, leaf_name, leaf, single))
+    translation = LoopTranslation(graph, host, single)
+    made = iter(translation.run(closed, values))
+    results: dict[str, Node] = {}
+    for name in sorted(shape):
+        for leaf_name, leaf in leaves_of(name, shape[name]).items():
+            nodes = np.ravel(translation.nodes(next(made)))
+            results |= dict(zip(numbers_of(leaf_name, leaf), nodes, strict=True))
+    return Function(results)
+
+
+def _inputs(graph: Graph, name: str, leaf: Any, single: bool) -> Value:
+    shape = tuple(1 if size == MARK else size for size in leaf.shape)
+    elements = MARK in leaf.shape and not single
+    level = Level.ELEMENT if elements else Level.POINT
+    out = np.empty(shape, object)
+    names = iter(numbers_of(name, leaf))
+    for place in np.ndindex(*shape):
+        out[place] = graph.input(next(names), KINDS[leaf.dtype.kind], level)
+    return out
+
+
+class LoopWriter(Writer):
+    """Writes functions whose inputs are at places that a family knows by their names.
+
+    Args:
+        places: Texts that read an input.
+    """
+
+    def __init__(self, places: Mapping[str, str]):
+        super().__init__()
+        self.places = places
+        self.loops: list[str] = []  # functions of one loop each
+
+    def input(self, node: Node) -> str:
+        name = node.args[0]
+        if name not in self.places:
+            raise Untranslatable(f"the use of {name!r}")
+        return self.places[name]
+
+    def body(
+        self,
+        name: str,
+        function: Function,
+        store: Mapping[str, str],
+        loop: "Loop",
+        indent: int = 4,
+    ) -> list[str]:
+        """The lines of a function; `store` are texts "target = {}" by the results' names."""
+        wanted = {key: node for key, node in function.results.items() if key in store}
+        phases = Function(wanted).phases()
+        last = max((phases[n] for n in wanted.values()), default=0)
+        scalars = [n for n in phases if n.level < Level.ELEMENT and n.op not in GATHERED]
+        out, known = [], set[Node]()
+        for phase in range(last + 1):
+            now = [n for n in scalars if phases[n] <= phase and n not in known]
+            out += self._scalars(now, known, indent)
+            gathered = [n for n in phases if n.op in GATHERED and phases[n] == phase + 1]
+            elements = {}
+            if phase == last:
+                elements = {store[key]: n for key, n in wanted.items() if n.level == Level.ELEMENT}
+            if gathered or elements:
+                out += self._loop(f"{name}_{phase}", gathered, elements, known, loop, indent)
+                known |= set(gathered)
+        for key, node in wanted.items():
+            if node.level < Level.ELEMENT:
+                out.append(f"{' ' * indent}{store[key].format(self.name(node))}")
+        return out
+
+    def _scalars(self, nodes: list[Node], known: set[Node], indent: int) -> list[str]:
+        out = []
+        for node in sorted(nodes, key=lambda n: n.number):
+            if node.op != "constant":
+                out.append(f"{' ' * indent}{self.name(node)} = {self._expression(node)}")
+            known.add(node)
+        return out
+
+    def _loop(
+        self,
+        name: str,
+        gathered: list[Node],
+        elements: dict[str, Node],
+        known: set[Node],
+        loop: "Loop",
+        indent: int,
+    ) -> list[str]:
+        """A function of one loop, and the line that calls it."""
+        results = [n.args[0] for n in gathered] + [*elements.values()]
+        rest = needed(results, known)
+        given = [n for n in rest if n in known and n.op != "constant"]
+        arguments = ", ".join([*loop.arguments, *(self.name(n) for n in given)])
+        out = ["@numba.njit(**LOOP)", f"def {name}({arguments}):"]
+        for node in gathered:
+            start = {"total": "REAL(0)", "largest": "-REAL(np.inf)", "place": "0"}[node.op]
+            out.append(f"    r{node.number} = {start}")
+            if node.op == "place":
+                out.append(f"    m{node.number} = -REAL(np.inf)")
+        out.append(f"    for {loop.index} in range({loop.count}):")
+        out += self.lines_of([n for n in rest if n not in known], 8)
+        for node in gathered:
+            value, r = self.name(node.args[0]), f"r{node.number}"
+            if node.op == "total":
+                out.append(f"        {r} += {value}")
+            elif node.op == "largest":
+                out.append(f"        {r} = {value} if {value} > {r} else {r}")
+            else:
+                m = f"m{node.number}"
+                out.append(f"        {r} = {loop.index} if {value} > {m} else {r}")
+                out.append(f"        {m} = {value} if {value} > {m} else {m}")
+        out += [f"        {text.format(self.name(node))}" for text, node in elements.items()]
+        names = [f"r{n.number}" for n in gathered]
+        if names:
+            out.append(f"    return {', '.join(names)}")
+        self.loops.append("\n".join([*out, "", ""]))
+        call = f"{name}({arguments})"
+        targets = ", ".join(self.name(n) for n in gathered)
+        return [f"{' ' * indent}{targets + ' = ' if names else ''}{call}"]
+
+    def lines_of(self, nodes: list[Node], indent: int) -> list[str]:
+        """Assignments of these nodes alone."""
+        return [
+            f"{' ' * indent}{self.name(n)} = {self._expression(n)}"
+            for n in sorted(nodes, key=lambda n: n.number)
+            if n.op != "constant"
+        ]
+
+
+@dataclasses.dataclass(frozen=True)
+class Loop:
+    """How a loop over elements is written."""
+
+    index: str
+    count: str
+    arguments: tuple[str, ...]  # of the function that holds it

@@ -1,0 +1,111 @@
+"""Trackers' kernels, which numba compiles, against `run`, which XLA compiles."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxevent import blob
+from jaxevent.blob.association import share
+from jaxevent.blob.fused.tracking import FusedRun
+from jaxevent.blob.lifecycle import begin
+from jaxevent.blob.prepare import Packing
+from jaxevent.blob.run import run
+from jaxevent.errors import InputError
+from jaxevent.recording import Events, Recording
+
+WIDTH, HEIGHT = 96, 64
+
+
+def crossing(rng, events=2400, seconds=0.03):
+    """Two blobs that meet, a third that appears, and stray events."""
+    t = np.sort(rng.integers(0, round(seconds * 1e6), events))
+    kind = rng.integers(0, 4, events)
+    kind[(kind == 2) & (t < 8000)] = 3
+    s = t * 1e-6
+    centre = np.stack(
+        [
+            np.select([kind == 0, kind == 1, kind == 2], [25 + 1500 * s, 70 - 1500 * s, 48.0], 0),
+            np.select([kind == 0, kind == 1, kind == 2], [22 + 100 * s, 24 + 0 * s, 52.0], 0),
+        ],
+        1,
+    )
+    xi = centre + rng.normal(0, (2.5, 1.5), (events, 2))
+    stray = rng.uniform(0, (WIDTH - 1, HEIGHT - 1), (events, 2))
+    xi = np.where((kind == 3)[:, None], stray, xi)
+    x, y = np.rint(xi).clip(0, (WIDTH - 1, HEIGHT - 1)).T.astype(np.uint16)
+    made = Events(t.astype(np.int64), x, y, rng.random(events) < 0.5)
+    return Recording("crossing", WIDTH, HEIGHT, made)
+
+
+CASES = {
+    "moment": {"events_per_step": 1},
+    "constant_velocity": {"events_per_step": 6},
+    "moving_moments": {"events_per_step": 6},
+    "batches": {"events_per_step": 8, "tau_q": 0.01, "t_still": 1e-3},
+    "clutter": {"events_per_step": 5, "clutter": 1e-3, "polarity_offset": True},
+    "nearest": {"events_per_step": 8, "association": "nearest", "gate_shape": "circle"},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_kernel_equals_run(case):
+    """States, births and deaths of seeds, of targets that are born and of those that end."""
+    values = CASES[case]
+    tracker = getattr(blob, case, blob.moment)
+    few = {"n_birth": 8.0, "n_confirm": 20.0, "lambda0": 4.0, "gate_min": 4.0, "t_coast": 0.004}
+    params = tracker.Params(**few, **values, max_targets=3)
+    seeds = [(25.0, 22.0, 4.0), (70.0, 24.0, 4.0, 0.001)]
+    rec = crossing(np.random.default_rng(7))
+    packing = Packing(rec, params, seeds, detect=True, steps=16, chunks=40)
+    state, mark, kernel = None, packing.first, FusedRun(tracker.filter, params, packing)
+    number = 0
+    scan = jax.jit(run, static_argnames=("filter", "wanted"))
+    while mark is not None:
+        stretch = packing.pack(mark)
+        mark, number = stretch.next, number + 1
+        if state is None:
+            state = begin(tracker.filter, params, stretch.features)
+        got = kernel(state, stretch.features, True)
+        state, told = scan(tracker.filter, params, state, stretch.features, wanted="begins")
+        expected = state, told
+        paths = jax.tree_util.tree_flatten_with_path(expected)[0]
+        for (path, one), other in zip(paths, jax.tree.leaves(got), strict=True):
+            name = f"{jax.tree_util.keystr(path)} of stretch {number}"
+            assert other.dtype == one.dtype, name
+            np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9, err_msg=name)
+    log = np.asarray(told.log.ended)
+    assert log.shape == (40, 5) and (np.asarray(state.next_id) > 2)
+
+
+@pytest.mark.slow
+def test_tracks_of_both_compilers(float32):
+    rec, seeds = crossing(np.random.default_rng(1)), [(25.0, 22.0, 4.0)]
+    params = blob.moment.Params(events_per_step=8, lambda0=4.0)
+    times = np.arange(500, 25_000, 700)
+    one, other = (
+        blob.moment.estimate(rec, params, seeds=seeds, compiler=compiler, progress=False)(times)
+        for compiler in ("numba", "xla")
+    )
+    assert one.valid.any()
+    np.testing.assert_array_equal(one.valid, other.valid)
+    np.testing.assert_allclose(one.mean, other.mean, rtol=1e-4, atol=1e-4)
+
+
+def test_a_filter_without_kernel_is_scanned():
+    def strange(params, held, density):
+        return share(params, held, jnp.sort(density))
+
+    mine = dataclasses.replace(
+        blob.moment,
+        name="strange",
+        filter=dataclasses.replace(blob.moment.filter, share=strange),
+    )
+    rec = crossing(np.random.default_rng(2), 50)
+    with pytest.raises(InputError, match="no kernel"):
+        mine.estimate(rec, mine.Params(), seeds=[(25.0, 22.0, 4.0)], compiler="numba")
+    with pytest.raises(InputError, match="no compiler"):
+        mine.estimate(rec, mine.Params(), compiler="gcc")
