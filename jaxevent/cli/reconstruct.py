@@ -16,10 +16,12 @@ def add(commands: Any) -> None:
         run,
         "Make images of a recording. The name of the output tells its kind: .h5 holds times, "
         "linear intensity and its variance; .mp4 is a video; without suffix it is a folder of PNG "
-        "images with images.txt.",
+        "images with images.txt. Recordings are read and images written a part at a time, so that "
+        "memory does not grow with their length (.npz, .mat and folders of text are read whole).",
         "slider_depth.zip --method akf --rate 200 --out slider.mp4",
         "slider_depth.zip --method akf --at frames --params mine.toml --out slider.h5",
         "bike.h5 --method akf --colour --tone log --out bike",
+        "drone.raw --method high-pass --times wanted.csv --start 2 --stop 3 --out drone.h5",
     )
     one.add_argument("path", metavar="PATH", type=Path, help="a recording")
     one.add_argument(
@@ -32,6 +34,21 @@ def add(commands: Any) -> None:
     when = one.add_mutually_exclusive_group()
     when.add_argument("--rate", metavar="HZ", type=float, help="images per second, evenly spaced")
     when.add_argument("--at", choices=["frames"], help="one image where each frame is")
+    when.add_argument(
+        "--times",
+        metavar="FILE",
+        type=Path,
+        help="one image at each time of a text or CSV file: one in each line, or its column t; "
+        "whole numbers are microseconds, others seconds",
+    )
+    one.add_argument(
+        "--start",
+        metavar="S",
+        type=float,
+        help="first time of images, on the recording's clock, in s; what is before it still "
+        "counts, so that images are those of the whole recording (jaxevent filter cuts it)",
+    )
+    one.add_argument("--stop", metavar="S", type=float, help="the first time left out, in s")
     one.add_argument(
         "--params",
         metavar="FILE",
@@ -53,6 +70,7 @@ def add(commands: Any) -> None:
         one, "--out", metavar="DIR_or_FILE", required=True, help="name in .h5, .mp4 or none"
     )
     arguments.add_size(one)
+    arguments.add_stream(one)
 
 
 def run(
@@ -60,31 +78,38 @@ def run(
     method: str,
     rate: float | int | None,
     at: str | None,
+    times: Path | None,
+    start: float | int | None,
+    stop: float | int | None,
     params: Path | None,
     size: tuple[int, int] | None,
+    stream: str | None,
     tone: str | None,
     colour: bool,
     out: Path,
 ) -> None:
     from jaxevent.io import load
+    from jaxevent.io.images import read_times
     from jaxevent.methods import find
     from jaxevent.runs.protocols import frame_times
-    from jaxevent.show.export import evenly, write_hdf5, writer
+    from jaxevent.show.export import evenly, within, write_hdf5, writer
 
     write = writer(out)
     if tone is not None and write is write_hdf5:
         raise InputError(f"{out}: --tone is for images to look at; HDF5 holds linear intensity")
     estimator = find(method, "reconstruction")
     values = estimator.Params() if params is None else estimator.Params.load(params, method)
-    recording = load(path, size, in_memory=False, progress=show_progress())
+    asked = None if times is None else read_times(times)
+    recording = load(path, size, in_memory=False, progress=show_progress(), stream=stream)
     name = recording.name
     recording = dataclasses.replace(recording, name=str(path))  # for messages
     if at == "frames" and recording.frames is None:
         raise InputError(f"{path}: holds no frames; give --rate instead of --at frames")
-    if rate is None and recording.frames is not None:
-        times = frame_times(recording.frames, values)
-    else:
-        times = evenly(recording, 100.0 if rate is None else rate)
+    if asked is None and rate is None and recording.frames is not None:
+        asked = frame_times(recording.frames, values)
+    elif asked is None:
+        asked = evenly(recording, 100.0 if rate is None else rate, start)
+    asked = within(asked, start, stop, str(path))
     clock = time.perf_counter()
     video = estimator.estimate(recording, values, progress=show_progress())
     colours = None
@@ -92,9 +117,9 @@ def run(
         from jaxevent.reconstruction.colour import colour_video
 
         colours = colour_video(video, recording)
-    how = write(video, times, out, tone or "linear", name, colours)
+    how = write(video, asked, out, tone or "linear", name, colours)
     seconds = time.perf_counter() - clock
     print(
-        f"{out}: {len(times):,} images{how}, {seconds:.2f} s, "
+        f"{out}: {len(asked):,} images{how}, {seconds:.2f} s, "
         f"{len(recording.events) / seconds:,.0f} events/s"
     )

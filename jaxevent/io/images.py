@@ -217,26 +217,57 @@ def read_image(file: Any, source: str, grey: bool = False) -> NDArray:
 
 def _times(path: Path) -> tuple[NDArray[np.int64], list[str] | None]:
     """The times (us) of a file of lines "t" or "t name", and the names."""
-    with reading(str(path)):
-        lines = [
-            line.split(maxsplit=1) for line in path.read_text(encoding="utf-8-sig").splitlines()
-        ]
-    lines = [words for words in lines if words and not words[0].startswith("#")]
+    lines = [line.split(maxsplit=1) for line in _lines(path)]
     if len({len(words) for words in lines}) > 1:
         raise InputError(f"{path}: some lines have a name and some have none; give all or none")
-    whole = all(re.fullmatch(r"[+-]?\d+", words[0]) for words in lines)
-    times: list[int] = []
-    for number, words in enumerate(lines):
-        value = math.nan
-        with contextlib.suppress(ValueError):
-            value = int(words[0]) if whole else float(words[0]) * 1e6
-        if not abs(value) < 9e18:
-            raise InputError(
-                f"{path}: line {number} of numbers starts with {words[0][:20]!r}, not a time; give "
-                "lines 't' or 't name'"
-            )
-        times.append(round(value))
+    times = _parsed(path, [words[0] for words in lines], "give lines 't' or 't name'")
     names = [words[1].strip() for words in lines] if lines and len(lines[0]) == 2 else None
     if names and all(re.fullmatch(r"[+-]?[\d.eE+-]+", name) for name in names):
         raise InputError(f"{path}: has two columns of numbers; keep the times only")
-    return np.array(times, np.int64), names
+    return times, names
+
+
+def read_times(path: Path) -> NDArray[np.int64]:
+    """The times (us) of a text file, sorted: a time in each line, or a table with a column t.
+
+    Columns are separated by commas, semicolons or spaces, and the first line names them; without
+    names the times are the first column. Where all are whole numbers they are microseconds,
+    otherwise seconds. Lines that begin with # do not count. Raises `InputError` for other files.
+    """
+    rows = [re.split(r"\s*[,;]\s*|\s+", line.strip()) for line in _lines(path)]
+    column = 0
+    if rows and not re.match(r"[+-]?\.?\d", rows[0][0]):
+        if "t" not in rows[0]:
+            raise InputError(f"{path}: has no column t but {', '.join(rows[0])[:80]}; add it")
+        column = rows.pop(0).index("t")
+    if not rows:
+        raise InputError(f"{path}: holds no times; give one in each line")
+    words = [row[column] if column < len(row) else "" for row in rows]
+    times = _parsed(path, words, "give a time in each line, or a table with a column t")
+    if (times[1:] < times[:-1]).any():
+        row = int(np.argmax(times[1:] < times[:-1])) + 1
+        raise InputError(f"{path}: time {row}, {words[row]}, is before the one above it; sort them")
+    return times
+
+
+def _lines(path: Path) -> list[str]:
+    """The lines of a text file that are neither empty nor comments."""
+    with reading(str(path)):
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    return [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
+
+
+def _parsed(path: Path, words: Sequence[str], remedy: str) -> NDArray[np.int64]:
+    """Times in us: of whole numbers, if all are, as they are, else of seconds."""
+    whole = all(re.fullmatch(r"[+-]?\d+", word) for word in words)
+    times: list[int] = []
+    for number, word in enumerate(words):
+        value = math.nan
+        with contextlib.suppress(ValueError):
+            value = int(word) if whole else float(word) * 1e6
+        if not abs(value) < 9e18:
+            raise InputError(
+                f"{path}: line {number} of numbers starts with {word[:20]!r}, not a time; {remedy}"
+            )
+        times.append(round(value))
+    return np.array(times, np.int64)

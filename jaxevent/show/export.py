@@ -13,19 +13,43 @@ from jaxevent.io.output import complete, complete_hdf5
 from jaxevent.progress import bar
 from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
 from jaxevent.reconstruction.video import BATCH, ImageSequence
-from jaxevent.recording import Recording
+from jaxevent.recording import Recording, microseconds
 from jaxevent.show.report import display_limits, tone_map, video_writer, write_png
 
 
-def evenly(recording: Recording, rate: float | int) -> NDArray[np.int64]:
-    """Times (us) at a rate (1/s) from the recording's start to its stop."""
+def evenly(
+    recording: Recording, rate: float | int, start: float | int | None = None
+) -> NDArray[np.int64]:
+    """Times (us) at a rate (1/s) from `start` (s), or the recording's start, to its stop."""
     if not 0 < rate <= 1e6:
         raise InputError(
             f"{recording.name}: cannot be read at --rate {rate:g}; give a number of images per "
             "second above 0, up to 1e6"
         )
-    count = math.floor((recording.stop - recording.start) * rate / 1e6 + 1e-9) + 1
-    return recording.start + np.rint(np.arange(count) * (1e6 / rate)).astype(np.int64)
+    first = recording.start
+    if start is not None:
+        first = max(first, int(microseconds(float(start), "--start")))
+    count = max(0, math.floor((recording.stop - first) * rate / 1e6 + 1e-9) + 1)
+    return first + np.rint(np.arange(count) * (1e6 / rate)).astype(np.int64)
+
+
+def within(
+    times: NDArray[np.int64], start: float | int | None, stop: float | int | None, name: str
+) -> NDArray[np.int64]:
+    """Those of the times (us) with start <= t < stop (s); None is no bound.
+
+    Raises `InputError`, naming the recording, where there are none.
+    """
+    first = -np.inf if start is None else microseconds(float(start), "--start")
+    end = np.inf if stop is None else microseconds(float(stop), "--stop")
+    chosen = times[(times >= first) & (times < end)]
+    if not len(chosen):
+        span = f"from {times[0] / 1e6:g} to {times[-1] / 1e6:g} s" if len(times) else "none"
+        raise InputError(
+            f"{name}: no image is asked for from --start to --stop; its times are {span}, so "
+            "choose others"
+        )
+    return chosen
 
 
 # Chunks of one image. What 204 images of 240x180 and their variances take, of `akf` on

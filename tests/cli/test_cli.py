@@ -468,6 +468,40 @@ def test_reconstruct_to_hdf5(folder, capsys):
     np.testing.assert_array_equal(contents[0]["variance"], variance.astype(np.float32))
 
 
+def test_reconstruct_some_times(folder, capsys):
+    """Images of a part are those of the whole, at the times asked for."""
+
+    def images(name: str, *options: str) -> tuple[np.ndarray, np.ndarray]:
+        out = folder / name
+        argv = ["reconstruct", folder / "small.h5", "--method", "akf", "--out", out, *options]
+        assert cli.main([str(word) for word in argv]) == 0
+        with h5py.File(out) as file:
+            return np.asarray(file["t"]), np.asarray(file["image"])
+
+    video = jaxevent.akf.estimate(small())
+    (folder / "wanted.csv").write_text("n,t,why\n1,0.0105,a\n2,0.02,b\n3,0.0315,c\n")
+    (folder / "wanted.txt").write_text("# us\n10500\n20000\n31500\n")
+    for name in ("wanted.csv", "wanted.txt"):
+        t, image = images(f"{name}.h5", "--times", folder / name)
+        np.testing.assert_array_equal(t, [10_500, 20_000, 31_500])
+        np.testing.assert_array_equal(image, video(t).mean.astype(np.float32))
+    t, image = images("part.h5", "--rate", "500", "--start", "0.0201", "--stop", "0.0301")
+    np.testing.assert_array_equal(t, 20_100 + np.arange(5) * 2_000)
+    np.testing.assert_array_equal(image, video(t).mean.astype(np.float32))
+    assert images("frames.h5", "--start", "0.009", "--stop", "0.03")[0].tolist() == [9_000, 21_000]
+    t, _ = images("both.h5", "--times", folder / "wanted.csv", "--stop", "0.0315")
+    assert t.tolist() == [10_500, 20_000]
+    capsys.readouterr()
+
+    blend = ["reconstruct", folder / "small.h5", "--method", "blend", "--out", folder / "no.h5"]
+    for options in (["--start", "1"], ["--stop", "0"], ["--rate", "10", "--start", "1"]):
+        fails(capsys, [*blend, *options], "small.h5", "--start")
+    fails(capsys, [*blend, "--stop", "nan"], "--stop")
+    (folder / "far.txt").write_text("0.01\n0.2\n")
+    fails(capsys, [*blend, "--times", folder / "far.txt"], "small.h5", "200000")
+    fails(capsys, [*blend, "--stream", "1"], "small.h5", "--stream")
+
+
 def test_reconstruct_to_images(folder):
     stored = []
     for name in ("a", "b"):
