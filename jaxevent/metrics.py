@@ -174,6 +174,17 @@ def ssim(image: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(values, np.float64).reshape(stack)
 
 
+def matlab_ssim(image: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
+    """The structural similarity as MATLAB's `ssim` has it of doubles, an array of shape (...).
+
+    Window and constants as of `ssim`, but averaged over all pixels: beyond the border images go on
+    with the values there. Arguments and errors as of `ssim`.
+    """
+    image, truth = _pair(image, truth)
+    border = [(0, 0)] * (image.ndim - 2) + [(5, 5)] * 2
+    return ssim(*(np.pad(one, border, mode="edge") for one in (image, truth)))
+
+
 def log_display(
     image: ArrayLike, truth: ArrayLike, offset: float | int = LOG_OFFSET
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -18,6 +18,7 @@ from jaxevent.metrics import (
     log_ssim,
     lpips,
     masked_mse,
+    matlab_ssim,
     mse,
     regions,
     ssim,
@@ -254,6 +255,25 @@ def test_global_ssim_by_hand():
     np.testing.assert_allclose(global_ssim(image, truth, 4, by_column=True), expected)
     with pytest.raises(InputError, match="single pixel"):
         global_ssim(np.ones((1, 1)), np.ones((1, 1)))
+
+
+def test_matlab_ssim_is_the_mean_of_every_pixels_window():
+    image, truth = hdr_pairs(10)
+    height, width = image.shape
+    away = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
+    window = np.outer(away, away) / away.sum() ** 2
+    values = []
+    for y, x in np.ndindex(height, width):
+        rows = np.clip(np.arange(y - 5, y + 6), 0, height - 1)  # borders go on as they are
+        columns = np.clip(np.arange(x - 5, x + 6), 0, width - 1)
+        a, b = (one[np.ix_(rows, columns)] for one in (image, truth))
+        m, n = (window * a).sum(), (window * b).sum()
+        s_mm, s_nn = (window * (a - m) ** 2).sum(), (window * (b - n) ** 2).sum()
+        s_mn = (window * (a - m) * (b - n)).sum()
+        over = (2 * m * n + 1e-4) * (2 * s_mn + 9e-4)
+        values.append(over / ((m**2 + n**2 + 1e-4) * (s_mm + s_nn + 9e-4)))
+    np.testing.assert_allclose(matlab_ssim(image, truth), np.mean(values))
+    assert matlab_ssim(image[:5, :5], truth[:5, :5]) < 1  # smaller than the window
 
 
 @pytest.mark.parametrize("measure", [log_mse, log_ssim])

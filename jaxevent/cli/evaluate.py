@@ -17,7 +17,7 @@ def add(commands: Any) -> None:
         "stopped, and computes only what is new. A recording or method that fails, or for which an "
         "extra is missing, is said, and the others go on; the exit status is 2 only if all fail.",
         "configs/slider_depth.toml --out results",
-        "mine.toml --out results --workers 8",
+        "mine.toml --metrics authors_ssim masked_mse --out results --workers 8",
         "mine.toml --out results --cluster tcp://10.0.0.1:8786",
     )
     one.add_argument("config", metavar="CONFIG.toml", type=Path, help="recordings and methods")
@@ -27,6 +27,14 @@ def add(commands: Any) -> None:
         shared=True,
         metavar="DIR",
         help="folder for report.html, results.json and others",
+    )
+    one.add_argument(
+        "--metrics",
+        metavar="NAME",
+        nargs="+",
+        default=[],
+        help="of images, besides those of the file: lpips, hdr_quality, global_ssim, matlab_ssim "
+        "(MATLAB's), authors_ssim and masked_mse (of the AKF's authors)",
     )
     where = one.add_mutually_exclusive_group()
     where.add_argument(
@@ -53,6 +61,7 @@ def add(commands: Any) -> None:
 def run(
     config: Path,
     out: Path | None,
+    metrics: list[str],
     workers: int | None,
     cluster: str | None,
     scheduler_file: Path | None,
@@ -72,6 +81,7 @@ def run(
         scheduler_file=scheduler_file,
         retries=retries,
         replace=force,
+        metrics=metrics,
     )
     print(markdown_table(rows), end="")
     if out is not None:

@@ -3,7 +3,8 @@
     recordings = ["slider_depth.zip", "more/*.h5"]  # paths or globs; $NAME is expanded
     protocol = "held-out"                           # or "reference", "motion" or "tracks"
     size = [240, 180]                               # only for recordings that do not tell it
-    metrics = ["lpips"]                             # of images; further ones, named in MEASURES
+    metrics = ["authors_ssim"]                      # of images; further ones, named in MEASURES
+    optional_metrics = ["lpips"]                    # of them those whose extra is installed
     gap = 4                                         # with "held-out": every 4th frame is given,
                                                     # the others are hidden; omitted: 2
     moving = true                                   # with "held-out": the error where something
@@ -22,7 +23,8 @@ Each family of estimators has protocols of its own, with settings of their own b
 are asked for by "held-out" and "reference", described below, the others are described in
 `jaxevent.runs.egomotion_scores` ("motion") and `jaxevent.runs.blob_scores` ("tracks").
 
-A method of the name "external" scores images of another program: `jaxevent.runs.external`. Paths
+A method of the name "external" scores images of another program: `jaxevent.runs.external`; one of
+the name "published" shows numbers that were printed beside ours: `jaxevent.runs.published`. Paths
 are relative to the folder of this file. The protocol "held-out" gives the methods frames 0, 2, 4,
 ... and asks for images where frames 1, 3, 5, ... are, at their time stamps plus the method's
 `clock_offset`; with another `gap` g it gives frames 0, g, 2 g, ... and asks for all others. Images
@@ -53,7 +55,7 @@ import dataclasses
 import hashlib
 import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +94,7 @@ def evaluate(
     scheduler_file: str | Path | None = None,
     retries: int = 2,
     replace: bool = True,
+    metrics: Sequence[str] = (),
 ) -> list[dict[str, Any]]:
     """Run an evaluation that a TOML file describes: a row per recording and method, as of `score`.
 
@@ -117,18 +120,21 @@ def evaluate(
         retries: How often a task is tried again whose process dies or that fails for another reason
             than bad input.
         replace: Whether files in `out` may be replaced that are not of an evaluation.
+        metrics: Further metrics besides those of the file, which config.toml then tells too.
 
     Raises:
         InputError: The file or a parameter cannot be used, `out` not be written or only over other
             files, the cluster not be reached; or not a single row could be computed.
     """
-    plan = read_plan(Path(config))
+    plan = read_plan(Path(config), metrics)
     if out is not None:
         own = (Path(out) / "tasks").is_dir()
         check_folder(Path(out), FILES, plan.inputs(Path(config)), replace=replace, own=own)
     place = Place(workers, cluster, None if scheduler_file is None else Path(scheduler_file))
     with contextlib.ExitStack() as stack:
         text = Path(config).read_bytes()
+        if metrics:
+            text = f"# With the further metrics {', '.join(metrics)}.\n".encode() + text
         write = None if out is None else stack.enter_context(results(Path(out)))
         folder = None if out is None else Path(out) / "tasks"
         stack.callback(_opened.clear)
@@ -224,6 +230,12 @@ def _compute(
             f"{path}: this worker has jaxevent {mine}, not {version}; install the same everywhere"
         )
     kind, family = find_protocol(protocol)
+    if method in kind.sources:
+        source = kind.sources[method](**params)
+        known = source.row(_name(Path(path)))
+        if known is not None:
+            row = {"method": method, **known, "params": source.values()}
+            return {"row": row, "picture": None}
     with jax.enable_x64(double):
         recording = _opened.load(Path(path), size, progress)
         if method in kind.sources:
@@ -291,8 +303,11 @@ class Entry:
         return values_of(self.params)
 
 
-def read_plan(config: Path) -> Plan:
-    """Read and check a configuration; raises `InputError` naming the file and the setting."""
+def read_plan(config: Path, metrics: Sequence[str] = ()) -> Plan:
+    """Read and check a configuration; raises `InputError` naming the file and the setting.
+
+    `metrics` are added to those that it names.
+    """
     table = read_toml(config)
     try:
         name = table.get("protocol", "held-out")
@@ -301,7 +316,12 @@ def read_plan(config: Path) -> Plan:
         known = {"recordings": anything, "protocol": NAME, "size": SIZE, "method": anything}
         check(table, {**known, **protocol.settings})
         options = {key: table[key] for key in protocol.settings if key in table}
+        if metrics:
+            if "metrics" not in protocol.settings:
+                raise InputError(f"the protocol {name!r} has no further metrics; omit --metrics")
+            options["metrics"] = list(dict.fromkeys([*options.get("metrics", ()), *metrics]))
         protocol.check(options)
+        options = protocol.available(options)
         size = table.get("size")
         recordings = find_recordings(table.get("recordings"), config.parent)
         methods = _methods(table.get("method"), config.parent, protocol, family, options)

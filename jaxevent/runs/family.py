@@ -33,6 +33,10 @@ class Source(abc.ABC):
     def values(self) -> dict[str, Any]:
         """The settings, as a row shows them."""
 
+    def row(self, recording: str) -> dict[str, Any] | None:
+        """The results of the recording of that name, where they are known; None: to be scored."""
+        return None
+
     @abc.abstractmethod
     def files(self, recording: str) -> Sequence[Path]:
         """What is read for the recording of that name."""
@@ -50,6 +54,10 @@ class Protocol(abc.ABC):
 
     def check(self, options: Mapping[str, Any]) -> None:  # noqa: B027
         """Raise `InputError` for settings that are missing or not possible together."""
+
+    def available(self, options: Mapping[str, Any]) -> dict[str, Any]:
+        """The settings without what needs an extra that is not installed, if it is optional."""
+        return dict(options)
 
     def check_method(  # noqa: B027
         self, method: Estimator, options: Mapping[str, Any]

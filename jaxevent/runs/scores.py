@@ -1,6 +1,8 @@
 """Images compared with the truth: `score` makes one row of a table of results."""
 
+import contextlib
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -21,6 +23,8 @@ from jaxevent.metrics import (
     log_ssim,
     lpips,
     lpips_weights,
+    masked_mse,
+    matlab_ssim,
     mse,
     regions,
     ssim,
@@ -29,7 +33,7 @@ from jaxevent.parameters import nearest
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.recording import Frames, Recording
-from jaxevent.runs.config import is_texts
+from jaxevent.runs.config import is_texts, one_of
 from jaxevent.runs.external import External, Normalise, check_normalise, fit_brightness
 from jaxevent.runs.family import Protocol
 from jaxevent.runs.protocols import (
@@ -41,13 +45,17 @@ from jaxevent.runs.protocols import (
     frames_around,
     is_gap,
 )
+from jaxevent.runs.published import Published
 
-# Further measures of an image and the truth, each a number per image. They cost more time, and the
-# first two need an extra.
+# Further measures of an image and the truth, each a number per image; the first two need an extra.
+# Where an HDR reference has no value both images are 0, which is all that the authors' error needs.
 MEASURES: dict[str, Callable[..., NDArray[np.float64]]] = {
     "lpips": lpips,
     "hdr_quality": hdr_quality,
     "global_ssim": global_ssim,
+    "authors_ssim": functools.partial(global_ssim, by_column=True),
+    "matlab_ssim": matlab_ssim,
+    "masked_mse": lambda image, truth: masked_mse(image, truth, np.ones(truth.shape, bool)),
 }
 
 
@@ -285,7 +293,9 @@ def score(
     [0, 1] before they are compared. `mse`, `ssim` and those of `metrics` (names in `MEASURES`) are
     means over the images. `seconds` is the time of reconstructing and reading images, with
     compilation but without scoring. What is not a number is None. `per_frame` lists t (us, as
-    stamped) and every measure of every image.
+    stamped) and every measure of every image. "authors_ssim" and "masked_mse" are what the
+    programs of the AKF's authors compute (Wang et al., TPAMI 2023: the whole image as one window;
+    pixels without reference count as right), "matlab_ssim" is MATLAB's `ssim`.
 
     With "held-out" every `gap`-th frame is given and all others are hidden; a gap other than 2 is
     in the row. With `moving` rows have also `moving`: the `share` of pixels where something moves,
@@ -335,15 +345,27 @@ class ImageProtocol(Protocol):
 
     settings = {
         "metrics": (is_texts, 'a list of names, as ["lpips"]'),
+        "optional_metrics": (is_texts, 'a list of names, as ["lpips"]'),
     }
     own = {"normalise": (lambda value: value in get_args(Normalise), "'none' or 'affine'")}
-    sources = {External.name: External}
+    sources = {External.name: External, Published.name: Published}
 
     def __init__(self, name: str):
         self.name = name
 
     def check(self, options: Mapping[str, Any]) -> None:
         check_measures(options.get("metrics", ()))
+        for name in options.get("optional_metrics", ()):
+            one_of(name, "metric", list(MEASURES))
+
+    def available(self, options: Mapping[str, Any]) -> dict[str, Any]:
+        found = dict(options)
+        names = list(found.get("metrics", ()))
+        for name in found.pop("optional_metrics", ()):
+            with contextlib.suppress(InputError):
+                check_measures([name])
+                names.append(name)
+        return {**found, "metrics": list(dict.fromkeys(names))} if names else found
 
     def label(self, options: Mapping[str, Any]) -> str:
         gap = options.get("gap", GAP)

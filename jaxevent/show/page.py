@@ -25,9 +25,10 @@ POINTS = 300  # of a curve over time, means of so many parts of it
 UNCERTAIN = 0.1  # a standard deviation of log intensity that is shown as bright as can be
 # Errors shown in full colour: of intensity, and of ln(I + 0.003) against an HDR reference.
 FULL = {False: 0.1, True: 1.0}
-HIGHER = {
-    "ssim", "log_ssim", "global_ssim", "hdr_quality", "covered", "mota", "idf1", "hota",
-}  # of these more is better  # fmt: skip
+HIGHER = {  # of these more is better
+    "ssim", "log_ssim", "global_ssim", "authors_ssim", "matlab_ssim", "hdr_quality", "covered",
+    "mota", "idf1", "hota",
+}  # fmt: skip
 
 MEANINGS = {
     "MSE x 1e-2": "mean square error of intensity, times 100; 0 is best",
@@ -41,6 +42,10 @@ MEANINGS = {
     "moving share": "the share of pixels where something moves",
     "LPIPS": "perceptual distance; 0 is best",
     "JOD": "quality by ColorVideoVDP; 10 is best",
+    "global SSIM": "structural similarity, the whole image as one window; 1 is best",
+    "authors' SSIM": "the same with means of columns, as Wang et al. 2023 compute it; 1 is best",
+    "MATLAB SSIM": "structural similarity with borders, as MATLAB's ssim; 1 is best",
+    "masked MSE x 1e-2": "over all pixels, those without reference counted as right",
     "frames": "images that were compared",
     "missing": "images without an estimate",
     "AEE %": "mean error of the image velocity, of its size",
@@ -130,6 +135,7 @@ def page(
     else:
         means, over_time = _plotted(done)
         values["points"] = _points(done, methods, means)
+        values["boxes"] = _boxes(done, methods, [*means, over_time])
         values["curves"] = _curves(done, recordings, methods, over_time, names)
     templates = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True,
@@ -331,7 +337,9 @@ NAMES = {
     "mse": "MSE", "ssim": "SSIM", "log_mse": "log MSE", "log_ssim": "log SSIM",
     "AEE_rel": "relative AEE (%)", "AAE_U": "AAE (degrees)", "AAE_T": "heading (degrees)",
     "vector_error": "error of Omega (%)", "AME_rel": "relative AME (%)", "error": "error (%)",
-    "rmse": "RMSE (px)", "covered": "covered", "distance": "distance (px)",
+    "rmse": "RMSE (px)", "covered": "covered", "distance": "distance (px)", "lpips": "LPIPS",
+    "hdr_quality": "JOD", "global_ssim": "global SSIM", "authors_ssim": "authors' SSIM",
+    "matlab_ssim": "MATLAB SSIM", "masked_mse": "masked MSE",
 }  # fmt: skip
 
 
@@ -375,6 +383,58 @@ def _points(
     return _plot(figure)
 
 
+def _series(row: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What a row lists of every image, or of every time; empty of published numbers."""
+    return row.get("per_frame") or row.get("per_time") or {}
+
+
+def _boxes(
+    rows: Sequence[Mapping[str, Any]], methods: Sequence[str], measures: Sequence[str]
+) -> str | None:
+    """How the values of all images, or times, of all recordings spread: a panel for each measure.
+
+    A box reaches from the first to the third quartile, the line in it is the median, whiskers
+    reach to the last value within 1.5 times the box's length. Further metrics have panels too.
+    """
+    from matplotlib.figure import Figure
+
+    further = [name for row in rows for name in _series(row) if name in NAMES]
+    values: dict[str, list[NDArray[np.float64]]] = {}
+    for measure in dict.fromkeys([*measures, *further]):
+        lists = [
+            [v for row in rows if row["method"] == one for v in _series(row).get(measure, [])]
+            for one in methods
+        ]
+        columns = [np.array(one, np.float64) for one in lists]  # None becomes NaN
+        columns = [one[np.isfinite(one)] for one in columns]
+        if any(len(one) for one in columns):
+            values[measure] = columns
+    if not values:
+        return None
+    wide = min(2, len(values))
+    high = math.ceil(len(values) / wide)
+    figure = Figure(figsize=(9, high * (0.8 + 0.28 * len(methods))), layout="constrained")
+    axes = figure.subplots(high, wide, squeeze=False).ravel()
+    for place, (axis, (measure, columns)) in enumerate(zip(axes, values.items(), strict=False)):
+        drawn = axis.boxplot(
+            columns, positions=range(len(methods)), orientation="horizontal", widths=0.6,
+            patch_artist=True, flierprops={"marker": ".", "markersize": 2, "alpha": 0.4},
+            medianprops={"color": "black"},
+        )  # fmt: skip
+        for i, box in enumerate(drawn["boxes"]):
+            box.set(facecolor=_colour(i), alpha=0.6)
+        if measure not in HIGHER and all((one > 0).all() for one in columns):
+            axis.set_xscale("log")
+            _label_plainly(axis.xaxis)
+        axis.set(xlabel=NAMES[measure], yticks=range(len(methods)), yticklabels=methods)
+        axis.invert_yaxis()
+        axis.tick_params(labelleft=place % wide == 0, left=False)
+        axis.spines[["top", "right", "left"]].set_visible(False)
+    for axis in axes[len(values) :]:
+        axis.set_axis_off()
+    return _plot(figure)
+
+
 def _curves(
     rows: Sequence[Mapping[str, Any]],
     recordings: Sequence[str],
@@ -392,7 +452,9 @@ def _curves(
         for row in rows:
             if row["recording"] != recording:
                 continue
-            series = row.get("per_frame") or row["per_time"]
+            series = _series(row)
+            if not series:
+                continue
             t = np.array(series["t"], np.float64) / 1e6
             values = np.array(series[measure], np.float64)  # None becomes NaN
             pieces = [

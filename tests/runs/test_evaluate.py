@@ -1,5 +1,6 @@
 """The evaluation against hand computations, what it hides, and its configuration."""
 
+import base64
 import dataclasses
 import json
 from pathlib import Path
@@ -330,6 +331,39 @@ def test_pixels_without_reference_leave_errors_and_regions():
     again = score(authors, brighter(3.0, 0.1), protocol="reference")
     assert again["regions"]["bright"]["mse"] == pytest.approx(row["regions"]["bright"]["mse"])
     assert again["per_frame"]["ssim"] == pytest.approx(row["per_frame"]["ssim"])
+
+
+def test_the_authors_metrics_of_references(folder):
+    """Pixels without reference are 0 in both images, and count as right among all pixels."""
+    truth = 4 * grey()
+    truth[:, :7] = np.nan
+    jaxevent.save(hdr_recording(truth), folder / "hdr.h5")
+    config = write_config(folder, 'protocol = "reference"\n' + ONE.replace("small", "hdr"))
+    names = ["authors_ssim", "masked_mse", "matlab_ssim"]
+    (row,) = evaluate(config, folder / "out", metrics=names)
+    between = METHODS["blend"].estimate(small())(STAMPS).mean
+    for n in range(len(STAMPS)):
+        known = np.isfinite(truth[n])
+        image, true = np.where(known, between[n], 0), np.where(known, truth[n], 0)
+        share = known.mean()
+        error = ((between[n] - truth[n])[known] ** 2).mean() * share
+        assert row["per_frame"]["masked_mse"][n] == pytest.approx(error, rel=1e-5)
+        similar = metrics.global_ssim(image.astype(float), true, by_column=True)
+        assert row["per_frame"]["authors_ssim"][n] == pytest.approx(float(similar), rel=1e-5)
+    assert row["masked_mse"] == pytest.approx(np.mean(row["per_frame"]["masked_mse"]))
+    told = (folder / "out" / "config.toml").read_text()
+    assert told.startswith("# ") and all(name in told.splitlines()[0] for name in names)
+    assert told.endswith(config.read_text())
+    table = (folder / "out" / "results.md").read_text()
+    assert all(title in table for title in ("authors' SSIM", "MATLAB SSIM", "masked MSE x 1e-2"))
+    with pytest.raises(jaxevent.InputError, match="did you mean 'masked_mse'"):
+        evaluate(config, metrics=["masked"])
+    # A panel of boxes for each measure of single images.
+    page = (folder / "out" / "report.html").read_text()
+    boxes = page.split("<h2>All images</h2>")[1].split("base64,")[1].split('"')[0]
+    drawn = base64.b64decode(boxes).decode()
+    for label in ("log MSE", "log SSIM", "authors' SSIM", "MATLAB SSIM", "masked MSE"):
+        assert label in drawn
 
 
 class Hot(Filter):
