@@ -17,6 +17,7 @@ registers rigs of two cameras, a folder each:
     RECORDED/NAME/frames or frames.* the other camera's: a recording, or images with timestamps.txt
     RECORDED/NAME/rig.toml           calibration (`jaxevent.register.Rig.read`), or homography.csv;
                                      without either a homography is estimated
+    RECORDED/NAME/offset.txt         s, added to the other camera's stamps; absent: estimated
     RECORDED/NAME/hdr                HDR references: images with timestamps.txt, as `frames` lie
 
 Recordings with references are made for configs/rigs_hdr.toml, RIGS=registered/hdr. With --triggers
@@ -93,8 +94,6 @@ def rig(folder: Path, triggers: bool) -> tuple[Recording, bool]:
     recording = jaxevent.load(events, in_memory=False)
     other = register.read_frames(frames)
     offset = None
-    if triggers:
-        other, offset = register.triggered(recording, other)
     grid, H = None, None
     if (folder / "rig.toml").exists():
         known = register.Rig.read(folder / "rig.toml", recording.camera)
@@ -105,6 +104,8 @@ def rig(folder: Path, triggers: bool) -> tuple[Recording, bool]:
     if (folder / "offset.txt").exists():
         offset = float((folder / "offset.txt").read_text())
     found = register.estimate(recording, other, grid, homography=H, offset=offset)
+    if triggers:
+        other, found = register.by_triggers(recording, other, found)
     print(f"{folder.name}: offset {found.offset:.6f} s, {register.seen(found.grid):.1%} seen")
     both = register.registered(recording, other, found)
     images = beside(folder, "hdr")

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command, print_stored, show_progress
@@ -18,6 +18,7 @@ def add(commands: Any) -> None:
         "far away or flat, which is estimated from the recordings, as is the offset of the clocks.",
         "events.raw --frames camera --out both.h5",
         "events.h5 --frames camera.bag --calibration rig.toml --depth 2.5 --out both.h5",
+        "events.raw --frames camera --triggers --out both.h5",
         "both.h5 --reference hdr --homography H.csv --offset 0.0123 --out truth.h5",
     )
     one.add_argument("path", metavar="PATH", type=Path, help="a recording of the event camera")
@@ -65,6 +66,19 @@ def add(commands: Any) -> None:
         help="added to the other camera's time stamps; default: estimated",
     )
     one.add_argument(
+        "--triggers",
+        metavar="EDGE",
+        nargs="?",
+        const="auto",
+        choices=["auto", "rising", "falling", "exposure"],
+        help="take the stamps of frames from the event camera's external triggers, and fit the lag "
+        "from these to mid-exposure, or take --offset for it: at rising or falling edges, or "
+        "halfway between both (exposure); default: exposure where there are both edges",
+    )
+    one.add_argument(
+        "--channel", metavar="N", type=int, help="of the triggers, where there are several"
+    )
+    one.add_argument(
         "--search", metavar="S", type=float, help="the largest offset that is thought possible"
     )
     one.add_argument(
@@ -90,6 +104,8 @@ def run(
     depth: float | Path | None,
     plane: tuple[float, float, float, float] | None,
     offset: float | int | None,
+    triggers: Literal["auto", "rising", "falling", "exposure"] | None,
+    channel: int | None,
     search: float | int | None,
     exposure: float | int | None,
     white: float | int | None,
@@ -109,6 +125,11 @@ def run(
             raise InputError(f"--{name} needs --calibration; add it or leave --{name} out")
     if depth is not None and plane is not None:
         raise InputError("--depth and --plane say the same; leave one of them out")
+    if channel is not None and triggers is None:
+        raise InputError("--channel is that of triggers; add --triggers or leave it out")
+    if triggers is not None and reference is not None:
+        raise InputError("--triggers is for frames; leave it out with --reference")
+    lag, offset = (offset, None) if triggers is not None else (None, offset)
     if offset is not None and search is not None:
         raise InputError("--search is for an offset that is not known; leave it out with --offset")
     if crop and reference is not None:
@@ -138,14 +159,21 @@ def run(
             recording, other, grid, homography=H, offset=offset, search=search,
             progress=show_progress(),
         )  # fmt: skip
+        if triggers is not None:
+            frames_given = len(other.frames) if other.frames else 0
+            other, found = rig.by_triggers(recording, other, found, triggers, channel, lag=lag)
         both = rig.registered(recording, other, found, crop=crop, reference=reference is not None)
         save(dataclasses.replace(both, name=name), partial, progress=show_progress())
     if found.homography is not None and H is None:
         print("homography from the event camera's pixels to the other's:")
         for row in found.homography:
             print("  " + ", ".join(f"{value:.9g}" for value in row))
-    how = "given" if offset is not None else "estimated"
-    print(f"offset added to the other camera's time stamps, {how}: {found.offset:.6f} s")
+    how = "given" if offset is not None or lag is not None else "estimated"
+    if triggers is not None:
+        print(f"frames with a trigger: {len(other.frames or ())} of {frames_given}")
+        print(f"lag from triggers to mid-exposure, {how}: {found.offset:.6f} s")
+    else:
+        print(f"offset added to the other camera's time stamps, {how}: {found.offset:.6f} s")
     if found.agreement is not None:
         print(f"correlation of the changes that frames and events show: {found.agreement:.3f}")
     print(f"pixels that the other camera sees: {rig.seen(found.grid):.1%}")

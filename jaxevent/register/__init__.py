@@ -10,6 +10,8 @@
     grid = rig.grid((346, 260), (1440, 1080), depth=2.5)
     found = register.estimate(recording, other, grid)           # then only the clock is unknown
 
+    other, found = register.by_triggers(recording, other, found)  # stamps from its triggers
+
 A *grid* (height, width, 2) says at which x, y of the other camera's images each pixel of the event
 camera looks, NaN where it does not see the same. Pixel centres are whole numbers. The offset of the
 clocks (s) is added to the other camera's time stamps to get times of the events' clock, as
@@ -28,6 +30,7 @@ from jaxevent.register.frames import read_frames
 from jaxevent.register.geometry import Grid, homography_grid, read_depth, read_homography, seen
 from jaxevent.register.refinement import Registration, refine
 from jaxevent.register.rig import Rig
+from jaxevent.register.triggers import by_triggers, match_triggers, trigger_times
 from jaxevent.register.warp import Warped, registered
 
 __all__ = [
@@ -35,13 +38,16 @@ __all__ = [
     "Registration",
     "Rig",
     "Warped",
+    "by_triggers",
     "clock_offsets",
     "estimate",
     "homography_grid",
+    "match_triggers",
     "read_depth",
     "read_frames",
     "read_homography",
     "refine",
     "registered",
     "seen",
+    "trigger_times",
 ]

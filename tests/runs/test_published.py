@@ -32,7 +32,9 @@ def as_text(path: Path) -> None:
             "events.txt", "".join(f"{t / 1e6:.6f} {x} {y} {p:d}\n" for t, x, y, p in rows)
         )
         lines = []
-        for number, (t, image) in enumerate(zip(STAMPS, recording.frames.images, strict=True)):
+        for number, (t, image) in enumerate(
+            zip(STAMPS, np.asarray(recording.frames.images), strict=True)
+        ):
             name = f"images/frame_{number:08d}.png"
             lines.append(f"{t / 1e6:.6f} {name}\n")
             with archive.open(name, "w") as file:
