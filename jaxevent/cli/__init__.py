@@ -16,6 +16,7 @@ from typing import Any
 
 import jaxevent
 from jaxevent.cli import (
+    camera,
     convert,
     demo,
     evaluate,
@@ -34,8 +35,8 @@ from jaxevent.errors import InputError, require
 
 # In the order of `jaxevent --help`.
 COMMANDS = (
-    demo, info, convert, filter, register, reconstruct, track, motion, evaluate, fit, simulate,
-    view,
+    demo, info, convert, filter, register, camera, reconstruct, track, motion, evaluate, fit,
+    simulate, view,
 )  # fmt: skip
 
 

@@ -10,13 +10,16 @@ from typing import Any
 
 
 def command(
-    commands: Any, run: Callable, description: str, *examples: str
+    commands: Any, run: Callable, description: str, *examples: str, part: str = ""
 ) -> argparse.ArgumentParser:
-    """Add a command, named by the module of `run`, which takes the parsed options."""
-    name = run.__module__.rpartition(".")[2]
+    """Add a command, named by the module of `run`, which takes the parsed options.
+
+    `part` is the name of one of its parts, as in `jaxevent camera merge`.
+    """
+    name = run.__module__.rpartition(".")[2] + f" {part}" * bool(part)
     lines = "".join(f"\n  jaxevent {name} {example}".rstrip() for example in examples)
     one = commands.add_parser(
-        name,
+        part or name,
         help=description.partition(".")[0],
         description="\n".join(textwrap.wrap(description, 79)),
         epilog=f"example{'s' * (len(examples) > 1)}:{lines}",

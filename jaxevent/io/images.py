@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.io import reading
+from jaxevent.io.output import complete
 from jaxevent.recording import microseconds
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
@@ -213,6 +214,34 @@ def read_image(file: Any, source: str, grey: bool = False) -> NDArray:
         if grey or image.mode in ("1", "LA"):
             return np.asarray(image.convert("L"))
         return np.asarray(image if image.mode in ("L", "RGB", "RGBA") else image.convert("RGB"))
+
+
+def read_intensity(path: Path) -> NDArray[np.float32]:
+    """An image of linear intensity (height, width), .npy or TIFF of floats, NaN where unknown."""
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; correct the path")
+    with reading(str(path)):
+        image = _image(path)
+    if image.ndim != 2 or image.dtype.kind != "f":
+        raise InputError(
+            f"{path}: is {image.dtype} of shape {image.shape}; store floats (height, width), as "
+            "`jaxevent camera merge` does"
+        )
+    return image.astype(np.float32)
+
+
+def write_intensity(path: Path, image: NDArray[np.float32]) -> None:
+    """Write an image of linear intensity as .npy or TIFF; raises `InputError` for other names."""
+    from PIL import Image
+
+    if path.suffix.lower() not in (".npy", ".tif", ".tiff"):
+        raise InputError(f"{path}: an image of intensity is .npy or .tif; end the name so")
+    with complete(path) as partial:
+        if path.suffix.lower() == ".npy":
+            with partial.open("wb") as file:
+                np.save(file, image)
+        else:
+            Image.fromarray(image).save(partial, format="TIFF")
 
 
 def _times(path: Path) -> tuple[NDArray[np.int64], list[str] | None]:

@@ -30,6 +30,7 @@ from jaxevent.register.frames import read_frames
 from jaxevent.register.geometry import Grid, homography_grid, read_depth, read_homography, seen
 from jaxevent.register.refinement import Registration, refine
 from jaxevent.register.rig import Rig
+from jaxevent.register.still import register_still
 from jaxevent.register.triggers import by_triggers, match_triggers, trigger_times
 from jaxevent.register.warp import Warped, registered
 
@@ -47,6 +48,7 @@ __all__ = [
     "read_frames",
     "read_homography",
     "refine",
+    "register_still",
     "registered",
     "seen",
     "trigger_times",

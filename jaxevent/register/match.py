@@ -14,7 +14,7 @@ from jaxevent.register.geometry import straighten
 
 _FEWEST = 12  # matches that agree on a homography
 _TOLERANCE = 3.0  # px of the other camera between matches and the homography
-_RATIO = 0.75  # of the distances to the nearest and the second descriptor; Lowe's 0.8 is laxer
+RATIO = 0.75  # of the distances to the nearest and the second descriptor; Lowe's 0.8 is laxer
 _MATCHED = 16  # frames whose features are matched
 _WIDEST = 400  # px to which wider images of events are shrunk for that
 _ALPHAS = (1.0, 3.0)  # rad/s, cut-off of the reconstructions that are matched
@@ -43,7 +43,7 @@ def match(
         image = image.astype(np.float32)
         size = round(image.shape[1] * scale), round(image.shape[0] * scale)
         seen = image if scale == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        points, about = sift.detectAndCompute(_even_out(seen), None)
+        points, about = sift.detectAndCompute(even_out(seen), None)
         if about is None or len(points) < 2:
             return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
         actual = np.array(image.shape[::-1]) / seen.shape[::-1]
@@ -55,7 +55,7 @@ def match(
         if not len(where) or not len(there):
             continue
         for pair in cv2.BFMatcher().knnMatch(described, about, k=2):
-            if len(pair) == 2 and pair[0].distance < _RATIO * pair[1].distance:
+            if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance:
                 begin.append(where[pair[0].queryIdx])
                 end.append(there[pair[0].trainIdx])
     found, count = [], 0
@@ -133,7 +133,7 @@ def _find_busiest(recording: Recording, t: NDArray[np.int64]) -> tuple[Recording
     return dataclasses.replace(recording, events=events, frames=None, extra={}), chosen
 
 
-def _even_out(image: NDArray[np.floating]) -> NDArray[np.uint8]:
+def even_out(image: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Grey levels of local contrast: both cameras' images look alike in them."""
     scale = image.shape[1] / 128
     detail = image - ndimage.gaussian_filter(image, 12 * scale)
