@@ -273,7 +273,8 @@ class Recording:
 
     `extra` keeps, by name, whatever arrays the file held beyond these fields (a contrast threshold,
     HDR reference images, a known motion). Of these the library reads: the camera response, see
-    `response`; `rgb`, colour frames (frames, height, width, 3) uint8, see `jaxevent.colour`.
+    `response`; `rgb`, colour frames (frames, height, width, 3) uint8, which may stay in a file as
+    frames do, see `jaxevent.colour`.
     """
 
     name: str
@@ -284,7 +285,7 @@ class Recording:
     camera: PinholeCamera | None = None
     poses: Poses | None = None
     imu: Imu | None = None
-    extra: Mapping[str, NDArray] = dataclasses.field(default_factory=dict)
+    extra: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     triggers: Triggers | None = None
 
     def __repr__(self) -> str:
@@ -385,7 +386,7 @@ class Recording:
             self, frames=frames if frames else None, extra=self._extra_of(rows)
         )
 
-    def _extra_of(self, rows: slice | NDArray | None) -> Mapping[str, NDArray]:
+    def _extra_of(self, rows: slice | NDArray | None) -> Mapping[str, Any]:
         """The further arrays; those with one entry per frame ("gain", "rgb") cut like frames."""
         if rows is None:
             return self.extra

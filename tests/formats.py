@@ -421,6 +421,14 @@ def n_caltech(events) -> bytes:
 # ROS
 
 
+def ros_image(image) -> tuple:
+    """The fields of sensor_msgs/Image after its header: mono8, or bgr8 of (height, width, 3)."""
+    height, width = image.shape[:2]
+    if image.ndim == 2:
+        return height, width, "mono8", 0, width, image.ravel()
+    return height, width, "bgr8", 0, 3 * width, image[..., ::-1].ravel()
+
+
 def bag(path: Path, events, size, images=(), image_t=(), prefix="/dvs", message=50, typed=False):
     """Written by rosbags; events as raw bytes, or `typed` as rosbags serialises them."""
     from rosbags.rosbag1 import Writer
@@ -475,8 +483,7 @@ def bag(path: Path, events, size, images=(), image_t=(), prefix="/dvs", message=
             info = add("/camera_info", "sensor_msgs/msg/CameraInfo")
         for i, (image, t) in enumerate(zip(images, image_t, strict=True)):
             at = 10**18 + i
-            args = (header(t), size[1], size[0], "mono8", 0, size[0], image.ravel())
-            one = types["sensor_msgs/msg/Image"](*args)
+            one = types["sensor_msgs/msg/Image"](header(t), *ros_image(image))
             writer.write(link, at, store.serialize_ros1(one, "sensor_msgs/msg/Image"))
             turn = vector("Quaternion", (0.1, 0.2, 0.3, 0.4))
             none = np.zeros(9)
@@ -614,7 +621,7 @@ def bag2(
                 "/dvs/camera_info", "sensor_msgs/msg/CameraInfo", typestore=store
             )
         for number, (image, t) in enumerate(zip(images, image_t, strict=True)):
-            one = types[kind](header(t), size[1], size[0], "mono8", 0, size[0], image.ravel())
+            one = types[kind](header(t), *ros_image(image))
             writer.write(link, 10**18 + number, store.serialize_cdr(one, kind))
             region = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
             d, k = np.arange(5) / 10, np.array([5.0, 0, 2, 0, 6, 3, 0, 0, 1])

@@ -191,15 +191,15 @@ class DecodedEvents:
 
 
 class DecodedImages:
-    """Images (frames, height, width) that a decoder gives in turn, left in the file.
+    """Images (frames, height, width), or in colour (frames, height, width, 3), left in the file.
 
-    `images(i)` iterates over the images from number i on.
+    `images(i)` decodes the images from number i on, in turn.
     """
 
     def __init__(
         self,
         images: Callable[[int], Iterable[NDArray]],
-        shape: tuple[int, int, int],
+        shape: tuple[int, ...],
         dtype: np.dtype,
         source: str,
     ):

@@ -31,10 +31,15 @@ LUMA = np.array([0.299, 0.587, 0.114])
 
 @dataclasses.dataclass(frozen=True)
 class Series:
-    """Images at sorted times (us), each read when asked for: `read(row)` is (height, width)."""
+    """Images at sorted times (us), each read when asked for: `read(row)` is (height, width).
+
+    `colour(row)` is (height, width, 3) uint8, red first, or None of an image that is stored
+    otherwise.
+    """
 
     t: NDArray[np.int64]
     read: Callable[[int], NDArray[np.float64]]
+    colour: Callable[[int], NDArray[np.uint8] | None]
     files: tuple[Path, ...]  # that hold all this
 
 
@@ -151,12 +156,19 @@ def _series(
             "images and times"
         )
 
-    def read(row: int) -> NDArray[np.float64]:
+    def image(row: int) -> NDArray:
         with reading(f"{source}: image {row}"):
-            image = stored(row)
-        return scale.intensity(np.asarray(image), f"{source}: image {row}")
+            return np.asarray(stored(row))
 
-    return Series(t, read, files)
+    def colour(row: int) -> NDArray[np.uint8] | None:
+        found = image(row)
+        is_colour = found.dtype == np.uint8 and found.ndim == 3 and found.shape[2] in (3, 4)
+        return found[..., :3] if is_colour else None
+
+    def read(row: int) -> NDArray[np.float64]:
+        return scale.intensity(image(row), f"{source}: image {row}")
+
+    return Series(t, read, colour, files)
 
 
 def _of_hdf5(path: Path, scale: Scale) -> Series:
@@ -214,6 +226,29 @@ def read_image(file: Any, source: str, grey: bool = False) -> NDArray:
         if grey or image.mode in ("1", "LA"):
             return np.asarray(image.convert("L"))
         return np.asarray(image if image.mode in ("L", "RGB", "RGBA") else image.convert("RGB"))
+
+
+def read_grey_and_colour(file: Any, source: str) -> tuple[NDArray, NDArray[np.uint8] | None]:
+    """An image in grey, as of `read_image`, and its colours (height, width, 3); None of a grey one.
+
+    `file` is a path or an open file that can be read from its beginning again.
+    """
+    from PIL import Image
+
+    grey = read_image(file, source, grey=True)
+    with Image.open(file) as image:
+        if image.mode in ("1", "L", "LA", "F") or image.mode.startswith("I"):
+            return grey, None
+        return grey, np.asarray(image.convert("RGB"))
+
+
+def kept_colours(images: Sequence[NDArray[np.uint8] | None]) -> dict[str, NDArray[np.uint8]]:
+    """Colours of all frames as `Recording.extra` keeps them: none if one is grey, or all are."""
+    colours = [one for one in images if one is not None]
+    if not colours or len(colours) < len(images):
+        return {}
+    differ = any((one != one[..., :1]).any() for one in colours)
+    return {"rgb": np.stack(colours)} if differ else {}
 
 
 def read_intensity(path: Path) -> NDArray[np.float32]:

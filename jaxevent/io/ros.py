@@ -8,12 +8,13 @@ are named in `extra["topics_left_out"]`. A bag with several cameras needs the to
 
 Times are those of the messages' headers and of the events, not those of recording, as ROS time in
 us (nanoseconds are cut off). The exposure of images is unknown: 0. Colour images become grey
-(ITU-R 601 luma).
+(ITU-R 601 luma), and `extra["rgb"]` keeps their colours.
 
 Decoder. The package rosbags reads the containers, see `bags`. importRosbag (GPL) fails with NumPy
 2. Both agree on bags of ROS 1 written by rosbags; of ROS 2, bags are read that rosbags wrote.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from jaxevent.errors import InputError
 from jaxevent.io import pinhole, reading, sensor_size
 from jaxevent.io.bags import Bag
 from jaxevent.io.decoded import DecodedImages, decoded
+from jaxevent.io.images import LUMA
 from jaxevent.io.ros_events import ARRAYS, PACKET, event_topic
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
@@ -57,7 +59,7 @@ def read(
     topic = _choose(path, bag.topics(*ARRAYS, PACKET), stream)
     chosen = {kind: bag.beside(topic, kind) for kind in (_IMAGE, _IMU, _POSE, _CAMERA)}
     with reading(source):
-        frames = _frames(path, bag, chosen[_IMAGE], in_memory)
+        frames, colours = _frames(path, bag, chosen[_IMAGE], in_memory)
         imu = _imu(bag, chosen[_IMU])
         poses = _poses(bag, chosen[_POSE])
         camera = _camera(bag, chosen[_CAMERA])
@@ -71,6 +73,7 @@ def read(
     left_out += [other for other in bag.topics(*ARRAYS, PACKET) if other != topic]
     extra = {name: np.array(number) for name, number in sorted(found.untimed.items())}
     extra |= {"topics_left_out": np.array(left_out)} if left_out else {}
+    extra |= {} if colours is None else {"rgb": colours}
     triggers = found.triggers()
     return Recording(path.stem, *size, events, frames, camera, poses, imu, extra, triggers)
 
@@ -99,14 +102,19 @@ def _stamp(message: Any) -> int:
     return stamp.sec * 1_000_000 + stamp.nanosec // 1000
 
 
-def _frames(path: Path, bag: Bag, topic: str | None, in_memory: bool) -> Frames | None:
+def _frames(path: Path, bag: Bag, topic: str | None, in_memory: bool) -> tuple[Frames | None, Any]:
+    """The frames of a topic, and their colours (frames, height, width, 3), None of grey ones."""
     if topic is None:
-        return None
-    times, images, places, shape = [], [], [], None
+        return None, None
+    times, images, colours, places, shape = [], [], [], [], None
+    coloured, differ = True, False
     for place, message in bag.decoded(topic):
         times.append(_stamp(message))
         places.append(place)
-        image = _image(path, topic, message)
+        stored = _image(path, topic, message)
+        coloured = coloured and stored.ndim == 3
+        differ = differ or (coloured and bool((stored != stored[..., :1]).any()))
+        image = _grey(stored)
         shape = shape or (image.shape, image.dtype)
         if shape != (image.shape, image.dtype):
             raise InputError(
@@ -116,22 +124,30 @@ def _frames(path: Path, bag: Bag, topic: str | None, in_memory: bool) -> Frames 
             )
         if in_memory:
             images.append(image)
+            colours += [stored] * coloured
     if shape is None:
-        return None
+        return None, None
+    t = np.array(times, np.int64)
     if in_memory:
-        stored: Any = np.stack(images)
-    else:
-        stored = DecodedImages(
-            lambda row: (_image(path, topic, one) for _, one in bag.decoded(topic, places[row])),
-            (len(times), *shape[0]),
+        kept = np.stack(colours) if coloured and differ else None
+        return Frames(t, np.stack(images), np.zeros_like(t)), kept
+
+    def decoded_images(of: Callable[[NDArray], NDArray], *channels: int) -> DecodedImages:
+        return DecodedImages(
+            lambda row: (
+                of(_image(path, topic, one)) for _, one in bag.decoded(topic, places[row])
+            ),
+            (len(times), *shape[0], *channels),
             shape[1],
             str(path),
         )
-    t = np.array(times, np.int64)
-    return Frames(t, stored, np.zeros_like(t))
+
+    kept = decoded_images(lambda image: image, 3) if coloured and differ else None
+    return Frames(t, decoded_images(_grey), np.zeros_like(t)), kept
 
 
 def _image(path: Path, topic: str, message: Any) -> NDArray:
+    """An image as it is stored, in colour (height, width, 3) with red first."""
     if message.encoding not in _CHANNELS:
         raise InputError(
             f"{path}: the images of {topic} are encoded as {message.encoding[:20]!r}; record them "
@@ -145,8 +161,12 @@ def _image(path: Path, topic: str, message: Any) -> NDArray:
     image = image.reshape(message.height, message.width, channels).astype(dtype.newbyteorder("="))
     if channels == 1:
         return image[..., 0]
-    red_first = image if message.encoding == "rgb8" else image[..., ::-1]
-    return np.rint(red_first @ np.array([0.299, 0.587, 0.114])).astype(np.uint8)
+    return image if message.encoding == "rgb8" else np.ascontiguousarray(image[..., ::-1])
+
+
+def _grey(image: NDArray) -> NDArray:
+    """An image in grey: ITU-R 601 luma of colours."""
+    return image if image.ndim == 2 else np.rint(image @ LUMA).astype(np.uint8)
 
 
 def _imu(bag: Bag, topic: str | None) -> Imu | None:

@@ -9,7 +9,7 @@
 All t are seconds; events.txt with whole numbers only, which would be microseconds or worse, is
 refused. Only events.txt is required, and it may be empty where there are images. In a
 zip the files may lie in one top folder. The exposure of the images is unknown: 0. Colour images
-become grey (ITU-R 601 luma).
+become grey (ITU-R 601 luma); where all are, `extra["rgb"]` keeps their colours.
 """
 
 import re
@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from jaxevent.errors import InputError
 from jaxevent.io import check_unfolded, checked_events, pinhole, reading, sensor_size, times
-from jaxevent.io.images import read_image
+from jaxevent.io.images import kept_colours, read_grey_and_colour
 from jaxevent.progress import is_shown
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
@@ -53,7 +53,7 @@ def _read(
     path: Path, root: Path | zipfile.Path, size: tuple[int, int] | None, progress: bool | None
 ) -> Recording:
     source = f"{path}: events.txt"
-    frames = _frames(path, root)
+    frames, colours = _frames(path, root)
     columns, header = _table(
         root / "events.txt", source, "t x y p", header="width height", progress=progress
     )
@@ -84,7 +84,7 @@ def _read(
         source = f"{path}: calib.txt"
         values, _ = _table(root / "calib.txt", source, "fx fy cx cy k1 k2 p1 p2 k3")
         camera = pinhole(np.concatenate(values), source)
-    return Recording(path.stem, *size, events, frames, camera, poses, imu)
+    return Recording(path.stem, *size, events, frames, camera, poses, imu, colours)
 
 
 def _table(
@@ -157,13 +157,16 @@ def _table(
     return columns, found
 
 
-def _frames(path: Path, root: Path | zipfile.Path) -> Frames | None:
+def _frames(
+    path: Path, root: Path | zipfile.Path
+) -> tuple[Frames | None, dict[str, NDArray[np.uint8]]]:
+    """The frames, and the colours of coloured ones as `extra` keeps them."""
     if not (root / "images.txt").is_file():
-        return None
+        return None, {}
     source = f"{path}: images.txt"
     with reading(source):
         lines = (root / "images.txt").read_text(encoding="utf-8-sig").splitlines()
-    stamps, images, unfolded = [], [], 0
+    stamps, images, colours, unfolded = [], [], [], 0
     seen, stored = set(), 0 if path.is_dir() else path.stat().st_size
     for number, line in enumerate(lines, 1):
         if not line.strip() or line.startswith("#"):
@@ -176,11 +179,13 @@ def _frames(path: Path, root: Path | zipfile.Path) -> Frames | None:
             raise InputError(
                 f"{source}: line {number} is {line[:60]!r}; each line must be 't path'"
             ) from None
-        images.append(_image(path, root, name))
+        image, colour = _image(path, root, name)
+        images.append(image)
+        colours.append(colour)
         if path.is_dir() and name not in seen:
             seen.add(name)
             stored += (path / name).stat().st_size
-        unfolded += images[-1].nbytes
+        unfolded += image.nbytes + (0 if colour is None else colour.nbytes)
         check_unfolded(unfolded, stored, source)
         if images[-1].shape != images[0].shape or images[-1].dtype != images[0].dtype:
             raise InputError(
@@ -188,12 +193,14 @@ def _frames(path: Path, root: Path | zipfile.Path) -> Frames | None:
                 f"{_kind(images[0])}; all images must have the sensor's size and one depth"
             )
     if not images:
-        return None
+        return None, {}
     t = times(np.array(stamps), source, "image")
-    return Frames(t, np.stack(images), np.zeros_like(t))
+    return Frames(t, np.stack(images), np.zeros_like(t)), kept_colours(colours)
 
 
-def _image(path: Path, root: Path | zipfile.Path, name: str) -> NDArray:
+def _image(
+    path: Path, root: Path | zipfile.Path, name: str
+) -> tuple[NDArray, NDArray[np.uint8] | None]:
     if name.startswith(("/", "\\")) or ".." in re.split(r"[/\\]", name):
         raise InputError(f"{path}: images.txt names {name}, outside the recording; copy it inside")
     file = root / name
@@ -203,7 +210,7 @@ def _image(path: Path, root: Path | zipfile.Path, name: str) -> NDArray:
             "its line"
         )
     with reading(f"{path}: {name}"), file.open("rb") as stream:
-        return read_image(stream, f"{path}: {name}", grey=True)
+        return read_grey_and_colour(stream, f"{path}: {name}")
 
 
 def _kind(image: NDArray) -> str:

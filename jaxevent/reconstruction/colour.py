@@ -120,7 +120,8 @@ def colour_video(
 
     @functools.lru_cache(maxsize=4)
     def chroma(frame: int) -> NDArray[np.floating]:
-        return chrominance(table[np.asarray(rgb[frame])], black=black, white=white)
+        colours = np.asarray(rgb[frame : frame + 1])[0]  # of a file, perhaps
+        return chrominance(table[colours], black=black, white=white)
 
     def colours(times: Times, extrapolate: bool = False) -> NDArray[np.floating]:
         image = video(times, extrapolate).mean

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.io import load
-from jaxevent.io.images import Scale, is_series, read_series
+from jaxevent.io.images import Scale, is_series, kept_colours, read_series
 from jaxevent.recording import Events, Frames, Recording
 
 _I0 = 0.05  # intensity inside logarithms: noise of dark pixels stays small
@@ -31,6 +31,7 @@ def read_frames(
     of lines "t name", or HDF5 of t and image. `exposure` (s) is that of the latter, which do not
     tell it. With `reference`, of a recording its HDR images are taken if it holds any
     (`extra["hdr"]` and `extra["hdr_t"]`), and `white` is the value of images that is intensity 1.
+    Colours of frames are kept in `extra["rgb"]`.
     Raises `InputError` for what cannot be read and where there are no frames.
     """
 
@@ -69,7 +70,9 @@ def _read_series(
         raise InputError(f"{path}: white = {white} is not possible; give a number above 0")
     series = read_series(path, Scale(white))
     images: list[NDArray[np.float32]] = []
+    colours: list[NDArray[np.uint8] | None] = []
     for row in range(len(series.t)):
+        colours.append(None if reference else series.colour(row))
         image = series.read(row).astype(np.float32)
         if images and image.shape != images[0].shape:
             raise InputError(
@@ -82,7 +85,8 @@ def _read_series(
     height, width = images[0].shape
     if not reference:
         frames.check(width, height, str(path))
-    return Recording(path.name, width, height, Events.empty(), frames)
+    extra = kept_colours(colours)
+    return Recording(path.name, width, height, Events.empty(), frames, extra=extra)
 
 
 def log_image(other: Recording, row: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
