@@ -50,7 +50,7 @@ class Pixel:
 
     def sharp(self, k):
         """EDI: log intensity at mid-exposure of frame k."""
-        level = math.log(self.grey[k] + self.p["I0"])
+        level = math.log(self.grey[k] + self.p["I0"]) + self.shift(k)
         if self.T[k] == 0:
             return level
         inside = [t for t in self.t if self.left[k] <= t < self.right[k]]
@@ -61,6 +61,13 @@ class Pixel:
             E = self.before(b) - self.before(self.mid[k])
             m += (b - a) / self.T[k] * math.exp(E)
         return level - math.log(m)
+
+    def shift(self, k):
+        """What is added for the mean error of a noisy frame's log (6)."""
+        if not self.p.get("log_bias"):
+            return 0.0
+        spread = 1 / (self.p["kappa"] * self.w(k) * (self.grey[k] + self.p["I0"]) ** 2)
+        return min(max(self.p["log_bias"] * spread / 2, -0.5), 0.5)
 
     def at_left(self, k):
         return self.sharp(k) + self.before(self.left[k]) - self.before(self.mid[k])

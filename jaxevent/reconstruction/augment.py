@@ -154,15 +154,17 @@ def clock_lag(params: FrameParams, frames: FrameFeatures) -> Float[Array, ""]:
 
 
 def deblur_frames(
-    params: FrameParams, frames: FrameFeatures
+    params: FrameParams,
+    frames: FrameFeatures,
+    shift: Float[Array, "frames pixels"] | float = 0.0,
 ) -> tuple[Float[Array, "frames pixels"], Float[Array, "frames pixels"]]:
     """Log intensity at the left and right edge of each exposure (event double integral).
 
     The exposure averages exp(E(t)), E the events' change since mid-exposure. E is piecewise
     constant, so the mean is exact: m = 1 + sum over segments of share (exp(E) - 1), and
-    l(D) = ln((I + I0) / m).
+    l(D) = ln((I + I0) / m). `shift` is added to ln(I + I0).
     """
-    level = jnp.log(frames.intensity + params.I0)
+    level = jnp.log(frames.intensity + params.I0) + shift
     if frames.segments is None or frames.head is None or frames.tail is None:
         return level, level
     s = frames.segments
@@ -219,8 +221,13 @@ class Augmented(Level):
     tilt: Float[Array, "pieces pixels"] | None
     lag: Float[Array, " pieces"]
 
-    def __init__(self, params: AugmentParams, frames: FrameFeatures):
-        left, right = deblur_frames(params, frames)
+    def __init__(
+        self,
+        params: AugmentParams,
+        frames: FrameFeatures,
+        shift: Float[Array, "frames pixels"] | float = 0.0,
+    ):
+        left, right = deblur_frames(params, frames, shift)
         span = brightness(params, frames.span[0], frames.span[1])  # row f: from frame f to f + 1
         following = jnp.roll(right, -1, axis=0)
         ratio = (following - left) / jnp.where(span == 0, 1, span)

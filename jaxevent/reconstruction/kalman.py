@@ -34,6 +34,11 @@ class Params(AugmentParams):
     kappa = Positive(
         7e5, "1 / (intensity^2 s)", "certainty of frames: 7e5 DAVIS, 7e7 FLIR", least=1e-12
     )
+    log_bias = Number(
+        0.0,
+        "Hz",
+        "added to ln I of frames for noise (6): the frame rate; -1 as the paper prints it",
+    )
     P0 = Positive(0.09, "(ln I)^2", "variance at the start")
     above = Number(0.0, "ln I", "how far above the bound of clipping saturated pixels start")
     below = Number(0.0, "ln I", "how far below the bound of clipping black pixels start")
@@ -70,6 +75,21 @@ class Params(AugmentParams):
         return found
 
 
+MOST_BIAS = 0.5  # ln I; the expansion holds for small noise
+
+
+def noise_bias(params: Params, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
+    """What is added to the log intensity of frames: `log_bias` Rbar / (2 (I + I0)^2), (6).
+
+    Of a noisy I with the variance V the log is too low by V / (2 (I + I0)^2) on average, to second
+    order; V is the density Rbar times the frame rate. (6) subtracts Rbar / (2 (I + I0)^2) "to
+    compensate", which doubles what it means to undo. At most `MOST_BIAS` is added.
+    """
+    Rbar = 1 / (params.kappa * belief(params, frames))
+    bias = params.log_bias * Rbar / (2 * (jnp.asarray(frames.intensity) + params.I0) ** 2)
+    return jnp.clip(bias, -MOST_BIAS, MOST_BIAS)
+
+
 class Augmentation(Observer):
     """L^A, and 1/R with R = Rbar / (I + I0)^2, Rbar and I linear between frames (4), (5), (7).
 
@@ -90,7 +110,7 @@ class Augmentation(Observer):
     push: Float[Array, "frames pixels"] | None
 
     def __init__(self, params: Params, frames: FrameFeatures):
-        self.level = Augmented(params, frames)
+        self.level = Augmented(params, frames, noise_bias(params, frames))
         self.I0, self.present = params.I0, jnp.asarray(frames.present)
         if params.weighting == "certainty":
             self.image = None

@@ -43,6 +43,7 @@ OPTIONS = {
     "margin": 2.5,
     "w_min": 1e-3,
     "certainty": [0.5, 1.3, 2.0, 0.7],
+    "log_bias": 40.0,
     "rho_width": 0.4,
     "above": 0.7,
     "below": 0.4,
@@ -121,7 +122,7 @@ METHODS = [
     recording=recordings(),
     offset=st.sampled_from([0.0, 0.0007, -0.0021]),
     values=st.sampled_from(
-        [PARAMS, OPTIONS, {**OPTIONS, "weighting": "linear", "one_sided": False}]
+        [PARAMS, OPTIONS, {**OPTIONS, "weighting": "linear", "one_sided": False, "log_bias": -9.0}]
     ),
 )
 def test_chain_equals_loop_over_events(name, recording, offset, values):
