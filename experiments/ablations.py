@@ -1,8 +1,11 @@
-"""What each part of the fitted filter is worth on the test scenes of ahdr.py; makes the table.
+"""What each part of the filter is worth on the test scenes of ahdr.py; makes the table.
 
-    python experiments/ahdr.py --out ahdr && python experiments/ablations.py --out ahdr
+    python experiments/ablations.py --out ablations
 
 Runs configs/ablations.toml; numbers are geometric means over recordings, as factors of the whole.
+In a folder that ahdr.py made the filter is the one that was fitted there. In another one the test
+scenes are recorded, one seed, and the filter is `preset = "hdr"` with the sensor's thresholds and
+dead time.
 """
 
 import argparse
@@ -12,7 +15,10 @@ from pathlib import Path
 
 import ahdr
 
+import jaxevent
+from jaxevent.io import toml
 from jaxevent.runs.evaluate import evaluate
+from jaxevent.simulate import SENSORS
 
 CONFIG = Path(__file__).parents[1] / "configs" / "ablations.toml"
 SHOWN = ("MSE", "log MSE", "bright MSE", "dark log MSE", "well-exposed MSE")
@@ -20,9 +26,16 @@ SHOWN = ("MSE", "log MSE", "bright MSE", "dark log MSE", "well-exposed MSE")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="the folder ahdr.py wrote")
+    parser.add_argument("--out", type=Path, required=True, help="its folder, or that of ahdr.py")
     out = parser.parse_args().out.absolute()
     os.environ["AHDR"] = str(out)
+    if not (out / "fitted" / "params.toml").exists():
+        ahdr.record(out / "test", ahdr.TESTING, range(2, 3), "davis")
+        sensor = SENSORS["davis"]
+        known = {"c_on": sensor.c_on, "c_off": sensor.c_off, "rho_ref": sensor.refractory}
+        params = jaxevent.akf.Params.of({"preset": "hdr", **known})
+        (out / "fitted").mkdir(exist_ok=True)
+        (out / "fitted" / "params.toml").write_text(f"[akf]\n{toml.parameters(params)}\n")
     rows = [{**row, "seed": 0} for row in evaluate(CONFIG, out / "ablations", progress=True)]
     labels = list(dict.fromkeys(row["method"] for row in rows))
 

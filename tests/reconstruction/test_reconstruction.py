@@ -329,23 +329,18 @@ def test_deblurring_a_blur_made_from_events_returns_the_sharp_image():
 # The authors' program
 
 
-@pytest.mark.parametrize("name", ["mini_akf_deblur_hfr300", "mini_akf_nodeblur_hfr300"])
-def test_step_reproduces_the_authors_program(name, golden):
-    """Row by row: state before each event, augmented frame, certainty and noise as they recorded.
+def recorded(path):
+    """What the authors' program did at each event: a pixel's L and P before it, and its row.
 
     A pixel's state is its previous row, or the last image written after that row (their program
-    updates every pixel whenever it writes one).
+    updates every pixel whenever it writes one). Files of the complementary filter have no P.
     """
-    z = np.load(golden / f"{name}.npz")
+    z = np.load(path)
     columns = [str(c) for c in z["ev_columns"]]
     par = json.loads(str(z["par_json"]))
-    c = float(z["in_ct"])
-    # Their noise is fed as recorded: sigma_iso = 1 makes `near` a variance.
-    params = jaxevent.akf.Params(
-        c_on=c, c_off=c, sigma_proc=par["sigma_p"] ** 0.5, sigma_iso=1.0, sigma_ref=0.0
-    )
     L = np.log(z["in_image"][:, :, 1] / 255 + 1)
     P = np.full(L.shape, par["p_ini"])
+    images_P = z["snap_P"] if "snap_P" in z else np.broadcast_to(P, z["snap_L"].shape)
     writes = sorted(zip(z["snap_event"], z["snap_kind"], range(len(z["snap_ts"])), strict=True))
     before, path = [], []
     for values in z["ev"]:
@@ -353,13 +348,25 @@ def test_step_reproduces_the_authors_program(name, golden):
         # Images of kind 1 come before the update of their event, of kind 2 after it.
         while writes and (writes[0][0], writes[0][1]) < (row["i"], 2):
             snapshot = writes.pop(0)[2]
-            L, P = z["snap_L"][snapshot].copy(), z["snap_P"][snapshot].copy()
+            L, P = z["snap_L"][snapshot].copy(), images_P[snapshot].copy()
         at = int(row["y"]) - 1, int(row["x"]) - 1
         before.append((L[at], P[at]))
         path.append(row)
-        L[at], P[at] = row["L_after"], row["P_after"]
+        L[at], P[at] = row["L_after"], row.get("P_after", par["p_ini"])
     state = State(*(jnp.asarray(v) for v in zip(*before, strict=True)))
     rows = {k: jnp.asarray([row[k] for row in path]) for k in columns}
+    assert len(path) == 1257
+    return par, float(z["in_ct"]), state, rows
+
+
+@pytest.mark.parametrize("name", ["mini_akf_deblur_hfr300", "mini_akf_nodeblur_hfr300"])
+def test_step_reproduces_the_authors_program(name, golden):
+    """Row by row: state, augmented frame, certainty and noise as they recorded them."""
+    par, c, state, rows = recorded(golden / f"{name}.npz")
+    # Their noise is fed as recorded: sigma_iso = 1 makes `near` a variance.
+    params = jaxevent.akf.Params(
+        c_on=c, c_off=c, sigma_proc=par["sigma_p"] ** 0.5, sigma_iso=1.0, sigma_ref=0.0
+    )
     event = Event(
         rows["delta_t_s"],
         rows["Q_i"] + rows["Q_r"],
@@ -367,9 +374,23 @@ def test_step_reproduces_the_authors_program(name, golden):
         Observation(rows["LA_used"], rows["Rinv_used"]),
     )
     after = jax.vmap(lambda s, e: jaxevent.akf.step(params, s, e))(state, event)
-    assert len(path) == 1257
     np.testing.assert_allclose(after.L, rows["L_after"], rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(after.P, rows["P_after"], rtol=1e-12)
+
+
+def test_step_reproduces_the_authors_complementary_filter(golden):
+    """The same of their filter with a constant gain on the augmented frame, 15 rad/s."""
+    par, c, state, rows = recorded(golden / "mini_eaf_cf15_hfr300.npz")
+    params = jaxevent.cf_augmented.Params(c_on=c, c_off=c, alpha=par["cutoff_rad_s"])
+    event = Event(
+        rows["delta_t_s"],
+        jnp.zeros_like(rows["delta_t_s"]),
+        rows["polarity"].astype(int),
+        Observation(rows["LA_used"], jnp.full_like(rows["LA_used"], params.alpha)),
+    )
+    after = jax.vmap(lambda s, e: jaxevent.cf_augmented.step(params, s, e))(state, event)
+    np.testing.assert_allclose(after.L, rows["L_after"], rtol=1e-12, atol=1e-15)
+    assert par["cutoff_rad_s"] == 15 and float(jnp.abs(rows["LA_used"] - state.L).max()) > 0.1
 
 
 # Pure functions
