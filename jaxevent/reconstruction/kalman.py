@@ -87,7 +87,7 @@ def noise_bias(params: Params, frames: FrameFeatures) -> Float[Array, "frames pi
     """
     Rbar = 1 / (params.kappa * belief(params, frames))
     bias = params.log_bias * Rbar / (2 * (jnp.asarray(frames.intensity) + params.I0) ** 2)
-    return jnp.clip(bias, -MOST_BIAS, MOST_BIAS)
+    return jnp.asarray(frames.present) * jnp.clip(bias, -MOST_BIAS, MOST_BIAS)
 
 
 class Augmentation(Observer):
