@@ -2,12 +2,11 @@
 
     python experiments/log_bias.py                  # some minutes on two shared cores
 
-Scenes of `jaxevent.simulate`, 96x72 pixels, panned slowly and fast, recorded by a DAVIS whose frames
-have little and much read noise. The AKF with the sensor's thresholds, with
-`log_bias` 0 (none), -1 (subtracted, as (6) prints it) and the frame rate (what makes it good), by
-the paper's constants and by `preset = "hdr"`; with them as they are, and with `kappa` such
-that 1 / (kappa w) times the frame rate is the variance that the read noise has. Geometric
-means over scenes and seeds.
+Scenes of `jaxevent.simulate`, 96x72 pixels, panned slowly and fast, recorded by a DAVIS whose
+frames have little and much read noise. The AKF with the sensor's thresholds, with `log_bias` 0
+(none), -1 (subtracted, as (6) prints it) and the frame rate (what makes it good), by the paper's
+constants and by `preset = "hdr"`; and by the paper's with `kappa` such that 1 / (kappa w) times the
+frame rate is the variance of the read noise. Geometric means over scenes and seeds.
 """
 
 import argparse
@@ -18,12 +17,12 @@ import numpy as np
 import jaxevent
 from jaxevent.runs.scores import score
 from jaxevent.simulate import SENSORS, Pan, scene, simulate
+from jaxevent.simulate.scenes import Speed
 
-SCENES = (("lake", "slow"), ("room", "fast"), ("forest", "slow"))
+SCENES: tuple[tuple[str, Speed], ...] = (("lake", "slow"), ("room", "fast"), ("forest", "slow"))
 NOISES = (0.7, 6.0)  # grey levels
 RATE = 50.0  # frames per second
 SIZE = (96, 72)
-SHOWN = ("mse", "log_mse", "dark", "well")
 
 
 def measures(row: dict) -> list[float]:

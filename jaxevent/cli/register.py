@@ -1,5 +1,6 @@
 """The command `jaxevent register`."""
 
+import argparse
 import dataclasses
 from pathlib import Path
 from typing import Any, Literal
@@ -59,6 +60,22 @@ def add(commands: Any) -> None:
         type=arguments.plane,
         help="instead: the scene is a x + b y + c z = d (m); --plane=A,... where A is negative",
     )
+    _add_clock(one)
+    one.add_argument(
+        "--exposure", metavar="S", type=float, help="of images in a folder, which do not tell it"
+    )
+    one.add_argument(
+        "--white", metavar="V", type=float, help="their value of intensity 1; default: the largest"
+    )
+    one.add_argument(
+        "--crop", action="store_true", help="cut to a rectangle of pixels that both cameras see"
+    )
+    arguments.add_size(one)
+    arguments.add_stream(one)
+    arguments.add_output(one, "--out", metavar="FILE", required=True, help="the HDF5 file to write")
+
+
+def _add_clock(one: argparse.ArgumentParser) -> None:
     one.add_argument(
         "--offset",
         metavar="S",
@@ -81,18 +98,23 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--search", metavar="S", type=float, help="the largest offset that is thought possible"
     )
-    one.add_argument(
-        "--exposure", metavar="S", type=float, help="of images in a folder, which do not tell it"
-    )
-    one.add_argument(
-        "--white", metavar="V", type=float, help="their value of intensity 1; default: the largest"
-    )
-    one.add_argument(
-        "--crop", action="store_true", help="cut to a rectangle of pixels that both cameras see"
-    )
-    arguments.add_size(one)
-    arguments.add_stream(one)
-    arguments.add_output(one, "--out", metavar="FILE", required=True, help="the HDF5 file to write")
+
+
+def _check(given: set[str]) -> None:
+    """Raise `InputError` for options that do not go together, of those that are given."""
+    for one, other in (("homography", "calibration"), ("depth", "plane")):
+        if {one, other} <= given:
+            raise InputError(f"--{one} and --{other} say the same; leave one of them out")
+    for name in ("depth", "plane"):
+        if name in given and "calibration" not in given:
+            raise InputError(f"--{name} needs --calibration; add it or leave --{name} out")
+    if "channel" in given and "triggers" not in given:
+        raise InputError("--channel is that of triggers; add --triggers or leave it out")
+    for name in ("triggers", "crop"):
+        if {name, "reference"} <= given:
+            raise InputError(f"--{name} is for frames; leave it out with --reference")
+    if {"offset", "search"} <= given and "triggers" not in given:
+        raise InputError("--search is for an offset that is not known; leave it out with --offset")
 
 
 def run(
@@ -118,22 +140,13 @@ def run(
     from jaxevent.io import load, save
     from jaxevent.io.output import complete
 
-    if homography is not None and calibration is not None:
-        raise InputError("--homography and --calibration say the same; leave one of them out")
-    for name, value in (("depth", depth), ("plane", plane)):
-        if value is not None and calibration is None:
-            raise InputError(f"--{name} needs --calibration; add it or leave --{name} out")
-    if depth is not None and plane is not None:
-        raise InputError("--depth and --plane say the same; leave one of them out")
-    if channel is not None and triggers is None:
-        raise InputError("--channel is that of triggers; add --triggers or leave it out")
-    if triggers is not None and reference is not None:
-        raise InputError("--triggers is for frames; leave it out with --reference")
+    given = {
+        "homography": homography, "calibration": calibration, "depth": depth, "plane": plane,
+        "offset": offset, "search": search, "channel": channel, "triggers": triggers,
+        "reference": reference, "crop": crop or None,
+    }  # fmt: skip
+    _check({name for name, value in given.items() if value is not None})
     lag, offset = (offset, None) if triggers is not None else (None, offset)
-    if offset is not None and search is not None:
-        raise InputError("--search is for an offset that is not known; leave it out with --offset")
-    if crop and reference is not None:
-        raise InputError("--crop is for frames; leave it out with --reference")
     source = frames or reference
     assert source is not None
     other = rig.read_frames(
