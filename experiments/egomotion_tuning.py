@@ -130,7 +130,7 @@ class Problem:
 
     def __call__(self, params: Params) -> tuple[Loss, list, list]:
         """The loss, and windows to fit to and unseen ones."""
-        goal = Simulated(voting, Loss(), self.model, "", RUNS, SETTLE, (0.0, 0.0, 0.0), self.truths)
+        goal = Simulated(voting, Loss(), self.model, "", RUNS, SETTLE, {}, self.truths)
         return goal.loss, *goal.problem(self.sources, None, None)(params)
 
 

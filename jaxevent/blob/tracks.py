@@ -366,6 +366,7 @@ class Tracks:
             if upto > done:
                 following = None
                 if self.smooth:
+                    assert told.slots is not None
                     following, _ = self._look_back(stretch, told.slots, self._later)
                 yield stretch, told.slots, following
             done = upto
@@ -415,6 +416,7 @@ class Tracks:
             for mark, state in self._backwards():
                 stretch = self._packing.pack(mark)
                 _, told = self._run(state, stretch.features)
+                assert told.slots is not None
                 _, first = self._look_back(stretch, told.slots, found)
                 found[mark] = jax.device_get(first)
                 shown.update(int(np.count_nonzero(stretch.features.valid)))
