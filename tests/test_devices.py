@@ -115,8 +115,8 @@ def reconstructions(folder: Path) -> dict[str, Any]:
 def video(folder: Path) -> dict[str, Any]:
     """Images of windows one after another."""
     recording = jaxevent.load(folder / "moving.h5")
-    akf = METHODS["akf"].estimate(recording, window_events=4000, devices=devices.local())
-    return {"akf": akf(np.linspace(0.05, 0.45, 5))}
+    cf = METHODS["cf"].estimate(recording, window_events=4000, devices=devices.local())
+    return {"windows": cf(np.linspace(0.05, 0.45, 5))}
 
 
 def motions(folder: Path) -> dict[str, Any]:
@@ -197,7 +197,7 @@ def test_pixels_are_the_same_on_four_devices(both):
     one, four = both
     assert (one["shared out"], four["shared out"]) == (1, 4)
     assert np.array_equal(one["cf"], four["cf"])
-    for name in ("akf", "aks"):
+    for name in ("windows", "aks"):
         # How the compiler contracts a b + c depends on what it fuses: the last bit or two.
         for a, b in zip(one[name], four[name], strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-15)

@@ -42,12 +42,13 @@ def crossing(rng, events=2400, seconds=0.03):
 
 CASES = {
     "moment": {"events_per_step": 1},
-    "constant_velocity": {"events_per_step": 6},
+    "constant_velocity": {
+        "events_per_step": 6, "association": "nearest", "gate_shape": "circle",
+    },
     "moving_moments": {"events_per_step": 6},
     "batches": {"events_per_step": 8, "tau_q": 0.01, "t_still": 1e-3},
     "clutter": {"events_per_step": 5, "clutter": 1e-3, "polarity_offset": True},
-    "nearest": {"events_per_step": 8, "association": "nearest", "gate_shape": "circle"},
-}
+}  # fmt: skip
 
 
 @pytest.mark.slow

@@ -158,7 +158,7 @@ def test_stretches_chunks_and_births_do_not_matter(three):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["moment", "chi2", "chi2_split"])
+@pytest.mark.parametrize("method", ["moment", "chi2"])
 def test_smoothed_states_are_nearer_and_know_it(three, method):
     rec, truth = three
     tracker = getattr(blob, method)

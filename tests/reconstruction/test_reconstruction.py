@@ -224,6 +224,7 @@ def test_many_frames_and_uneven_pixels_in_windows():
 
 
 @pytest.mark.slow
+@settings(max_examples=10)
 @given(recording=recordings())
 def test_reading_more_times_changes_nothing(recording):
     params = params_of(jaxevent.akf, **PARAMS)
@@ -237,6 +238,7 @@ def test_reading_more_times_changes_nothing(recording):
 
 
 @pytest.mark.slow
+@settings(max_examples=10)
 @given(recording=recordings())
 def test_later_clock_changes_nothing(recording):
     shift = 10**9
@@ -255,6 +257,7 @@ def test_later_clock_changes_nothing(recording):
 
 
 @pytest.mark.slow
+@settings(max_examples=10)
 @given(recording=recordings(fewest_frames=1))
 def test_order_of_pixels_changes_nothing(recording):
     """Mirrored in x and y, the neighbourhoods stay and every pixel gets another number."""
