@@ -213,34 +213,24 @@ def _sum(
 ) -> Float[Array, "K N"]:
     """S = sum_c `vote` over candidates of the ages asked for.
 
-    Those that are too young or too old for all particles, most of them, are left out: of each event
-    the others are looked up in order. Blocks that hold none are skipped, by a condition outside of
-    the maps, within which both sides would be computed.
+    Candidates fill their places from the first, so the later blocks of most batches hold none and
+    are skipped: by a condition outside of the maps, within which both sides would be computed.
     """
-    age, d = jnp.asarray(batch.age), jnp.asarray(batch.d)
-    pad = -len(age) % BLOCK
-    some = (age >= ages.youngest.min(-1)) & (age <= ages.oldest.max(-1)) & (age > 0)
-    before = jnp.cumsum(some, 0)  # and this one
+    C, K = batch.age.shape
+    pad = -C % BLOCK
+    age = jnp.pad(jnp.asarray(batch.age), [(0, pad), (0, 0)]).reshape(-1, BLOCK, K)
+    d = jnp.pad(jnp.asarray(batch.d), [(0, 0), (0, pad), (0, 0)]).reshape(2, -1, BLOCK, K)
     votes = each(vote, EVENT, EVENT, BOTH, BOTH, BOTH, SAME, SAME)
 
-    def add(S, first):
-        place = first + 1 + jnp.arange(BLOCK)[:, None]
-        at = (before < place[:, None]).sum(1)  # of the place's candidate; all if there is none
-        there = place <= before[-1]
-        at = jnp.where(there, at, 0)
-        dt = jnp.where(there, jnp.take_along_axis(age, at, 0), -1)
-        dx, dy = (jnp.take_along_axis(part, at, 0) for part in d)
+    def add(S, dx, dy, age):
         for c in range(BLOCK):
-            S = S + votes((dx[c], dy[c]), dt[c], U, line, ages, exponent, rho_max)
+            S = S + votes((dx[c], dy[c]), age[c], U, line, ages, exponent, rho_max)
         return S
 
-    most = before[-1].max()
+    def body(S, block):
+        return lax.cond((block[2] > 0).any(), add, lambda S, *_: S, S, *block), None
 
-    def body(S, first):
-        return lax.cond(first < most, add, lambda S, _: S, S, first), None
-
-    blocks = jnp.arange(0, len(age) + pad, BLOCK)
-    return lax.scan(body, jnp.zeros_like(U[0]), blocks)[0]
+    return lax.scan(body, jnp.zeros_like(U[0]), (d[0], d[1], age))[0]
 
 
 def miss(
