@@ -218,7 +218,8 @@ def test_figure_is_a_grid_of_panels(tmp_path, count, rows, columns):
     assert [path.name for path in tmp_path.iterdir()] == ["figure.png"]
 
 
-def test_figures_do_not_depend_on_each_other(tmp_path):
+def test_figures_do_not_depend_on_each_other(tmp_path, monkeypatch):
+    monkeypatch.delitem(sys.modules, "matplotlib.pyplot", raising=False)  # of another test
     for name in ("a.png", "b.png"):
         comparison_figure(tmp_path / name, panels())
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
