@@ -44,20 +44,20 @@ class Stretch(NamedTuple):
 class Batch(eqx.Module):
     """A prepared stretch to be fitted to: what is true of it, and the estimates of some runs."""
 
-    time: eqx.AbstractVar[Float[Array | np.ndarray, " T"]]  # s since the stretch's start
-    grid: eqx.AbstractVar[Float[Array | np.ndarray, " G"]]  # s, of the truth
-    truth: eqx.AbstractVar[Float[Array | np.ndarray, "G d"]]
-    counted: eqx.AbstractVar[Float[Array | np.ndarray, " T"]]  # 1: the error counts
-    weight: eqx.AbstractVar[Float[Array | np.ndarray, ""]]
-    model: eqx.AbstractVar[Model]
+    time: Float[Array | np.ndarray, " T"]  # s since the stretch's start
+    grid: Float[Array | np.ndarray, " G"]  # s, of the truth
+    truth: Float[Array | np.ndarray, "G d"]
+    counted: Float[Array | np.ndarray, " T"]  # 1: the error counts
+    weight: Float[Array | np.ndarray, ""]
+    model: Model
 
     def estimates(self, params: Any) -> tuple[Float[Array, "runs T d"], Float[Array, "runs T"]]:
         """Means of every run, and by how much (s) what was seen is older; differentiable."""
         raise NotImplementedError
 
     def over(self, devices: Sequence[Any]) -> "Batch":
-        """The batch on several devices."""
-        raise NotImplementedError
+        """The batch on several devices; on the first of them, where it is not shared out."""
+        return jax.device_put(self, devices[0])
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -176,12 +176,6 @@ def truth_of(stretch: Stretch) -> tuple[NDArray[np.float64], NDArray[np.float64]
 class Stacked(Batch):
     """Of any differentiable estimator: what it prepares for every run, one after another."""
 
-    time: Float[Array | np.ndarray, " T"]
-    grid: Float[Array | np.ndarray, " G"]
-    truth: Float[Array | np.ndarray, "G d"]
-    counted: Float[Array | np.ndarray, " T"]
-    weight: Float[Array | np.ndarray, ""]
-    model: Model
     prepared: tuple[tuple[Any, Any], ...]  # features and out of every run
     method: Any = eqx.field(static=True)
 
@@ -215,19 +209,10 @@ class Stacked(Batch):
         means = jnp.stack(means)
         return means, jnp.zeros(means.shape[:2], means.dtype)
 
-    def over(self, devices: Sequence[Any]) -> "Stacked":
-        return jax.device_put(self, devices[0])
-
 
 class Told(Batch):
     """A stretch whose motion was told when it was prepared, by a method on the host."""
 
-    time: Float[Array | np.ndarray, " T"]
-    grid: Float[Array | np.ndarray, " G"]
-    truth: Float[Array | np.ndarray, "G d"]
-    counted: Float[Array | np.ndarray, " T"]
-    weight: Float[Array | np.ndarray, ""]
-    model: Model
     mean: Float[Array | np.ndarray, "runs T d"]
 
     def estimates(self, params: Any) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from jaxevent.errors import InputError, require
 from jaxevent.io.images import is_series, read_series
 from jaxevent.io.output import complete
 from jaxevent.reconstruction.video import ImageSequence
-from jaxevent.recording import Recording
+from jaxevent.recording import Recording, microseconds
 from jaxevent.show.track_tables import COLUMNS
 
 ON, OFF = (200, 64, 30), (58, 120, 181)
@@ -122,7 +122,7 @@ class _Sender:
             u, v = 2 * along * np.cos(CIRCLE), 2 * across * np.sin(CIRCLE)
             c, s = np.cos(angle), np.sin(angle)
             outline = np.stack([x + c * u - s * v, y + s * u + c * v], 2) + 0.5
-            t = np.rint(rows["t"].to_numpy() * 1e6).astype(np.int64)
+            t = microseconds(rows["t"].to_numpy(np.float64))
             columns = rerun.LineStrips2D.columns(
                 strips=list(outline), labels=[str(number)] * len(rows)
             )
@@ -138,7 +138,7 @@ class _Sender:
         for name in names:
             values = table[name].to_numpy(np.float64)
             known = np.isfinite(values)
-            t = np.rint(table["t"].to_numpy(np.float64)[known] * 1e6).astype(np.int64)
+            t = microseconds(table["t"].to_numpy(np.float64)[known])
             columns = self._rerun.Scalars.columns(scalars=values[known])
             self._stream.send_columns(f"motion/{name}", self._times(t), columns)
 

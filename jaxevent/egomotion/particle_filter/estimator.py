@@ -300,12 +300,6 @@ class Voting(MotionEstimator[Params]):
 class Followed(Batch):
     """A stretch whose motion is followed from its true beginning on, in some runs."""
 
-    time: Float[Array | np.ndarray, " batches"]
-    grid: Float[Array | np.ndarray, " T"]
-    truth: Float[Array | np.ndarray, "T d"]
-    counted: Float[Array | np.ndarray, " batches"]
-    weight: Float[Array | np.ndarray, ""]
-    model: Model
     candidates: Candidates
     noise: Noise  # leaves begin with [runs]
     start: Float[Array | np.ndarray, "N d"]  # standard normal, of the first particles
