@@ -56,11 +56,6 @@ _SIZES = (  # of sensors whose files may not tell their size, by the name of Met
 )
 
 
-def is_prophesee(head: bytes) -> bool:
-    """Whether a file that begins so has the header of RAW and DAT files."""
-    return head.startswith(b"% ")
-
-
 def read(
     path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
 ) -> Recording:
