@@ -2,19 +2,21 @@
 .DELETE_ON_ERROR:
 
 bin := .venv/bin
+# A worker that dies is a failed test and the end: pytest-xdist would wait for it for ever.
+suite := $(bin)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 install := $(bin)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e
 
 demo: .venv/demo.stamp
 	$(bin)/jaxevent demo
 
 test: lint
-	$(bin)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+	$(suite)
 
 # For the edit loop: no types, and none of the tests that take long.
 quick: .venv/test.stamp
 	$(bin)/ruff check
 	$(bin)/ruff format --check
-	$(bin)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "not slow"
+	$(suite) -m "not slow"
 
 lint: .venv/test.stamp
 	$(bin)/ruff check
