@@ -154,13 +154,14 @@ def from_akf(seed: int, size: tuple[int, int] = (64, 48)) -> Recording:
     return Recording("akf", width, height, events, frames, extra=extra).check()
 
 
-def akf_recovery(seed: int) -> Recovered:
+def akf_recovery(seed: int, size: tuple[int, int] = (64, 48)) -> Recovered:
     """Of the AKF, by the likelihood of an image at the end; frames tell nothing but the start."""
     start = jaxevent.akf.Params(
         c_on=0.2, c_off=0.2, sigma_proc=0.1, sigma_iso=0.2, sigma_ref=0.1, rho=RHO, I0=I0, P0=P0,
         kappa=1e-9, calibrate=False, deblur=False,
     )  # fmt: skip
-    problem = Problem(Objective(jaxevent.akf, "nll", False), parts(from_akf(seed), "reference"))
+    drawn = parts(from_akf(seed, size), "reference")
+    problem = Problem(Objective(jaxevent.akf, "nll", False), drawn)
     settings = Settings(iterations=80, learning_rate=0.1, rounds=2)
     return AKF, found_by(problem.objective, start, list(AKF), problem, settings)
 

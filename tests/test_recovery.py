@@ -17,9 +17,9 @@ def recovery():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", ["smoother", "akf"])
-def test_intervals_hold_what_the_data_were_drawn_with(recovery, part):
-    true, told = recovery.PARTS[part](0)
+@pytest.mark.parametrize("part, few", [("model", {}), ("akf", {"size": (40, 32)})])
+def test_intervals_hold_what_the_data_were_drawn_with(recovery, part, few, optimised):
+    true, told = getattr(recovery, f"{part}_recovery")(0, **few)
     for name, value in true.items():
         one = told[name]
         assert one.holds(value) and not one.holds(one.start), (name, value, one)

@@ -77,7 +77,7 @@ def test_a_fit_of_process_noise_improves_what_it_has_not_seen(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_the_gradient_with_resampling_is_that_of_common_random_numbers():
-    """Of the mean estimate, over 256 seeds, within three standard errors.
+    """Of the mean estimate, over 128 seeds, within three standard errors.
 
     Of squared errors it is so only for many particles: the carried score tells how the mean of an
     estimate changes, not how its variance does, which is of the order of 1 / N.
@@ -100,7 +100,7 @@ def test_the_gradient_with_resampling_is_that_of_common_random_numbers():
     made = jax.tree.map(lambda leaf: jnp.asarray(leaf[-30:]), made)
     truth = jnp.asarray(VELOCITIES[0])
     names = ("alpha", "noise", "sigma_x")
-    keys = jax.random.split(jax.random.key(0), 256)
+    keys = jax.random.split(jax.random.key(0), 128)
 
     def loss(theta, key):
         raw = {name: params.raw[name] + theta[k] for k, name in enumerate(names)}
