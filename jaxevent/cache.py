@@ -7,6 +7,7 @@ JAXEVENT_CACHE=FOLDER names another folder.
 """
 
 import contextlib
+import gc
 import hashlib
 import os
 import platform
@@ -15,6 +16,10 @@ import warnings
 from pathlib import Path
 
 LEAST = 0.3  # s; shorter compilations are not worth a file
+
+# Of Linux's limit of 65,530, at which LLVM aborts the process. The programs that a method needs
+# for a recording of another shape have 500 (smoother) to 900 (mc).
+MAPS = 30_000
 
 
 def keep_compiled() -> Path | None:
@@ -54,6 +59,21 @@ def folder_for_compiled() -> Path | None:
     except OSError:  # no home, as in some containers: everything works without
         return None
     return folder if os.access(folder, os.W_OK) else None
+
+
+def release_compiled(maps: int = MAPS) -> None:
+    """Forget all compiled programs if the process has more than so many memory maps.
+
+    Each program keeps several maps. What is needed again is read from the cache folder.
+    """
+    jax = sys.modules.get("jax")
+    try:
+        many = len(Path("/proc/self/maps").read_bytes().splitlines()) > maps
+    except OSError:  # other systems have no such limit
+        return
+    if jax and many:
+        jax.clear_caches()
+        gc.collect()
 
 
 def _user_folder() -> Path:

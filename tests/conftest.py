@@ -30,8 +30,6 @@ hypothesis.settings.register_profile(
     "any", hypothesis.settings.get_profile("tests"), phases=(hypothesis.Phase.generate,)
 )
 
-MAPS = 10_000
-
 # They take longest. Begun first, they leave no worker waiting for another at the end.
 LONGEST = (
     "test_egomotion_batch.py",
@@ -52,15 +50,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def few_maps():
     """Release compiled programs before the process has too many of them.
 
-    Each keeps several memory maps, Linux grants a process 65,530, and LLVM aborts at the next. The
-    whole suite made 42,000 in its first quarter. What stays is not looked at again for garbage,
-    which took a tenth of the time of tests that came after others.
+    The whole suite made 42,000 in its first quarter, of 65,530. What stays is not looked at again
+    for garbage, which took a tenth of the time of tests that came after others.
     """
     yield
-    maps = Path("/proc/self/maps")
-    if maps.exists() and len(maps.read_bytes().splitlines()) > MAPS:
-        gc.unfreeze()
-        jax.clear_caches()
+    from jaxevent.cache import release_compiled  # not above: see there
+
+    gc.unfreeze()
+    release_compiled(10_000)
     gc.collect()
     gc.freeze()
 

@@ -1,10 +1,14 @@
-"""What the library tells JAX about keeping compiled programs, in fresh processes."""
+"""Compiled programs are kept on disk, for later processes, and released where they are too many."""
 
 import os
 import subprocess
 import sys
 
+import jax
 import pytest
+
+from jaxevent import cache
+from jaxevent.runs import tasks
 
 pytestmark = pytest.mark.slow
 
@@ -48,3 +52,22 @@ def test_what_was_compiled_is_found_again(tmp_path):
     )
     first = int(told(code, JAXEVENT_CACHE=tmp_path))
     assert first > 0 and int(told(code, JAXEVENT_CACHE=tmp_path)) == first
+
+
+def test_many_programs_are_released():
+    """Otherwise LLVM aborts a process that evaluates recordings of a hundred shapes."""
+    twice = jax.jit(lambda x: x * 2)
+    assert twice(1.0) == 2.0 and twice._cache_size() == 1
+    cache.release_compiled()
+    assert twice._cache_size() == 1  # there are not so many
+    cache.release_compiled(maps=0)
+    assert twice._cache_size() == (0 if sys.platform == "linux" else 1) and twice(1.0) == 2.0
+
+
+def test_they_are_released_after_each_task(monkeypatch):
+    released = []
+    monkeypatch.setattr(cache, "release_compiled", lambda: released.append(True))
+    assert tasks.attempt(dict, tasks.Task("done", {"a": 1}), None)["result"] == {"a": 1}
+    with pytest.raises(TypeError):
+        tasks.attempt(len, tasks.Task("failed", {}), None)
+    assert len(released) == 2

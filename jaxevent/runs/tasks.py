@@ -28,6 +28,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxevent import cache
 from jaxevent.devices import local
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.progress import bar
@@ -195,6 +196,8 @@ def attempt(function: Callable[..., Any], task: Task, folder: Path | None) -> di
     except Exception:
         _log(folder, task.key, f"failed\n{traceback.format_exc()}")
         raise
+    finally:
+        cache.release_compiled()  # a data set's recordings may have a hundred shapes
     # The caller stores it again where this fails, and says why if that fails too.
     with contextlib.suppress(InputError):
         _store(folder, task.key, record)
