@@ -25,6 +25,7 @@ from jaxevent.blob.targets import (
     seconds,
     shift_slots,
     silence_limits,
+    start_memory,
     start_states,
 )
 
@@ -65,7 +66,8 @@ def begin(filter: Filter, params: TrackerParams, features: Features) -> State:
     size = jnp.broadcast_to(params.lambda0, number).astype(real)
     state = start_states(filter, params, own, jnp.zeros((number, 2), real), size)
     free = jnp.zeros(number, bool)
-    slots = Slots(state, size, 0 * size, none, none, none, none, none - 1, free, own)
+    memory = start_memory(params, none, real)
+    slots = Slots(state, size, 0 * size, none, none, none, none, none - 1, free, own, memory)
     grid = None
     if features.detect:
         grid = Grid(jnp.zeros((3, *features.cells), real), jnp.zeros((), jnp.int32))
@@ -188,7 +190,7 @@ def judge(
     """Whether one target is confirmed and whether it ends.
 
     `now` is what it expects, `inside` whether it is within one lambda of an older one, `found`
-    whether it is no seed.
+    whether it is no seed. With `association = "authors"` a track ends by silence only.
     """
     alive = slot.id >= 0
     age = seconds(stop - slot.born, slot.gate)
@@ -220,6 +222,8 @@ def judge(
         [0, 7, 1, 2, 3, 4, 5, 6],
         0,
     ).astype(jnp.int32)
+    if params.association == "authors":
+        ended = jnp.where((ended >= 3) & (ended <= 6), 0, ended)
     return Verdict(confirmed, ended, jnp.where(ended == 1, slot.heard + limit, stop), since)
 
 

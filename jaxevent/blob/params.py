@@ -51,8 +51,9 @@ class TrackerParams(Parameters):
     )
 
     association = Choice(
-        ("soft", "nearest"),
-        "an event in several gates: shared by its likelihood (JPDA), or the likeliest target's",
+        ("soft", "nearest", "authors"),
+        "an event in several gates: shared by its likelihood (JPDA), or the likeliest target's; "
+        "authors: that of the nearest last position, as in the paper's program, ties included",
     )
     clutter = Positive(
         0.0, "1/px^2", "soft: density of stray events inside a gate, per event of the target"

@@ -101,7 +101,8 @@ class Packing:
         chunks: Of a stretch; None: as suits the steps.
 
     Raises:
-        InputError: A seed is outside the sensor or the time, or there is no time to track.
+        InputError: A seed is outside the sensor or the time, there is no time to track, or events
+            share steps though the association takes them singly.
     """
 
     def __init__(
@@ -117,6 +118,11 @@ class Packing:
         steps: int | None = None,
         chunks: int | None = None,
     ):
+        if params.association == "authors" and params.events_per_step > 1:
+            raise InputError(
+                f"{recording.name}: association = \"authors\" takes one event after the other, but "
+                f"events_per_step is {params.events_per_step}; omit it"
+            )
         begin, end = span_of(recording, start, stop)
         if found is not None:
             if seeds is not None or detect:

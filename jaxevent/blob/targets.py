@@ -5,6 +5,7 @@ inside its gate are shared out among the targets and update them. The steps of a
 target and are mapped over all of them here.
 """
 
+import dataclasses
 import functools
 import math
 from typing import Any, TypeVar
@@ -16,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxevent.blob.association import gate_radius
+from jaxevent.blob.authors import Memory, nearest, remember, take
 from jaxevent.blob.finding.paths import ANYBODY
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import LONGEST
@@ -37,6 +39,7 @@ class Slots(eqx.Module):
     id: Int[Array, "*targets"]  # serial number; -1: free
     confirmed: Bool[Array, "*targets"]
     own: dict[str, Float[Array, "*targets"]]  # numbers (`raw`) that are a target's own, see `Found`
+    memory: Memory | None = None  # of `association = "authors"`
 
 
 class Step(eqx.Module):
@@ -91,14 +94,21 @@ def begin_slots(
     at = jnp.broadcast_to(time, which.shape)
     new = Slots(
         state, gate, jnp.zeros_like(gate), at, at, at, at, ids, jnp.full_like(which, confirmed),
-        slots.own,
+        slots.own, start_memory(params, at, gate.dtype),
     )  # fmt: skip
     return jax.vmap(choose)(which, new, slots)
 
 
 def start_gate(params: TrackerParams, size: Array) -> Array:
     """Radius (px) of the gate of a target of a size (px)."""
+    if params.association == "authors":
+        return jnp.broadcast_to(params.gate_min, size.shape)
     return jnp.clip(params.gate * size, params.gate_min, params.gate_max)
+
+
+def start_memory(params: TrackerParams, time: Array, dtype: Any) -> Memory | None:
+    """What targets remember that begin at some times (targets,)."""
+    return Memory.empty(time, dtype) if params.association == "authors" else None
 
 
 def start_states(
@@ -119,7 +129,10 @@ def shift_slots(slots: Slots, elapsed: Array) -> Slots:
         return jnp.maximum(t - elapsed, -2 * LONGEST)
 
     times = lambda s: (s.last, s.heard, s.born, s.apart)  # noqa: E731
-    return eqx.tree_at(times, slots, tuple(shift(t) for t in times(slots)))
+    slots = eqx.tree_at(times, slots, tuple(shift(t) for t in times(slots)))
+    if slots.memory is None:
+        return slots
+    return dataclasses.replace(slots, memory=slots.memory.shift(elapsed))
 
 
 def silence_limits(params: TrackerParams, slots: Slots) -> Int[Array, "*targets"]:
@@ -211,7 +224,42 @@ def update_slot(
         slot.id,
         slot.confirmed,
         slot.own,
+        slot.memory,
     )
+
+
+def update_nearest(
+    filter: Filter,
+    params: TrackerParams,
+    slots: Slots,
+    ahead: Ahead,
+    time: Array,
+    batch: Batch,
+    valid: Array,
+) -> tuple[Slots, Ahead, Array]:
+    """All targets after the one event of a step, as `authors` has it, and its weights."""
+    p, _, _ = place(filter, params, lax.stop_gradient(slots))
+    k = nearest(p, ahead.alive, batch.xi[0])
+    slot = jax.tree.map(lambda a: a[k], slots)
+    since = jnp.where(slot.hits > 0, seconds(time - slot.last, batch.xi), 0)  # the first is at 0
+    own = own_params(params, slot.own)
+    taken = take(filter, own, slot.state, slot.gate, slot.memory, time, since, batch)
+    new = Slots(
+        taken.state, taken.radius, slot.hits + taken.accepted,
+        jnp.where(taken.updated, time, slot.last), jnp.where(taken.accepted, time, slot.heard),
+        slot.born, slot.apart, slot.id, slot.confirmed, slot.own, taken.memory,
+    )  # fmt: skip
+    hit = (jnp.arange(len(slots.id)) == k) & ahead.alive & valid[0]
+    after = jax.vmap(choose, (0, None, 0))(hit, new, slots)
+
+    def memory(slot: Slots) -> Memory:
+        assert slot.memory is not None
+        return remember(filter, own_params(params, slot.own), slot.state, slot.memory, time)
+
+    kept = choose(valid[0], jax.vmap(memory)(after), after.memory)
+    inside = (hit & taken.accepted)[:, None]
+    ahead = dataclasses.replace(ahead, inside=inside)
+    return dataclasses.replace(after, memory=kept), ahead, inside.astype(batch.xi.dtype)
 
 
 def step(
@@ -231,10 +279,13 @@ def step(
     batch = Batch(xi, age, polarity)
     look = functools.partial(look_ahead, filter, params)
     ahead = jax.vmap(look, (0, 0, None, None, None, None))(slots, limit, time, batch, valid, owner)
-    shares = jax.vmap(functools.partial(filter.share, params), 1, 1)
-    weight = shares(ahead.inside, ahead.density)
-    update = functools.partial(update_slot, filter, params)
-    slots = jax.vmap(update, (0, 0, None, None, 0))(slots, ahead, time, batch, weight)
+    if params.association == "authors":
+        slots, ahead, weight = update_nearest(filter, params, slots, ahead, time, batch, valid)
+    else:
+        shares = jax.vmap(functools.partial(filter.share, params), 1, 1)
+        weight = shares(ahead.inside, ahead.density)
+        update = functools.partial(update_slot, filter, params)
+        slots = jax.vmap(update, (0, 0, None, None, 0))(slots, ahead, time, batch, weight)
 
     told: dict[str, Any] = {}
     if wanted == "states":

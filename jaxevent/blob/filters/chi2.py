@@ -57,9 +57,19 @@ class Params(WindowParams):
 
     presets = {
         **TrackerParams.presets,
+        # As printed, but for the errors that docs/theory/tracking.md lists. Of the gate the paper
+        # gives no numbers; its shape and that it follows the size are the paper's.
+        "paper": {
+            "target": "2n",
+            "current_in_jacobian": True,
+            "association": "nearest",
+            "gate_shape": "circle",
+            "gate_position": 0.0,
+        },
         # Published settings of the authors' program, for cars.
         "authors": {
             "formulation": "authors",
+            "association": "authors",
             "target": "2n",
             "beta": 0.0,
             "polarity_offset": True,
@@ -78,6 +88,8 @@ class Params(WindowParams):
             "gate": 2.5,
             "gate_decay": 1.4,
             "gate_min": 10.0,
+            "gate_max": 1e6,
+            "t_coast": 1e3,
         },
     }
 

@@ -339,6 +339,8 @@ def kernel_of(
     filter: Filter, params: TrackerParams, own: dict[str, Any], owned: bool, dtype: np.dtype
 ) -> Kernel:
     """The kernel of a filter with its parameters; raises `Untranslatable`."""
+    if params.association == "authors":
+        raise Untranslatable('association = "authors"')
     leaves, tree = jax.tree.flatten(params)
     key = filter, tree, tuple(np.shape(leaf) for leaf in leaves), tuple(own), owned, dtype
     made = _made.setdefault(key, [])
