@@ -120,7 +120,7 @@ class Packing:
     ):
         if params.association == "authors" and params.events_per_step > 1:
             raise InputError(
-                f"{recording.name}: association = \"authors\" takes one event after the other, but "
+                f'{recording.name}: association = "authors" takes one event after the other, but '
                 f"events_per_step is {params.events_per_step}; omit it"
             )
         begin, end = span_of(recording, start, stop)

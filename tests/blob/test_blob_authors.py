@@ -4,23 +4,21 @@ The golden files hold all events, whose each is, and states after some of them: 
 its polarity offset (upd10) and without (upd8). Pixels count from 1 there.
 """
 
-import dataclasses
 import functools
 import re
 
 import jax
-import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 
 import jaxevent
 from jaxevent.blob import chi2
-from jaxevent.blob.authors import DISPLAY, WAITING
+from jaxevent.blob.authors import WAITING
 from jaxevent.cli import main
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
-
-NAMES = ("blob_mini", "lights_mini", "ties_mini")
+from jaxevent.runs.evaluate import evaluate
 
 
 @functools.cache
@@ -55,8 +53,10 @@ def followed(recording, seeds, **values):
     return jax.tree.map(lambda a: np.asarray(a)[:, 1:][valid], slots)
 
 
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("offset", [False, True])
+CASES = [("blob_mini", True), ("lights_mini", True), ("ties_mini", True), ("ties_mini", False)]
+
+
+@pytest.mark.parametrize(("name", "offset"), CASES)
 def test_the_authors_program(golden, name, offset):
     recording, seeds, tables = golden_of(golden, name)
     slots = followed(recording, seeds, polarity_offset=offset)
@@ -64,8 +64,6 @@ def test_the_authors_program(golden, name, offset):
     count = len(tables["events_x_y_p_tus"]) - len(recording.events)  # events left out before
 
     # Which events move which target.
-    before = np.concatenate([np.full((1, len(seeds)), -1), slots.last[:-1]])
-    before[1:] = slots.hits[:-1]
     changed = (np.diff(slots.state.x, axis=0, prepend=np.nan) != 0).any(-1)
     changed[0] = slots.hits[0] > 0
     wanted = np.zeros_like(changed)
@@ -88,3 +86,84 @@ def test_the_authors_program(golden, name, offset):
     np.testing.assert_allclose(slots.gate[event, target], radius, 1e-9, 1e-9)
     if name != "lights_mini":  # it ends before the gate adapts
         assert (rows[:, 0] > 0.026).sum() > 20 and radius[-1] > 10.001
+
+
+def stream(t, xi, p):
+    x, y = np.asarray(xi).T.astype(np.uint16)
+    made = Events(np.asarray(t, np.int64), x, y, np.asarray(p, bool))
+    return Recording("ties", 64, 48, made)
+
+
+@pytest.mark.parametrize("waiting", [1, 20, WAITING + 5])
+def test_events_of_one_time_are_replayed(waiting):
+    """They act as if they had come one after the other until the next event, in its place."""
+    rng, most = np.random.default_rng(waiting), min(waiting, WAITING)
+    few = rng.integers(20, 28, (5, 2))
+    tied, n = rng.integers(20, 28, (waiting, 2)), len(few)
+    t, gap = 100 + 50 * np.arange(n), 3 * most  # us
+    t = np.r_[t, np.full(waiting, t[-1]), t[-1] + gap, t[-1] + gap + 70]
+    ends = [[24, 25], [23, 22]]
+    xi = np.concatenate([few, tied, ends])
+    p = np.r_[rng.random(n + waiting) < 0.5, True, False]
+    apart = np.r_[t[:n], t[n - 1] + 3 * np.arange(1, most + 1), t[-1]]
+    kept = np.concatenate([few, tied[:most], ends[1:]])
+    signs = np.r_[p[:n], np.ones(most), False]
+    seeds = [(24.0, 24.0, 10.0), (60.0, 40.0, 10.0)]
+    one = followed(stream(t, xi, p), seeds)
+    other = followed(stream(apart, kept, signs), seeds)
+    np.testing.assert_allclose(one.state.x[-1], other.state.x[-1], 1e-12, 1e-12)
+    np.testing.assert_allclose(one.state.P[-1], other.state.P[-1], 1e-12, 1e-12)
+    assert one.hits[-1, 0] == len(t) and (one.state.x[n - 1] == one.state.x[n + waiting - 1]).all()
+
+
+def test_the_nearest_target_alone_may_take_an_event():
+    seeds = [(10.0, 10.0, 4.0), (40.0, 10.0, 4.0)]
+    xi = [[10, 10], [10, 30], [22, 10], [41, 10], [31, 10]]
+    slots = followed(stream(10 * np.arange(5), xi, [1, 1, 1, 0, 0]), seeds)
+    np.testing.assert_array_equal(slots.hits, [[1, 0], [1, 0], [1, 0], [1, 1], [1, 2]])
+    assert (np.diff(slots.state.x[:4, 0], axis=0) == 0).all()
+    np.testing.assert_array_equal(slots.memory.assigned[-1] - slots.memory.seen[-1], [-20, 0])
+
+
+@pytest.mark.slow
+def test_track_and_evaluate(golden, tmp_path):
+    """The commands tell the program's states; they are the truth that `evaluate` compares with."""
+    recording, seeds, tables = golden_of(golden, "blob_mini")
+    jaxevent.save(recording, tmp_path / "blob.h5")
+    (tmp_path / "authors.toml").write_text('preset = "authors"\n')
+    seed = ",".join(map(str, seeds[0]))
+    given = ["--method", "chi2", "--params", tmp_path / "authors.toml", "--filtered"]
+    given += ["--seed", seed, "--at", "events", "--out", tmp_path / "out.csv"]
+    assert main(list(map(str, ["track", tmp_path / "blob.h5", *given]))) == 0
+    found = pd.read_csv(tmp_path / "out.csv", comment="#")
+    wanted = pd.DataFrame(tables["upd10"], columns=list(tables["columns"]))
+    wanted[["px", "py"]] -= 1  # pixels from 0
+    rows = np.abs(found["t"].to_numpy() - wanted["ts_s"].to_numpy()[:, None]).argmin(1)
+    for name, other in {"x": "px", "y": "py", "vx": "vx", "vy": "vy"}.items():
+        np.testing.assert_allclose(found[name][rows], wanted[other], 1e-9, 1e-9)
+    sizes = np.sort(found[["lambda1", "lambda2"]].to_numpy()[rows])
+    np.testing.assert_allclose(sizes, np.sort(wanted[["lam1", "lam2"]]), 1e-9)
+
+    truth = wanted.rename(columns={"ts_s": "t", "px": "x", "py": "y"})[["t", "x", "y"]]
+    truth.to_csv(tmp_path / "blob.csv", index=False)
+    (tmp_path / "evaluate.toml").write_text(
+        f"""
+        recordings = ["blob.h5"]
+        protocol = "tracks"
+        positions = "*.csv"
+        seeds = [{list(seeds[0])}]
+        smooth = false
+        [[method]]
+        name = "chi2"
+        params = {{ preset = "authors" }}
+        """
+    )
+    (row,) = evaluate(tmp_path / "evaluate.toml", tmp_path / "scores")
+    assert row["rmse"] < 1e-6 and row["covered"] == 1
+
+
+def test_steps_of_several_events_are_refused(golden):
+    recording, seeds, _ = golden_of(golden, "blob_mini")
+    params = chi2.Params(preset="authors", events_per_step=4)
+    with pytest.raises(InputError, match="events_per_step is 4; omit it"):
+        chi2.estimate(recording, params, seeds=seeds)
