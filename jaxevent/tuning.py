@@ -48,6 +48,86 @@ class Weighted(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
+class Believed:
+    """A loss plus what is believed of some numbers beforehand: `with_prior` makes it.
+
+    It adds weight / 2 ((u - centre) / spread)^2 for each of `terms`, (name, centre, spread), with u
+    the unconstrained number, the logarithm of a positive one.
+    """
+
+    loss: Loss
+    terms: tuple[tuple[str, float, float], ...]
+    weight: float
+
+    @property
+    def likelihood(self) -> bool:
+        """Whether the loss is the mean of -ln p, see `jaxevent.confidence.examine`."""
+        return bool(getattr(self.loss, "likelihood", False))
+
+    def penalty(self, params: Any) -> Array:
+        """What is added, ()."""
+        parts = [(((params.raw[k] - c) / s) ** 2).mean() for k, c, s in self.terms]
+        return 0.5 * self.weight * jnp.stack(parts).sum()
+
+    def __call__(self, params: Any, batch: Any) -> Array:
+        return self.loss(params, batch) + self.penalty(params)
+
+
+@dataclasses.dataclass(frozen=True)
+class BelievedParts(Believed):
+    """The same of a loss that tells parts apart, see `jaxevent.confidence.Parted`."""
+
+    def parts(self, params: Any, batch: Any) -> tuple[Array, Array]:
+        """The mean of each part, with what is added, and its weight."""
+        part: Any = self.loss
+        values, weights = part.parts(params, batch)
+        return values + self.penalty(params), weights
+
+
+def with_prior(
+    loss: Loss,
+    params: Parameters,
+    prior: Mapping[str, Sequence[float | int]],
+    weight: float | int = 1.0,
+) -> Loss:
+    """A loss that rises as numbers leave what is believed of them: a log-normal prior.
+
+    Args:
+        loss: To be minimised by `optimise`.
+        params: Of the kind that is fitted.
+        prior: Of each number (centre, spread): the believed value in the number's unit, and the
+            standard deviation of its logarithm (of a share ln(p / (1 - p))).
+        weight: Twice what one standard deviation costs, in the loss's unit. Of a loss that is the
+            mean of -ln p over n measurements 1 / n is Bayes' weight.
+
+    Raises:
+        InputError: A number does not exist, a centre is not one of its values or has no logarithm,
+            a spread or the weight is not positive.
+    """
+    if not 0 < weight < math.inf:
+        raise InputError(f"the weight of a prior is {weight}; give a number above 0")
+    terms = []
+    for name, (centre, spread) in prior.items():
+        if name not in params.raw:
+            raise InputError(
+                f"the prior names {name!r}, which is no number; {nearest(name, params.raw)}"
+            )
+        if not 0 < spread < math.inf:
+            raise InputError(
+                f"the prior of {name} has the spread {spread}; give a standard deviation of its "
+                "logarithm, above 0"
+            )
+        raw = float(params.replace(**{name: centre}).raw[name].mean())
+        if not math.isfinite(raw):
+            raise InputError(f"the prior of {name} is about {centre}, which has no logarithm")
+        terms.append((name, raw, float(spread)))
+    if not terms:
+        return loss
+    kind = BelievedParts if hasattr(loss, "parts") else Believed
+    return kind(loss, tuple(terms), float(weight))
+
+
+@dataclasses.dataclass(frozen=True)
 class Settings:
     """How `optimise` goes about it.
 

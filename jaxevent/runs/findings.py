@@ -22,7 +22,7 @@ def find(task: Task, one: Fitted, problem: Callable[[Any], Batches]) -> list[dic
     `interval` says it in words and `of` what it was told from.
     """
     told = examine(
-        task.goal.loss, task.params, one.params, task.names, problem, task.search,
+        task.loss, task.params, one.params, task.names, problem, task.search,
         task.settings.forward,
     )  # fmt: skip
     of = f"{told.parts} {task.goal.part}s" if told.parts else INDEPENDENT

@@ -26,10 +26,13 @@ describes it:
     params = { c_on = 0.08 }            # to start from, or a TOML file; omitted: defaults
     fit = ["c_on", "c_off"]             # by gradient
     search = { clock_offset = [-0.02, 0.02, 9] }  # from, to, number of points
+    prior = { c_on = [0.1, 0.5] }       # what is believed, standard deviation of its logarithm
+    prior_weight = 1.0                  # twice what one standard deviation adds to the loss
 
-A method may have its own loss, error, learning_rate, iterations and starts. Parameters that are
-fixed when a recording is prepared have no gradient to follow; each candidate of a search is
-prepared anew. Values omitted are those above, except where comments say otherwise.
+A method may have its own loss, error, learning_rate, iterations, starts and prior_weight.
+Parameters that are fixed when a recording is prepared have no gradient to follow; each candidate of
+a search is prepared anew. Values omitted are those above, except where comments say otherwise, and
+no prior.
 
 The settings from `loss` on are those of reconstruction; `jaxevent.runs.blob` and
 `jaxevent.runs.egomotion` tell those of the other families. All local devices are used, and several
@@ -216,7 +219,7 @@ def _fit_tasks(
                 problem = task.goal.problem(sources, plan.split, plan.window)
                 if number == len(done):
                     one = optimise(
-                        task.goal.loss, task.params, task.names, problem, (),
+                        task.loss, task.params, task.names, problem, (),
                         task.settings, task.search,
                         run=run, save=keep, progress=progress, title=task.label,
                     )  # fmt: skip

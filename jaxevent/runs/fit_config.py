@@ -33,7 +33,7 @@ from jaxevent.runs.contents import fingerprint
 from jaxevent.runs.families import HOMES, family_of, find_family
 from jaxevent.runs.family import Goal, Shares
 from jaxevent.splits import SPLITS
-from jaxevent.tuning import Interval, Settings, begin
+from jaxevent.tuning import Interval, Loss, Settings, begin, with_prior
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +46,7 @@ class Task:
     names: tuple[str, ...]
     search: Mapping[str, Interval]
     goal: Goal
+    loss: Loss  # the goal's, with what is believed of numbers
     settings: Settings
 
 
@@ -101,6 +102,7 @@ _SETTINGS: dict[str, Check] = {
 }
 _COMMON: dict[str, Check] = {
     **_SETTINGS,
+    "prior_weight": POSITIVE,
     "recordings": PATHS,
     "validation": PATHS,
     "test": PATHS,
@@ -122,6 +124,17 @@ _COMMON: dict[str, Check] = {
 }
 _METHOD: dict[str, Check] = {
     **{name: _SETTINGS[name] for name in ("learning_rate", "iterations", "starts")},
+    "prior_weight": POSITIVE,
+    "prior": (
+        lambda value: (
+            isinstance(value, dict)
+            and all(
+                isinstance(v, list) and len(v) == 2 and all(map(is_number, v))
+                for v in value.values()
+            )
+        ),
+        "a table of name = [believed value, standard deviation of its logarithm]",
+    ),
     "name": NAME,
     "label": NAME,
     "params": (lambda value: isinstance(value, str | dict), "a table or the path of a TOML file"),
@@ -215,8 +228,14 @@ def _task(entry: Mapping[str, Any], table: Mapping[str, Any], folder: Path) -> T
             f"the method {method.name!r} computes on the host and has no gradient to follow; "
             f"search its numbers: search = {{ {names[0]} = [from, to, number of points] }}"
         )
+    prior = entry.get("prior", {})
+    for one in prior:
+        if one not in names and one not in search:
+            raise InputError(f"the prior names {one}, which is not fitted; omit it")
+    loss = with_prior(goal.loss, params, prior, both.get("prior_weight", 1.0))
     given = {name: both[name] for name in _SETTINGS if name in both}
     settings = Settings(**given, forward=goal.forward)
     intervals = {name: (low, high, count) for name, (low, high, count) in search.items()}
     begin(params, names, settings, intervals)  # checks the names
-    return Task(entry.get("label", name), method, params, names, intervals, goal, settings)
+    label = entry.get("label", name)
+    return Task(label, method, params, names, intervals, goal, loss, settings)

@@ -525,6 +525,19 @@ def test_thresholds_and_clock_are_recovered(fitted):
     assert abs(scan[int(np.argmin(losses))] - float(params.clock_offset)) <= 2.5e-4
 
 
+def test_a_prior_holds_what_is_believed(fitted, tmp_path):
+    """A strong one ends where it is centred, one that is all but nothing where there is none."""
+    folder, _ = fitted
+    found = {}
+    for weight in (1e-9, 1e3):
+        prior = f"prior = {{ c_on = [0.15, 0.2] }}\nprior_weight = {weight}\n"
+        fit(write(folder, EDI + prior, f"{weight}.toml"), tmp_path / str(weight))
+        found[weight] = METHODS["edi"].Params.load(tmp_path / str(weight) / "params.toml", "edi")
+    free = METHODS["edi"].Params.load(folder / "out" / "params.toml", "edi")
+    assert float(found[1e-9].c_on) == pytest.approx(float(free.c_on), rel=1e-3)
+    assert float(found[1e3].c_on) == pytest.approx(0.15, rel=0.02)
+
+
 def test_what_a_fit_writes(fitted):
     folder, rows = fitted
     out = folder / "out"
@@ -844,6 +857,10 @@ GOOD = TWO.replace("starts = 2\n", "")
         (GOOD.replace('["c_on"]', '["clock_offset"]'), "search = { clock_offset = [from, to"),
         (GOOD.replace('["c_on"]', '"c_on"'), "fit is"),
         (GOOD.replace('["I0", "c_on"]', "[]"), "nothing is to be fitted"),
+        (GOOD + "prior = { c_off = [0.1, 0.5] }", "the prior names c_off, which is not fitted"),
+        (GOOD + "prior = { c_on = [0.1, 0] }", "method 2: the prior of c_on has the spread 0"),
+        (GOOD + "prior = { c_on = 0.1 }", "method 2: prior is"),
+        (GOOD + "prior_weight = 0", "method 2: prior_weight is"),
         (GOOD.replace("[0, 0.01, 3]", "[0, 0.01]"), "search is"),
         (GOOD.replace("[0, 0.01, 3]", "[0.01, 0, 3]"), "search of clock_offset"),
         (GOOD + "search = { I0 = [0, 1, 3] }", "I0 is both"),
