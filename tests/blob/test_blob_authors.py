@@ -13,12 +13,13 @@ import pandas as pd
 import pytest
 
 import jaxevent
-from jaxevent.blob import chi2
+from jaxevent.blob import chi2, negative_log_likelihood
 from jaxevent.blob.authors import WAITING
 from jaxevent.cli import main
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
 from jaxevent.runs.evaluate import evaluate
+from jaxevent.simulate import Circle, Target, simulate_blobs
 
 
 @functools.cache
@@ -160,6 +161,38 @@ def test_track_and_evaluate(golden, tmp_path):
     )
     (row,) = evaluate(tmp_path / "evaluate.toml", tmp_path / "scores")
     assert row["rmse"] < 1e-6 and row["covered"] == 1
+
+
+@pytest.mark.slow
+def test_the_likelihood_has_its_gradient(golden):
+    """Through gates and ties, by differences."""
+    recording, seeds, _ = golden_of(golden, "ties_mini")
+    params = chi2.Params(preset="authors")
+    features, _ = chi2.prepare(recording, [], params, seeds=seeds)
+
+    def loss(raw):
+        return negative_log_likelihood(chi2, params.with_raw(raw), features)
+
+    loss, raw, h = jax.jit(loss), {k: params.raw[k] for k in ("Q_p", "Q_lambda")}, 1e-4
+    for name, slope in jax.grad(loss)(raw).items():
+        ends = (loss({**raw, name: raw[name] + sign * h}) for sign in (1, -1))
+        np.testing.assert_allclose(slope, -np.diff([*map(float, ends)])[0] / (2 * h), 1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["paper", "authors"])
+def test_targets_may_be_born_too(preset):
+    """Two dots, found on the grid and followed in single steps until the events end."""
+    circles = [Circle((x, 32.0), 4.0, 10.0, size=(2.0, 2.0)) for x in (24.0, 72.0)]
+    dots = [Target(circle, 2e4) for circle in circles]
+    recording, truth = simulate_blobs(dots, (96, 64), 0.06, 0, 2)
+    small = {"lambda0": 5.0, "gate_min": 8.0, "n_birth": 10.0}
+    params = chi2.Params(preset=preset, **small)
+    tracks = chi2.estimate(recording, params, smooth=False)
+    assert len(tracks) == 2 and tracks.ended == ("end", "end")
+    told, true = tracks([0.05]).mean[0, :, :2], truth(np.array([0.05]))[0, :, :2]
+    order = np.argsort(told[:, 0])
+    np.testing.assert_allclose(told[order], true, atol=1.5)
 
 
 def test_steps_of_several_events_are_refused(golden):
