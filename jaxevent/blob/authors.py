@@ -94,7 +94,7 @@ def take(
 
     state = lax.cond(updated, move, lambda s: s, state)
     place = jnp.where(waits, memory.number, WAITING)  # beyond the queue: nowhere
-    waiting = memory.waiting.at[place].set(batch.xi[0])
+    waiting = memory.waiting.at[place].set(batch.xi[0], mode="drop")
     number = jnp.minimum(jnp.where(updated, 0, memory.number + waits), WAITING).astype(jnp.int32)
     memory = Memory(memory.seen, time, memory.display, memory.adapting, waiting, number)
     return Taken(state, radius, memory, accepted, updated)
