@@ -18,11 +18,15 @@ LOOK = "; import jax; print(jax.config.jax_compilation_cache_dir)"
 
 def told(code: str, **variables: object) -> str:
     """What the code prints with these variables, and none of JAX's own."""
-    kept = {k: v for k, v in os.environ.items() if k not in (*THEIRS, "JAXEVENT_CACHE")}
-    env = {**kept, **{k: str(v) for k, v in variables.items()}}
-    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
+    done = ran(code, **variables)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
+
+
+def ran(code: str, **variables: object) -> subprocess.CompletedProcess:
+    kept = {k: v for k, v in os.environ.items() if k not in (*THEIRS, "JAXEVENT_CACHE")}
+    env = {**kept, **{k: str(v) for k, v in variables.items()}}
+    return subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
 
 
 def test_programs_are_kept_in_the_users_folder(tmp_path):
@@ -71,3 +75,19 @@ def test_they_are_released_after_each_task(monkeypatch):
     with pytest.raises(TypeError):
         tasks.attempt(len, tasks.Task("failed", {}), None)
     assert len(released) == 2
+
+
+@pytest.mark.parametrize("spoilt", [b"", b"foreign", None])
+def test_a_damaged_file_is_compiled_again(spoilt, tmp_path):
+    code = (
+        "import jaxevent, jax; jax.config.update('jax_persistent_cache_min_compile_time_secs', 0)\n"
+        "print(jax.jit(lambda x: x * 2)(1.0))"
+    )
+    assert told(code, JAXEVENT_CACHE=tmp_path) == "2.0"
+    kept = [path for path in tmp_path.rglob("*-cache") if path.is_file()]
+    assert kept
+    for path in kept:
+        content = path.read_bytes()
+        path.write_bytes(content[: len(content) // 2] if spoilt is None else spoilt)
+    done = ran(code, JAXEVENT_CACHE=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "2.0\n", "")

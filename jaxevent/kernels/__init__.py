@@ -9,10 +9,12 @@ from typing import Any
 
 import numba
 
+from jaxevent.kernels import kept
+
 
 def compiled(function: Callable) -> Any:
     """Compile with numba, without the argument checks that tests wrap around functions."""
-    return numba.njit(cache=True, nogil=True)(inspect.unwrap(function))
+    return kept.compiled(inspect.unwrap(function), nogil=True)
 
 
 def part(function: Callable) -> Any:

@@ -2,7 +2,6 @@
 
 import functools
 import hashlib
-import importlib.util
 import os
 import sys
 import tempfile
@@ -16,21 +15,28 @@ from jaxevent.kernels import numeric
 
 
 def module_of(text: str) -> ModuleType:
-    """The module of a text, from a file that numba keeps compiled functions beside."""
+    """The module of a text, from a file with its compiled functions beside it (`kept`)."""
     about = f"{numba.__version__} {_shared()}\n{text}"
     name = f"kernel_{hashlib.blake2b(about.encode(), digest_size=8).hexdigest()}"
     folder = cache.folder_for_compiled() or Path(_own_folder().name)
     path = folder / f"{name}.py"
-    if not path.exists():  # numba looks at its time: it is written once
-        with tempfile.NamedTemporaryFile("w", dir=folder, suffix=".py", delete=False) as file:
-            file.write(text)
+    if _content(path) != text.encode():
+        with tempfile.NamedTemporaryFile("wb", dir=folder, suffix=".py", delete=False) as file:
+            file.write(text.encode())
         os.replace(file.name, path)
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
+    module = ModuleType(name)
+    module.__file__ = str(path)
     sys.modules[name] = module
-    spec.loader.exec_module(module)
+    # Not by an import: Python keeps bytecode beside a file, and a part of that ends the process.
+    exec(compile(text, path, "exec"), module.__dict__)
     return module
+
+
+def _content(path: Path) -> bytes | None:
+    try:
+        return path.read_bytes()
+    except OSError:
+        return None
 
 
 @functools.cache

@@ -8,10 +8,11 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 from numba.core import types
 from numba.extending import intrinsic
+
+from jaxevent.kernels import kept
 
 F = np.float32
 INFINITE, NAN = F(np.inf), F(np.nan)
@@ -19,8 +20,8 @@ INFINITE, NAN = F(np.inf), F(np.nan)
 
 def part(function: Callable) -> Any:
     """Compile for kernels: divisions by zero are infinite, products are fused to sums."""
-    how = numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
-    return how(inspect.unwrap(function))
+    plain = inspect.unwrap(function)
+    return kept.compiled(plain, error_model="numpy", fastmath={"contract"})
 
 
 def operation(function: Callable) -> Any:

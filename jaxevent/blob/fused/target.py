@@ -59,19 +59,20 @@ import numba
 import numpy as np
 from numba import types
 
+from jaxevent.kernels.kept import callback
 from jaxevent.kernels.numeric import {imports}
 
 REAL = np.{real}
 I, F = types.int64, types.{real}
 CELLS, WHOLE, NUMBERS = types.CPointer(F), types.CPointer(I), types.CPointer(types.float64)
-HOW = {{"cache": True, "error_model": "numpy", "fastmath": {{"contract"}}}}
+HOW = {{"error_model": "numpy", "fastmath": {{"contract"}}}}
 LOOP = {{"error_model": "numpy", "fastmath": {{"contract", "reassoc", "nsz"}}}}
 {constants}
 
 
 '''
 
-FUNCTION = """@numba.cfunc(types.void(CELLS, WHOLE, CELLS, WHOLE, NUMBERS, I, I, I, I), **HOW)
+FUNCTION = """@callback(types.void(CELLS, WHOLE, CELLS, WHOLE, NUMBERS, I, I, I, I), **HOW)
 def {name}(cells, whole, work, marks, numbers, target, row, room, count):
     of_cells, of_whole = target * {width}, target * {whole_width}
 {body}

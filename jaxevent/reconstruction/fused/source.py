@@ -143,23 +143,23 @@ class Source:
 
 HEAD = '''"""The functions of a kernel (`jaxevent.reconstruction.fused`)."""
 
-import numba
 import numpy as np
 from numba import types
 
+from jaxevent.kernels.kept import callback
 {imports}
 
 REAL, STRIDE = np.{real}, {stride}
 I, D, F = types.int64, types.float64, types.{real}
 CELLS, WHOLE, TIMES = types.CPointer(F), types.CPointer(I), types.CPointer(D)
 MARKS = types.CPointer(types.uint8)
-HOW = {{"cache": True, "error_model": "numpy", "fastmath": {{"contract"}}}}
+HOW = {{"error_model": "numpy", "fastmath": {{"contract"}}}}
 {constants}
 
 '''
 
 EVENTS = """
-@numba.cfunc(I(CELLS, WHOLE, TIMES, WHOLE, CELLS, I, I, I, I, I, I, I, D, D, D, D, CELLS), **HOW)
+@callback(I(CELLS, WHOLE, TIMES, WHOLE, CELLS, I, I, I, I, I, I, I, D, D, D, D, CELLS), **HOW)
 def events(
     cells, whole, last, stream, weights, weighted, i, end, till, first_own, last_own, padded,
     begin, rate, mid, blend_rate, numbers,
@@ -197,7 +197,7 @@ def events(
 """
 
 IMAGES = """
-@numba.cfunc(
+@callback(
     types.void(CELLS, WHOLE, TIMES, I, I, I, D, D, D, CELLS, CELLS, CELLS, MARKS, I), **HOW
 )
 def images(
@@ -217,12 +217,12 @@ def images(
 """
 
 TABLES = """
-@numba.cfunc(types.void(I, CELLS, I, I, CELLS, CELLS, I), **HOW)
+@callback(types.void(I, CELLS, I, I, CELLS, CELLS, I), **HOW)
 def tables(variant, cells, begin, end, numbers, uniform, at):
 """
 
 EXCESS = """
-@numba.cfunc(F(D, D, F, F, CELLS), **HOW)
+@callback(F(D, D, F, F, CELLS), **HOW)
 def excess(share64, edge64, on, off, numbers):
     share, edge = REAL(share64), REAL(edge64)
 {lines}

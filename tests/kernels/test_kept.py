@@ -1,0 +1,144 @@
+"""Compiled functions in files: two processes at once, damaged and foreign files."""
+
+import importlib
+import os
+import sys
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+from numba.core import types
+
+from jaxevent.kernels import kept, modules
+
+
+@pytest.fixture
+def half(tmp_path, monkeypatch):
+    """Makes new dispatchers of a function in a file of its own, as new processes would."""
+    (tmp_path / "halves.py").write_text("def half(x):\n    return x / 2\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "halves", raising=False)
+    function = importlib.import_module("halves").half
+    return lambda: kept.compiled(function)
+
+
+def files_of(folder: Path) -> list[Path]:
+    return sorted(folder.glob("__pycache__/*.nbc"))
+
+
+def test_signatures_compiled_at_the_same_time_keep_apart(half, tmp_path, monkeypatch):
+    # Whenever one process has written a file and is about to name it, another one compiles.
+    replace, others = os.replace, [half(), half()]
+
+    def interrupted(*names):
+        if others:
+            others.pop()(np.float32(3))
+        replace(*names)
+
+    monkeypatch.setattr(os, "replace", interrupted)
+    assert half()(3) == 1.5
+    monkeypatch.undo()
+    assert not others
+    for value in (3, np.float32(3)):
+        later = half()
+        assert later(value) == 1.5
+        assert sum(later.stats.cache_hits.values()) == 1 and len(later.nopython_signatures) == 1
+        assert later.nopython_signatures[0].args == (numba.typeof(value),)
+
+
+def spoil(path: Path, how: str) -> None:
+    content = path.read_bytes()
+    if how == "a folder":
+        path.unlink()
+        path.mkdir()
+        return
+    changed = {
+        "empty": b"",
+        "cut in the hash": content[:20],
+        "cut": content[: len(content) // 2],
+        "one byte less": content[:-1],
+        "one bit": content[:-1] + bytes([content[-1] ^ 1]),
+        "foreign": b"something else\n" * 100,
+        "a pickle": b"cos\nsystem\n(S'exit 1'\ntR.",
+    }
+    path.write_bytes(changed[how])
+
+
+HOW = (
+    "empty",
+    "cut in the hash",
+    "cut",
+    "one byte less",
+    "one bit",
+    "foreign",
+    "a pickle",
+    "a folder",
+)
+
+
+@pytest.mark.parametrize("how", HOW)
+def test_a_damaged_file_is_compiled_again(how, half, tmp_path):
+    assert half()(5) == 2.5
+    (kept_file,) = files_of(tmp_path)
+    spoil(kept_file, how)
+    again = half()
+    assert again(5) == 2.5 and not again.stats.cache_hits
+    if how != "a folder":  # what was damaged is whole again
+        later = half()
+        assert later(5) == 2.5 and len(later.stats.cache_hits) == 1
+
+
+def test_another_signature_in_the_place_of_a_file_is_not_run(half, tmp_path):
+    half()(5)
+    (whole,) = files_of(tmp_path)
+    half()(np.float32(5))
+    (real,) = set(files_of(tmp_path)) - {whole}
+    real.write_bytes(whole.read_bytes())
+    later = half()
+    assert later(np.float32(5)) == 2.5 and not later.stats.cache_hits
+
+
+def test_what_cannot_be_written_is_compiled_alone(half, tmp_path, monkeypatch):
+    def full(*names):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    assert half()(5) == 2.5
+    assert not [p for p in (tmp_path / "__pycache__").iterdir() if p.is_file()]
+
+
+def test_what_depends_on_addresses_is_not_kept(half, tmp_path):
+    apply = kept.compiled(lambda f, x: f(x))
+    files = apply._cache._cache_file
+    key = (types.Dispatcher(half()), "x")
+    files.save(key, "data")
+    assert files.load(key) is None
+
+
+TEXT = """
+import numpy as np
+from numba import types
+
+from jaxevent.kernels.kept import callback
+
+@callback(types.float64(types.float64), error_model="numpy")
+def third(x):
+    return x / 3 + {number}
+"""
+
+
+def test_a_module_of_text_is_made_again_from_damaged_files(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAXEVENT_CACHE", str(tmp_path))
+    text = TEXT.format(number=0.25)
+    module = modules.module_of(text)
+    assert module.third.ctypes(6) == 2.25
+    path = Path(module.__file__)
+    (compiled,) = files_of(path.parent)
+    content = path.read_bytes(), compiled.read_bytes()
+    assert modules.module_of(text).third.cache_hits == 1
+    for spoilt in (path, compiled):
+        spoilt.write_bytes(spoilt.read_bytes()[:100])
+    assert modules.module_of(text).third.ctypes(6) == 2.25
+    assert path.read_bytes() == content[0]
+    assert modules.module_of(text).third.cache_hits == 1
