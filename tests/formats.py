@@ -629,3 +629,66 @@ def bag2(
             one = types["sensor_msgs/msg/CameraInfo"](*told, 0, 0, region)
             data = store.serialize_cdr(one, "sensor_msgs/msg/CameraInfo")
             writer.write(camera, 10**18 + number, data)
+
+
+def evimo_meta(t, size, images=(), depths=()) -> dict:
+    """The dictionary that EVIMO2 pickles: poses at `t` (us), frames at the times of images."""
+    poses = [
+        {
+            "ts": one / 1e6,
+            "cam": {
+                "ts": one / 1e6,
+                "pos": {
+                    "t": {"x": 0.1 * i, "y": 0.2, "z": -1.5},
+                    "q": {"w": 0.8, "x": 0.6, "y": 0.0, "z": 0.0},
+                },
+            },
+            "gt_frame": "depth_mask_18446744073709551615.png",
+            "id": 18446744073709551615,
+        }
+        for i, one in enumerate(t)
+    ]
+    frames: list[dict] = [
+        {"id": i, "ts": one / 1e6, "classical_frame": f"img_{i}.png"} for i, one in images
+    ]
+    frames += [{"id": i, "ts": one / 1e6, "gt_frame": f"depth_mask_{i}.png"} for i, one in depths]
+    sample = {
+        "angular_velocity": {"x": -0.1, "y": 0.2, "z": 0.3},
+        "linear_acceleration": {"x": 8.0, "y": 0.5, "z": -5.0},
+    }
+    about = {"fx": 30.0, "fy": 31.0, "cx": 20.0, "cy": 15.0, "res_x": size[0], "res_y": size[1]}
+    about |= {"k1": -0.1, "k2": 0.05, "k3": 0.0, "k4": 0.0, "p1": 0.001, "p2": 0.002}
+    return {
+        "frames": frames,
+        "full_trajectory": poses,
+        "imu": {"/prophesee/left/imu": [{"ts": 0.02, **sample}, {"ts": 0.03, **sample}]},
+        "meta": {**about, "dist_model": "radtan", "ros_time_offset": 1606265321.4},
+    }
+
+
+def evimo(folder: Path, events, meta, images=None, depths=None):
+    """A folder of EVIMO2; images and depths by number of their frame, depths used as masks too."""
+    folder.mkdir()
+    np.save(folder / "dataset_events_t.npy", (events.t / 1e6).astype(np.float32))
+    np.save(folder / "dataset_events_xy.npy", np.stack([events.x, events.y], 1).astype("u2"))
+    np.save(folder / "dataset_events_p.npy", events.p.astype("u1"))
+    about = meta["meta"]
+    matrix = np.diag([about["fx"], about["fy"], 1.0])
+    matrix[:2, 2] = about["cx"], about["cy"]
+    distortion = np.array([about[name] for name in ("k1", "k2", "k3", "k4")])
+    index = np.searchsorted(events.t, np.arange(0, 100_000, 10_000)).astype("u4")
+    np.savez(
+        folder / "dataset_info.npz",
+        allow_pickle=True,
+        K=matrix,
+        D=distortion,
+        index=index,
+        discretization=0.01,
+        meta=np.array(meta),
+    )
+    kinds = {"classical": images, "depth": depths, "mask": depths}
+    for name, held in kinds.items():
+        arrays = {f"{name}_{i:010d}": image for i, image in (held or {}).items()}
+        none = {} if arrays else {"empty": np.array(None)}  # as the dataset's own writer does
+        np.savez_compressed(folder / f"dataset_{name}.npz", allow_pickle=True, **arrays, **none)
+    return folder

@@ -1,10 +1,10 @@
 """Reading and writing recordings: `load` any readable file or folder, `save` as HDF5.
 
 The layouts are described in the reader modules, and what each was checked against: `aedat2`,
-`aedat4`, `columns` (tables of text and NumPy records), `event_stream`, `hdf5`, `hdf5_layouts`,
-`mat`, `n_caltech`, `npz`, `prophesee`, `ros` (with `bags` and `ros_events`) and `text`. They are
-imported when first needed. This module also turns the raw numbers of a file into checked fields, so
-that every reader accepts the same values and words its errors alike.
+`aedat4`, `columns` (tables of text and NumPy records), `event_stream`, `evimo`, `hdf5`,
+`hdf5_layouts`, `mat`, `n_caltech`, `npz`, `prophesee`, `ros` (with `bags` and `ros_events`) and
+`text`. They are imported when first needed. This module also turns the raw numbers of a file into
+checked fields, so that every reader accepts the same values and words its errors alike.
 """
 
 import contextlib
@@ -34,8 +34,8 @@ _MOST_TIME = 1 << 62  # us, 146,000 years: sums and differences of two times sta
 READABLE = (
     "readable are a folder or zip with events.txt (Event-Camera Dataset), AEDAT 2 and 4, "
     "Prophesee RAW and DAT, Event Stream, bags of ROS 1 and ROS 2, HDF5 (jaxevent's own, DSEC, "
-    "MVSEC, M3ED and others), MATLAB .mat (v5 and v7.3), N-Caltech101 .bin, .npz, .npy and tables "
-    "of text"
+    "MVSEC, M3ED and others), MATLAB .mat (v5 and v7.3), N-Caltech101 .bin, folders of EVIMO2, "
+    ".npz, .npy and tables of text"
 )
 
 
@@ -117,6 +117,10 @@ def _reader(
     if stream is not None:
         raise InputError(f"{path}: holds one camera only; leave out stream= or --stream")
     if is_folder:
+        from jaxevent.io import evimo
+
+        if evimo.knows(path):
+            return functools.partial(evimo.read, in_memory=in_memory, progress=progress)
         if not (path / "events.txt").is_file():
             raise InputError(f"{path}: the folder holds no events.txt; {READABLE}")
         from jaxevent.io import text
@@ -159,9 +163,10 @@ def _streamed_reader(path: Path, head: bytes) -> Callable[..., Recording]:
     """The reader of a format that is told by its first bytes and decoded block by block."""
     if head.startswith(b"#!AER-DAT"):
         if not head.startswith(b"#!AER-DAT2"):
+            version = head[9:12].decode("latin-1")
             raise InputError(
-                f"{path}: is AEDAT {head[9:12].decode('latin-1')}; only AEDAT 2 and 4 can be read, "
-                "so convert it with jAER or DV"
+                f"{path}: is AEDAT {version if version.isprintable() else '?'}; only AEDAT 2 and "
+                "4 can be read, so convert it with jAER or DV"
             )
         from jaxevent.io import aedat2
 

@@ -105,6 +105,10 @@ _UNITS = {
     "extra/cut": "levels: 0 black, 255 white",
     "extra/read_noise": "levels: 0 black, 255 white",
     "extra/clock_offset": "s",
+    "extra/depth": "mm",
+    "extra/depth_t": CLOCK,
+    "extra/mask": "1000 times the number of the object",
+    "extra/mask_t": CLOCK,
 }
 _BLOSC = 32001
 _BLOCK = 1 << 20  # events copied at a time: 13 MB

@@ -1,19 +1,20 @@
 """A recording in a few lines: sensor, events, frames, clocks, and what else it holds."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.events import is_hot
 from jaxevent.progress import bar
-from jaxevent.recording import EventSource, Frames, Recording, Triggers
+from jaxevent.recording import EventSource, Frames, ImageSource, Recording, Triggers
 
 BLOCK = 1 << 20  # events looked at together: 13 MB
 BIN = 10_000  # us over which the peak rate is taken
 PARTS = 10  # of a recording, whose rates show how the rate changes
 GAP = 100_000  # us without an event that may be a jump of the clock
-_TRUTH = ("omega", "rvec", "tvec", "HDR_mat", "hdr", "motion", "tracks")
+_TRUTH = ("omega", "rvec", "tvec", "HDR_mat", "hdr", "motion", "tracks", "depth", "mask")
 
 
 def describe(recording: Recording, progress: bool | None = None) -> list[tuple[str, str]]:
@@ -49,11 +50,14 @@ def describe(recording: Recording, progress: bool | None = None) -> list[tuple[s
     lines += [("clocks", text) for text in _about_clocks(recording)]
     lines.append(("ground truth", _truth(recording, recording.extra)))
     for name, values in recording.extra.items():
-        lines.append((f"extra {name}", _value(np.asarray(values))))
+        lines.append((f"extra {name}", _value(values)))
     return lines
 
 
-def _value(values: NDArray) -> str:
+def _value(values: Any) -> str:
+    if isinstance(values, ImageSource) and len(values.shape) > 1:  # it may stay in its file
+        return f"{values.dtype} of shape {values.shape}"
+    values = np.asarray(values)
     if values.ndim == 0 or (values.dtype.kind == "U" and values.size < 10):
         return ", ".join(str(value) for value in values.ravel().tolist())
     return f"{values.dtype} of shape {values.shape}"

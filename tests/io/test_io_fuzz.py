@@ -39,6 +39,7 @@ fuzz = _script()
 @example(seed=3637)  # hdf5: a string's heap far past the end, for which libhdf5 takes 4 GB
 @example(seed=1442)  # hdf5: an attribute of a type that is none
 @example(seed=2163)  # mat: complex, without imaginary numbers
+@example(seed=20261929)  # aedat4: a line break for the version
 @example(seed=34)  # zip: a long name in the reason
 def test_damaged_files_are_refused_or_read(name, seed, tmp_path_factory):
     pytest.importorskip(NEEDS.get(name, "numpy"))
