@@ -15,7 +15,17 @@ from typing import TYPE_CHECKING, Any
 from jaxevent import cache
 
 if TYPE_CHECKING:
-    from jaxevent import blob, camera, egomotion, events, metrics, register, show, simulate
+    from jaxevent import (
+        blob,
+        camera,
+        datasets,
+        egomotion,
+        events,
+        metrics,
+        register,
+        show,
+        simulate,
+    )
     from jaxevent.errors import InputError
     from jaxevent.estimator import Estimate, Estimator
     from jaxevent.io import load, save
@@ -60,8 +70,8 @@ _HOMES = {
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 _MODULES = {
-    **{name: name for name in ("blob", "camera", "egomotion", "events", "metrics")},
-    **{name: name for name in ("register", "show", "simulate")},
+    **{name: name for name in ("blob", "camera", "datasets", "egomotion", "events")},
+    **{name: name for name in ("metrics", "register", "show", "simulate")},
     "colour": "reconstruction.colour",
 }
 
@@ -84,6 +94,7 @@ __all__ = [
     "cf",
     "cf_augmented",
     "colour",
+    "datasets",
     "edi",
     "egomotion",
     "evaluate",

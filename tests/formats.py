@@ -6,6 +6,7 @@ height) and returns the bytes of a file, or writes one where a library does.
 
 import functools
 import struct
+import zlib
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
@@ -692,3 +693,56 @@ def evimo(folder: Path, events, meta, images=None, depths=None):
         none = {} if arrays else {"empty": np.array(None)}  # as the dataset's own writer does
         np.savez_compressed(folder / f"dataset_{name}.npz", allow_pickle=True, **arrays, **none)
     return folder
+
+
+# Ground truth beside recordings
+
+
+def mvsec_truth(matrices, pose_t, depth, flow, image_t, side="left") -> bytes:
+    """NAME_gt.hdf5; matrices are of the camera in the world, times in us."""
+
+    def fill(file):
+        group = file.create_group(f"davis/{side}")
+        group["pose"], group["pose_ts"] = matrices, np.array(pose_t) / 1e6
+        group["depth_image_raw"], group["depth_image_raw_ts"] = depth, np.array(image_t) / 1e6
+        group["flow_dist"], group["flow_dist_ts"] = flow, np.array(image_t) / 1e6
+
+    return _hdf5(fill)
+
+
+def m3ed_truth(matrices, t, depth=None) -> bytes:
+    """NAME_pose_gt.h5, or with depth NAME_depth_gt.h5."""
+
+    def fill(file):
+        file["Cn_T_C0"], file["ts"] = np.linalg.inv(matrices), np.array(t, float)
+        if depth is not None:
+            file.create_dataset("depth/prophesee/left", data=depth, compression="lzf")
+
+    return _hdf5(fill)
+
+
+def png16(image) -> bytes:
+    """A PNG of (height, width, 3) uint16, red first."""
+
+    def chunk(kind, data):
+        crc = zlib.crc32(kind + data)
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc)
+
+    height, width, _ = image.shape
+    rows = image.astype(">u2").reshape(height, -1).view(np.uint8)
+    data = zlib.compress(np.insert(rows, 0, 0, axis=1).tobytes())  # no filter
+    head = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+
+
+def dsec_flow(folder: Path, flow, t):
+    """The folder flow of DSEC: flow (n, 2, height, width) in px, NaN where unknown."""
+    (folder / "forward").mkdir(parents=True)
+    lines = [f"{a}, {b}" for a, b in t]
+    text = "\n".join(["# from_timestamp_us, to_timestamp_us", *lines]) + "\n"
+    (folder / "forward_timestamps.txt").write_text(text)
+    for i, one in enumerate(flow):
+        known = np.isfinite(one[0])
+        stored = np.where(known, 2**15 + 128 * one, 0)
+        image = np.stack([*stored, known], axis=-1).astype(np.uint16)
+        (folder / f"forward/{2 * i + 4:06d}.png").write_bytes(png16(image))

@@ -59,9 +59,10 @@ def read(
     """Read a folder; `size` is (width, height).
 
     With `meta`, the dictionary of dataset_info.npz, there are frames of the classical camera, the
-    calibration, the poses of the camera in the world and, in `extra`, the ground truth: `depth` in
-    mm, `mask`, and their times `depth_t` and `mask_t` (us). `imu` names one of the series of
-    samples in `meta`.
+    calibration, the poses of the camera in the world and, in `extra`, the ground truth: `depth`
+    (n, height, width) in m, `mask`, and their times `depth_t` and `mask_t` (n,) in us. Depths and
+    masks stay in their files until they are asked for. `imu` names one of the series of samples in
+    `meta`.
 
     Raises `InputError` for bad input.
     """
@@ -77,8 +78,9 @@ def read(
         samples = _imu(meta["imu"][imu], source) if imu is not None else None
         frames = None
         for name, part in parts.items():
-            t, images = part.at(meta.get("frames", ()), in_memory)
+            t, images = part.at(meta.get("frames", ()))
             if len(t) and name == "classical":
+                images = np.asarray(images) if in_memory else images
                 frames = Frames(t, images, np.zeros_like(t))
             elif len(t):
                 extra |= {name: images, f"{name}_t": t}
@@ -187,9 +189,7 @@ class _Images:
                     raise InputError(f"{self.file}: {first} is no image (height, width)")
                 self.shape = (shape[0], shape[1])
 
-    def at(
-        self, frames: Sequence[Mapping[str, Any]], in_memory: bool
-    ) -> tuple[NDArray[np.int64], Any]:
+    def at(self, frames: Sequence[Mapping[str, Any]]) -> tuple[NDArray[np.int64], Any]:
         """Times and images of those frames of `meta` that have one."""
         held = [(frame["ts"], self._name(frame)) for frame in frames]
         held = [(stamp, name) for stamp, name in held if name in self.names]
@@ -201,7 +201,7 @@ class _Images:
         images = DecodedImages(
             lambda row: self._images(names[row:]), (len(t), *self.shape), dtype, str(self.file)
         )
-        return t, np.asarray(images) if in_memory else images
+        return t, images
 
     def _name(self, frame: Mapping[str, Any]) -> str:
         return f"{self.kind}_{whole_number(frame['id'], str(self.file), 'id'):010d}.npy"
@@ -210,9 +210,12 @@ class _Images:
         with reading(str(self.file)), _archive(self.file) as archive:
             for name in names:
                 image = _member(archive, name, str(self.file))
-                # Of OpenCV: blue, green, red.
-                grey = image if image.ndim == 2 else np.rint(image[..., :3] @ LUMA[::-1])
-                yield grey.astype(image.dtype)
+                if self.kind == "depth":
+                    yield (image / 1000).astype(np.float32)
+                elif image.ndim == 3:  # of OpenCV: blue, green, red
+                    yield np.rint(image[..., :3] @ LUMA[::-1]).astype(image.dtype)
+                else:
+                    yield image
 
 
 def _camera(

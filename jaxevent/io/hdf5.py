@@ -105,10 +105,12 @@ _UNITS = {
     "extra/cut": "levels: 0 black, 255 white",
     "extra/read_noise": "levels: 0 black, 255 white",
     "extra/clock_offset": "s",
-    "extra/depth": "mm",
+    "extra/depth": "m",
     "extra/depth_t": CLOCK,
     "extra/mask": "1000 times the number of the object",
     "extra/mask_t": CLOCK,
+    "extra/flow": "px",
+    "extra/flow_t": CLOCK,
 }
 _BLOSC = 32001
 _BLOCK = 1 << 20  # events copied at a time: 13 MB

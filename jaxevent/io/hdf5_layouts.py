@@ -15,7 +15,7 @@
 
 Integers are us, floats seconds. Exposures are unknown: 0. Where a file holds two cameras, left or
 right must be chosen. M3ED's frames come from cameras beside the event camera, with pixels of their
-own, and MVSEC's and M3ED's ground truth from further files: they are not read.
+own, and are not read. Poses come from further files beside these, see `truth`.
 """
 
 from collections.abc import Mapping
@@ -42,6 +42,7 @@ from jaxevent.io.columns import find, order_of
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.hdf5 import Column, Microseconds, StoredEvents, StoredImages, in_memory
 from jaxevent.io.hdf5_files import array, attribute, dataset, filters_of, open_file
+from jaxevent.io.truth import read_poses
 from jaxevent.recording import Frames, Imu, Recording, Triggers
 
 _GROUPS = ("events", "", "CD/events")
@@ -162,7 +163,9 @@ def _m3ed(file: Any, path: Path, size: tuple[int, int] | None, group: str) -> Re
     table = None
     if f"{group}/ms_map_idx" in file:
         table = dataset(file, f"{group}/ms_map_idx", source)
-    return Recording(path.stem, *size, StoredEvents(columns, size, source, 0, table), camera=camera)
+    events = StoredEvents(columns, size, source, 0, table)
+    poses = read_poses(path, group)
+    return Recording(path.stem, *size, events, camera=camera, poses=poses)
 
 
 def _camera(file: Any, group: str, source: str) -> PinholeCamera | None:
@@ -215,7 +218,9 @@ def _mvsec(file: Any, path: Path, size: tuple[int, int] | None, group: str) -> R
         imu = Imu(stamps, values[:, 3:], values[:, :3])
     otherwise = f"{path}: has no {group}/image_raw to tell the sensor's size;"
     size = sensor_size(size, frames=frames, otherwise=otherwise)
-    return Recording(path.stem, *size, StoredEvents(columns, size, source), frames, imu=imu)
+    events = StoredEvents(columns, size, source)
+    poses = read_poses(path, group)
+    return Recording(path.stem, *size, events, frames, poses=poses, imu=imu)
 
 
 def _fields(file: Any, name: str) -> Mapping[str, str] | None:

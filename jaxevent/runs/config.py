@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from jaxevent import datasets
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters, nearest, read_toml
 
@@ -39,6 +40,7 @@ NATURAL = (is_natural, "a whole number, 1 or more")
 NAME = (is_text, "text")
 PATHS = (is_texts, 'a list of paths, as ["file.zip"]')
 
+STREAM = (is_text, 'the name of a camera, as "left"')
 SIZE: Check = (
     lambda value: isinstance(value, list) and len(value) == 2 and all(map(is_natural, value)),
     "[width, height] in pixels",
@@ -64,7 +66,8 @@ def one_of(value: str, what: str, known: Sequence[str]) -> str:
 def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path]]:
     """Recordings as given and their paths, of paths and globs relative to `folder`.
 
-    $NAME is expanded. Raises `InputError` for what is not there.
+    "NAME:FOLDER" stands for all recordings of a data set of `jaxevent.datasets`. $NAME is expanded.
+    Raises `InputError` for what is not there.
     """
     if not (isinstance(given, list) and given and all(isinstance(one, str) for one in given)):
         raise InputError('recordings is missing or not a list; give recordings = ["file.zip", ...]')
@@ -75,6 +78,11 @@ def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path]]:
         if unset and not (folder / expanded).exists():
             name = unset.group(1).strip("{}")
             raise InputError(f"the recording {text!r} needs the variable {name}, which is not set")
+        name, _, rest = expanded.partition(":")
+        if rest and name in datasets.LAYOUTS and not (folder / expanded).exists():
+            for one, path in datasets.open(name, folder / rest).paths.items():
+                found.setdefault(path, f"{name}:{one}")
+            continue
         if not glob.has_magic(expanded) or (folder / expanded).exists():
             found.setdefault(folder / expanded, text)
             continue

@@ -13,6 +13,7 @@ from typing import Any
 from jaxevent.errors import InputError
 from jaxevent.io import load
 from jaxevent.io.output import complete
+from jaxevent.io.truth import beside
 from jaxevent.progress import bar
 from jaxevent.recording import Recording
 
@@ -26,14 +27,17 @@ class Opened(threading.local):
     def clear(self) -> None:
         self._last: tuple[Any, Recording | InputError | None] = (None, None)
 
-    def load(self, path: Path, size: tuple[int, int] | None, progress: bool | None) -> Recording:
+    def load(
+        self, path: Path, size: tuple[int, int] | None, stream: str | None, progress: bool | None
+    ) -> Recording:
         size = None if size is None else (size[0], size[1])
-        what = (path, size, [_stamp(file) for file in _files(path)])
+        files = [*_files(path), *beside(path)]
+        what = (path, size, stream, [_stamp(file) for file in files])
         before, loaded = self._last
         if loaded is None or before != what:
             self.clear()
             try:
-                loaded = load(path, size, in_memory=False, progress=progress)
+                loaded = load(path, size, in_memory=False, progress=progress, stream=stream)
                 loaded = dataclasses.replace(loaded, name=str(path))  # for messages
             except InputError as error:
                 loaded = error

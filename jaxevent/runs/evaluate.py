@@ -1,8 +1,10 @@
 """Methods compared with what is known, for every recording: images, motion or tracks.
 
     recordings = ["slider_depth.zip", "more/*.h5"]  # paths or globs; $NAME is expanded
+                                                    # "mvsec:FOLDER": all of a data set
     protocol = "held-out"                           # or "reference", "motion" or "tracks"
     size = [240, 180]                               # only for recordings that do not tell it
+    stream = "left"                                 # only for files of several cameras
     metrics = ["authors_ssim"]                      # of images; further ones, named in MEASURES
     optional_metrics = ["lpips"]                    # of them those whose extra is installed
     gap = 4                                         # with "held-out": every 4th frame is given,
@@ -66,9 +68,19 @@ import jaxevent
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
 from jaxevent.io.output import values_of
+from jaxevent.io.truth import beside
 from jaxevent.methods import find
 from jaxevent.parameters import Parameters, read_toml
-from jaxevent.runs.config import NAME, SIZE, Check, check, find_recordings, named_files, read_params
+from jaxevent.runs.config import (
+    NAME,
+    SIZE,
+    STREAM,
+    Check,
+    check,
+    find_recordings,
+    named_files,
+    read_params,
+)
 from jaxevent.runs.contents import Contents, Opened
 from jaxevent.runs.families import find_protocol
 from jaxevent.runs.family import Protocol, Source
@@ -188,6 +200,7 @@ def _tasks(plan: "Plan", folder: Path | None, progress: bool | None, here: bool)
             "protocol": plan.name,
             "options": {**plan.options, **entry.own},
             "size": plan.size,
+            "stream": plan.stream,
             "double": double,
             "version": f"{jaxevent.__version__}, results {RESULTS_VERSION}",
         }
@@ -196,7 +209,7 @@ def _tasks(plan: "Plan", folder: Path | None, progress: bool | None, here: bool)
             # What cannot be read has no key; computing it says why.
             with contextlib.suppress(OSError, InputError):
                 whole = {**about, "content": contents.of(path)}
-                files = plan.protocol.files(path, plan.options)
+                files = [*beside(path), *plan.protocol.files(path, plan.options)]
                 if isinstance(entry.method, Source):
                     files = [*files, *entry.method.files(_name(path))]
                     whole["params"] = entry.method.values()
@@ -217,6 +230,7 @@ def _compute(
     protocol: str,
     options: dict[str, Any],
     size: tuple[int, int] | None,
+    stream: str | None,
     double: bool,
     version: str,
     progress: bool | None,
@@ -237,7 +251,7 @@ def _compute(
             row = {"method": method, **known, "params": source.values()}
             return {"row": row, "picture": None}
     with jax.enable_x64(double):
-        recording = _opened.load(Path(path), size, progress)
+        recording = _opened.load(Path(path), size, stream, progress)
         if method in kind.sources:
             source, values = kind.sources[method](**params), None
             told = source.values()
@@ -266,6 +280,7 @@ class Plan:
     protocol: Protocol
     options: dict[str, Any]
     size: tuple[int, int] | None
+    stream: str | None
 
     def inputs(self, config: Path) -> list[Path]:
         """All files that are read, and can be."""
@@ -313,8 +328,8 @@ def read_plan(config: Path, metrics: Sequence[str] = ()) -> Plan:
         name = table.get("protocol", "held-out")
         protocol, family = find_protocol(name)
         anything: Check = (lambda value: True, "")
-        known = {"recordings": anything, "protocol": NAME, "size": SIZE, "method": anything}
-        check(table, {**known, **protocol.settings})
+        known = {"recordings": anything, "protocol": NAME, "size": SIZE, "stream": STREAM}
+        check(table, {**known, "method": anything, **protocol.settings})
         options = {key: table[key] for key in protocol.settings if key in table}
         if metrics:
             if "metrics" not in protocol.settings:
@@ -326,7 +341,8 @@ def read_plan(config: Path, metrics: Sequence[str] = ()) -> Plan:
         recordings = find_recordings(table.get("recordings"), config.parent)
         methods = _methods(table.get("method"), config.parent, protocol, family, options)
         size = None if size is None else (size[0], size[1])
-        return Plan(recordings, methods, name, protocol, options, size)
+        stream = table.get("stream")
+        return Plan(recordings, methods, name, protocol, options, size, stream)
     except InputError as error:
         raise InputError(f"{config}: {error}") from None
 

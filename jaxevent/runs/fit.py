@@ -3,11 +3,13 @@
 `fit` and the command `jaxevent fit CONFIG.toml` run the loop of `jaxevent.tuning` as a file
 describes it:
 
-    recordings = ["slider_depth.zip"]   # paths or globs, relative to this file; $NAME is expanded
+    recordings = ["slider_depth.zip"]   # paths or globs, relative to this file; $NAME is expanded;
+                                        # "mvsec:FOLDER": all of a data set
     validation = []                     # recordings for early stopping,
     test = []                           # and those that are only scored; if neither is given,
     split = [2, 1, 1]                   # of every 4 images in turn 2 are fitted, 1, 1 are those
     size = [240, 180]                   # only for recordings that do not tell it
+    stream = "left"                     # only for files of several cameras
     window = 1.0                        # s, of mini-batches; omitted: whole recordings
     batch = 4                           # windows per step; omitted: all
     iterations = 300                    # and the other fields of `Settings`
@@ -291,7 +293,7 @@ def _sources(plan: Plan, progress: bool | None) -> Sources:
 
 
 def _load(path: Path, plan: Plan, progress: bool | None) -> Recording:
-    recording = load(path, plan.size, in_memory=False, progress=progress)
+    recording = load(path, plan.size, in_memory=False, progress=progress, stream=plan.stream)
     return dataclasses.replace(recording, name=str(path))  # for messages
 
 

@@ -21,6 +21,7 @@ from jaxevent.runs.config import (
     PATHS,
     POSITIVE,
     SIZE,
+    STREAM,
     Check,
     check,
     find_recordings,
@@ -59,6 +60,7 @@ class Plan:
     recordings: Mapping[str, list[tuple[str, Path]]]
     tasks: list[Task]
     size: tuple[int, int] | None
+    stream: str | None
     split: Shares
     window: float | int | None
 
@@ -116,6 +118,7 @@ _COMMON: dict[str, Check] = {
         "[fit, validation, test] in whole numbers, the first not 0",
     ),
     "size": SIZE,
+    "stream": STREAM,
     "window": POSITIVE,
     "method": (
         lambda value: isinstance(value, list) and all(isinstance(n, dict) for n in value),
@@ -203,6 +206,7 @@ def read_plan(config: Path, recordings: Sequence[str | Path] | None = None) -> P
             found,
             tasks,
             None if size is None else (size[0], size[1]),
+            table.get("stream"),
             None if apart else tuple(table.get("split", (2, 1, 1))),
             table.get("window"),
         )

@@ -14,7 +14,7 @@ BLOCK = 1 << 20  # events looked at together: 13 MB
 BIN = 10_000  # us over which the peak rate is taken
 PARTS = 10  # of a recording, whose rates show how the rate changes
 GAP = 100_000  # us without an event that may be a jump of the clock
-_TRUTH = ("omega", "rvec", "tvec", "HDR_mat", "hdr", "motion", "tracks", "depth", "mask")
+_TRUTH = ("omega", "rvec", "tvec", "HDR_mat", "hdr", "motion", "tracks", "depth", "mask", "flow")
 
 
 def describe(recording: Recording, progress: bool | None = None) -> list[tuple[str, str]]:

@@ -1,0 +1,192 @@
+"""Ground truth that data sets keep in files beside a recording.
+
+    MVSEC   NAME_gt.hdf5 beside NAME_data.hdf5: /davis/{left, right}/pose (n, 4, 4), from the camera
+            to the world; depth_image_raw (n, H, W) in m, NaN where unknown; flow_dist (n, 2, H, W)
+            in px from one of its times to the next; each with its times in s, NAME_ts
+    M3ED    NAME_pose_gt.h5 beside NAME_data.h5: Cn_T_C0 (n, 4, 4), from the first left camera to
+            the n-th; ts in us. NAME_depth_gt.h5: depth/prophesee/left (n, H, W) in m, infinite
+            where unknown; ts
+    DSEC    SEQUENCE/flow beside SEQUENCE/events/left/events.h5: forward_timestamps.txt, two times
+            in us a line, and forward/*.png of 16 bits: x and y as 2^15 + 128 px, and 1 where known.
+            In place of SEQUENCE/flow also train_optical_flow/SEQUENCE/flow, as it is downloaded
+
+`load` takes poses from these files, as `Recording.poses`. `read_images` gives, by name as
+`Recording.extra` keeps them, `depth` (n, H, W) in m with its times `depth_t` (n,), and `flow`
+(n, 2, H, W), x and y in px, with `flow_t` (n, 2), from when to when. All times are us. Images stay
+in their files until they are asked for. DSEC's flow is that of the rectified image, see
+`rectify_map`, and NaN where unknown; what else is unknown is as stored.
+
+Sources: daniilidis-group/mvsec, website/content/data_format/index.md, and readers of its HDF5
+files; daniilidis-group/m3ed, build_system/lidar_depth/fasterlio_gt.py; uzh-rpg/DSEC and its page
+dsec.ifi.uzh.ch/data-format. Checked against files written by these layouts.
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError, require
+from jaxevent.io import reading, times
+from jaxevent.io.decoded import DecodedImages
+from jaxevent.io.hdf5 import StoredImages
+from jaxevent.io.hdf5_files import array, dataset, open_file
+from jaxevent.recording import Poses
+
+_SUFFIXES = {"_data.hdf5": ("_gt.hdf5",), "_data.h5": ("_pose_gt.h5", "_depth_gt.h5")}
+
+
+def beside(path: Path) -> list[Path]:
+    """The files of ground truth that exist beside a recording's."""
+    found = []
+    for end, others in _SUFFIXES.items():
+        if path.name.endswith(end):
+            found += [path.with_name(path.name.removesuffix(end) + other) for other in others]
+    flow = _flow_folder(path)
+    found += [] if flow is None else [flow / "forward_timestamps.txt"]
+    return [file for file in found if file.is_file()]
+
+
+def read_poses(path: Path, camera: str) -> Poses | None:
+    """Poses of a camera in the world; `camera` is its group in the file, as "davis/left"."""
+    for file in beside(path):
+        with reading(str(file)):
+            if file.name.endswith("_gt.hdf5"):
+                return _poses_mvsec(file, camera)
+            if file.name.endswith("_pose_gt.h5") and camera == "prophesee/left":
+                return _poses_m3ed(file)
+    return None
+
+
+def read_images(path: Path, side: str = "left") -> dict[str, Any]:
+    """Depth and flow of the left or right camera, by name; empty where there are none.
+
+    Raises `InputError` where they are damaged.
+    """
+    found: dict[str, Any] = {}
+    for file in beside(path):
+        with reading(str(file)):
+            if file.name.endswith("_gt.hdf5"):
+                found |= _images_mvsec(file, f"davis/{side}")
+            elif file.name.endswith("_depth_gt.h5"):
+                found |= _depth_m3ed(file, side)
+            elif file.name == "forward_timestamps.txt" and side == "left":
+                found |= _flow_dsec(file.parent)
+    return found
+
+
+def _poses_mvsec(file: Path, camera: str) -> Poses | None:
+    with open_file(file) as opened:
+        if f"{camera}/pose" not in opened:
+            return None
+        t = times(array(opened, f"{camera}/pose_ts", str(file)), str(file), "pose")
+        return _poses(t, array(opened, f"{camera}/pose", str(file)), f"{file}: {camera}/pose")
+
+
+def _poses_m3ed(file: Path) -> Poses:
+    with open_file(file) as opened:
+        stamps = array(opened, "ts", str(file))
+        matrices = array(opened, "Cn_T_C0", str(file))
+    t = times(stamps, str(file), "pose", scale=1.0)
+    if matrices.shape[1:] == (4, 4):
+        matrices = np.linalg.inv(matrices.astype(float))
+    return _poses(t, matrices, f"{file}: Cn_T_C0")
+
+
+def _poses(t: NDArray[np.int64], matrices: NDArray, source: str) -> Poses:
+    from scipy.spatial.transform import Rotation
+
+    if matrices.shape != (len(t), 4, 4) or not np.isfinite(matrices).all():
+        raise InputError(
+            f"{source} has shape {matrices.shape}; it must be {len(t)} finite 4 x 4 matrices, one "
+            "for each time"
+        )
+    quaternion = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
+    return Poses(t, matrices[:, :3, 3].astype(float), quaternion)
+
+
+def _stored(opened: Any, name: str, axes: int, count: int, file: Path) -> StoredImages:
+    images = dataset(opened, name, str(file))
+    if images.ndim != axes or len(images) != count or images.dtype.kind not in "iuf":
+        raise InputError(
+            f"{file}: {name} has shape {images.shape}; it must have {axes} axes, and one image for "
+            f"each of {count} times"
+        )
+    return StoredImages(images, f"{file}: {name}")
+
+
+def _images_mvsec(file: Path, camera: str) -> dict[str, Any]:
+    opened = open_file(file)
+    found: dict[str, Any] = {}
+    for name, axes, key in (("depth_image_raw", 3, "depth"), ("flow_dist", 4, "flow")):
+        if f"{camera}/{name}" in opened:
+            t = times(array(opened, f"{camera}/{name}_ts", str(file)), str(file), key)
+            found[key] = _stored(opened, f"{camera}/{name}", axes, len(t), file)
+            found[f"{key}_t"] = t
+    if "flow" in found:
+        t = found["flow_t"]
+        found["flow"] = found["flow"][: max(len(t) - 1, 0)]
+        found["flow_t"] = np.stack([t[:-1], t[1:]], axis=1)
+    return found
+
+
+def _depth_m3ed(file: Path, side: str) -> dict[str, Any]:
+    opened = open_file(file)
+    name = f"depth/prophesee/{side}"
+    if name not in opened:
+        return {}
+    t = times(array(opened, "ts", str(file)), str(file), "depth", scale=1.0)
+    return {"depth": _stored(opened, name, 3, len(t), file), "depth_t": t}
+
+
+def _flow_folder(path: Path) -> Path | None:
+    """Where the flow of DSEC's left camera lies, whose events are in `path`; None elsewhere."""
+    if path.name != "events.h5":
+        return None
+    if path.parts[-3:-1] == ("events", "left"):
+        sequence = path.parents[2]
+    elif path.parent.name == "events_left":
+        sequence = path.parents[1]
+    else:
+        return None
+    places = (sequence, sequence.parents[1] / "train_optical_flow" / sequence.name)
+    return next((place / "flow" for place in places if (place / "flow").is_dir()), None)
+
+
+def _flow_dsec(folder: Path) -> dict[str, Any]:
+    from PIL import Image
+
+    file = folder / "forward_timestamps.txt"
+    t = np.loadtxt(file, np.int64, delimiter=",", ndmin=2)
+    images = sorted((folder / "forward").glob("*.png"))
+    if t.shape != (len(images), 2):
+        raise InputError(
+            f"{file}: holds times of shape {t.shape} but {folder / 'forward'} has {len(images)} "
+            "images; each image needs a line of two times"
+        )
+    if not images:
+        return {}
+    with Image.open(images[0]) as first:
+        width, height = first.size
+    flow = DecodedImages(
+        lambda row: _flows_of(images[row:], (height, width)),
+        (len(images), 2, height, width),
+        np.dtype(np.float32),
+        str(folder),
+    )
+    return {"flow": flow, "flow_t": t}
+
+
+def _flows_of(images: Sequence[Path], shape: tuple[int, int]) -> Iterator[NDArray[np.float32]]:
+    # Pillow reads 8 of the 16 bits.
+    cv2 = require("cv2", "vision")
+    for image in images:
+        stored = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
+        if stored is None or stored.dtype != np.uint16 or stored.shape != (*shape, 3):
+            raise InputError(
+                f"{image}: is no flow; store {shape[1]}x{shape[0]} pixels of 3 x 16 bits"
+            )
+        known, y, x = np.moveaxis(stored.astype(np.float32), 2, 0)  # OpenCV has blue first
+        yield np.where(known == 1, (np.stack([x, y]) - 2**15) / 128, np.nan).astype(np.float32)
