@@ -213,6 +213,19 @@ def bag_of_mcap_without_an_index(folder):
     return folder / "a.mcap"
 
 
+def bag_of_mcap_with_many_chunks_without_an_index(folder):
+    """Each chunk may unfold so far, all of them may not."""
+    block = ((1 << 17) << 3 | 1 << 1).to_bytes(3, "little") + b"\0"
+    each = MOST // 4
+    packed = b"\x28\xb5\x2f\xfd\0\x58" + block * (each * 8)
+    chunk = struct.pack("<3QII", 0, 0, each << 20, 0, 4) + b"zstd" + struct.pack("<Q", len(packed))
+    header = struct.pack("<I", 4) + b"ros2" + struct.pack("<I", 0)
+    records = ((1, header), *[(6, chunk + packed)] * 4, (2, bytes(20)))
+    stored = b"".join(struct.pack("<BQ", kind, len(held)) + held for kind, held in records)
+    (folder / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + stored + b"\x89MCAP0\r\n")
+    return folder / "a.mcap"
+
+
 def aedat4_with_a_packet_of_lz4(folder):
     content = formats.aedat4(EVENTS[:0], SIZE).replace(b"NONE", b"LZ4 ")
     packed = lz4.frame.compress(ZEROS * MOST)
@@ -266,7 +279,8 @@ FILES = {  # what the refusal says
     mat_of_zeros: "over 100 times",
     mat_of_an_empty_array_with_a_size: "events is said to be empty but has a size",
     bag_with_a_chunk_of_bz2: "over 100 times",
-    bag_of_mcap_without_an_index: "a chunk of .* bytes claims to hold 167,772,160",
+    bag_of_mcap_without_an_index: "claim to hold 167,772,160, over 100 times",
+    bag_of_mcap_with_many_chunks_without_an_index: "claim to hold 167,772,160, over 100 times",
     aedat4_with_a_packet_of_lz4: "over 100 times",
     aedat4_with_a_packet_of_zstandard: "over 100 times",
     aedat4_with_entities_in_its_header: "header is damaged",

@@ -1,7 +1,8 @@
 """The containers of ROS messages: bags of ROS 1, and of ROS 2 as a folder, .mcap or .db3.
 
 The package rosbags (Apache 2, no ROS) reads all of them. Its readers unfold a compressed chunk to
-however much it holds; here no chunk of a file may unfold beyond `most_unfolded`. A database (.db3)
+however much it holds; here neither a chunk nor all chunks of a file together, named by an index or
+not, may unfold beyond `most_unfolded`. A database (.db3)
 may hold plain tables only, as a view or a column made by a formula could take any time and memory.
 A folder whose files or messages rosbag2 compressed by itself is refused for the same reason.
 """
@@ -10,6 +11,7 @@ import contextlib
 import functools
 import importlib
 import sqlite3
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,8 @@ bool is_bigendian
 uint8[] events
 """
 
+_CHUNK = 6  # records of MCAP
+
 Place = tuple[int, int]  # a time of recording (ns), and how many messages of it come before
 
 
@@ -43,6 +47,10 @@ class Bag:
                 self._head = file.read(16)
         self._is_database = self._head.startswith(b"SQLite")
         self.is_ros1 = self._head.startswith(b"#ROSBAG")
+        if not self.is_ros1 and not self._is_database:
+            for file in path.glob("*.mcap") if path.is_dir() else [path]:
+                if file.is_file():
+                    _check_chunks(file)
         with self._open() as reader:
             self._types = [(c.topic, c.msgtype, c.msgcount) for c in reader.connections]
 
@@ -139,6 +147,22 @@ def _unfolded(path: Path, data: bytes) -> bytes:
     unfolded = decompressor.decompress(data, max_length=most_unfolded(length) + 1)
     check_unfolded(len(unfolded), length, str(path))
     return unfolded
+
+
+def _check_chunks(path: Path) -> None:
+    """Raise `InputError` where the chunks of an MCAP together claim too much.
+
+    Without an index rosbags finds them one after another; each could claim the most for itself.
+    """
+    length, at, unfolded = path.stat().st_size, 8, 0
+    with path.open("rb") as file:
+        while at + 9 <= length:
+            file.seek(at)
+            kind, size = struct.unpack("<BQ", file.read(9))
+            if kind == _CHUNK and len(head := file.read(24)) == 24:
+                unfolded += struct.unpack("<16xQ", head)[0]
+            at += 9 + size
+    check_unfolded(unfolded, length, str(path))
 
 
 def _check_chunk(size: int, data: bytes) -> None:

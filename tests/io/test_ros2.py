@@ -198,6 +198,23 @@ def test_chunks_of_mcap_are_bounded(tmp_path):
         load(path)
 
 
+def test_mcap_is_read_without_its_index(tmp_path):
+    formats.bag2(tmp_path / "a", EVENTS, SIZE, "mono", compression="STORAGE")
+    (path,) = (tmp_path / "a").glob("*.mcap")
+    content = path.read_bytes()
+    (summary,) = struct.unpack_from("<Q", content, len(content) - 28)
+    footer = b"\x02" + struct.pack("<QQQI", 20, 0, 0, 0)
+    path.write_bytes(content[:summary] + footer + content[-8:])
+    for in_memory in (True, False):
+        assert_events(load(path, None, in_memory).events, EVENTS)
+    # What a chunk claims for itself counts, too: after its length, two times.
+    at = content.index(b"\x06", 8 + 9 + struct.unpack_from("<Q", content, 9)[0])
+    lie = content[: at + 25] + struct.pack("<Q", 1 << 40) + content[at + 33 :]
+    path.write_bytes(lie[:summary] + footer + lie[-8:])
+    with pytest.raises(InputError, match="claim to hold 1,099,511,627,776, over 100 times"):
+        load(path)
+
+
 def test_databases_of_more_than_tables_are_refused(tmp_path):
     formats.bag2(tmp_path / "a", EVENTS, SIZE, "mono", "sqlite3")
     (path,) = (tmp_path / "a").glob("*.db3")
