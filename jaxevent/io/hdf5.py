@@ -413,11 +413,11 @@ def write(
         ):
             if part is not None:
                 for name, values in vars(part).items():
-                    _write(file, f"{group}/{name}", values, compression)
+                    _write(file, f"{group}/{name}", values, compression, check)
         if (camera := recording.camera) is not None:
             file["camera"] = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
         for name, values in recording.extra.items():
-            _write(file, f"extra/{name}", values, compression)
+            _write(file, f"extra/{name}", values, compression, check)
         _tell_units(file)
 
 
@@ -469,7 +469,9 @@ def _write_events(
         ms = end
 
 
-def _write(file: h5py.File, name: str, values: Any, compression: str | None) -> None:
+def _write(
+    file: h5py.File, name: str, values: Any, compression: str | None, check: Callable[[], None]
+) -> None:
     if isinstance(values, ImageSource) and not isinstance(values, np.ndarray):
         options = _options(values.shape[0], compression)
         if options:
@@ -477,6 +479,7 @@ def _write(file: h5py.File, name: str, values: Any, compression: str | None) -> 
         stored = file.create_dataset(name, values.shape, values.dtype, **options)
         for row in range(values.shape[0]):
             stored[row : row + 1] = np.asarray(values[row : row + 1])
+            check()
         return
     values = np.asarray(values)
     dtype = h5py.string_dtype() if values.dtype.kind == "U" else values.dtype

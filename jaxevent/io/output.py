@@ -2,10 +2,13 @@
 
 import contextlib
 import contextvars
+import inspect
 import io
 import math
 import re
 import shutil
+import signal
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -124,10 +127,55 @@ def complete_hdf5(
 
     with complete(path) as partial, partial.open("r+b", buffering=0) as raw:
         sink = _Sink(raw)
-        with h5py.File(sink, "w") as file:
-            describe(file, method, params)
-            yield file, sink.check
-        sink.check()
+        with _signals_outside(sink.readinto, sink.write, sink.truncate) as let_signals_in:
+
+            def check() -> None:
+                let_signals_in()
+                sink.check()
+
+            with h5py.File(sink, "w") as file:
+                describe(file, method, params)
+                yield file, check
+            check()
+
+
+@contextlib.contextmanager
+def _signals_outside(*callbacks: Callable) -> Iterator[Callable[[], None]]:
+    """Have signals that come while one of these functions runs wait; gives what lets them in.
+
+    What a handler raises there would unwind through libhdf5, which crashes. While libhdf5
+    compresses, signals are first seen in a callback.
+    """
+    codes = {inspect.unwrap(getattr(one, "__func__", one)).__code__ for one in callbacks}
+    before: dict[int, Any] = {}
+    waiting: list[int] = []
+
+    def handle(number: int, frame: Any) -> None:
+        caller = frame
+        while caller is not None and caller.f_code not in codes:
+            caller = caller.f_back
+        if caller is None:
+            before[number](number, frame)
+        else:
+            waiting.append(number)
+
+    def let_in() -> None:
+        while waiting:
+            number = waiting.pop()
+            before[number](number, None)
+
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)
+            if number is not None and callable(handler := signal.getsignal(number)):
+                before[number] = handler
+                signal.signal(number, handle)
+    try:
+        yield let_in
+        let_in()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class _Sink:
