@@ -5,6 +5,8 @@ import pickle
 import formats
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from jaxevent import io
 from jaxevent.errors import InputError
@@ -132,6 +134,34 @@ def test_what_is_wrong_is_refused(folder, how, match):
     with pytest.raises(InputError, match=match) as error:
         evimo.read(folder, meta=meta)
     assert str(folder) in str(error.value)
+
+
+FILES = ("events_t.npy", "events_xy.npy", "events_p.npy", "info.npz", "depth.npz")
+
+
+@pytest.mark.slow
+@settings(max_examples=60)
+@given(
+    name=st.sampled_from(FILES),
+    place=st.floats(0, 1),
+    how=st.sampled_from(("cut", "byte", "number")),
+    value=st.integers(0, 255),
+)
+def test_damaged_files_are_refused_or_read(name, place, how, value, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("evimo") / "a"
+    formats.evimo(folder, EVENTS[:50], META, depths=DEPTHS)
+    file = folder / f"dataset_{name}"
+    content = file.read_bytes()
+    at = min(int(place * len(content)), len(content) - 1)
+    new = {"cut": b"", "byte": bytes([value]), "number": b"\xff\xff\xff\x7f"}[how]
+    after = b"" if how == "cut" else content[at + len(new) :]
+    file.write_bytes(content[:at] + new + after)
+    for in_memory in (True, False):
+        try:
+            recording = evimo.read(folder, in_memory=in_memory, meta=META).check()
+            np.asarray(recording.extra.get("depth", 0))
+        except InputError as error:
+            assert str(folder) in str(error) and "\n" not in str(error)
 
 
 def test_the_size_must_be_known(tmp_path):

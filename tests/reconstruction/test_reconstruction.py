@@ -15,6 +15,7 @@ from noise import small
 import jaxevent
 from jaxevent.methods import names
 from jaxevent.reconstruction import video
+from jaxevent.reconstruction.compensated import estimator as compensated
 from jaxevent.reconstruction.estimator import PixelEstimator
 from jaxevent.reconstruction.filtering import Event, Observation, State
 from jaxevent.recording import Events, Frames, Recording
@@ -195,6 +196,26 @@ def test_windows_do_not_change_the_result(name, recording, events):
     np.testing.assert_allclose(look(video, times), whole, rtol=1e-12, atol=1e-12)
     # Read again from the start: windows are opened anew from their kept states.
     np.testing.assert_allclose(look(video, times[2]), whole_at(whole, 2), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cf-augmented", "high-pass", "augmented", "blend", "last-frame"])
+def test_windows_do_not_change_the_result_of_baselines(name):
+    method, recording = jaxevent.METHODS[name], random_recording(4, 300, 6, exposure=500)
+    times = np.linspace(recording.start, recording.stop, 7).astype(np.int64)
+    whole = look(method.estimate(recording), times)
+    parts = look(method.estimate(recording, window_events=37), times)
+    for a, b in zip(whole, parts, strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_windows_do_not_change_the_evidence_of_mc():
+    recording, params = random_recording(4, 300, 6, exposure=500), jaxevent.mc.Params()
+    times = np.linspace(recording.start, recording.stop, 7).astype(np.int64)
+    whole = compensated.Images(recording, params, 10**6)(times)
+    for a, b in zip(whole, compensated.Images(recording, params, 37)(times), strict=True):
+        np.testing.assert_allclose(b, a, rtol=2e-6, atol=1e-9)  # kept in single precision
 
 
 @pytest.mark.slow
