@@ -1,5 +1,7 @@
 """Items of tonic's data sets, by the types that tonic 1.7 gives them (tests do without tonic)."""
 
+from typing import Any
+
 import formats
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ DTYPES = (
 
 
 def structured(dtype, events=EVENTS):
-    records = np.empty(len(events), dtype)
+    records: Any = np.empty(len(events), dtype)
     for name in "txyp":
         records[name] = getattr(events, name)
     return records
