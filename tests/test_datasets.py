@@ -6,6 +6,7 @@ import pytest
 import scipy.io
 from scipy.spatial.transform import Rotation
 
+import jaxevent
 from jaxevent import datasets, io
 from jaxevent.errors import InputError
 from jaxevent.runs.config import find_recordings
@@ -225,3 +226,24 @@ def test_damaged_truth_is_refused(how, tmp_path):
     spoilt_truth(tmp_path, how)
     with pytest.raises(InputError, match="a_gt.hdf5"):
         io.load(tmp_path / "a_data.hdf5")
+
+
+@pytest.mark.slow
+def test_a_data_set_is_evaluated_and_fitted(tmp_path):
+    images = RANDOM.integers(0, 256, (8, 30, 40)).astype(np.uint8)
+    whole = formats.mvsec(
+        EVENTS, SIZE, images, range(5_000, 85_000, 10_000), sides=("left", "right")
+    )
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set/a_data.hdf5").write_bytes(whole)
+    text = 'recordings = ["mvsec:set"]\n{}[[method]]\nname = "akf"\n'
+    config = tmp_path / "run.toml"
+    config.write_text(text.format(""))
+    with pytest.raises(InputError, match="two cameras, left and right; choose one"):
+        jaxevent.evaluate(config)
+    config.write_text(text.format('stream = "left"\n'))
+    (row,) = jaxevent.evaluate(config, tmp_path / "out")
+    assert row["recording"] == "mvsec:a" and np.isfinite(row["mse"])
+    config.write_text(text.format('stream = "left"\niterations = 2\n') + 'fit = ["c_on"]\n')
+    jaxevent.fit(config, tmp_path / "fitted")
+    assert (tmp_path / "fitted/params.toml").is_file()
