@@ -121,7 +121,8 @@ def _retyped(random, group, name) -> str:
         elif other == "pair":
             group[name] = np.zeros(count, [("a", "i4"), ("b", "f4")])
         else:
-            group[name] = np.zeros(count, other) if other == "V4" else values.astype(other)
+            with np.errstate(over="ignore", invalid="ignore"):
+                group[name] = np.zeros(count, other) if other == "V4" else values.astype(other)
     elif kind == "shape":
         others = (values[0], values[:, None], values[None], values[:-1], np.r_[values, values])
         group[name] = _chosen(random, others)
