@@ -171,10 +171,7 @@ def objects(seeds: range) -> Iterator[tuple]:
 def compared(targets: Iterator[tuple]) -> Iterator[dict[str, Any]]:
     compare = jax.jit(fusion.compare)
     for label, video, t, truth, hdr in targets:
-        instants, p, _ = video._target(t)
-        L, V, clear = video._images(instants.t)
-        L, V, along, place = estimator.gather(instants, L, V, clear, p)
-        told = compare(video.params, L, V, along, place)
+        told = compare(*estimator.look(video.params, video.follow(t)))
         yield {
             "label": label,
             "ingredients": np.asarray(told.ingredients),

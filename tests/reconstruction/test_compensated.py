@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 import jaxevent
 from jaxevent.errors import InputError
 from jaxevent.methods import find
-from jaxevent.reconstruction.compensated import fusion, instants, trajectories, warping
+from jaxevent.reconstruction.compensated import agreement, fusion, instants, trajectories, warping
 from jaxevent.reconstruction.compensated.parameters import OTHERS, SIGNS, Params
 from jaxevent.recording import Frames
 from jaxevent.simulate import Sensor, simulate
@@ -144,7 +144,7 @@ def place(count, own, before, after):
     framed = np.zeros(count, np.float32)
     framed[[before, after]] = 1
     near = (np.abs(np.arange(count) - own) <= 1).astype(np.float32)
-    return fusion.Place(
+    return agreement.Place(
         s, np.ones(count, np.float32), framed, near, *(np.int32(k) for k in (own, before, after))
     )
 
@@ -153,6 +153,17 @@ def still(L, V=0.01):
     """Images along trajectories that stand still."""
     ones = np.ones_like(L)
     return warping.Along(L, np.full_like(L, V), ones, ones)
+
+
+def test_agreement_is_that_of_the_pure_function():
+    L, V, clear, s, p = warped_case()
+    along, at = warping.warp(L, V, clear, s, p), place(3, 1, 0, 2)
+    L[0, 4:9, 5:12] += 1.0  # a thing in front
+    one = agreement.agree(Params(), L, along, at)
+    given = jax.tree.map(jnp.asarray, (along, at))
+    other = agreement.agree_purely(Params(), jnp.asarray(L), *given)
+    for name, quick, pure in zip(agreement.Agreement._fields, one, other, strict=True):
+        np.testing.assert_allclose(quick, pure, rtol=3e-5, atol=3e-5, err_msg=name)
 
 
 def only(name):
@@ -321,7 +332,7 @@ def test_a_later_clock_changes_nothing():
     moved_images = mc.estimate(late, params(), progress=False)
     # The first and last instants of the recording, and its grid, are those of its own clock.
     t = np.array([205_000])
-    assert moved_images.schedule.step == video().schedule.step
+    assert moved_images.follow.schedule.step == video().follow.schedule.step
     one, other = video()(t), moved_images(t + shift)
     np.testing.assert_array_equal(one.mean, other.mean)
 
@@ -412,4 +423,4 @@ def test_tiny_sensors_and_single_frames(size):
 def test_blurring_is_scipys():
     image = np.random.default_rng(5).normal(size=(20, 25)).astype(np.float32)
     expected = gaussian_filter(image, 1.5, mode="nearest", truncate=3.34)
-    np.testing.assert_allclose(fusion.blur(jnp.asarray(image), 1.5), expected, atol=1e-5)
+    np.testing.assert_allclose(agreement.blur(jnp.asarray(image), 1.5), expected, atol=1e-5)

@@ -10,7 +10,7 @@ import collections
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +22,20 @@ from jaxevent.errors import InputError
 from jaxevent.estimator import Described, Estimate
 from jaxevent.reconstruction.clock import Clock, Timing, time_span
 from jaxevent.reconstruction.compensated import trajectories
+from jaxevent.reconstruction.compensated.agreement import Agreement, Place, agree
 from jaxevent.reconstruction.compensated.evidence import Evidence
-from jaxevent.reconstruction.compensated.fusion import SOURCES, Fused, Place, fuse
+from jaxevent.reconstruction.compensated.fusion import (
+    SOURCES,
+    Fused,
+    Views,
+    compare,
+    decide,
+    fuse,
+    views,
+)
 from jaxevent.reconstruction.compensated.instants import ROOM, Instants, Schedule, speed_of
 from jaxevent.reconstruction.compensated.parameters import Params
-from jaxevent.reconstruction.compensated.warping import Along, warp, warp_purely
+from jaxevent.reconstruction.compensated.warping import warp, warp_purely
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.features import Features, Numeric, ReadOut
 from jaxevent.reconstruction.video import ImageSequence, Video
@@ -36,6 +45,9 @@ from jaxevent.recording import Recording, Times, microseconds
 PROBES = 6  # instants at which the speed of the image is measured
 KEPT = 96  # images of instants that a video remembers
 FADE = 0.35  # of variances from one resolution to the half of it
+APART = 16  # steps of the schedule between anchors
+ANCHORS = 2  # whose motion is remembered
+STEPS = 2  # with which a target's motion is found at half and at full resolution
 INFLATE = 3.0  # of the variance of an image that motion is refined with
 
 evidence = Evidence("evidence", Params)  # reads images at single instants
@@ -116,30 +128,78 @@ def schedule_of(recording: Recording, params: Params, images: Images) -> Schedul
     return Schedule(frames, (first, last), speed)
 
 
-def estimate_motion(
-    params: Params, instants: Instants, L: NDArray, V: NDArray, clear: NDArray
-) -> NDArray[np.float32]:
-    """Trajectories (rows, columns, 4) of a target, px at s = 1, from images at its instants."""
-    s, own = instants.s, instants.own
-    smoothness = trajectories.Smoothness(
-        *(float(v) for v in (params.smooth, params.jump, params.edge, params.straight))
-    )
-    caution, floor, nu = (float(v) for v in (params.caution, params.floor, params.robust))
-    doubted = (V * np.where(clear > 0, 1, caution)).astype(np.float32)
-    settings = (floor, nu, smoothness)
-    pyramid = trajectories.Pyramid(L, doubted, FADE)
-    plan = trajectories.stages(s, instants.first)
-    motion = trajectories.follow(pyramid, s, plan, *settings)
-    p = motion.at(0, *L.shape[1:]).p
-    # The target's own image is the smoother's. What is fused so far is a better one to refine with.
-    fused = fuse_images(params, instants, L, V, clear, p)
-    L, doubted = L.copy(), doubted.copy()
-    L[own] = fused.L
-    doubted[own] = INFLATE * np.asarray(fused.P) + floor
-    packed = trajectories.pack(L, doubted)
-    for _ in range(2):
-        p = trajectories.step(packed, s, p, *settings)
-    return p
+class Followed(NamedTuple):
+    """A target, the images at its instants, and how its points move."""
+
+    instants: Instants
+    L: NDArray[np.float32]  # (K, h, w)
+    V: NDArray[np.float32]
+    clear: NDArray[np.float32]
+    p: NDArray[np.float32]  # (rows, columns, 4), px at s = 1
+
+
+class Follower:
+    """Estimates the motion of a recording's targets.
+
+    Motion is sought from nothing at anchors only, which are evenly spaced in time. That of a target
+    starts from the nearest anchor's. So the images of a video cost less than single ones, and none
+    depends on which others were asked for.
+    """
+
+    def __init__(self, recording: Recording, params: Params, images: Images):
+        self.params, self.images = params, images
+        self.schedule = schedule_of(recording, params, images)
+        self._anchors: collections.OrderedDict[int, tuple[Instants, NDArray[np.float32]]]
+        self._anchors = collections.OrderedDict()
+        caution, floor, nu = (float(v) for v in (params.caution, params.floor, params.robust))
+        numbers = (params.smooth, params.jump, params.edge, params.straight)
+        self._caution = caution
+        self._settings = (floor, nu, trajectories.Smoothness(*(float(v) for v in numbers)))
+
+    def _doubted(self, V: NDArray, clear: NDArray) -> NDArray[np.float32]:
+        return (V * np.where(clear > 0, 1, self._caution)).astype(np.float32)
+
+    def _anchor(self, t: int) -> tuple[Instants, NDArray[np.float32]]:
+        """The anchor next to a time, and its motion at half resolution."""
+        first, last = self.schedule.span
+        apart = APART * self.schedule.step
+        at = min(max(first + round((t - first) / apart) * apart, first), last)
+        if at in self._anchors:
+            self._anchors.move_to_end(at)
+        else:
+            instants = self.schedule(at)
+            L, V, clear = self.images(instants.t)
+            pyramid = trajectories.Pyramid(L, self._doubted(V, clear), FADE)
+            plan = trajectories.stages(instants.s, instants.first)
+            motion = trajectories.follow(pyramid, instants.s, plan, *self._settings)
+            self._anchors[at] = instants, motion.at(1, *L.shape[1:]).p
+            if len(self._anchors) > ANCHORS:
+                self._anchors.popitem(last=False)
+        return self._anchors[at]
+
+    def __call__(self, t: int) -> Followed:
+        """The target at a time (us)."""
+        anchor, known = self._anchor(t)
+        instants = self.schedule(t)
+        s = instants.s
+        L, V, clear = self.images(instants.t)
+        apart = (t - anchor.t[anchor.own]) * 1e-6 / anchor.unit
+        p = trajectories.advect(known, apart, instants.unit / anchor.unit)
+        doubted = self._doubted(V, clear)
+        pyramid = trajectories.Pyramid(L, doubted, FADE)
+        for _ in range(STEPS):
+            p = trajectories.step(pyramid[1], s, p, *self._settings)
+        p = trajectories.Motion(p, 1).at(0, *L.shape[1:]).p
+        # The target's own image is the smoother's. What is fused so far is a better one to refine
+        # with.
+        fused = fuse_images(self.params, Followed(instants, L, V, clear, p))
+        better, own = L.copy(), instants.own
+        better[own] = fused.L
+        doubted[own] = INFLATE * np.asarray(fused.P) + self._settings[0]
+        packed = trajectories.pack(better, doubted)
+        for _ in range(STEPS):
+            p = trajectories.step(packed, s, p, *self._settings)
+        return Followed(instants, L, V, clear, p)
 
 
 def filled(values: NDArray, room: int, rest: float | int = 0) -> NDArray:
@@ -172,26 +232,21 @@ def place_of(instants: Instants, clear: NDArray, room: int) -> Place:
 
 
 @jax.jit
-def _fuse(params: Params, L, V, along, place) -> Fused:
-    return fuse(params, L, V, along, place)
+def _decide(params: Params, told: Agreement, seen: Views) -> Fused:
+    return decide(params, compare(told, seen))
 
 
-def gather(
-    instants: Instants, L: NDArray, V: NDArray, clear: NDArray, p: NDArray
-) -> tuple[NDArray, NDArray, Along, Place]:
-    """What `fusion` takes besides params: the images, those along trajectories, their place."""
+def look(params: Params, target: Followed) -> tuple[Agreement, Views]:
+    """What `fusion.compare` looks at, of a target's images along trajectories."""
+    instants, L, V, clear, p = target
     along = warp(L, V, np.asarray(clear, np.float32), instants.s, p)
-    room = room_for(len(instants))
-    place = place_of(instants, clear, room)
-    whole = Along(*(filled(part, room) for part in along))
-    return filled(L, room), filled(V, room), whole, place
+    place = place_of(instants, clear, len(instants))
+    return agree(params, L, along, place), views(L, V, along, place)
 
 
-def fuse_images(
-    params: Params, instants: Instants, L: NDArray, V: NDArray, clear: NDArray, p: NDArray
-) -> Fused:
+def fuse_images(params: Params, target: Followed) -> Fused:
     """The images at a target's instants along trajectories, in one."""
-    return _fuse(params, *gather(instants, L, V, clear, p))
+    return _decide(params, *look(params, target))
 
 
 class CompensatedVideo(ImageSequence[Params]):
@@ -212,28 +267,26 @@ class CompensatedVideo(ImageSequence[Params]):
     ):
         super().__init__(estimator, recording, params, progress=progress)
         self._images = Images(recording, params, window_events)
-        self._schedule: Schedule | None = None
+        self._follower: Follower | None = None
 
     @property
     def dtype(self) -> np.dtype:
         return self._images.dtype
 
     @property
-    def schedule(self) -> Schedule:
-        """Which instants are looked at; made when first asked for."""
-        if self._schedule is None:
-            self._schedule = schedule_of(self.recording, self.params, self._images)
-        return self._schedule
+    def follow(self) -> Follower:
+        """What estimates the motion of targets; made when first asked for."""
+        if self._follower is None:
+            self._follower = Follower(self.recording, self.params, self._images)
+        return self._follower
 
-    def _target(self, t: int) -> tuple[Instants, NDArray[np.float32], Fused]:
-        instants = self.schedule(t)
-        L, V, clear = self._images(instants.t)
-        p = estimate_motion(self.params, instants, L, V, clear)
-        return instants, p, fuse_images(self.params, instants, L, V, clear, p)
+    def _target(self, t: int) -> tuple[Followed, Fused]:
+        target = self.follow(t)
+        return target, fuse_images(self.params, target)
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         for n, t in enumerate(times.tolist()):
-            _, _, fused = self._target(t)
+            _, fused = self._target(t)
             image = np.exp(np.asarray(fused.L)) - np.asarray(self.params.I0)
             whole = (image.astype(self.dtype), np.asarray(fused.P, self.dtype), np.isfinite(image))
             yield times[n : n + 1], tuple(v[None] for v in whole)
@@ -252,8 +305,8 @@ class CompensatedVideo(ImageSequence[Params]):
         """
         size = (self.recording.height, self.recording.width)
         found = [
-            trajectories.velocity(p, size) / np.float32(instants.unit)
-            for instants, p, _ in self._targets(times, extrapolate)
+            trajectories.velocity(target.p, size) / np.float32(target.instants.unit)
+            for target, _ in self._targets(times, extrapolate)
         ]
         return np.stack(found)
 
@@ -265,7 +318,7 @@ class CompensatedVideo(ImageSequence[Params]):
         `visible_before` and `visible_after`, 0 to 1, tell whether the frames next to the target
         show the point. Times are as those of images.
         """
-        found = [fused for _, _, fused in self._targets(times, extrapolate)]
+        found = [fused for _, fused in self._targets(times, extrapolate)]
         shares = {name: [one.sources[k] for one in found] for k, name in enumerate(SOURCES)}
         shares["visible_before"] = [one.visible[0] for one in found]
         shares["visible_after"] = [one.visible[1] for one in found]
@@ -295,8 +348,8 @@ class MotionCompensated(ImageEstimator[Params]):
         if not len(wanted):
             raise InputError(f"{recording.name}: no times to prepare images for; give some")
         images = Images(recording, params, WINDOW_EVENTS)
-        schedule = schedule_of(recording, params, images)
-        chosen = [schedule(t) for t in wanted.tolist()]
+        follow = Follower(recording, params, images)
+        chosen = [follow.schedule(t) for t in wanted.tolist()]
         room = room_for(max(len(one) for one in chosen))
         every = np.unique(np.concatenate([one.t for one in chosen]))
         features, instants = prepare(recording, every, Timing.of(params), filtering=False)
@@ -304,8 +357,7 @@ class MotionCompensated(ImageEstimator[Params]):
         rows, p = np.zeros((len(chosen), room), np.int32), np.zeros(shape, np.float32)
         places = []
         for n, one in enumerate(chosen):
-            L, V, clear = images(one.t)
-            p[n] = estimate_motion(params, one, L, V, clear)
+            _, _, _, clear, p[n] = follow(int(wanted[n]))
             rows[n, : len(one)] = np.searchsorted(every, one.t)
             places.append(place_of(one, clear, room))
         place = jax.tree.map(lambda *leaves: np.stack(leaves), *places)

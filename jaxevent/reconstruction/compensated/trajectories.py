@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled, over_rows
+from jaxevent.kernels import compiled, over_rows, part
 
 CHANNELS = 4  # of packed images: log intensity, its variance, its gradient along x and y
 OUTSIDE = np.float32(1e-6)  # weight of what lies outside the image
@@ -273,28 +273,51 @@ def _weigh_differences(p, edge, reach, smoothness, across, down):
                     down[i, j] = weight
 
 
-@compiled
-def _rough(p, across, down, i, j, c):
-    """The weighted graph Laplacian of the channel c at a node."""
-    rows, columns, _ = p.shape
-    here, total = p[i, j, c], np.float32(0)
-    if j > 0:
-        total += across[i, j - 1] * (here - p[i, j - 1, c])
-    if j < columns - 1:
-        total += across[i, j] * (here - p[i, j + 1, c])
-    if i > 0:
-        total += down[i - 1, j] * (here - p[i - 1, j, c])
-    if i < rows - 1:
-        total += down[i, j] * (here - p[i + 1, j, c])
-    return total
+@part
+def _add_product(a, b, out):
+    for x in range(len(out)):
+        out[x] += a[x] * b[x]
 
 
-@compiled
-def _times(N, n0, n1, n2, n3, out):
-    out[0] = N[0] * n0 + N[1] * n1 + N[2] * n2 + N[3] * n3
-    out[1] = N[1] * n0 + N[4] * n1 + N[5] * n2 + N[6] * n3
-    out[2] = N[2] * n0 + N[5] * n1 + N[7] * n2 + N[8] * n3
-    out[3] = N[3] * n0 + N[6] * n1 + N[8] * n2 + N[9] * n3
+@part
+def _add_difference(weight, a, b, out):
+    for x in range(len(out)):
+        out[x] += weight[x] * (a[x] - b[x])
+
+
+@part
+def _scale_and_add(factor, a, out):
+    """out = factor out + a."""
+    for x in range(len(out)):
+        out[x] = factor * out[x] + a[x]
+
+
+@part
+def _add_scaled(factor, a, out):
+    for x in range(len(out)):
+        out[x] += factor * a[x]
+
+
+@part
+def _times(N, i, q, out):
+    """Symmetric 4 x 4 matrices of a row of nodes, times vectors (4, columns)."""
+    for c in range(4):
+        out[c] = np.float32(0)
+        for e in range(4):
+            low, high = min(c, e), max(c, e)
+            _add_product(N[low * (7 - low) // 2 + high, i], q[e], out[c])
+
+
+@part
+def _rough(q, across, down, i, out):
+    """The weighted graph Laplacian (columns,) of a channel in a row; all are padded by a node."""
+    width = len(out)
+    here, left, right = q[i + 1, 1:-1], q[i + 1, :width], q[i + 1, 2:]
+    out[:] = np.float32(0)
+    _add_difference(across[i, :width], here, left, out)
+    _add_difference(across[i, 1:], here, right, out)
+    _add_difference(down[i], here, q[i, 1:-1], out)
+    _add_difference(down[i + 1], here, q[i + 2, 1:-1], out)
 
 
 @compiled
@@ -337,59 +360,80 @@ def _invert(N, added, out):
 def _solve(N, b, p, across, down, smooth, ridge, iterations, d):
     """(N + smooth Laplacian + ridge) d = b - smooth Laplacian p - ridge p, by conjugate gradients.
 
-    The preconditioner are the nodes' own 4 x 4 blocks.
+    The preconditioner are the nodes' own 4 x 4 blocks. Here channels come first, rows of nodes are
+    what loops go over at once.
     """
     rows, columns, _ = p.shape
-    P = np.empty_like(N)
-    r, z, q, Aq = np.empty_like(p), np.empty_like(p), np.empty_like(p), np.empty_like(p)
-    added = np.empty(4, np.float32)
-    rz = 0.0
+    A, P = np.empty((2, 10, rows, columns), np.float32)
+    beside, below = (
+        np.zeros((rows, columns + 1), np.float32),
+        np.zeros((rows + 1, columns), np.float32),
+    )
+    q = np.zeros((4, rows + 2, columns + 2), np.float32)
+    r, found = np.zeros((2, rows, 4, columns), np.float32)
+    Aq, z = np.empty((2, rows, 4, columns), np.float32)
+    rough, sums = np.empty((2, columns), np.float32)
+    added, block = np.empty(4, np.float32), np.empty(10, np.float32)
     for i in range(rows):
         for j in range(columns):
-            degree = np.float32(0)
-            if j > 0:
-                degree += across[i, j - 1]
-            if j < columns - 1:
-                degree += across[i, j]
-            if i > 0:
-                degree += down[i - 1, j]
-            if i < rows - 1:
-                degree += down[i, j]
+            beside[i, j + 1] = across[i, j] if j < columns - 1 else np.float32(0)
+            below[i + 1, j] = down[i, j] if i < rows - 1 else np.float32(0)
+            for c in range(4):
+                q[c, i + 1, j + 1] = p[i, j, c]
+    for i in range(rows):
+        for c in range(4):
+            _rough(q[c], beside, below, i, rough)
+            for j in range(columns):
+                pull = smooth[c] * rough[j] + ridge[c] * p[i, j, c]
+                r[i, c, j] = b[i, j, c] - pull
+        for j in range(columns):
+            degree = beside[i, j] + beside[i, j + 1] + below[i, j] + below[i + 1, j]
             for c in range(4):
                 added[c] = smooth[c] * degree + ridge[c] + np.float32(1e-6)
-                rough = _rough(p, across, down, i, j, c)
-                r[i, j, c] = b[i, j, c] - smooth[c] * rough - ridge[c] * p[i, j, c]
-                d[i, j, c] = 0
-            _invert(N[i, j], added, P[i, j])
-            _times(P[i, j], r[i, j, 0], r[i, j, 1], r[i, j, 2], r[i, j, 3], z[i, j])
+            _invert(N[i, j], added, block)
+            for c in range(10):
+                P[c, i, j] = block[c]
+                A[c, i, j] = N[i, j, c]
+    rz = 0.0
+    for turn in range(iterations + 1):
+        sums[:] = np.float32(0)
+        for i in range(rows):
+            _times(P, i, r[i], z[i])
             for c in range(4):
-                q[i, j, c] = z[i, j, c]
-                rz += r[i, j, c] * z[i, j, c]
-    for _ in range(iterations):
-        curvature = 0.0
-        for i in range(rows):
-            for j in range(columns):
-                _times(N[i, j], q[i, j, 0], q[i, j, 1], q[i, j, 2], q[i, j, 3], Aq[i, j])
-                for c in range(4):
-                    Aq[i, j, c] += smooth[c] * _rough(q, across, down, i, j, c)
-                    Aq[i, j, c] += ridge[c] * q[i, j, c]
-                    curvature += q[i, j, c] * Aq[i, j, c]
-        step = np.float32(rz / (curvature + 1e-20))
+                _add_product(r[i, c], z[i, c], sums)
         following = 0.0
-        for i in range(rows):
-            for j in range(columns):
-                for c in range(4):
-                    d[i, j, c] += step * q[i, j, c]
-                    r[i, j, c] -= step * Aq[i, j, c]
-                _times(P[i, j], r[i, j, 0], r[i, j, 1], r[i, j, 2], r[i, j, 3], z[i, j])
-                for c in range(4):
-                    following += r[i, j, c] * z[i, j, c]
-        share = np.float32(following / (rz + 1e-20))
+        for j in range(columns):
+            following += sums[j]
+        share = np.float32(following / (rz + 1e-20)) if turn else np.float32(0)
         rz = following
+        if turn == iterations:
+            break
         for i in range(rows):
+            for c in range(4):
+                if turn == 0:
+                    q[c, i + 1, 1:-1] = z[i, c]
+                else:
+                    _scale_and_add(share, z[i, c], q[c, i + 1, 1:-1])
+        sums[:] = np.float32(0)
+        for i in range(rows):
+            _times(A, i, q[:, i + 1, 1:-1], Aq[i])
+            for c in range(4):
+                _rough(q[c], beside, below, i, rough)
+                _add_scaled(smooth[c], rough, Aq[i, c])
+                _add_scaled(ridge[c], q[c, i + 1, 1:-1], Aq[i, c])
+                _add_product(q[c, i + 1, 1:-1], Aq[i, c], sums)
+        curvature = 0.0
+        for j in range(columns):
+            curvature += sums[j]
+        step = np.float32(rz / (curvature + 1e-20))
+        for i in range(rows):
+            for c in range(4):
+                _add_scaled(step, q[c, i + 1, 1:-1], found[i, c])
+                _add_scaled(-step, Aq[i, c], r[i, c])
+    for i in range(rows):
+        for c in range(4):
             for j in range(columns):
-                for c in range(4):
-                    q[i, j, c] = z[i, j, c] + share * q[i, j, c]
+                d[i, j, c] = found[i, c, j]
 
 
 @compiled
@@ -562,6 +606,38 @@ def follow(
                 p = step(images, s[chosen], p, floor, nu, smoothness)
             motion = Motion(p, level)
     return motion
+
+
+@compiled
+def _advect(begin, end, p, s, out):
+    rows, columns, _ = p.shape
+    half = np.float32(0.5)  # nodes per px
+    for i in range(begin, end):
+        for j in range(columns):
+            X, Y = np.float32(j), np.float32(i)
+            for _ in range(4):
+                _, j0, i0, j1, i1, fx, fy = around(X, Y, rows, columns)
+                for c in range(4):
+                    top = p[i0, j0, c] + fx * (p[i0, j1, c] - p[i0, j0, c])
+                    bottom = p[i1, j0, c] + fx * (p[i1, j1, c] - p[i1, j0, c])
+                    out[i, j, c] = top + fy * (bottom - top)
+                X = np.float32(j) - half * (out[i, j, 0] + out[i, j, 2] * s) * s
+                Y = np.float32(i) - half * (out[i, j, 1] + out[i, j, 3] * s) * s
+            for c in range(2):
+                out[i, j, c] += np.float32(2) * out[i, j, c + 2] * s
+
+
+def advect(p: NDArray[np.float32], s: float, unit: float) -> NDArray[np.float32]:
+    """Trajectories (rows, columns, 4) of the points visible at s, and on a clock of that unit.
+
+    Args:
+        p: Trajectories of the points visible at 0.
+        s: The new target's time on the clock of `p`.
+        unit: What 1 stands for on the new clock, in units of the old one.
+    """
+    out = np.empty_like(p)
+    over_rows(_advect, len(p), p, np.float32(s), out)
+    return out * np.array([unit, unit, unit**2, unit**2], np.float32)
 
 
 @compiled

@@ -1,0 +1,390 @@
+"""How images agree along trajectories: in loops for images, as a pure function for derivatives."""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from jaxevent.kernels import compiled, over_rows, part
+from jaxevent.reconstruction.compensated.parameters import Params
+from jaxevent.reconstruction.compensated.warping import Along
+from jaxevent.reconstruction.features import Numeric
+
+PLAIN = 3.0  # the misfit of an instant that scatter hardly counts
+OUTSIDE = 1e6  # variance beyond the image's border
+MISFIT, SCATTER = 1.5, 2.0  # px, of the Gaussians that gather them
+
+
+class Place(NamedTuple):
+    """Where the instants of a target lie among each other."""
+
+    s: Float[Numeric, " k"]  # times relative to the target, -1..1
+    present: Float[Numeric, " k"]  # 1, or 0 of instants that only fill up the number
+    framed: Float[Numeric, " k"]  # 1 where a frame was taken
+    near: Float[Numeric, " k"]  # 1 of those next to the target, frames aside, and of the target
+    own: Numeric  # (), the target's
+    before: Numeric  # (), that of the frame before
+    after: Numeric
+
+
+class Agreement(NamedTuple):
+    """What all instants together tell of the target's points, each (h, w)."""
+
+    M: Float[Numeric, "h w"]  # their robust mean
+    total: Float[Numeric, "h w"]  # its information
+    scatter: Float[Numeric, "h w"]  # variance beyond what the instants' own explain
+    near: Float[Numeric, "h w"]  # the mean of the near instants
+    near_information: Float[Numeric, "h w"]
+    frame_information: Float[Numeric, "h w"]
+    activity: Float[Numeric, "h w"]  # squared changes in place between the frames next to it
+    parts: Float[Numeric, "3 h w"]  # shares in M: frames before, frames after, all others
+    seen: Float[Numeric, "2 h w"]  # how far the frames before and after see the point, 0..1
+
+
+def taps_of(sigma: float) -> NDArray[np.float32]:
+    """A Gaussian of `sigma` px, of odd length."""
+    reach = int(np.ceil(3 * sigma))
+    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    return (taps / taps.sum()).astype(np.float32)
+
+
+def blur(image: Array, sigma: float) -> Array:
+    """A Gaussian over the last two axes."""
+    taps = taps_of(sigma)
+    for axis in (image.ndim - 2, image.ndim - 1):
+        size = image.shape[axis]
+        padded = _pad(image, axis, len(taps) // 2)
+        moved = [jax.lax.slice_in_dim(padded, i, i + size, axis=axis) for i in range(len(taps))]
+        image = functools.reduce(
+            jnp.add, [float(tap) * one for tap, one in zip(taps, moved, strict=True)]
+        )
+    return image
+
+
+def _pad(image: Array, axis: int, size: int) -> Array:
+    rest = [(0, 0)] * image.ndim
+    rest[axis] = (size, size)
+    return jnp.pad(image, rest, mode="edge")
+
+
+def steepness(image: Array) -> Array:
+    """|grad|^2 of an image (h, w)."""
+    total = jnp.zeros_like(image)
+    for axis in (0, 1):
+        padded, size = _pad(image, axis, 2), image.shape[axis]
+        a, b, _, d, e = (jax.lax.slice_in_dim(padded, i, i + size, axis=axis) for i in range(5))
+        total = total + ((8 * (d - b) - e + a) / 12) ** 2
+    return total
+
+
+def agree_purely(params: Params, L: Float[Array, "k h w"], along: Along, place: Place) -> Agreement:
+    """The robust mean along trajectories, begun from the target's own image; differentiable.
+
+    An instant counts by its information, V and what warping adds to it; where it differs from the
+    others by more than that the point is hidden there. Excess scatter tells failed motion. L are
+    the images as they are.
+    """
+    p = params
+    count = len(place.s)
+    s, present, framed = (v[:, None, None] for v in (place.s, place.present, place.framed))
+    here = (jnp.arange(count) == place.own)[:, None, None]
+    eta = (p.information + (1 - p.information) * along.clear) * present
+    base = jnp.where(along.inside > 0, along.V + p.floor, OUTSIDE)
+    steep = steepness(blur(L[place.own], 1.0))
+    variance, misfit = base, base
+    seen = jnp.broadcast_to(jnp.exp(-2 * s**2), base.shape)  # at first the near instants tell
+    for turn in range(3):
+        variance = base + jnp.where(here, 0, p.sigma_place**2 * steep + p.sigma_between**2)
+        R = eta / variance * seen
+        M = (R * along.L).sum(0) / R.sum(0)
+        steep = steepness(M)
+        misfit = blur((along.L - M) ** 2 / variance, MISFIT)
+        if turn == 0:
+            misfit = jnp.where(here, jnp.minimum(misfit, 1), misfit)
+        seen = 1 / (1 + (misfit / p.tolerance) ** 2)
+    W = eta / variance
+    R = W * seen
+    total = R.sum(0)
+    M = (R * along.L).sum(0) / total
+    # Of all instants but the plainly hidden ones, whatever the tolerance.
+    plain = present / variance / (1 + (misfit / PLAIN) ** 2)
+    excess = (plain * ((along.L - M) ** 2 - 0.6 * variance)).sum(0)
+    scatter = jnp.maximum(blur(excess, SCATTER) / blur((plain * eta).sum(0), SCATTER), 0)
+    W = W * along.inside
+    near_information = (W * place.near[:, None, None]).sum(0)
+    near = (W * place.near[:, None, None] * along.L).sum(0) / jnp.maximum(near_information, 1e-9)
+    order = jnp.arange(count)
+    between = ((order > place.before) & (order + 1 < place.after))[:-1, None, None]
+    share = R / total
+    parts = [(share * framed * side).sum(0) for side in (s < 0, s > 0)]
+    return Agreement(
+        M,
+        total,
+        scatter,
+        near,
+        near_information,
+        (W * framed).sum(0),
+        ((L[1:] - L[:-1]) ** 2 * between).sum(0),
+        jnp.stack([*parts, (share * (1 - framed * (s != 0))).sum(0)]),
+        jnp.stack([seen[k] * along.inside[k] for k in (place.before, place.after)]),
+    )
+
+
+class _Settings(NamedTuple):
+    """Numbers of `agree` for its loops."""
+
+    information: Any
+    floor: Any
+    place: Any  # variances of the place of points and between pixels
+    between: Any
+    tolerance: Any
+
+
+@part
+def _across(row, taps, padded, out):
+    """`row` blurred along x; the image's border goes on."""
+    w, reach = len(row), len(taps) // 2
+    for x in range(reach):
+        padded[x] = row[0]
+        padded[w + reach + x] = row[w - 1]
+    for x in range(w):
+        padded[reach + x] = row[x]
+        out[x] = np.float32(0)
+    for i in range(len(taps)):
+        tap = taps[i]
+        for x in range(w):
+            out[x] += tap * padded[i + x]
+
+
+@part
+def _down(image, y, taps, out):
+    """The row y of an image that is blurred along y."""
+    h, w = image.shape
+    for x in range(w):
+        out[x] = np.float32(0)
+    for i in range(len(taps)):
+        row, tap = image[min(max(y + i - len(taps) // 2, 0), h - 1)], taps[i]
+        for x in range(w):
+            out[x] += tap * row[x]
+
+
+@part
+def _steep(image, y, out):
+    """|grad|^2 in the row y."""
+    h, w = image.shape
+    eight, twelfth = np.float32(8), np.float32(1 / 12)
+    here, up, down = image[y], image[max(y - 1, 0)], image[min(y + 1, h - 1)]
+    up2, down2 = image[max(y - 2, 0)], image[min(y + 2, h - 1)]
+    for x in range(w):
+        left, right = here[max(x - 1, 0)], here[min(x + 1, w - 1)]
+        left2, right2 = here[max(x - 2, 0)], here[min(x + 2, w - 1)]
+        gx = (eight * (right - left) - right2 + left2) * twelfth
+        gy = (eight * (down[x] - up[x]) - down2[x] + up2[x]) * twelfth
+        out[x] = gx * gx + gy * gy
+
+
+@part
+def _variance(V, inside, steep, settings, here, out):
+    for x in range(len(V)):
+        added = settings.place * steep[x] + settings.between
+        base = V[x] + settings.floor if inside[x] > 0 else np.float32(OUTSIDE)
+        out[x] = base if here else base + added
+
+
+@part
+def _add(L, clear, variance, seen, settings, total, mean):
+    one = np.float32(1)
+    for x in range(len(L)):
+        eta = settings.information + (one - settings.information) * clear[x]
+        R = eta / variance[x] * seen[x]
+        total[x] += R
+        mean[x] += R * L[x]
+
+
+@part
+def _see(misfit, tolerance, most, seen):
+    one = np.float32(1)
+    for x in range(len(misfit)):
+        ratio = min(misfit[x], most) / tolerance
+        seen[x] = one / (one + ratio * ratio)
+
+
+@part
+def _differ(L, M, variance, out):
+    for x in range(len(L)):
+        out[x] = (L[x] - M[x]) * (L[x] - M[x]) / variance[x]
+
+
+@part
+def _divide(a, b, out):
+    for x in range(len(a)):
+        out[x] = a[x] / b[x]
+
+
+@compiled
+def _blur_across(begin, end, image, taps, out):
+    padded = np.empty(image.shape[1] + len(taps), np.float32)
+    for y in range(begin, end):
+        _across(image[y], taps, padded, out[y])
+
+
+@compiled
+def _blur_down(begin, end, image, taps, out):
+    for y in range(begin, end):
+        _down(image, y, taps, out[y])
+
+
+@compiled
+def _find_mean(begin, end, along, near, misfits, M, steep, settings, own, turn, taps, out):
+    """The mean over instants of some rows; `misfits` are blurred across."""
+    count, _, w = along.L.shape
+    variance, misfit, seen, total, mean, slope = np.empty((6, w), np.float32)
+    for y in range(begin, end):
+        _steep(M, y, slope)
+        steep[y] = slope
+        total[:] = np.float32(0)
+        mean[:] = np.float32(0)
+        for k in range(count):
+            if turn == 0:
+                seen[:] = near[k]
+            else:
+                _down(misfits[k], y, taps, misfit)
+                most = np.float32(1 if turn == 1 and k == own else np.inf)
+                _see(misfit, settings.tolerance, most, seen)
+            _variance(along.V[k, y], along.inside[k, y], slope, settings, k == own, variance)
+            _add(along.L[k, y], along.clear[k, y], variance, seen, settings, total, mean)
+        _divide(mean, total, out[y])
+
+
+@compiled
+def _find_misfits(begin, end, along, M, steep, settings, own, taps, misfits):
+    """Squared differences from M in parts of their variances, blurred across."""
+    count, _, w = along.L.shape
+    variance, ratio = np.empty((2, w), np.float32)
+    padded = np.empty(w + len(taps), np.float32)
+    for y in range(begin, end):
+        for k in range(count):
+            here = k == own
+            _variance(along.V[k, y], along.inside[k, y], steep[y], settings, here, variance)
+            _differ(along.L[k, y], M[y], variance, ratio)
+            _across(ratio, taps, padded, misfits[k, y])
+
+
+@part
+def _gather(along, y, k, seen, variance, settings, place, out):
+    """Add an instant to what the means are made of."""
+    one, zero = np.float32(1), np.float32(0)
+    near, framed = place.near[k], place.framed[k]
+    before = framed if place.s[k] < 0 else zero
+    after = framed if place.s[k] > 0 else zero
+    rest = one - before - after
+    L, clear, inside = along.L[k, y], along.clear[k, y], along.inside[k, y]
+    total, mean, near_total, near_mean = out[0], out[1], out[2], out[3]
+    frames, from_before, from_after, from_rest = out[4], out[5], out[6], out[7]
+    for x in range(len(L)):
+        eta = settings.information + (one - settings.information) * clear[x]
+        W = eta / variance[x]
+        R = W * seen[x]
+        total[x] += R
+        mean[x] += R * L[x]
+        W = W * inside[x]
+        near_total[x] += W * near
+        near_mean[x] += W * near * L[x]
+        frames[x] += W * framed
+        from_before[x] += R * before
+        from_after[x] += R * after
+        from_rest[x] += R * rest
+
+
+@part
+def _exceed(L, clear, M, misfit, variance, settings, excess, weight):
+    one, plainly, expected = np.float32(1), np.float32(PLAIN), np.float32(0.6)
+    for x in range(len(L)):
+        eta = settings.information + (one - settings.information) * clear[x]
+        ratio = misfit[x] / plainly
+        plain = one / variance[x] / (one + ratio * ratio)
+        e = L[x] - M[x]
+        excess[x] += plain * (e * e - expected * variance[x])
+        weight[x] += plain * eta
+
+
+@part
+def _change(early, late, out):
+    for x in range(len(out)):
+        out[x] += (late[x] - early[x]) * (late[x] - early[x])
+
+
+@compiled
+def _finish(begin, end, L, along, misfits, steep, settings, place, taps, out, excess, weight):
+    """What is told of some rows; scatter is yet to be gathered."""
+    count, _, w = along.L.shape
+    misfit, variance = np.empty((2, count, w), np.float32)
+    seen, sums = np.empty(w, np.float32), np.empty((8, w), np.float32)
+    own, a, b = place.own, place.before, place.after
+    for y in range(begin, end):
+        sums[:] = np.float32(0)
+        excess[y], weight[y], out.activity[y] = np.float32(0), np.float32(0), np.float32(0)
+        for k in range(count):
+            here = k == own
+            _down(misfits[k], y, taps, misfit[k])
+            _see(misfit[k], settings.tolerance, np.float32(np.inf), seen)
+            _variance(along.V[k, y], along.inside[k, y], steep[y], settings, here, variance[k])
+            _gather(along, y, k, seen, variance[k], settings, place, sums)
+            if k == a:
+                out.seen[0, y] = seen * along.inside[k, y]
+            if k == b:
+                out.seen[1, y] = seen * along.inside[k, y]
+            if a < k and k + 1 < b:
+                _change(L[k, y], L[k + 1, y], out.activity[y])
+        out.total[y] = sums[0]
+        _divide(sums[1], sums[0], out.M[y])
+        out.near_information[y] = sums[2]
+        for x in range(w):
+            out.near[y, x] = sums[3, x] / max(sums[2, x], np.float32(1e-9))
+        out.frame_information[y] = sums[4]
+        for part_of in range(3):
+            _divide(sums[5 + part_of], sums[0], out.parts[part_of, y])
+        for k in range(count):
+            clear, M = along.clear[k, y], out.M[y]
+            _exceed(along.L[k, y], clear, M, misfit[k], variance[k], settings, excess[y], weight[y])
+
+
+def _blurred(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    taps = taps_of(sigma)
+    across, out = np.empty_like(image), np.empty_like(image)
+    over_rows(_blur_across, len(image), image, taps, across)
+    over_rows(_blur_down, len(image), across, taps, out)
+    return out
+
+
+def agree(params: Params, L: NDArray, along: Along, place: Place) -> Agreement:
+    """The same as `agree_purely`, of instants that are all present."""
+    p = params
+    count, h, w = L.shape
+    numbers = (p.information, p.floor, p.sigma_place**2, p.sigma_between**2, p.tolerance)
+    settings = _Settings(*(np.float32(v) for v in numbers))
+    own, taps = int(place.own), taps_of(MISFIT)
+    weights = np.exp(-2 * place.s**2).astype(np.float32)
+    place = place._replace(own=own, before=int(place.before), after=int(place.after))
+    misfits = np.empty((count, h, w), np.float32)
+    steep, M = np.empty((2, h, w), np.float32)
+    seen_from = _blurred(np.ascontiguousarray(L[own]), 1.0)
+    for turn in range(3):
+        given = (along, weights, misfits, seen_from, steep, settings, own, turn, taps, M)
+        over_rows(_find_mean, h, *given)
+        over_rows(_find_misfits, h, along, M, steep, settings, own, taps, misfits)
+        seen_from = M.copy()
+    images = np.empty((7, h, w), np.float32)
+    M, total, scatter, near, near_information, frame_information, activity = images
+    parts, seen = np.empty((3, h, w), np.float32), np.empty((2, h, w), np.float32)
+    out = Agreement(
+        M, total, scatter, near, near_information, frame_information, activity, parts, seen
+    )
+    excess, weight = np.empty((2, h, w), np.float32)
+    over_rows(_finish, h, L, along, misfits, steep, settings, place, taps, out, excess, weight)
+    scatter = np.maximum(_blurred(excess, SCATTER) / _blurred(weight, SCATTER), 0)
+    return out._replace(scatter=scatter)
