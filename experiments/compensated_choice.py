@@ -5,6 +5,7 @@
 Every image that is scored here was hidden from the methods: frames of the first half of
 slider_depth, at gaps of 2 to 16 frames, and true images of simulated HDR scenes and of moving
 objects, of the scenes and seeds that are for fitting. Prints the numbers as TOML.
+Frames that serve as truth are noisy: their own variance is added to that of the images.
 """
 
 import argparse
@@ -24,10 +25,12 @@ import jaxevent
 from jaxevent.metrics import ssim
 from jaxevent.reconstruction.compensated import estimator, fusion
 from jaxevent.reconstruction.compensated.parameters import OTHERS, SIGNS, Params
+from jaxevent.recording import Frames
 from jaxevent.runs.protocols import frame_times
 from jaxevent.simulate import FITTING, SENSORS, TESTING, Objects, Pan, Sensor, scene, simulate
 from jaxevent.simulate.scenes import Speed
 
+BLOCK = 8  # px, over which the noise of frames is averaged
 GAPS = {2: 12, 4: 12, 8: 12, 16: 8}  # frames from one that is given to the next: images scored
 # What `jaxevent fit` finds with the likelihood of frames: configs/fit_slider_depth.toml, and the
 # same for davis346_street.
@@ -51,6 +54,24 @@ STREET: dict[str, Any] = dict(
     sigma_floor=0.009652,
     share=0.5594,
 )
+
+
+def noise_of(frames: Frames) -> float:
+    """The variance of a frame's pixel: half of what two frames differ by where nothing moves.
+
+    The median of blocks, of the two consecutive frames that are most alike.
+    """
+    changes = np.diff(frames.intensity.astype(np.float64), axis=0) ** 2 / 2
+    count, h, w = changes.shape
+    h, w = h // BLOCK, w // BLOCK
+    blocks = changes[:, : h * BLOCK, : w * BLOCK].reshape(count, h, BLOCK, w, BLOCK).mean((2, 4))
+    return float(np.median(blocks.reshape(count, -1), axis=1).min())
+
+
+def frames_of(path: Path) -> Frames:
+    frames = jaxevent.load(path).frames
+    assert frames is not None
+    return frames
 
 
 def hidden(path: Path, params: Params, gaps: dict[int, int], half: int | None) -> Iterator[tuple]:
@@ -190,8 +211,20 @@ def errors(L: Any, I0: Any, truth: Any, hdr: Any) -> Any:
     return jnp.where(hdr, logs, linear) ** 2
 
 
-def fit(rows: list[dict], sub: int = 7, iterations: int = 400, l2: float = 3e-4) -> tuple:
-    """`choice` (2, signs) and `doubt` (signs)."""
+def noise_in(row: dict[str, Any], noises: dict[str, float]) -> np.ndarray:
+    """The variance of the true ln(I + I0) of a row: frames are noisy, simulated truth is not."""
+    noise = noises.get(row["label"].split()[0], 0.0)
+    return noise / (row["truth"] + row["I0"]) ** 2
+
+
+def fit(
+    rows: list[dict],
+    noises: dict[str, float],
+    sub: int = 7,
+    iterations: int = 400,
+    l2: float = 3e-4,
+) -> tuple:
+    """`choice` (2, signs) and `doubt` (signs); `noises` are those of frames, by recording."""
 
     def column(part) -> jnp.ndarray:
         return jnp.asarray(np.concatenate([np.asarray(part(r), np.float32) for r in rows]))
@@ -203,6 +236,17 @@ def fit(rows: list[dict], sub: int = 7, iterations: int = 400, l2: float = 3e-4)
     Y = column(lambda r: some(r["ingredients"]).T)
     truth = column(lambda r: some(r["truth"]))
     I0 = column(lambda r: np.full(len(some(r["truth"])), r["I0"]))
+    R = column(lambda r: some(noise_in(r, noises)))
+    groups: dict[str, list[int]] = {}
+    for k, row in enumerate(rows):
+        groups.setdefault(row["label"], []).append(k)
+    # Every kind of images counts the same for the variance.
+    share = column(
+        lambda r: np.full(
+            len(some(r["truth"])), 1 / (len(some(r["truth"])) * len(groups[r["label"]]))
+        )
+    )
+    share = share / share.sum()
     hdr = column(lambda r: np.full(len(some(r["truth"])), r["hdr"])) > 0
     # Every image counts by what its ingredients get wrong, so that hard ones do not outweigh.
     scale = column(
@@ -232,9 +276,9 @@ def fit(rows: list[dict], sub: int = 7, iterations: int = 400, l2: float = 3e-4)
 
     def surprise(w, squares):
         # Heavy-tailed as a t distribution, so that a few lost pixels do not set all variances.
-        logs = X @ w
-        tail = 10 * jnp.log1p(squares * jnp.exp(-logs) / 10)
-        return 0.5 * (1.1 * tail + logs).mean() + 1e-4 * (w[:-1] ** 2).sum()
+        P = jnp.exp(X @ w) + R
+        tail = 10 * jnp.log1p(squares / P / 10)
+        return 0.5 * (share * (1.1 * tail + jnp.log(P))).sum() + 1e-4 * (w[:-1] ** 2).sum()
 
     def descend(value: Callable[[Any], Any], start: Any) -> tuple[Any, float]:
         optimiser = optax.adam(0.05)
@@ -254,18 +298,25 @@ def fit(rows: list[dict], sub: int = 7, iterations: int = 400, l2: float = 3e-4)
     squares = (choose(W) - level) ** 2
     start = jnp.zeros(X.shape[1]).at[-1].set(jnp.log(squares.mean()))
     w, _ = descend(lambda w: surprise(w, squares), start)
-    # Scaled so that the mean squared standardised error is 1, in the geometric mean over images.
+    # Scaled so that the mean squared standardised error is 1, in the geometric mean over images of
+    # a kind, and then over kinds.
     places = np.cumsum([0, *(len(some(r["truth"])) for r in rows)])
-    z2 = np.asarray(squares * jnp.exp(-(X @ w)))
-    means = [np.log(z2[i:j].mean()) for i, j in zip(places[:-1], places[1:], strict=True)]
-    factor = float(np.exp(np.mean(means)))
+    factor = 1.0
+    for _ in range(5):
+        z2 = np.asarray(squares / (factor * jnp.exp(X @ w) + R))
+        means = [np.log(z2[i:j].mean()) for i, j in zip(places[:-1], places[1:], strict=True)]
+        factor *= float(np.exp(np.mean([np.mean([means[k] for k in g]) for g in groups.values()])))
     w = w.at[-1].add(np.log(factor))
-    print(f"loss {found:.4f}, mean squared standardised error before scaling {factor:.2f}")
+    print(f"loss {found:.4f}, variances times {factor:.2f}")
     return np.asarray(plain(W)), np.asarray(plain(w))
 
 
-def show(rows: list[dict], params: Params) -> None:
-    """Errors of the ingredients and of the choice, by label."""
+def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:
+    """Errors of the ingredients and of the choice, by label.
+
+    The last columns: which part of pixels is not valid; and among these and among the valid ones,
+    which part is wrong by more than `vague`.
+    """
     decide = jax.jit(fusion.decide)
     table: dict[str, list] = {}
     for r in rows:
@@ -281,11 +332,20 @@ def show(rows: list[dict], params: Params) -> None:
             line.append(float(errors(L, r["I0"], r["truth"], r["hdr"]).mean()) * 100)
         shown = (np.exp(np.asarray(fused.L)) - r["I0"]).clip(0, 1).astype(np.float32)
         line.append(float(ssim(shown, r["truth"])) if not r["hdr"] else np.nan)
-        z2 = (np.asarray(fused.L) - np.log(r["truth"] + r["I0"])) ** 2 / np.asarray(fused.P)
-        table.setdefault(r["label"], []).append([*line, z2.mean()])
-    print("| images | along | smoothed | blend | mc | SSIM | z2 |\n|---|---|---|---|---|---|---|")
+        squares = (np.asarray(fused.L) - np.log(r["truth"] + r["I0"])) ** 2
+        P, bound = np.asarray(fused.P), float(params.vague) ** 2
+        z2 = squares / (P + noise_in(r, noises))
+        vague, wrong = bound <= P, squares > bound
+        counts = [vague.mean(), (vague & wrong).mean(), (~vague & wrong).mean()]
+        table.setdefault(r["label"], []).append([*line, z2.mean(), *counts])
+    print(
+        "| images | along | smoothed | blend | mc | SSIM | z2 | vague | wrong there | elsewhere |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
     for label, lines in table.items():
-        cells = " | ".join(f"{v:.4f}" for v in np.mean(lines, 0))
+        means = np.mean(lines, 0)
+        means[-2:] /= np.maximum([means[-3], 1 - means[-3]], 1e-9)
+        cells = " | ".join(f"{v:.4f}" for v in means)
         print(f"| {label} | {cells} |", flush=True)
 
 
@@ -321,7 +381,8 @@ def main() -> None:
         kept("textures_test", textures(range(2000, 2030))),
         kept("objects_test", objects(range(11, 13))),
     ]
-    choice, doubt = fit([row for part in fitting for row in part])
+    noises = {path.stem: noise_of(frames_of(path)) for path in (slider, street)}
+    choice, doubt = fit([row for part in fitting for row in part], noises)
     numbers = Params().replace(
         choice=[round(float(v), 3) for v in choice.ravel()],
         doubt=[round(float(v), 3) for v in doubt],
@@ -330,7 +391,7 @@ def main() -> None:
     for name, parts in (("fitted", fitting), ("not seen", testing)):
         print(name)
         for part in parts:
-            show(part, numbers)
+            show(part, numbers, noises)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,8 @@ Of hidden frames a few are scored, evenly chosen among those that lie between gi
 recordings are those of seeds 101 to 103; the smoother and the filter are fitted to seeds 1 to 3.
 The method `mc` is left out where there is none. Rows that the folder holds are not computed again.
 Columns are means over images; z2 is the mean squared standardised error of ln(I + I0), 1 for honest
-variances; s is seconds per image, of reconstruction and reading, without compilation.
+variances, to which that of the hidden frame's own noise is added; s is seconds per image, of
+reconstruction and reading, without compilation.
 """
 
 import argparse
@@ -28,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from compensated_choice import noise_of
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -174,14 +176,17 @@ def scored(
     truth: Frames,
     moving: Sequence[NDArray[np.bool_]] | None = None,
     parts: Mapping[str, NDArray[np.int64]] | None = None,
+    noise: float = 0.0,
 ) -> Row:
     """A row of means over the images at the times of `truth`.
 
     `moving` is where something moves, for each image; `parts` are rows of images whose error is
-    told apart.
+    told apart; `noise` is the variance of a pixel of the truth.
     """
     times = frame_times(truth, params)
     image, variance, seconds = images_of(method, params, given, times)
+    if variance is not None and noise:
+        variance = variance + noise / (truth.intensity + float(params.I0)) ** 2
     scores = [
         hidden_scores(
             image[k],
@@ -226,6 +231,7 @@ def real(
     """Score hidden frames of a recording, `halves` of it: 0, 1, or None for the whole."""
     frames = recording.frames
     assert frames is not None
+    noise = noise_of(frames)
     cells = [(gap, half) for gap in gaps for half in halves]
     for gap, half in tqdm(cells, desc=store.file.stem, disable=not sys.stderr.isatty()):
         given, hidden = held_out(recording, gap)
@@ -235,7 +241,7 @@ def real(
         rows = evenly(rows, IMAGES[gap])
         places = np.searchsorted(hidden.t, frames.t[rows])
         where = [moves(given, int(place), gap) for place in places] if moving else None
-        score = _scorer(given, hidden[places], where)
+        score = _scorer(given, hidden[places], where, noise=noise)
         store.add({"gap": gap, "half": half}, methods, score)
 
 
@@ -244,8 +250,9 @@ def _scorer(
     truth: Frames,
     moving: Sequence[NDArray[np.bool_]] | None = None,
     parts: Mapping[str, NDArray[np.int64]] | None = None,
+    noise: float = 0.0,
 ) -> Callable[..., Row]:
-    return lambda method, params: scored(method, params, given, truth, moving, parts)
+    return lambda method, params: scored(method, params, given, truth, moving, parts, noise)
 
 
 def sensor(rate: float, exposure: float = 5e-3, samples: int = 8) -> Any:

@@ -45,7 +45,7 @@ from jaxevent.recording import Recording, Times, microseconds
 PROBES = 6  # instants at which the speed of the image is measured
 KEPT = 96  # images of instants that a video remembers
 FADE = 0.35  # of variances from one resolution to the half of it
-APART = 16  # steps of the schedule between anchors
+APART = 8  # steps of the schedule between anchors
 ANCHORS = 2  # whose motion is remembered
 STEPS = 2  # with which a target's motion is found at half and at full resolution
 INFLATE = 3.0  # of the variance of an image that motion is refined with
@@ -252,6 +252,8 @@ def fuse_images(params: Params, target: Followed) -> Fused:
 class CompensatedVideo(ImageSequence[Params]):
     """Images of `mc`: `image, variance, valid = video(times)`; also `flow` and `sources`.
 
+    `valid` is false, too, where the standard deviation is above the parameter `vague`: there lie
+    most of the large errors, of points that the frames do not show and motion that was not found.
     The smoother's images are read as `Video` reads them, in constant memory. Images do not depend
     on which other images were asked for.
     """
@@ -288,7 +290,8 @@ class CompensatedVideo(ImageSequence[Params]):
         for n, t in enumerate(times.tolist()):
             _, fused = self._target(t)
             image = np.exp(np.asarray(fused.L)) - np.asarray(self.params.I0)
-            whole = (image.astype(self.dtype), np.asarray(fused.P, self.dtype), np.isfinite(image))
+            valid = np.isfinite(image) & (np.sqrt(fused.P) < np.asarray(self.params.vague))
+            whole = (image.astype(self.dtype), np.asarray(fused.P, self.dtype), valid)
             yield times[n : n + 1], tuple(v[None] for v in whole)
 
     def _targets(self, times: Times, extrapolate: bool) -> Iterator[tuple]:
@@ -383,7 +386,8 @@ class MotionCompensated(ImageEstimator[Params]):
 
         found, P = jax.lax.map(one, (out.rows, out.place, out.p))
         image = (jnp.exp(found) - params.I0).reshape(len(found), -1)
-        return Estimate(image, P.reshape(image.shape), jnp.isfinite(image))
+        P = P.reshape(image.shape)
+        return Estimate(image, P, jnp.isfinite(image) & (jnp.sqrt(P) < params.vague))
 
     def estimate(
         self, recording: Recording, params: Params | None = None, **options: Any

@@ -33,8 +33,8 @@ CHOICE = (
     -2.626, -0.072, 0.484, 0.442, -0.067, -0.09, -0.424, -0.208, -0.412, -0.102, -8.12,
 )
 DOUBT = (
-    0.428, 0.295, 0.198, 0.028, 0.572, -0.637, -2.831, 0.227, -0.209, -0.048, -0.022,
-    -0.074, 0.018, 0.124, -0.09, -0.013, 7.134,
+    0.478, 0.306, 0.329, 0.006, 0.573, -1.969, -2.776, 0.185, -0.231, 0.005, 0.084,
+    -0.097, 0.011, 0.352, -0.262, 0.011, 7.72,
 )
 # fmt: on
 
@@ -79,6 +79,14 @@ class Params(smoother.Params):
         "how signs choose smoother and blend instead of the mean along trajectories",
     )
     doubt = Number(DOUBT, "1", "how signs tell the logarithm of the result's variance")
+    vague = Positive(
+        0.2, "ln I", "standard deviation from which an image is not valid", gradient=False
+    )
     presets = {
-        "hdr": {**smoother.Params.presets["hdr"], "sigma_pixel": 0.006, "sigma_between": 0.02}
+        "hdr": {
+            **smoother.Params.presets["hdr"],
+            "sigma_pixel": 0.006,
+            "sigma_between": 0.02,
+            "vague": 0.5,
+        }
     }

@@ -100,11 +100,31 @@ def places(p: Array, s: Array, height: int, width: int) -> tuple[Array, Array]:
     return Y, X
 
 
+def sample(images: Array, Y: Array, X: Array) -> Array:
+    """Images (K, h, w) at the points Y and X (K, h, w) of each, bilinear; differentiable."""
+    _, h, w = images.shape
+    Y, X = jnp.clip(Y, 0, h - 1), jnp.clip(X, 0, w - 1)
+    y0 = jnp.minimum(Y.astype(int), max(h - 2, 0))
+    x0 = jnp.minimum(X.astype(int), max(w - 2, 0))
+    y1, x1 = jnp.minimum(y0 + 1, h - 1), jnp.minimum(x0 + 1, w - 1)
+    fy, fx = Y - y0, X - x0
+    k = jnp.arange(len(images))[:, None, None]
+    top = (1 - fx) * images[k, y0, x0] + fx * images[k, y0, x1]
+    bottom = (1 - fx) * images[k, y1, x0] + fx * images[k, y1, x1]
+    return (1 - fy) * top + fy * bottom
+
+
+def within(Y: Array, X: Array, height: int, width: int) -> Array:
+    """Where points lie in an image."""
+    return (X >= -0.5) & (X <= width - 0.5) & (Y >= -0.5) & (Y <= height - 0.5)
+
+
 def warp_purely(L: Array, V: Array, clear: Array, s: Array, p: Array) -> Along:
     """The same as `warp`; differentiable."""
     _, h, w = L.shape
     Y, X = places(p, s, h, w)
-    inside = (X >= -0.5) & (X <= w - 0.5) & (Y >= -0.5) & (Y <= h - 0.5)
+    inside = within(Y, X, h, w)
+    V, clear = sample(V, Y, X), sample(clear, Y, X)
     Y, X = jnp.clip(Y, 0, h - 1), jnp.clip(X, 0, w - 1)
     y0 = jnp.minimum(Y.astype(int), max(h - 2, 0))
     x0 = jnp.minimum(X.astype(int), max(w - 2, 0))
@@ -112,15 +132,6 @@ def warp_purely(L: Array, V: Array, clear: Array, s: Array, p: Array) -> Along:
     k = jnp.arange(len(s))[:, None, None]
     row = [jnp.clip(y0 + i, 0, h - 1) for i in range(-1, 3)]
     column = [jnp.clip(x0 + j, 0, w - 1) for j in range(-1, 3)]
-
-    def taps(images: Array, near: slice) -> Array:
-        """Values around the points: (rows, columns, k, h, w)."""
-        rows, columns = jnp.stack(row[near])[:, None], jnp.stack(column[near])
-        return images[k, rows, columns]
-
-    def linear(images: Array) -> Array:
-        weights = jnp.stack([1 - fy, fy])[:, None] * jnp.stack([1 - fx, fx])
-        return (weights * taps(images, slice(1, 3))).sum((0, 1))
 
     def cubic(f: Array) -> Array:
         a = CUBIC
@@ -130,5 +141,7 @@ def warp_purely(L: Array, V: Array, clear: Array, s: Array, p: Array) -> Along:
         third = ((a + 2) * rest - (a + 3)) * rest * rest + 1
         return jnp.stack([first, second, third, 1 - first - second - third])
 
-    bicubic = (cubic(fy)[:, None] * cubic(fx) * taps(L, slice(0, 4))).sum((0, 1))
-    return Along(bicubic, linear(V), linear(clear), inside.astype(L.dtype))
+    # Around the points: (rows, columns, k, h, w).
+    taps = L[k, jnp.stack(row)[:, None], jnp.stack(column)]
+    bicubic = (cubic(fy)[:, None] * cubic(fx) * taps).sum((0, 1))
+    return Along(bicubic, V, clear, inside.astype(L.dtype))
