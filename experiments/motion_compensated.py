@@ -9,6 +9,8 @@
     objects  simulated objects, frames at 25 and 100 Hz, halfway between frames
     blur     pans and objects, long exposures: at the frames' middles, and halfway between them
     flow     the optical flow of objects, against the true one
+    video    seconds of all cores per image of `mc` on slider_depth, 100 images per second, and the
+             error of hidden frames: as it is, and with an anchor for every target
 
 Of hidden frames a few are scored, evenly chosen among those that lie between given ones. Simulated
 recordings are those of seeds 101 to 103; the smoother and the filter are fitted to seeds 1 to 3.
@@ -20,6 +22,8 @@ reconstruction and reading, without compilation.
 
 import argparse
 import dataclasses
+import functools
+import itertools
 import json
 import os
 import sys
@@ -36,6 +40,7 @@ from tqdm import tqdm
 import jaxevent
 from jaxevent.camera import UnknownResponse
 from jaxevent.parameters import Parameters, read_toml
+from jaxevent.reconstruction.compensated import estimator
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.fit import fit
 from jaxevent.runs.protocols import frame_times, held_out
@@ -400,6 +405,35 @@ def _flow_scorer(
     return score
 
 
+def video(store: Store, recording: Recording, fits: Chosen) -> None:
+    """Time evenly spaced images, with the motion of anchors and with every target's own."""
+    frames = recording.frames
+    assert frames is not None
+    for gap, apart in itertools.product((2, 8), (estimator.APART, 1)):
+        given, hidden = held_out(recording, gap)
+        rows = evenly(hidden_between(len(frames), gap), IMAGES[gap])
+        truth = hidden[np.searchsorted(hidden.t, frames.t[rows])]
+        score = functools.partial(_paced, given=given, truth=truth, apart=apart)
+        store.add({"gap": gap, "apart": apart}, {"mc": fits["mc"]}, score)
+
+
+def _paced(method: Any, params: Any, given: Recording, truth: Frames, apart: int) -> Row:
+    kept, estimator.APART = estimator.APART, apart
+    times = frame_times(truth, params)
+    evenly_spaced = times[len(times) // 2] + np.arange(16) * 10_000
+    try:
+        image = method.estimate(given, params, progress=False)(times)[0]
+        made = method.estimate(given, params, progress=False)
+        made(evenly_spaced[:1])  # the smoother has gone through the recording
+        clock = time.process_time()
+        made(evenly_spaced)
+        seconds = (time.process_time() - clock) / len(evenly_spaced)
+    finally:
+        estimator.APART = kept
+    errors = (np.clip(image, 0, 1) - truth.intensity) ** 2
+    return {"mse": float(errors.mean()), "seconds": seconds, "images": len(times)}
+
+
 IMAGE_COLUMNS = (
     ("MSE x 1e-2", "mse", 100, 4),
     ("SSIM", "ssim", 1, 3),
@@ -434,7 +468,7 @@ def markdown(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    tables = ("slider", "street", "objects", "blur", "flow")
+    tables = ("slider", "street", "objects", "blur", "flow", "video")
     parser.add_argument(
         "--params", type=Path, required=True, help="folder of a fit to slider_depth"
     )
@@ -497,6 +531,12 @@ def _tables(
         dense_flow(store, out, fits)
         columns = (*FLOW_COLUMNS, ("s", "seconds", 1, 3))
         yield "flow", markdown(store.means(list(keys), names), keys, columns)
+    if "video" in wanted and "mc" in names:
+        store = Store(out / "video.json")
+        video(store, jaxevent.load(data / "slider_depth.zip"), fits(arguments.params))
+        columns = (("MSE x 1e-2", "mse", 100, 4), ("s", "seconds", 1, 3))
+        keys = {"gap": "gap", "apart": "steps between anchors"}
+        yield "video", markdown(store.means(list(keys), names), keys, columns)
 
 
 if __name__ == "__main__":

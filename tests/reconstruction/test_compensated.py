@@ -12,7 +12,14 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 import jaxevent
 from jaxevent.errors import InputError
 from jaxevent.methods import find
-from jaxevent.reconstruction.compensated import agreement, fusion, instants, trajectories, warping
+from jaxevent.reconstruction.compensated import (
+    agreement,
+    fusion,
+    implicit,
+    instants,
+    trajectories,
+    warping,
+)
 from jaxevent.reconstruction.compensated.parameters import OTHERS, SIGNS, Params
 from jaxevent.recording import Frames
 from jaxevent.simulate import Sensor, simulate
@@ -72,6 +79,19 @@ def test_motion_of_half_the_image_alone():
     p = trajectories.follow(pyramid, s, plan, 2e-4, 10.0, SMOOTHNESS).p
     assert np.abs(p[:, :5, :2] * 2).max() < 0.3  # of half resolution
     np.testing.assert_allclose(p[2:-2, -5:-2, 0] * 2, 3, atol=0.4)
+
+
+def test_motion_of_a_later_target():
+    p = np.zeros((8, 10, 4), np.float32)
+    p[..., 0], p[..., 2] = 0.2 * 2 * np.arange(10), 0.5  # px/s at s = 0: it grows with x
+    p[..., 1] = -2.0
+    later = trajectories.advect(p, 0.4, 1.5)
+    # x + (0.2 x) s + 0.5 s^2 is where a point is; x is that of the target before.
+    before = (2 * np.arange(10) - 0.5 * 0.4**2) / (1 + 0.2 * 0.4)
+    expected = 1.5 * (0.2 * before + 2 * 0.5 * 0.4)
+    np.testing.assert_allclose(later[3, 1:, 0], expected[1:], atol=2e-3)
+    np.testing.assert_allclose(later[..., 1], -3, atol=1e-5)
+    np.testing.assert_allclose(later[..., 2], 0.5 * 1.5**2, atol=1e-5)
 
 
 def test_equations_are_solved():
@@ -383,6 +403,68 @@ def test_derivatives_are_those_of_differences():
     assert slope == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=0.05)
     assert all(np.isfinite(v).all() for v in gradient.values())
     assert all(np.any(gradient[n] != 0) for n in names)
+
+
+def balanced():
+    """Images that move, trajectories near theirs, and numbers of the motion."""
+    rng = np.random.default_rng(6)
+    s = np.linspace(-1, 1, 3).astype(np.float32)
+    L = moved((1.0, -0.5), (0.2, 0.1), s, 9, 10) + rng.normal(0, 0.02, (3, 9, 10))
+    V = rng.uniform(2e-4, 1e-3, L.shape)
+    p = np.float32([1, -0.5, 0.2, 0.1]) + rng.normal(0, 0.02, (5, 5, 4))
+    images = [np.asarray(v, np.float32) for v in (L, V, s, np.ones(3))]
+    numbers = [np.float32(v) for v in (2e-4, 10, 40, 0.04, 0.1, 0.2)]
+    return jnp.float32(p), implicit.Seen(*images), implicit.Numbers(*numbers)
+
+
+def test_equations_are_those_of_the_steps():
+    p, (L, V, s, _), numbers = balanced()
+    near = np.exp(-2 * s**2).astype(np.float32)
+    points, M = np.empty((9, 10, 3, 4), np.float32), np.empty((9, 10), np.float32)
+    N, b = np.empty((5, 5, 10), np.float32), np.empty((5, 5, 4), np.float32)
+    edge, softened = np.empty((5, 5), np.float32), np.empty((5, 5, 10), np.float32)
+    images = trajectories.pack(L, V)
+    trajectories._fetch(
+        0, 9, images, s, near, np.asarray(p), numbers.floor, numbers.robust, points, M
+    )
+    trajectories._linearise(0, 5, points, s, M, N, b, edge)
+    found = jax.jit(implicit.equations)(*balanced())
+    trajectories._soften(N, softened)
+    upper = [found.N[..., i, j] for i in range(4) for j in range(i, 4)]
+    scale = np.abs(softened).max()
+    np.testing.assert_allclose(np.stack(upper, -1), softened, atol=1e-4 * scale)
+    trajectories._soften(b, softened[..., :4])
+    np.testing.assert_allclose(found.b, softened[..., :4], atol=1e-4 * np.abs(b).max())
+    across, down = np.zeros((2, 5, 5), np.float32)
+    smoothness = trajectories.Smoothness(*(float(v) for v in numbers[2:]))
+    trajectories._weigh_differences(np.asarray(p), edge, np.float32(1), smoothness, across, down)
+    np.testing.assert_allclose(found.across, across[:, :-1], rtol=1e-3)
+    np.testing.assert_allclose(found.down, down[:-1], rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_motion_keeps_its_balance():
+    """Images, numbers and motion change together: the normal equations stay as they are."""
+    p, seen, numbers = balanced()
+    rng = np.random.default_rng(7)
+    noise = rng.normal(0, 0.02, seen.L.shape).astype(np.float32)
+    change = (seen._replace(L=noise, V=0.3 * seen.V, s=0 * seen.s, present=0 * seen.s), numbers)
+    step = jax.jit(lambda *d: jax.jvp(lambda *v: implicit.depending(p, *v), (seen, numbers), d))
+    same, dp = step(*change)
+    np.testing.assert_array_equal(same, p)
+    balance, h = jax.jit(implicit.imbalance), 1e-3
+
+    def slope(dp):
+        ends = [
+            balance(
+                *jax.tree.map(lambda v, d, sign=sign: v + sign * h * d, (p, seen, numbers), moved)
+            )
+            for sign in (1, -1)
+            for moved in [(dp, *change)]
+        ]
+        return np.linalg.norm(ends[0] - ends[1])
+
+    assert slope(dp) < 0.03 * slope(0 * p)
 
 
 def test_bad_input():

@@ -33,6 +33,7 @@ from jaxevent.reconstruction.compensated.fusion import (
     fuse,
     views,
 )
+from jaxevent.reconstruction.compensated.implicit import Numbers, Seen, depending
 from jaxevent.reconstruction.compensated.instants import ROOM, Instants, Schedule, speed_of
 from jaxevent.reconstruction.compensated.parameters import Params
 from jaxevent.reconstruction.compensated.warping import warp, warp_purely
@@ -330,9 +331,15 @@ class CompensatedVideo(ImageSequence[Params]):
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class MotionCompensated(ImageEstimator[Params]):
-    """The estimator of this package."""
+    """The estimator of this package.
+
+    Attributes:
+        through_motion: Whether derivatives of what `read` returns go through the motion, too, as
+            through a fixpoint (`implicit`). Else motion counts as fixed. Values are the same.
+    """
 
     options: frozenset[str] = dataclasses.field(default=frozenset({"window_events"}), kw_only=True)
+    through_motion: bool = dataclasses.field(default=False, kw_only=True)
 
     def prepare(
         self,
@@ -380,6 +387,8 @@ class MotionCompensated(ImageEstimator[Params]):
         def one(target: tuple) -> tuple[Array, Array]:
             rows, place, p = target
             images = (L[rows], V[rows], clear[rows])
+            if self.through_motion:
+                p = self._moved(params, images, place, p)
             along = warp_purely(*images, place.s, p)
             fused = fuse(params, images[0], images[1], along, place)
             return fused.L, fused.P
@@ -388,6 +397,16 @@ class MotionCompensated(ImageEstimator[Params]):
         image = (jnp.exp(found) - params.I0).reshape(len(found), -1)
         P = P.reshape(image.shape)
         return Estimate(image, P, jnp.isfinite(image) & (jnp.sqrt(P) < params.vague))
+
+    def _moved(
+        self, params: Params, images: tuple[Array, Array, Array], place: Place, p: Array
+    ) -> Array:
+        """Trajectories that depend on images and parameters."""
+        L, V, clear = images
+        chosen = (params.floor, params.robust, params.smooth, params.jump, params.edge)
+        numbers = Numbers(*(jnp.asarray(v, L.dtype) for v in (*chosen, params.straight)))
+        doubted = V * jnp.where(clear > 0, 1, params.caution)
+        return depending(p, Seen(L, doubted, place.s, place.present), numbers)
 
     def estimate(
         self, recording: Recording, params: Params | None = None, **options: Any
