@@ -422,7 +422,7 @@ def _paced(method: Any, params: Any, given: Recording, truth: Frames, apart: int
     times = frame_times(truth, params)
     evenly_spaced = times[len(times) // 2] + np.arange(16) * 10_000
     try:
-        image = method.estimate(given, params, progress=False)(times)[0]
+        image = method.estimate(given, params, progress=False)(times).mean
         made = method.estimate(given, params, progress=False)
         made(evenly_spaced[:1])  # the smoother has gone through the recording
         clock = time.process_time()

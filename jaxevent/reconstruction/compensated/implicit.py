@@ -94,7 +94,7 @@ def equations(p: Array, seen: Seen, numbers: Numbers) -> Equations:
     """The normal equations of `trajectories.step`, as a pure function."""
     L, V, s, present = seen
     count, h, w = L.shape
-    Y, X = places(p, s, h, w)
+    Y, X = (one.astype(p.dtype) for one in places(p, s, h, w))
     inside = within(Y, X, h, w)
     gx, gy = _slopes(L)
     L, V, gx, gy = (sample(images, Y, X) for images in (L, V, gx, gy))
@@ -121,7 +121,7 @@ def equations(p: Array, seen: Seen, numbers: Numbers) -> Equations:
         weight = numbers.jump / jnp.sqrt((apart**2).sum(-1) + numbers.jump**2)
         return weight * (0.1 + 0.9 * jnp.exp(-(one + other) / 2 / numbers.edge))
 
-    smooth = numbers.smooth * jnp.ones(4)
+    smooth = numbers.smooth * jnp.ones(4, p.dtype)
     tiny = 1e-5 * numbers.smooth
     ridge = jnp.stack([tiny, tiny, numbers.straight, numbers.straight])
     return Equations(
@@ -148,7 +148,7 @@ def _solve(eq: Equations, right: Array) -> Array:
     degree = jnp.pad(eq.across, [(0, 0), (1, 0)]) + jnp.pad(eq.across, [(0, 0), (0, 1)])
     degree = degree + jnp.pad(eq.down, [(1, 0), (0, 0)]) + jnp.pad(eq.down, [(0, 1), (0, 0)])
     diagonal = eq.smooth * degree[..., None] + eq.ridge + 1e-6
-    blocks = jnp.linalg.inv(eq.N + diagonal[..., None] * jnp.eye(4))
+    blocks = jnp.linalg.inv(eq.N + diagonal[..., None] * jnp.eye(4, dtype=right.dtype))
 
     def times(q: Array) -> Array:
         return jnp.einsum("ijab,ijb->ija", eq.N, q) + _pull(eq, q)
