@@ -1,11 +1,13 @@
-"""Images of events that come over the network: a recording replayed by UDP on loopback.
+"""Images or tracks of events that come over the network: a recording replayed by UDP on loopback.
 
     python experiments/live_udp.py [RECORDING] [--speed 1] [--window 131072]
+    python experiments/live_udp.py RECORDING --track [--preset slow]
 
 One thread sends the recording's events, 13 bytes each, at their times (`--speed` times as fast);
 the other adds them to `jaxevent.akf.live` and asks for the image of now every 20 ms of the
-recording. Printed are how many events came, how late images were, how many events were held, and
-how far the last image is from that of the whole recording.
+recording; with `--track` it adds them to `jaxevent.blob.moment.live` and asks for the targets.
+Printed are how many events came, how late images were, how many events were held, and how far the
+last answer is from that of the whole recording.
 """
 
 import argparse
@@ -47,41 +49,93 @@ def receive(receiver: socket.socket):
         yield Events(*(np.ascontiguousarray(records[name]) for name in "txyp"))
 
 
+class Images:
+    """The image of now, by the AKF."""
+
+    def __init__(self, recording: Recording, arguments: argparse.Namespace):
+        size = recording.width, recording.height
+        self.recording, self.window = recording, arguments.window
+        self.live = jaxevent.akf.live(size, frames=False, window_events=arguments.window)
+
+    def warm(self) -> None:
+        self.live.add(self.recording.events[: 3 * self.window])
+        self.live(self.live.stop)
+
+    def held(self) -> int:
+        return len(self.live._events.held())
+
+    def compare(self) -> str:
+        image = self.live(self.live.stop).mean
+        whole = jaxevent.akf.estimate(self.recording)(self.live.stop).mean
+        return f"the last image is within {np.abs(image - whole).max():.1e} of the whole's"
+
+
+class Targets:
+    """The targets of now, by the moment filter."""
+
+    def __init__(self, recording: Recording, arguments: argparse.Namespace):
+        self.recording = recording
+        self.params = jaxevent.blob.moment.Params(preset=arguments.preset)
+        self.live = jaxevent.blob.moment.live((recording.width, recording.height), self.params)
+
+    def warm(self) -> None:
+        self.live.add(self.recording.events[:10_000])
+        self.live(self.live.stop)
+
+    def held(self) -> int:
+        return len(self.live._tail.held())
+
+    def compare(self) -> str:
+        t = self.live.stop
+        now = self.live(t)
+        tracks = jaxevent.blob.moment.estimate(self.recording, self.params, smooth=False)
+        whole = tracks(t)
+        shown = whole.valid[0] & (tracks.confirmed <= t)
+        if len(now.id) != shown.sum():
+            return f"{len(now.id)} targets at the end, {shown.sum()} of the whole recording"
+        apart = np.abs(now.mean[0, :, :2] - whole.mean[0, shown, :2])
+        return (
+            f"{len(now.id)} targets at the end, the whole's within {apart.max(initial=0):.1e} px; "
+            f"{self.live._count} in all, {len(tracks)} of the whole"
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     packaged = files("jaxevent") / "data/slider_depth_crop.h5"
     parser.add_argument("recording", nargs="?", default=packaged)
     parser.add_argument("--speed", type=float, default=1.0)
     parser.add_argument("--window", type=int, default=1 << 17)
+    parser.add_argument("--track", action="store_true", help="targets instead of images")
+    parser.add_argument("--preset", help="of the tracker's parameters")
     arguments = parser.parse_args()
     recording = dataclasses.replace(jaxevent.load(arguments.recording), frames=None)
-    size = recording.width, recording.height
     receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 24)
     receiver.bind(("127.0.0.1", 0))
-    # Programs are compiled before the first event comes.
-    warm = jaxevent.akf.live(size, frames=False, window_events=arguments.window)
-    warm.add(recording.events[: 3 * arguments.window])
-    warm(warm.stop)
-    live = jaxevent.akf.live(size, frames=False, window_events=arguments.window)
+    made = Targets if arguments.track else Images
+    made(recording, arguments).warm()  # programs are compiled before the first event comes
+    estimate = made(recording, arguments)
+    live = estimate.live
     port = receiver.getsockname()[1]
     threading.Thread(target=send, args=(recording, port, arguments.speed), daemon=True).start()
-    count, held, due, late, image = 0, 0, recording.start, [], None
+    count, held, due, late, spent = 0, 0, recording.start, [], time.process_time()
     for events in receive(receiver):
         live.add(events)
         count += len(events)
-        held = max(held, len(live._events.held()))
+        held = max(held, estimate.held())
         if live.stop >= due:
             clock = time.perf_counter()
-            image = live(live.stop)
+            live(live.stop)
             late.append(time.perf_counter() - clock)
             due = live.stop + EVERY
+    spent = time.process_time() - spent
     print(f"{count:,} of {len(recording.events):,} events came, at most {held:,} were held")
     middle, worst = 1e3 * np.median(late), 1e3 * max(late)
-    print(f"{len(late)} images, median {middle:.1f} ms, worst {worst:.1f} ms")
-    image = live(live.stop)
-    whole = jaxevent.akf.estimate(recording)(live.stop)
-    print(f"the last image is within {np.abs(image.mean - whole.mean).max():.1e} of the whole's")
+    print(
+        f"{len(late)} answers, median {middle:.1f} ms, worst {worst:.1f} ms; {spent:.1f} s of CPU"
+    )
+    print(estimate.compare())
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ STRETCH_STEPS = 8192
 READ_ROWS = 65536  # events read from a file at a time
 NEAR = 3.5  # standard deviations from a found path within which events may be the target's
 LONGEST = 2**29  # us between boundaries; two of them fit into int32
+NEVER = np.iinfo(np.int64).max  # us
 
 Numeric = Array | np.ndarray
 
@@ -160,8 +161,12 @@ class Packing:
         self.chunks = max(1, STRETCH_STEPS // steps) if chunks is None else chunks
         self.first = Mark(self.rows[0], begin, begin, 0)
 
-    def pack(self, mark: Mark) -> Stretch:
-        """The stretch that begins there."""
+    def pack(self, mark: Mark, *, more: bool = False) -> Stretch:
+        """The stretch that begins there.
+
+        With `more` events are still to come: a chunk that these may change is left to the next
+        stretch.
+        """
         shape = self.chunks, self.steps, self.events
         real = np.dtype(jnp.result_type(float))
         out = _Chunks(
@@ -176,10 +181,11 @@ class Packing:
             np.full(len(self.seeds.t), -1, np.int32),
             np.full(shape, ANYBODY, np.int32),
         )
-        bounds = _Bounds(self.start, self.stop, self.period, self.seeds.t)
+        stop = NEVER if more else self.stop
+        bounds = _Bounds(self.start, stop, self.period, self.seeds.t)
         place = _Place(0, 0, 0, mark.previous, mark.start, 0, mark.seed)
         at, done = mark.row, False
-        while not done:
+        while not done and not (more and at == self.rows[1]):
             upto = min(at + READ_ROWS, self.rows[1])
             events = self.recording.events[at:upto]
             kept, owner = self._kept(events, at), np.full(len(events), ANYBODY, np.int32)
@@ -187,9 +193,12 @@ class Packing:
                 owner = candidates(events, self.joined, NEAR)
                 kept &= owner != NOBODY
             given = _Given(events.t, events.x, events.y, events.p, kept, owner)
-            done, used, place = _pack(given, at, upto == self.rows[1], bounds, place, out)
+            final = upto == self.rows[1] and not more
+            done, used, place = _pack(given, at, final, bounds, place, out)
             at += used
-        out.start[place.chunk :] = np.iinfo(np.int64).max
+        if place.opened:
+            at, place = _leave_open(place, out)
+        out.start[place.chunk :] = NEVER
         features = Features(
             out.t, out.xi, out.polarity, out.row >= 0, out.elapsed, out.stop, out.cycle, out.seed,
             self.seeds.xi.astype(real), self.seeds.size.astype(real),
@@ -197,7 +206,7 @@ class Packing:
             np.array([self.recording.width, self.recording.height], real),
             self.detect, self.cells,
         )  # fmt: skip
-        ended = place.previous == place.begin == self.stop
+        ended = place.previous == place.begin == stop
         following = None if ended else Mark(at, place.previous, place.begin, place.seed)
         return Stretch(features, out.start, out.row, following)
 
@@ -207,7 +216,7 @@ class Packing:
         while mark is not None:
             stretches.append(self.pack(mark))
             mark = stretches[-1].next
-        used = sum(int((w.start < np.iinfo(np.int64).max).sum()) for w in stretches)
+        used = sum(int((w.start < NEVER).sum()) for w in stretches)
         used = -(-used // 32) * 32  # so that few shapes occur
         fields = {}
         names = ("t", "xi", "polarity", "valid", "elapsed", "stop", "cycle")
@@ -319,6 +328,15 @@ class _Chunks(NamedTuple):
     owner: NDArray
 
 
+def _leave_open(place: _Place, out: _Chunks) -> tuple[int, _Place]:
+    """Take back the chunk that is open: the row of its first event, and the place before it."""
+    chunk = place.chunk
+    row, sown = int(out.row[chunk, 0, 0]), out.seed == chunk
+    out.row[chunk], out.seed[sown], out.elapsed[chunk] = -1, -1, 0
+    begun = place.seed - int(sown.sum())
+    return row, _Place(chunk, 0, 0, place.previous, place.begin, 0, begun)
+
+
 @compiled
 def _pack(given, first_row, final, bounds, place, out):
     """Fill chunks until they are full or events end: (full or ended, events used, place).
@@ -330,7 +348,7 @@ def _pack(given, first_row, final, bounds, place, out):
     chunks, steps, size = out.t.shape
     i, count = 0, len(given.t)
     while i < count + (1 if final else 0):
-        if i < count and not given.kept[i]:
+        if i < count and not given.kept[i] and not (opened and given.t[i] >= end):
             i += 1
             continue
         now = given.t[i] if i < count else finish

@@ -59,6 +59,9 @@ def run(
     return lax.scan(jax.checkpoint(chunk), state, parts)
 
 
+run_compiled = jax.jit(run, static_argnames=("filter", "wanted"))
+
+
 def _run_chunk(
     filter: Filter,
     params: TrackerParams,

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.steps import Filter
-from jaxevent.blob.targets import Slots, own_params, predict, seconds
+from jaxevent.blob.targets import Slots, own_params, predict, seconds, silence_limits
 from jaxevent.estimator import Estimate
 
 THETA_RATIO = 1.15  # lambda1 / lambda2 from which theta means something
@@ -55,6 +55,11 @@ def canonical(
 def wrap(theta: Array) -> Array:
     """The same angle in [-pi, pi]."""
     return theta - 2 * jnp.pi * jnp.round(theta / (2 * jnp.pi))
+
+
+def is_alive(params: TrackerParams, slots: Slots, time: Array) -> Array:
+    """Which targets are confirmed and not silent for too long at a time (us, in their chunk)."""
+    return (slots.id >= 0) & slots.confirmed & (time - slots.heard < silence_limits(params, slots))
 
 
 def tell(

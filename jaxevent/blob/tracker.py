@@ -14,13 +14,14 @@ from jaxtyping import Array
 from jaxevent.blob.finding import Found, find
 from jaxevent.blob.fused.tracking import FusedRun
 from jaxevent.blob.lifecycle import State, shift
+from jaxevent.blob.live import LiveTracks
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Packing, ReadOut
 from jaxevent.blob.run import run
 from jaxevent.blob.smoother import Smoothed, at_end, look_back, nothing_later, tell_smoothed
-from jaxevent.blob.states import TrackStates, tell
+from jaxevent.blob.states import TrackStates, is_alive, tell
 from jaxevent.blob.steps import Filter
-from jaxevent.blob.targets import Slots, silence_limits
+from jaxevent.blob.targets import Slots
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
@@ -123,8 +124,7 @@ class Tracker(Estimator[P]):
             slots, of_one = now, functools.partial(tell, self.filter, params)
             told = jax.vmap(jax.vmap(of_one, (0, None)))(slots, time)
         mean, covariance, idle = told
-        limits = jax.vmap(silence_limits, (None, 0))(params, slots)
-        valid = (slots.id >= 0) & slots.confirmed & (time[:, None] - slots.heard < limits)
+        valid = jax.vmap(is_alive, (None, 0, 0))(params, slots, time)
         valid &= jnp.asarray(out.inside)[:, None]
         seeds = len(out.given)
         valid = valid.at[:, :seeds].set(valid[:, :seeds] & ~jnp.asarray(out.ended))
@@ -188,8 +188,7 @@ class Tracker(Estimator[P]):
                 filter's states cannot be smoothed, or numba is asked for and has no kernel.
         """
         self.check(recording)
-        if compiler not in (None, "numba", "xla"):
-            raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
+        self._check_compiler(compiler)
         if smooth:
             self._check_smoothing()
         smooth = self.filter.transition is not None if smooth is None else smooth
@@ -198,8 +197,44 @@ class Tracker(Estimator[P]):
         if params is None:
             params = self.Params(**found.settings()) if found is not None else self.Params()
         packing = Packing(recording, params, seeds, start, stop, detect, found=found)
-        fused = self._fused(packing, params, compiler)
+        steps = (packing.rows[1] - packing.rows[0]) // packing.events
+        fused = self._fused(params, compiler, steps, packing)
         return Tracks(self.filter, packing, params, progress, smooth, fused)
+
+    def live(
+        self,
+        size: tuple[int, int],
+        params: P | None = None,
+        *,
+        seeds: Sequence[Any] | np.ndarray | None = None,
+        start: int | float | None = None,
+        detect: bool | None = None,
+        compiler: str | None = None,
+    ) -> LiveTracks:
+        """Targets of events that are still to come; see `LiveTracks`.
+
+        Nothing is found beforehand, as `find` needs the whole recording, and nothing is smoothed.
+
+        Args:
+            size: (width, height) of the sensor, px.
+            params: See `Params`; None: the defaults.
+            seeds: Where targets are, as `estimate` takes them.
+            start: Tracking begins there, and earlier events are left out; by default at the first
+                event.
+            detect: Whether tracks are born where events belong to none; by default only without
+                seeds.
+            compiler: As of `estimate`; None: numba on CPUs in single precision, where it has a
+                kernel.
+
+        Raises:
+            InputError: A seed is outside the sensor, or numba is asked for and has no kernel.
+        """
+        self._check_compiler(compiler)
+        params = self.Params() if params is None else params
+        kernel = functools.partial(self._fused, params, compiler, KERNEL_STEPS)
+        return LiveTracks(
+            self.filter, params, size, seeds=seeds, start=start, detect=detect, kernel=kernel
+        )
 
     def _check_smoothing(self) -> None:
         if self.filter.transition is None:
@@ -208,10 +243,15 @@ class Tracker(Estimator[P]):
                 "`transition`; leave out smooth"
             )
 
-    def _fused(self, packing: Packing, params: P, compiler: str | None) -> FusedRun | None:
+    def _check_compiler(self, compiler: str | None) -> None:
+        if compiler not in (None, "numba", "xla"):
+            raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
+
+    def _fused(
+        self, params: P, compiler: str | None, steps: int, packing: Packing
+    ) -> FusedRun | None:
         """The kernel that follows targets; None where XLA does."""
         on_host = jnp.result_type(float) == np.float32 and jax.default_backend() == "cpu"
-        steps = (packing.rows[1] - packing.rows[0]) // packing.events
         if compiler == "xla" or (compiler is None and not (on_host and steps >= KERNEL_STEPS)):
             return None
         try:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from jaxevent.blob.fused.tracking import FusedRun
 from jaxevent.blob.lifecycle import ENDS, Log, begin
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.prepare import Features, Mark, Packing, Stretch, count_steps
-from jaxevent.blob.run import Told, run
+from jaxevent.blob.prepare import NEVER, Features, Mark, Packing, Stretch, count_steps
+from jaxevent.blob.run import Told, run_compiled
 from jaxevent.blob.smoother import (
     Later,
     Smoothed,
@@ -36,7 +36,6 @@ BEGINS = 32  # stretches from which tracking can be taken up again
 READS = 64  # times read per call
 
 _begin = jax.jit(begin, static_argnames="filter")
-_run = jax.jit(run, static_argnames=("filter", "wanted"))
 _nothing_later = jax.jit(lambda begins: nothing_later(jax.tree.map(lambda a: a[-1], begins)))
 
 
@@ -271,7 +270,9 @@ class Tracks:
             stretch = self._packing.pack(mark)
             mark = stretch.next
             wanted = "associations" if mark is None or mark.start > t0 else "begins"
-            state, told = _run(self._filter, self.params, state, stretch.features, wanted=wanted)
+            state, told = run_compiled(
+                self._filter, self.params, state, stretch.features, wanted=wanted
+            )
             if told.association is None:
                 continue
             valid = np.asarray(stretch.features.valid)
@@ -379,7 +380,7 @@ class Tracks:
         """Track through a stretch, by the kernel if there is one."""
         if self._fused is not None:
             return self._fused(state, features, begins)
-        return _run(self._filter, self.params, state, features, wanted="begins")
+        return run_compiled(self._filter, self.params, state, features, wanted="begins")
 
     def _begin_of(self, time: int) -> tuple[Mark | None, Any]:
         known = [(mark, state) for mark, _, state in self._begins if mark.start <= time]
@@ -396,7 +397,7 @@ class Tracks:
         if stretch.next is not None:
             later, elapsed = known[stretch.next], stretch.next.start - stretch.next.previous
         features, found = jax.device_put(stretch.features), []
-        used = int((stretch.start < np.iinfo(np.int64).max).sum())
+        used = int((stretch.start < NEVER).sum())
         for chunk in reversed(range(used)):
             found.append(_Following(later, np.int32(elapsed)))
             at = np.int32(chunk), found[-1]

@@ -17,56 +17,11 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
+from jaxevent.events.tail import Tail
 from jaxevent.reconstruction.video import PixelMethod, Video
 from jaxevent.recording import Events, Frames, Recording, Times, microseconds
 
 WINDOW_EVENTS = 1 << 17  # filtered together, and at most so many anew for an image
-
-
-class Tail:
-    """An `EventSource` of which only the last events, and the very first one, are held."""
-
-    def __init__(self) -> None:
-        self.count = self.dropped = 0
-        self.last = np.iinfo(np.int64).min  # us
-        self._first = Events.empty()
-        self._parts: list[Events] = []
-
-    def __len__(self) -> int:
-        return self.count
-
-    def add(self, events: Events) -> None:
-        if len(events):
-            self._first = self._first if self.count else events[:1]
-            self._parts.append(events)
-            self.count += len(events)
-            self.last = int(events.t[-1])
-
-    def held(self) -> Events:
-        """Those from row `dropped` on."""
-        if len(self._parts) != 1:
-            parts = self._parts or [Events.empty()]
-            joined = (np.concatenate([getattr(e, name) for e in parts]) for name in "txyp")
-            self._parts = [Events(*joined)]
-        return self._parts[0]
-
-    def __getitem__(self, rows: slice) -> Events:
-        first, stop, _ = rows.indices(self.count)
-        if (first, stop) == (0, 1):
-            return self._first
-        if first < self.dropped:
-            raise IndexError(f"events before row {self.dropped} are gone")
-        return self.held()[first - self.dropped : stop - self.dropped]
-
-    def index(self, time: int) -> int:
-        return self.dropped + self.held().index(time)
-
-    def drop(self, row: int) -> None:
-        """Forget the events before a row."""
-        held = self.held()[max(row - self.dropped, 0) :]
-        # A copy: a slice would hold the array that it is of.
-        self._parts = [Events(*(getattr(held, name).copy() for name in "txyp"))]
-        self.dropped = max(row, self.dropped)
 
 
 class TailImages:
@@ -141,14 +96,7 @@ class LiveVideo:
 
     def add(self, events: Events) -> None:
         """Add events that are not earlier than those before; raises `InputError` for bad ones."""
-        tail, r = self._events, self._recording
-        events.check(r.width, r.height, "the events added", len(tail))
-        if len(events) and events.t[0] < tail.last:
-            raise InputError(
-                f"the events added begin at {events.t[0]} us, before the last one at {tail.last} "
-                "us; add them in order of time"
-            )
-        tail.add(events)
+        self._events.add(events, self._recording.width, self._recording.height)
         self._grown = True
         self._settle()
 

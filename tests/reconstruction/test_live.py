@@ -9,7 +9,7 @@ from noise import HEIGHT, WIDTH, small
 
 import jaxevent
 from jaxevent.errors import InputError
-from jaxevent.reconstruction.live import Tail
+from jaxevent.events.tail import Tail
 from jaxevent.recording import Events, Frames, Recording
 
 EVENTS = 128  # of a window
@@ -95,7 +95,7 @@ def test_what_cannot_be_added_is_said():
 def test_the_tail_keeps_its_numbers():
     events, tail = small().events, Tail()
     for row in range(0, 400, 50):
-        tail.add(events[row : row + 50])
+        tail.add(events[row : row + 50], WIDTH, HEIGHT)
     tail.drop(120)
     assert (len(tail), tail.dropped, len(tail.held())) == (400, 120, 280)
     assert tail[:1].t[0] == events.t[0] and tail.index(int(events.t[200])) <= 200
