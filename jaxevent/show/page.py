@@ -7,6 +7,7 @@ import io
 import math
 import os
 import platform
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
@@ -22,9 +23,13 @@ from jaxevent.show.report import Column, columns_of, display_limits, find, numbe
 SIDE = 360  # pixels of the longer side of a picture
 STRIPS = 12  # recordings with pictures and plots over time; more would make the page slow to open
 POINTS = 300  # of a curve over time, means of so many parts of it
-UNCERTAIN = 0.1  # a standard deviation of log intensity that is shown as bright as can be
+# Standard deviations of log intensity shown black and white; between them by their logarithm.
+UNCERTAIN = 0.001, 0.1
+WIDTH = 4.5  # inches of a plot: 27 rem of the page
+LABEL = 18  # letters of a line of a method's label in a plot
 # Errors shown in full colour: of intensity, and of ln(I + 0.003) against an HDR reference.
 FULL = {False: 0.1, True: 1.0}
+WORK = {"frames", "missing", "seconds", "times"}  # of these no method is best
 HIGHER = {  # of these more is better
     "ssim", "log_ssim", "global_ssim", "authors_ssim", "matlab_ssim", "hdr_quality", "covered",
     "mota", "idf1", "hota",
@@ -110,19 +115,20 @@ def page(
     columns, names = columns_of(done), _names(recordings)
     hdr = any("log_mse" in row for row in done)
     now = datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
-    counts = [len([row for row in done if row["method"] == method]) for method in methods]
+    counts = [len(_measured(done, method, columns)) for method in methods]
     values: dict[str, Any] = {
         "title": title,
         "about": f"{len(recordings)} recordings, {len(methods)} methods, protocol {protocol}, "
         f"{now}",
         "meaning": MEANINGS,
-        "failures": _failures(rows),
+        "failures": _failures(rows, names),
         "means": _means(done, methods, columns),
         "unequal": len(set(counts)) > 1,
         "strips": _strips(rows, pictures, recordings, names),
         "full": f"{FULL[hdr]:g}",
         "unit": "ln(I + 0.003)" if hdr else "intensity",
-        "uncertain": UNCERTAIN,
+        "certain": UNCERTAIN[0],
+        "uncertain": UNCERTAIN[1],
         "everything": _table(rows, columns, names),
         "parameters": _parameters(rows, methods),
         "computed": _computed(hosts),
@@ -178,7 +184,9 @@ def picture(sample: Any) -> dict[str, Any]:
         "error": _diverging(error),
     }
     if sample.deviation is not None:
-        share = np.nan_to_num(np.asarray(sample.deviation, np.float64) / UNCERTAIN, nan=1.0)
+        least, most = UNCERTAIN
+        deviation = np.nan_to_num(np.asarray(sample.deviation, np.float64), nan=most)
+        share = np.log(np.maximum(deviation, least) / least) / np.log(most / least)
         shown["deviation"] = _grey(np.rint(255 * share.clip(0, 1)).astype(np.uint8))
     if sample.given is not None:
         shown["given"] = _grey(tone_map(np.asarray(sample.given, np.float64), tone, limits))
@@ -221,11 +229,13 @@ def _png(image: Any) -> str:
     return base64.b64encode(held.getvalue()).decode()
 
 
-def _failures(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str]]]:
+def _failures(
+    rows: Sequence[Mapping[str, Any]], names: Mapping[str, str]
+) -> list[tuple[str, list[str]]]:
     parts = []
     for how in ("failed", "skipped"):
         lines = [
-            f"{row['recording']}, {row['method']}: {row['error']}"
+            f"{names[row['recording']]}, {row['method']}: {row['error']}"
             for row in rows
             if "error" in row and ("skipped" in row) == (how == "skipped")
         ]
@@ -241,11 +251,24 @@ def _mean(rows: Sequence[Mapping[str, Any]], place: str) -> float | None:
     return float(np.mean(values)) if values else None
 
 
+def _measured(
+    rows: Sequence[Mapping[str, Any]], method: str, columns: Sequence[Column]
+) -> list[Mapping[str, Any]]:
+    """The rows of a method that have any of the numbers but those of work."""
+    places = [place for _, place, _, _ in columns if place not in WORK]
+    return [
+        row
+        for row in rows
+        if row["method"] == method and any(find(row, place) is not None for place in places)
+    ]
+
+
 def _means(
     rows: Sequence[Mapping[str, Any]], methods: Sequence[str], columns: Sequence[Column]
 ) -> Table:
     measures = [column for column in columns if column[1] not in ("frames", "missing")]
-    mine = {method: [row for row in rows if row["method"] == method] for method in methods}
+    mine = {method: _measured(rows, method, columns) for method in methods}
+    most = max(map(len, mine.values()))
     means = {
         place: [_mean(mine[method], place) for method in methods] for _, place, _, _ in measures
     }
@@ -254,9 +277,13 @@ def _means(
         cells = [Cell(method, "left"), Cell(str(len(mine[method])))]
         for _, place, factor, digits in measures:
             value = means[place][i]
-            others = [one for one in means[place] if one is not None]
+            others = [
+                mean
+                for mean, other in zip(means[place], methods, strict=True)
+                if mean is not None and len(mine[other]) == most
+            ]
             best = others and value == (max if place in HIGHER else min)(others)
-            marked = best and len(others) > 1 and place != "seconds"
+            marked = best and len(others) > 1 and len(mine[method]) == most and place not in WORK
             cell = number({"mean": value}, "mean", factor, digits)
             cells.append(Cell(cell, "best" if marked else ""))
         lines.append(cells)
@@ -360,12 +387,11 @@ def _plotted(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], str]:
 
 def _points(
     rows: Sequence[Mapping[str, Any]], methods: Sequence[str], measures: Sequence[str]
-) -> str:
-    """Means over recordings, a panel for each measure; errors on a logarithmic scale."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 0.8 + 0.28 * len(methods)), layout="constrained")
-    for axis, measure in zip(figure.subplots(1, len(measures)), measures, strict=True):
+) -> list[str]:
+    """Means over recordings, a plot for each measure; errors on a logarithmic scale."""
+    plots = []
+    for measure in measures:
+        figure, axis = _panel(methods)
         values = [
             _mean([row for row in rows if row["method"] == method], measure) for method in methods
         ]
@@ -376,11 +402,23 @@ def _points(
         if measure not in HIGHER and all(place > 0 for place in places if place == place):
             axis.set_xscale("log")
             _label_plainly(axis.xaxis)
-        axis.set(xlabel=NAMES[measure], yticks=range(len(methods)), yticklabels=methods)
-        axis.invert_yaxis()
-        axis.tick_params(labelleft=measure == measures[0], left=False)
-        axis.spines[["top", "right", "left"]].set_visible(False)
-    return _plot(figure)
+        axis.set_xlabel(NAMES[measure])
+        plots.append(_plot(figure))
+    return plots
+
+
+def _panel(methods: Sequence[str]) -> tuple[Any, Any]:
+    """A figure and its axes with a line for each method, from above."""
+    from matplotlib.figure import Figure
+
+    lines = sum(len(textwrap.wrap(method, LABEL)) for method in methods)
+    figure = Figure(figsize=(WIDTH, 0.8 + 0.14 * (lines + len(methods))), layout="constrained")
+    axis = figure.subplots()
+    labels = [textwrap.fill(method, LABEL) for method in methods]
+    axis.set(yticks=range(len(methods)), yticklabels=labels, ylim=(len(methods) - 0.5, -0.5))
+    axis.tick_params(left=False)
+    axis.spines[["top", "right", "left"]].set_visible(False)
+    return figure, axis
 
 
 def _series(row: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -390,16 +428,14 @@ def _series(row: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def _boxes(
     rows: Sequence[Mapping[str, Any]], methods: Sequence[str], measures: Sequence[str]
-) -> str | None:
-    """How the values of all images, or times, of all recordings spread: a panel for each measure.
+) -> list[str]:
+    """How the values of all images, or times, of all recordings spread: a plot for each measure.
 
     A box reaches from the first to the third quartile, the line in it is the median, whiskers
-    reach to the last value within 1.5 times the box's length. Further metrics have panels too.
+    reach to the last value within 1.5 times the box's length. Further metrics have plots too.
     """
-    from matplotlib.figure import Figure
-
     further = [name for row in rows for name in _series(row) if name in NAMES]
-    values: dict[str, list[NDArray[np.float64]]] = {}
+    plots = []
     for measure in dict.fromkeys([*measures, *further]):
         lists = [
             [v for row in rows if row["method"] == one for v in _series(row).get(measure, [])]
@@ -407,32 +443,22 @@ def _boxes(
         ]
         columns = [np.array(one, np.float64) for one in lists]  # None becomes NaN
         columns = [one[np.isfinite(one)] for one in columns]
-        if any(len(one) for one in columns):
-            values[measure] = columns
-    if not values:
-        return None
-    wide = min(2, len(values))
-    high = math.ceil(len(values) / wide)
-    figure = Figure(figsize=(9, high * (0.8 + 0.28 * len(methods))), layout="constrained")
-    axes = figure.subplots(high, wide, squeeze=False).ravel()
-    for place, (axis, (measure, columns)) in enumerate(zip(axes, values.items(), strict=False)):
+        if not any(len(one) for one in columns):
+            continue
+        figure, axis = _panel(methods)
         drawn = axis.boxplot(
             columns, positions=range(len(methods)), orientation="horizontal", widths=0.6,
             patch_artist=True, flierprops={"marker": ".", "markersize": 2, "alpha": 0.4},
-            medianprops={"color": "black"},
+            medianprops={"color": "black"}, manage_ticks=False,
         )  # fmt: skip
         for i, box in enumerate(drawn["boxes"]):
             box.set(facecolor=_colour(i), alpha=0.6)
         if measure not in HIGHER and all((one > 0).all() for one in columns):
             axis.set_xscale("log")
             _label_plainly(axis.xaxis)
-        axis.set(xlabel=NAMES[measure], yticks=range(len(methods)), yticklabels=methods)
-        axis.invert_yaxis()
-        axis.tick_params(labelleft=place % wide == 0, left=False)
-        axis.spines[["top", "right", "left"]].set_visible(False)
-    for axis in axes[len(values) :]:
-        axis.set_axis_off()
-    return _plot(figure)
+        axis.set_xlabel(NAMES[measure])
+        plots.append(_plot(figure))
+    return plots
 
 
 def _curves(
@@ -447,7 +473,7 @@ def _curves(
 
     parts = []
     for recording in recordings[:STRIPS]:
-        figure = Figure(figsize=(9, 2.8), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 2.8), layout="constrained")
         axis = figure.subplots()
         for row in rows:
             if row["recording"] != recording:
@@ -484,7 +510,9 @@ def _curves(
             axis.set_yscale("log")
             _label_plainly(axis.yaxis)
         axis.spines[["top", "right"]].set_visible(False)
-        axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8)
+        longest = max(len(str(line.get_label())) for line in axis.lines)
+        columns = max(1, 60 // (longest + 6))
+        figure.legend(loc="outside lower center", ncols=columns, frameon=False, fontsize=8)
         parts.append((names[recording], _plot(figure)))
     return parts
 

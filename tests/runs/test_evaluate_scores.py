@@ -222,16 +222,18 @@ def test_recordings_are_called_by_name_where_that_tells_them_apart():
 def test_a_picture_shows_the_frame_before_and_the_uncertainty():
     truth = np.full((4, 6), 0.2)
     truth[0, 0] = 0.4
-    deviation = np.full((4, 6), 0.05)
-    deviation[1, 2] = 7.0
+    deviation = np.full((4, 6), 0.01)
+    deviation[1, 2], deviation[1, 3] = 7.0, 1e-4
     sample = Sample(5, truth, truth, False, deviation, truth / 2)
     shown = {
         name: np.asarray(Image.open(io.BytesIO(base64.b64decode(png))).convert("L"))
         for name, png in picture(sample).items()
         if name != "t"
     }
-    # White is the truth's brightest 0.5 %, for all alike; an uncertainty of 0.1 is white.
+    # White is the truth's brightest 0.5 %, for all alike; an uncertainty of 0.1 is white, of 0.001
+    # black and of 0.01 in the middle.
     assert shown["truth"][0, 0] == 255 and 120 < shown["truth"][2, 2] < 140
     np.testing.assert_array_equal(shown["image"], shown["truth"])
     assert abs(int(shown["given"][2, 2]) - shown["truth"][2, 2] / 2) <= 1
-    assert shown["deviation"][1, 2] == 255 and shown["deviation"][0, 0] in (127, 128)
+    assert shown["deviation"][1, 2] == 255 and shown["deviation"][1, 3] == 0
+    assert shown["deviation"][0, 0] in (127, 128)
