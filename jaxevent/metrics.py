@@ -23,6 +23,65 @@ NETS = {"alex": ("AlexNet", "alexnet"), "vgg": ("VGG16", "vgg16")}  # names in l
 LOG_OFFSET = 0.003  # inside logarithms, in intensity: about one grey level of 255
 
 
+# What numbers of evaluations, fits and motions are, by their places in results.json. Intensity is 0
+# at black and 1 at the frames' white.
+MEANINGS = {
+    "mse": "mean square error of intensity; 0 is best",
+    "ssim": "structural similarity of intensity, from -1 to 1; 1 is best",
+    "log_mse": "mean square error of ln(I + 0.003); 0 is best",
+    "log_ssim": "structural similarity of ln(I + 0.003); 1 is best",
+    "regions.bright.mse": "mean square error of intensity where the frames are saturated",
+    "regions.dark.log_mse": "mean square error of ln(I + 0.003) where the frames are black",
+    "regions.well.mse": "mean square error of intensity where the frames are well exposed",
+    "moving.mse": "mean square error of intensity where something moves",
+    "moving.share": "share of pixels where something moves",
+    "z2": "mean of (error of ln(I + I0))^2 / variance; 1 for honest variances",
+    "z2_median": "median of the same; 0.45 for honest variances of Gaussian errors",
+    "lpips": "perceptual distance by a network (LPIPS); 0 is best",
+    "hdr_quality": "just objectionable differences by ColorVideoVDP; 10 is best",
+    "global_ssim": "structural similarity, the whole image as one window; 1 is best",
+    "authors_ssim": "the same with means of columns, as Wang et al. 2023 compute it; 1 is best",
+    "matlab_ssim": "structural similarity with borders, as MATLAB's ssim; 1 is best",
+    "masked_mse": "mean square error over all pixels, those without reference counted as right",
+    "frames": "images that were compared",
+    "missing": "images without an estimate",
+    "AEE": "mean of |U - U_true|, U the image velocity, px/s",
+    "AEE_rel": "mean of |U - U_true| / |U_true|, U the image velocity",
+    "AAE_U": "mean angle between U and U_true, the image velocities",
+    "AAE_T": "mean angle between heading and true heading",
+    "AAE_Omega": "mean angle between Omega and Omega_true, the angular velocities",
+    "AME": "mean difference of |Omega| and |Omega_true|, the angular velocities, degrees/s",
+    "AME_rel": "mean difference of the speeds / true speed",
+    "AME_N": "mean difference of |Omega| and |Omega_true| / largest |Omega_true| of these times",
+    "vector_error": "mean size of the velocities' difference / true speed",
+    "outliers": "share of times at which speeds differ by 5 % or more",
+    "lost": "share of the time after the first estimate that has none",
+    "startup": "time until the first estimate",
+    "error": "mean size of the velocities' difference / true speed",
+    "heading": "mean angle between heading and true heading",
+    "rmse": "root mean square distance from the true positions",
+    "median": "median distance from the true positions",
+    "covered": "share of the true positions at which the target is tracked",
+    "tracks": "tracks that were found",
+    "missed": "targets that no track follows for half of their time",
+    "false": "tracks that follow no target for half of their time",
+    "switches": "times at which a target's track becomes another one",
+    "mota": "1 - (misses, false positives and switches) / truth; 1 is best",
+    "idf1": "share for which one pairing of whole tracks holds; 1 is best",
+    "hota": "higher order tracking accuracy, of detection and of identity; 1 is best",
+    "velocity": "root mean square error of the velocity",
+    "size": "root mean square error of the sizes' logarithms",
+    "theta": "root mean square error of the orientation",
+    "inverse_ttc": "root mean square error of the inverse time to contact",
+    "range": "root mean square error of the range, of its size",
+    "nll": "mean negative log-likelihood of an event, nats; less is better",
+    "times": "times that were compared",
+    "windows": "stretches of the recordings that were compared",
+    "events": "events in them",
+    "seconds": "seconds of computing, compilation included",
+}
+
+
 def checked(images: ArrayLike, what: str) -> NDArray[np.floating]:
     """The images, of shape (..., height, width), as an array of floats.
 

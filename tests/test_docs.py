@@ -12,6 +12,8 @@ import pytest
 from pages import run_page
 
 import jaxevent
+from jaxevent.metrics import MEANINGS
+from jaxevent.show.report import COLUMNS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -63,6 +65,14 @@ def test_table_of_parameters_is_that_of_the_code():
         for setting, value in values.items():  # numbers are shown to four digits
             number = isinstance(value, float | list)
             assert told[setting] == (pytest.approx(value, rel=1e-3) if number else value), setting
+
+
+def test_every_number_is_explained_as_in_the_code():
+    text = (DOCS / "fitting.md").read_text()
+    told = re.findall(r"^\| `([\w.]+)` \| (.*?) \| (.*) \|$", text, re.MULTILINE)
+    titles = {place: title for title, place, _, _ in COLUMNS}
+    expected = [(name, titles.get(name, ""), text) for name, text in MEANINGS.items()]
+    assert [(name, title, text.replace(r"\|", "|")) for name, title, text in told] == expected
 
 
 def test_toml_is_toml():

@@ -9,26 +9,12 @@ from numpy.typing import NDArray
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.truth import Known, axis_error, motion_errors, relative_error
+from jaxevent.metrics import MEANINGS
 
 FIGURES = {  # of `motion_errors`: their units
     "AEE": "px/s", "AEE_rel": "%", "AAE_U": "deg", "AAE_T": "deg", "AAE_Omega": "deg",
     "AME": "deg/s", "AME_rel": "%", "AME_N": "%", "vector_error": "%", "outliers": "%",
 }  # fmt: skip
-
-MEANINGS = {  # likewise: what it is the mean of, over times
-    "AEE": "|U - U_true|",
-    "AEE_rel": "|U - U_true| / |U_true|",
-    "AAE_U": "angle between U and U_true",
-    "AAE_T": "angle between heading and true heading",
-    "AAE_Omega": "angle between Omega and Omega_true",
-    "AME": "difference of |Omega| and |Omega_true|",
-    "AME_rel": "difference of sizes / true size",
-    "AME_N": "difference of |Omega| and |Omega_true| / largest |Omega_true| of these times",
-    "vector_error": "size of the difference / true size",
-    "outliers": "times at which sizes differ by 5 % or more",
-    "lost": "later times without a motion",
-    "startup": "until the motion is first found",
-}
 
 
 @dataclasses.dataclass(frozen=True)

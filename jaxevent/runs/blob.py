@@ -53,7 +53,7 @@ from jaxevent.runs.blob_positions import Known, Targets, seed_at, span_of_events
 from jaxevent.runs.blob_scores import TrackProtocol
 from jaxevent.runs.config import NAME
 from jaxevent.runs.family import Family, Goal, Shares, Sources
-from jaxevent.show.report import aligned
+from jaxevent.show.report import aligned, legend
 from jaxevent.splits import SPLITS, windows
 
 LOSSES = ("likelihood", "positions")
@@ -188,7 +188,7 @@ class TrackGoal(Goal):
         if any("rmse" in row for row in rows):
             columns[1:1] = [("RMSE px", "rmse", 1, 3), ("median px", "median", 1, 3)]
             columns[3:3] = [("covered", "covered", 1, 3)]
-        return aligned(rows, columns)
+        return aligned(rows, columns) + legend(columns)
 
     def _parts(self, sources: Sources, split: Shares, window: float | int | None) -> list[Part]:
         """The windows of all recordings, those without events left out."""

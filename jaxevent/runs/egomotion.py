@@ -56,7 +56,7 @@ from jaxevent.runs import egomotion_scores as scores
 from jaxevent.runs.config import NATURAL
 from jaxevent.runs.family import Family, Shares, Sources
 from jaxevent.runs.family import Goal as FamilyGoal
-from jaxevent.show.report import aligned
+from jaxevent.show.report import aligned, legend
 from jaxevent.splits import SPLITS, windows
 
 
@@ -174,7 +174,7 @@ class Goal(FamilyGoal):
         for part in self.kind.parts:
             if part.direction and any(part.name in row for row in rows):
                 columns.insert(1, (f"{part.name} deg", part.name, 1, 2))
-        return aligned(rows, columns)
+        return aligned(rows, columns) + legend(columns)
 
     def known(self, recording: Recording) -> Known:
         """What is true of the motion of a recording, whose name is its path."""

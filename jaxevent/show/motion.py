@@ -14,7 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from jaxevent.egomotion import flow as event_flow
-from jaxevent.egomotion.comparison import MEANINGS, Comparison, compare
+from jaxevent.egomotion.comparison import Comparison, compare
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.truth import Known, constant_between, from_poses, known, nearest_axes
@@ -22,6 +22,7 @@ from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.estimator import Estimate
 from jaxevent.io.description import CLOCK
 from jaxevent.io.output import complete, complete_hdf5
+from jaxevent.metrics import MEANINGS
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
 from jaxevent.show.motion_pictures import (
@@ -359,6 +360,9 @@ class Written:
             "  ".join(cell.rjust(w) for cell, w in zip(line, widths, strict=True)).rstrip()
             for line in cells
         ]
+        lines.append(
+            "mean, least and most over the times found; sigma: median of the standard deviations"
+        )
         for part in model.parts:
             if part.direction:
                 blocks = self.told.covariance[first, part.rows, part.rows]

@@ -9,7 +9,7 @@ import os
 import platform
 import textwrap
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,8 +17,16 @@ from numpy.typing import NDArray
 
 import jaxevent
 from jaxevent.errors import install_command
-from jaxevent.metrics import LOG_OFFSET
-from jaxevent.show.report import Column, columns_of, display_limits, find, number, tone_map
+from jaxevent.metrics import LOG_OFFSET, MEANINGS
+from jaxevent.show.report import (
+    Column,
+    columns_of,
+    display_limits,
+    find,
+    number,
+    short_names,
+    tone_map,
+)
 
 SIDE = 360  # pixels of the longer side of a picture
 STRIPS = 12  # recordings with pictures and plots over time; more would make the page slow to open
@@ -34,47 +42,6 @@ HIGHER = {  # of these more is better
     "ssim", "log_ssim", "global_ssim", "authors_ssim", "matlab_ssim", "hdr_quality", "covered",
     "mota", "idf1", "hota",
 }  # fmt: skip
-
-MEANINGS = {
-    "MSE x 1e-2": "mean square error of intensity, times 100; 0 is best",
-    "SSIM": "structural similarity; 1 is best",
-    "log MSE": "mean square error of ln(I + 0.003); 0 is best",
-    "log SSIM": "structural similarity of log images; 1 is best",
-    "bright MSE": "where the frames are saturated",
-    "dark log MSE": "where the frames are black",
-    "well MSE x 1e-2": "where the frames are well exposed",
-    "moving MSE x 1e-2": "where something moves",
-    "moving share": "the share of pixels where something moves",
-    "LPIPS": "perceptual distance; 0 is best",
-    "JOD": "quality by ColorVideoVDP; 10 is best",
-    "global SSIM": "structural similarity, the whole image as one window; 1 is best",
-    "authors' SSIM": "the same with means of columns, as Wang et al. 2023 compute it; 1 is best",
-    "MATLAB SSIM": "structural similarity with borders, as MATLAB's ssim; 1 is best",
-    "masked MSE x 1e-2": "over all pixels, those without reference counted as right",
-    "frames": "images that were compared",
-    "missing": "images without an estimate",
-    "AEE %": "mean error of the image velocity, of its size",
-    "AAE deg": "mean angle between image velocities",
-    "heading deg": "mean angle between headings",
-    "Omega %": "mean error of the angular velocity, of its size",
-    "AME %": "mean error of the speed, of its size",
-    "lost": "share of time without an estimate",
-    "start-up s": "time until the first estimate",
-    "RMSE px": "root mean square distance of positions",
-    "covered": "share of time at which the truth is tracked",
-    "missed": "targets that no track follows for half of their time",
-    "false": "tracks that follow no target for half of their time",
-    "switches": "times at which a target's track becomes another one",
-    "MOTA": "1 - (misses, false positives and switches) / truth; 1 is best",
-    "IDF1": "share for which one pairing of whole tracks holds; 1 is best",
-    "HOTA": "higher order tracking accuracy; 1 is best",
-    "velocity px/s": "root mean square error of the velocity",
-    "size %": "root mean square error of the sizes' logarithms",
-    "theta deg": "root mean square error of the orientation",
-    "1/TTC 1/s": "root mean square error of the inverse time to contact",
-    "range %": "root mean square error of the range, of its size",
-    "seconds": "of computing",
-}
 
 
 class Cell(NamedTuple):
@@ -112,7 +79,7 @@ def page(
     recordings = list(dict.fromkeys(row["recording"] for row in rows))
     methods = list(dict.fromkeys(row["method"] for row in rows))
     done = [row for row in rows if "error" not in row]
-    columns, names = columns_of(done), _names(recordings)
+    columns, names = columns_of(done), short_names(recordings)
     hdr = any("log_mse" in row for row in done)
     now = datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
     counts = [len(_measured(done, method, columns)) for method in methods]
@@ -120,7 +87,7 @@ def page(
         "title": title,
         "about": f"{len(recordings)} recordings, {len(methods)} methods, protocol {protocol}, "
         f"{now}",
-        "meaning": MEANINGS,
+        "meaning": {title: MEANINGS[place] for title, place, _, _ in columns},
         "failures": _failures(rows, names),
         "means": _means(done, methods, columns),
         "unequal": len(set(counts)) > 1,
@@ -148,15 +115,6 @@ def page(
         undefined=jinja2.ChainableUndefined, keep_trailing_newline=True,
     )  # fmt: skip
     return templates.get_template("page.html").render(values)
-
-
-def _names(recordings: Sequence[str]) -> dict[str, str]:
-    """What recordings are called: the file's name, the path where several have that."""
-    short = [PurePath(one).name for one in recordings]
-    return {
-        one: name if short.count(name) == 1 else one
-        for one, name in zip(recordings, short, strict=True)
-    }
 
 
 def picture(sample: Any) -> dict[str, Any]:

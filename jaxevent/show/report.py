@@ -9,7 +9,7 @@ import math
 import subprocess
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.errors import InputError, require
 from jaxevent.io.output import complete
-from jaxevent.metrics import checked
+from jaxevent.metrics import MEANINGS, checked
 
 Tone = Literal["linear", "log", "percentile", "clahe"]
 Kind = Literal["image", "error", "uncertainty"]
@@ -348,7 +348,8 @@ def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
     Each row has the keys recording, method and, of images, mse, ssim, frames and seconds. Others of
     `COLUMNS` get columns where a row has them; what is not there is not shown. A number that is
     None, NaN or absent appears as "-". MSE is multiplied by 100 where its column says so; seconds
-    are those of computing. The `error` of rows that have one follows the table, each once.
+    are those of computing. What the columns mean follows the table, then the `error` of rows that
+    have one, each once.
     """
     rows = list(rows)
     errors = [
@@ -362,19 +363,38 @@ def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
     said = "".join(
         f"\n{how} ({errors.count((how, one))}): {one}\n" for how, one in dict.fromkeys(errors)
     )
-    return aligned(rows, columns_of(rows)) + said
+    columns = columns_of(rows)
+    return aligned(rows, columns) + (legend(columns) if rows else "") + said
+
+
+def legend(columns: Sequence[Column]) -> str:
+    """What columns mean: a Markdown list, a line for each that `metrics.MEANINGS` explains."""
+    known = [(title, place) for title, place, _, _ in columns if place in MEANINGS]
+    lines = [f"- {title}: {MEANINGS[place]}\n" for title, place in known]
+    return "\n" * bool(lines) + "".join(lines)
+
+
+def short_names(recordings: Iterable[str]) -> dict[str, str]:
+    """What recordings are called: the file's name, the path where several have that."""
+    given = list(dict.fromkeys(recordings))
+    short = [PurePath(one).name for one in given]
+    return {
+        one: name if short.count(name) == 1 else one for one, name in zip(given, short, strict=True)
+    }
 
 
 def aligned(rows: Iterable[Mapping[str, Any]], columns: Sequence[Column]) -> str:
     """A Markdown table of rows with the keys recording and method, and columns of numbers.
 
     A column is its title, its place in a row ("regions.well.mse"), a factor and how many digits are
-    shown. A number that is None, NaN or absent appears as "-".
+    shown. A number that is None, NaN or absent appears as "-". Recordings are called as
+    `short_names` does.
     """
-
+    rows = list(rows)
+    names = short_names(row["recording"] for row in rows)
     table = [["recording", "method", *(title for title, _, _, _ in columns)]]
     for row in rows:
-        cells = [row["recording"], row["method"]]
+        cells = [names[row["recording"]], row["method"]]
         for _, place, factor, digits in columns:
             cells.append(number(row, place, factor, digits))
         table.append(cells)

@@ -312,7 +312,26 @@ class Written:
         ]
         if len(tracks) > most:
             lines.append(f"and {len(tracks) - most} shorter ones")
+        reasons = dict.fromkeys(tracks.ended[i] for i in order)
+        lines += ["", f"ended: {'; '.join(f'{one}, {ENDED[one]}' for one in reasons)}"] * bool(
+            order
+        )
+        lines += [
+            "px/s, lambda1, lambda2: medians over time of the speed and of the standard deviations "
+            "of a blob's events along its axes"
+        ] * bool(order)
         return lines
+
+
+ENDED = {  # of `Tracks.ended`, what it means
+    "end": "with the events",
+    "idle": "no event for too long",
+    "left": "it left the image",
+    "size": "larger, smaller or longer than blobs may be",
+    "uncertain": "its place is too uncertain",
+    "merged": "it was at an older one for too long",
+    "not finite": "a number of it was not finite",
+}
 
 
 class _AtEvents(NamedTuple):

@@ -17,8 +17,8 @@ from jaxevent.errors import InputError
 from jaxevent.runs import evaluate
 from jaxevent.runs.blob_positions import read_positions
 from jaxevent.runs.scores import Sample
-from jaxevent.show.page import _names, page, picture
-from jaxevent.show.report import markdown_table
+from jaxevent.show.page import page, picture
+from jaxevent.show.report import markdown_table, short_names
 from jaxevent.simulate import blob_scene, motion_scene
 from jaxevent.simulate.blobs import Approach, Target, simulate_blobs
 
@@ -216,7 +216,11 @@ def test_bad_settings(text, named, folder):
 
 def test_recordings_are_called_by_name_where_that_tells_them_apart():
     paths = ["a/one.h5", "b/one.h5", "b/two.h5"]
-    assert _names(paths) == {"a/one.h5": "a/one.h5", "b/one.h5": "b/one.h5", "b/two.h5": "two.h5"}
+    assert short_names(paths) == {
+        "a/one.h5": "a/one.h5",
+        "b/one.h5": "b/one.h5",
+        "b/two.h5": "two.h5",
+    }
 
 
 def test_a_picture_shows_the_frame_before_and_the_uncertainty():

@@ -9,8 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from jaxevent.egomotion.comparison import FIGURES
 from jaxevent.errors import InputError, install_command
+from jaxevent.metrics import MEANINGS
 from jaxevent.show.report import (
+    COLUMNS,
     comparison_figure,
     display_limits,
     markdown_table,
@@ -258,8 +261,18 @@ def test_markdown_table():
         "| --------- | ------ | ---------: | ----: | -----: | ------: |\n"
         "| night     | akf    |      0.180 | 0.860 |     22 |   12.00 |\n"
         "| a\\|b c    | cf     |          - |     - |     22 |    0.50 |\n"
+        "\n"
+        "- MSE x 1e-2: mean square error of intensity; 0 is best\n"
+        "- SSIM: structural similarity of intensity, from -1 to 1; 1 is best\n"
+        "- frames: images that were compared\n"
+        "- seconds: seconds of computing, compilation included\n"
     )
     assert markdown_table([]).count("\n") == 2
+
+
+def test_every_number_that_is_shown_is_explained():
+    assert {place for _, place, _, _ in COLUMNS} < MEANINGS.keys()
+    assert {*FIGURES, "lost", "startup"} < MEANINGS.keys()
 
 
 @pytest.mark.parametrize("how", ["linear", "log", "percentile", "clahe"])
