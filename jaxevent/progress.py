@@ -1,7 +1,14 @@
-"""Progress bars: shown by default where somebody looks on, in a terminal or a notebook."""
+"""What is being done, shown where somebody looks on: in a terminal or a notebook.
+
+`bar` counts what is done of something, `stage` says what is done that cannot be counted. Whatever
+was begun last and is not over has the line; from 2 s on a thread keeps its time moving while no
+step ends.
+"""
 
 import sys
 import threading
+import time
+import weakref
 from collections.abc import Iterable
 from typing import Any
 
@@ -11,6 +18,94 @@ from tqdm.auto import tqdm
 # when a process is killed. No two processes share a bar here.
 tqdm.set_lock(threading.RLock())
 
+DELAY = 2.0  # s before anything is shown
+TICK = 0.5  # s between looks at the time
+
+_open: list[weakref.ref["Bar"]] = []  # the last one has the line
+_over = threading.Event()
+
+
+class Bar(tqdm):
+    """A bar of tqdm on a line that all share, and a rate that holds from its first step on.
+
+    The first step often compiles what all others use; a rate with it would promise too long a time.
+    """
+
+    _first: tuple[float, float] | None = None  # what was done, and when (s), after the first step
+    _told = False  # whether it is on the line
+
+    def __init__(self, *arguments: Any, **options: Any):
+        super().__init__(*arguments, **options)
+        if not self.disable:
+            with self.get_lock():
+                _open.append(weakref.ref(self))
+                if len(_open) == 1:
+                    _over.clear()
+                    threading.Thread(target=_tick, daemon=True).start()
+
+    @property
+    def format_dict(self) -> dict[str, Any]:
+        known = super().format_dict
+        now, done = time.time(), self.n - self.initial
+        if self._first is None and done > 0:
+            self._first = self.n, now
+        count, since = self._first or (self.n, now)
+        steps, elapsed = self.n - count, now - since
+        return {**known, "rate": steps / elapsed if steps > 0 and elapsed >= 1 else 0}  # 0: unknown
+
+    def update(self, n: float | int | None = 1) -> bool | None:
+        told = super().update(n)
+        if self._first is None and not self.disable:
+            self._first = self.n, time.time()
+        return told
+
+    def display(self, *arguments: Any, **options: Any) -> Any:
+        if _last() is self or self._told:
+            self._told = True
+            return super().display(*arguments, **options)
+        return None
+
+    def hide(self) -> None:
+        """Leave the line to others, until it is shown again."""
+        if self._told:
+            self._told = False
+            self.clear()
+
+    def close(self) -> None:
+        super().close()
+        with self.get_lock():
+            # By identity: tqdm takes bars of one line for equal.
+            _open[:] = [one for one in _open if one() is not None and one() is not self]
+            if not _open:
+                _over.set()
+
+
+def _last() -> Bar | None:
+    """That which has the line."""
+    while _open and _open[-1]() is None:
+        _open.pop()
+    return _open[-1]() if _open else None
+
+
+def _tick() -> None:
+    """Keep the time of what has the line moving."""
+    began = time.time()
+    while not _over.wait(TICK):
+        if time.time() - began >= DELAY:
+            with tqdm.get_lock():
+                _show()
+
+
+def _show() -> None:
+    """Give the line to what was begun last. A function, so that the thread holds none of them."""
+    shown = _last()
+    for one in (other() for other in _open[:-1]):
+        if one is not None:
+            one.hide()
+    if shown is not None:
+        shown.refresh()
+        shown.delay = 0  # so that it is cleared in the end
+
 
 def watched() -> bool:
     """Whether somebody looks on: stderr is a terminal, or the code runs in a notebook."""
@@ -19,13 +114,35 @@ def watched() -> bool:
 
 
 def bar(
-    items: Iterable[Any] | None = None, *, unit: str, progress: bool | None = None, **more: Any
-) -> tqdm:
+    items: Iterable[Any] | None = None,
+    *,
+    desc: str,
+    unit: str,
+    progress: bool | None = None,
+    **more: Any,
+) -> Bar:
     """A bar on stderr that appears after 2 s and goes when done; see `tqdm` for further options.
 
-    `progress` shows or hides it; None: shown where somebody looks on (`watched`).
+    `desc` says what is done. `progress` shows or hides it; None: shown where somebody looks on
+    (`watched`).
     """
-    return tqdm(items, unit=unit, delay=2, leave=False, disable=not is_shown(progress), **more)
+    return Bar(
+        items, desc=desc, unit=unit, delay=DELAY, leave=False, position=0,
+        disable=not is_shown(progress), **more,
+    )  # fmt: skip
+
+
+def stage(desc: str, progress: bool | None = None) -> Bar:
+    """A context during which a line says what is done, and for how long; as `bar` does."""
+    return bar(desc=desc, unit="", progress=progress, bar_format="{desc} [{elapsed}]")
+
+
+def hide() -> None:
+    """Clear the line, for what is printed next; it comes again while what it tells of goes on."""
+    with tqdm.get_lock():
+        for one in (other() for other in _open):
+            if one is not None:
+                one.hide()
 
 
 def is_shown(progress: bool | None) -> bool:

@@ -447,7 +447,11 @@ class Tracks:
         state, number, every = None, 0, 1
         logs: list[tuple[Stretch, Log]] = []
         with bar(
-            total=rows[1] - rows[0], unit="event", unit_scale=True, progress=self._progress
+            total=rows[1] - rows[0],
+            desc="follow targets",
+            unit="event",
+            unit_scale=True,
+            progress=self._progress,
         ) as shown:
             while mark is not None:
                 stretch = self._packing.pack(mark)

@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 sys.stdout.flush()  # help
             command = arguments.pop("command")
             words = ["jaxevent", *(sys.argv[1:] if argv is None else argv)]
-            with guarded(arguments, words) as options:
+            with guarded(arguments, words) as options, _shown(words):
                 command(**options)
             sys.stdout.flush()
     except InputError as error:
@@ -82,6 +82,44 @@ def main(argv: Sequence[str] | None = None) -> int:
         _say(f"what was to be printed cannot be written ({error.strerror or error})")
         return 2
     return 0
+
+
+@contextlib.contextmanager
+def _shown(words: Sequence[str]) -> Iterator[None]:
+    """Say in a terminal which command runs, wherever it says no more itself."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    from jaxevent.progress import stage
+
+    with stage(" ".join(words[:2])), contextlib.redirect_stdout(_Printed(sys.stdout)):
+        yield
+
+
+class _Printed(io.TextIOBase):
+    """A stream before whose texts the line of progress is cleared."""
+
+    def __init__(self, stream: Any):
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        from jaxevent.progress import hide
+
+        hide()
+        return self._stream.write(text)
+
+    def flush(self) -> None:
+        self._stream.flush()
+
+    def isatty(self) -> bool:
+        return self._stream.isatty()
+
+    def fileno(self) -> int:
+        return self._stream.fileno()
+
+    @property
+    def encoding(self) -> str:
+        return self._stream.encoding
 
 
 class _Signal(BaseException):

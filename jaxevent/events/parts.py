@@ -47,7 +47,7 @@ def duration(length: int | float, what: str, least: int = 1) -> int:
 def blocks(source: EventSource, start: int = 0, stop: int | None = None) -> Iterator[Events]:
     """The events of a range of rows, block by block."""
     stop = len(source) if stop is None else stop
-    for row in bar(range(start, stop, BLOCK), unit="M events"):
+    for row in bar(range(start, stop, BLOCK), desc="read events", unit="M events"):
         yield source[row : min(row + BLOCK, stop)]
 
 

@@ -50,7 +50,7 @@ def decoded(
     row = 0
     with (
         reading(source),
-        bar(unit=" events", unit_scale=True, progress=progress) as shown,
+        bar(desc="decode", unit=" events", unit_scale=True, progress=progress) as shown,
     ):
         for state, (t, x, y, p) in decode(None):
             if not len(t):

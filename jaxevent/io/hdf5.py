@@ -453,7 +453,7 @@ def _write_events(
         )
     ms = 0
     blocks = range(0, count, _BLOCK)
-    for row in bar(blocks, unit="M events", progress=progress):
+    for row in bar(blocks, desc="store events", unit="M events", progress=progress):
         block = events[row : row + _BLOCK]
         since = block.t - offset
         rows = slice(row, row + len(block))

@@ -21,12 +21,12 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from tqdm import tqdm
+from tqdm.utils import CallbackIOWrapper
 
 from jaxevent.errors import InputError
 from jaxevent.io import check_unfolded, checked_events, pinhole, reading, sensor_size, times
 from jaxevent.io.images import kept_colours, read_grey_and_colour
-from jaxevent.progress import is_shown
+from jaxevent.progress import bar
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
 
@@ -118,21 +118,17 @@ def _table(
         if not line.strip() and not lines.read().strip():
             return [np.empty(0) for _ in names], found
     # 4 to 5 million events/s with sep=r"\s+" on one core, 40 times numpy.loadtxt.
+    total = file.stat().st_size if isinstance(file, Path) else None
     with (
         reading(source),
         file.open("rb") as stream,
-        tqdm.wrapattr(
-            stream,
-            "read",
-            unit="B",
-            unit_scale=True,
-            delay=2,
-            disable=not is_shown(progress),
-            leave=False,
-        ) as watched,
-    ):
+        bar(
+            total=total, desc=f"read {file.name}", unit="B", unit_scale=True,
+            progress=progress,
+        ) as shown,
+    ):  # fmt: skip
         table = pd.read_csv(
-            cast(Any, watched),
+            cast(Any, CallbackIOWrapper(shown.update, stream, "read")),
             sep=r"\s+",
             header=None,
             names=names,

@@ -188,7 +188,7 @@ class ImageSequence(abc.ABC, Generic[P]):
         if not extrapolate:
             self.estimator.check_span(self.recording, times, self.params)
         start, stop = self.recording.start, self.recording.stop
-        with bar(total=len(times), unit="image", progress=self.progress) as shown:
+        with bar(total=len(times), desc="images", unit="image", progress=self.progress) as shown:
             for batch, images in self._read(times):
                 shape = (len(batch), self.recording.height, self.recording.width)
                 image, variance, valid = (
@@ -315,7 +315,9 @@ class Video(ImageSequence[P]):
         """Pass over all windows once, to know at each what later ones say."""
         begin, starts, links = self._begins[0], [], []
         total = len(self.recording.events)
-        with bar(total=total, unit="event", unit_scale=True, progress=self.progress) as shown:
+        with bar(
+            total=total, desc="look ahead", unit="event", unit_scale=True, progress=self.progress
+        ) as shown:
             while True:
                 starts.append(begin.start)
                 filtered, begin = self._filter(begin)

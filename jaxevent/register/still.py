@@ -61,7 +61,7 @@ def register_still(
     where, described = features(level)
     tolerance = _TOLERANCE * max(1.0, image.shape[1] / recording.width)
     homographies: list[NDArray[np.float64] | None] = []
-    for row in bar(range(len(frames)), unit="frame", progress=progress):
+    for row in bar(range(len(frames)), desc="register frames", unit="frame", progress=progress):
         seen, about = features(log_image(recording, row)[0])
         homographies.append(None)
         if described is None or about is None or len(about) < 2 or len(described) < 2:

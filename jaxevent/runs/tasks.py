@@ -149,7 +149,9 @@ def run(
     else:
         done = _here(function, todo, folder, retries)
     with (
-        bar(total=len(tasks), initial=len(found), unit="task", progress=progress) as shown,
+        bar(
+            total=len(tasks), initial=len(found), desc="evaluate", unit="task", progress=progress
+        ) as shown,
         contextlib.closing(done),
     ):
         for number, record in done:

@@ -125,7 +125,7 @@ def _about_events(
     in_part = np.zeros(PARTS, np.int64)
     longest, longest_after, before = 0, first, first
     blocks = range(0, count, BLOCK)
-    for row in bar(blocks, unit="M events", progress=progress):
+    for row in bar(blocks, desc="look at events", unit="M events", progress=progress):
         block = events[row : row + BLOCK]
         on += int(block.p.sum())
         at_pixel += np.bincount(block.y.astype(np.int64) * width + block.x, minlength=len(at_pixel))

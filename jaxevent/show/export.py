@@ -178,7 +178,7 @@ def _batches(
             yield batch, {"image": told.mean, "variance": told.covariance}
         return
     rows = range(0, len(times), BATCH)
-    for row in bar(rows, unit="batch", progress=video.progress):
+    for row in bar(rows, desc="images", unit="batch", progress=video.progress):
         batch = times[row : row + BATCH]
         with np.errstate(invalid="ignore"):  # infinity times 0
             image = colours(batch)

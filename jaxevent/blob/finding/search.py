@@ -17,6 +17,7 @@ from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.scale import CONTACT, choose_scale
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.blob.seeds import span_of
+from jaxevent.progress import stage
 from jaxevent.recording import Recording
 
 PASSES = 4
@@ -52,12 +53,14 @@ def find(
     stream = Stream(recording, *span_of(recording, start, stop))
     if len(stream) < FEWEST:
         return Found((), (), 0, 0.0, recording)
-    background = measure_background(stream)
+    with stage("find: background", progress):
+        background = measure_background(stream)
     found: list[Path] = []
     near: list[Path] = []
     passes: list[Pass] = []
     for number in range(PASSES):
-        choice = choose_scale(stream, background)
+        with stage(f"find, pass {number + 1}: scale", progress):
+            choice = choose_scale(stream, background)
         if choice is None or choice.score < WORTH:
             break
         confirmed = Links(stream, background, choice.scale).follow(
@@ -67,10 +70,13 @@ def find(
             passes.append(Pass(choice, 0))
             break
         near += confirmed
-        rest = stream.without(near, GATE)
-        new = [
-            _look_back(path, rest, background, choice.scale) for path in confirmed if _lasting(path)
-        ]
+        with stage(f"find, pass {number + 1}: beginnings", progress):
+            rest = stream.without(near, GATE)
+            new = [
+                _look_back(path, rest, background, choice.scale)
+                for path in confirmed
+                if _lasting(path)
+            ]
         new = [
             path
             for path in _stitch(new, (stream.width, stream.height))

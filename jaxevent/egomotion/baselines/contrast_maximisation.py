@@ -453,7 +453,9 @@ def solve(params: Params, given: Given) -> Motion:
     if not len(windows):
         return Motion.nothing(given.model)
     motion, t, fits, contrasts, spans = None, [], [], [], []
-    for middle, start, stop in bar(windows, unit="window", progress=given.progress):
+    for middle, start, stop in bar(
+        windows, desc="sharpen windows", unit="window", progress=given.progress
+    ):
         t.append(middle)
         spans.append(windows.span(start, stop))
         if stop - start < params.fewest:

@@ -91,7 +91,9 @@ def normal_flow(
     surface, latest = np.full(shape, NEVER), np.full(shape, NEVER)
     scratch = np.zeros((3, (2 * params.radius + 1) ** 2))
     end, parts, rules = len(recording.events), [], Rules.of(params)
-    with bar(total=end, unit="event", unit_scale=True, progress=progress) as shown:
+    with bar(
+        total=end, desc="fit planes", unit="event", unit_scale=True, progress=progress
+    ) as shown:
         for start in range(0, end, READ_ROWS):
             events = recording.events[start : start + READ_ROWS]
             row = np.arange(start, start + len(events))

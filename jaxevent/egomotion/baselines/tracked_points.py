@@ -60,7 +60,7 @@ def solve(params: Params, given: Given) -> Motion:
     model = given.model(f)
     size = model.arms(positions)
     fits, pairs = [], _pairs(frames, float(params.span) if model.half_line else 0.0)
-    for one, two in bar(pairs, unit="pair", progress=given.progress):
+    for one, two in bar(pairs, desc="track points", unit="pair", progress=given.progress):
         images = [np.rint(255 * i).astype(np.uint8) for i in frames[one : two + 1].intensity]
         begin, end = _followed(cv2, params, images)
         before, after = _undistorted(begin, positions), _undistorted(end, positions)

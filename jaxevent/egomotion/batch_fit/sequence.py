@@ -57,7 +57,7 @@ def _followed(
     def onward(path: Path, steps: int = 1) -> Path:
         return advanced(path, steps * step * 1e-6, half * 1e-6)
 
-    shown = bar(centres, unit="window", progress=progress)
+    shown = bar(centres, desc="fit motion", unit="window", progress=progress)
     with ThreadPoolExecutor(1) as beside:
         for row, centre in enumerate(shown):
             if not enough[row]:

@@ -192,7 +192,11 @@ class Voting(MotionEstimator[Params]):
         key, corners = jax.random.key(seed), _corners(kind, gatherer)
         state, parts, number, span = None, [], 0, SPAN * float(params.tau_max)
         with bar(
-            total=len(recording.events), unit="event", unit_scale=True, progress=progress
+            total=len(recording.events),
+            desc="find motion",
+            unit="event",
+            unit_scale=True,
+            progress=progress,
         ) as shown:
             while not gatherer.done:
                 noise = _draw(jax.random.fold_in(key, number), batches, params, kind)
