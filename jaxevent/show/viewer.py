@@ -39,7 +39,8 @@ def view(
     A result is a reconstruction (shown at the frames' times), tracks, a motion, or a path: images
     with times, as `jaxevent reconstruct` writes in HDF5, or the folder or table (CSV) of `jaxevent
     track` and `jaxevent motion`. Events are shown in windows of `window` s. With `out`, a file
-    .rrd, no viewer is opened. Time begins with the recording.
+    .rrd, no viewer is opened. Time begins with the recording. Every sequence of images has a view of
+    its own, with events and tracks over it; motions have one of curves.
 
     Raises `MissingExtra` without the extra "view" and `InputError` for a result that is neither.
     """
@@ -54,6 +55,7 @@ def view(
         send.events(recording, round(window * 1e6))
         for name, log in layers:
             log(send, name)
+        stream.send_blueprint(send.layout(recording.width, recording.height))
 
 
 @contextlib.contextmanager
@@ -81,6 +83,32 @@ class _Sender:
     def __init__(self, stream: Any, start: int):
         self._stream, self._start = stream, start
         self._rerun: Any = require("rerun", "view")
+        self._pictures: list[str] = []
+        self._curves = False
+        self._white = 0.0
+
+    def layout(self, width: int, height: int) -> Any:
+        """A view for each sequence of images, with events and tracks over it, and one of curves."""
+        plan = self._rerun.blueprint
+        bounds = plan.VisualBounds2D(x_range=(0, width), y_range=(0, height))
+        over = ["/image/events", "/image/tracks/**", "/image/paths/**"]
+        views = [
+            plan.Spatial2DView(
+                origin="/image", contents=[name, *over], name=name.rpartition("/")[2],
+                visual_bounds=bounds,
+            )
+            for name in self._pictures or ["/image/events"]
+        ]  # fmt: skip
+        shown = plan.Grid(*views)
+        if self._curves:
+            curves = plan.TimeSeriesView(origin="/motion", name="motion")
+            shown = plan.Vertical(shown, curves, row_shares=[2, 1])
+        return plan.Blueprint(
+            shown,
+            plan.TimePanel(timeline="time", state="expanded"),
+            plan.SelectionPanel(state="collapsed"),
+            plan.BlueprintPanel(state="collapsed"),
+        )
 
     def _times(self, t: NDArray[np.int64]) -> list[Any]:
         return [self._rerun.TimeColumn("time", duration=(t - self._start) * 1e-6)]
@@ -102,12 +130,17 @@ class _Sender:
             self._stream.send_columns("image/events", self._times(times), columns)
 
     def images(self, name: str, t: NDArray[np.int64], image: Callable[[int], NDArray]) -> None:
-        """Grey images of linear intensity; brighter ones than 1 are scaled to the brightest."""
-        white = 1.0
+        """Grey images of linear intensity.
+
+        White is the brightest 0.5 % of the first image of all that are sent, so that sequences
+        compare, and of brighter ones that follow.
+        """
+        self._pictures.append(f"/{name}")
         for row, time in enumerate(t.tolist()):
             values = np.asarray(image(row))
-            white = max(white, float(np.nanpercentile(values, 99.5)))
-            grey = np.clip(np.nan_to_num(values) / white, 0, 1)
+            bright = np.nanpercentile(values, 99.5) if np.isfinite(values).any() else 0.0
+            self._white = max(self._white, float(bright))
+            grey = np.clip(np.nan_to_num(values) / (self._white or 1.0), 0, 1)
             self._stream.set_time("time", duration=(time - self._start) * 1e-6)
             shown = self._rerun.Image(np.rint(255 * grey).astype(np.uint8))
             self._stream.log(name, shown)
@@ -134,6 +167,7 @@ class _Sender:
 
     def curves(self, table: pd.DataFrame) -> None:
         """One curve for each column but t, those of sigmas aside; gaps where it is lost."""
+        self._curves = True
         names = [n for n in table.columns if n not in ("t", "lost") and not n.startswith("sigma_")]
         for name in names:
             values = table[name].to_numpy(np.float64)

@@ -1,6 +1,8 @@
 """What is sent to the Rerun viewer, which a stand-in for its package writes down."""
 
 import dataclasses
+import re
+import subprocess
 import sys
 import types
 
@@ -36,6 +38,7 @@ class Kind:
 
 class Stream:
     sent: list = []
+    layout: Kind
 
     def __init__(self, name):
         self.time, self.path = None, None
@@ -55,6 +58,9 @@ class Stream:
     def send_columns(self, name, times, columns):
         Stream.sent.append((name, times[0].named["duration"], columns))
 
+    def send_blueprint(self, blueprint):
+        Stream.layout = blueprint
+
     def flush(self):
         if self.path:
             self.path.write_text("complete")
@@ -70,6 +76,10 @@ def sent(monkeypatch):
     for name in kinds:
         setattr(rerun, name, type(name, (Kind,), {}))
     setattr(rerun, "RecordingStream", Stream)  # noqa: B010
+    parts = ("Blueprint", "BlueprintPanel", "Grid", "SelectionPanel", "Spatial2DView", "TimePanel",
+             "TimeSeriesView", "Vertical", "VisualBounds2D")  # fmt: skip
+    plan = types.SimpleNamespace(**{name: type(name, (Kind,), {}) for name in parts})
+    setattr(rerun, "blueprint", plan)  # noqa: B010
     monkeypatch.setitem(sys.modules, "rerun", rerun)
     Stream.sent = []
     return Stream.sent
@@ -80,6 +90,7 @@ def seen():
     x, y = np.arange(6, dtype=np.uint16), np.arange(1, 7, dtype=np.uint16)
     events = Events(t, x, y, np.array([1, 0, 1, 0, 1, 0], bool))
     images = np.full((2, 8, 8), 51, np.uint8)
+    images[:, :4] = 102
     frames = Frames(START + np.array([0, 20_000]), images, np.zeros(2, np.int64))
     return Recording("a", 8, 8, events, frames)
 
@@ -95,7 +106,11 @@ def test_events_are_shown_in_windows_and_frames_at_their_times(sent):
     assert on != off and points["colors"][4].tolist() == on
     frames = [one for one in sent if one[0] == "image/frames"]
     assert [time for _, time, _ in frames] == pytest.approx([0, 0.02])
-    assert np.unique(frames[0][2].values[0]).tolist() == [51]
+    # White is the brightest of the first frame.
+    assert np.unique(frames[0][2].values[0]).tolist() == [128, 255]
+    (view_of_frames,) = Stream.layout.values[0].values
+    assert view_of_frames.named["contents"][:2] == ["/image/frames", "/image/events"]
+    assert view_of_frames.named["visual_bounds"].named == {"x_range": (0, 8), "y_range": (0, 8)}
 
 
 def test_a_track_is_an_ellipse_until_it_ends(sent, tmp_path):
@@ -156,3 +171,23 @@ def test_the_command(sent, tmp_path, capsys, monkeypatch):
     (tmp_path / "moved.rrd").write_text("kept")
     assert main(["view", "a.h5", "moved.rrd", "--out", "moved.rrd", "--force"]) == 2
     assert (tmp_path / "moved.rrd").read_text() == "kept"
+
+
+def test_the_viewer_itself_reads_it(tmp_path):
+    """With the extra "view": entities, times and rows as its own tool prints them."""
+    pytest.importorskip("rerun", reason="the extra view is not installed")
+    state = {"x": 3.0, "y": 4.0, "vx": 0, "vy": 0, "lambda1": 2.0, "lambda2": 0.5, "theta": 0.3}
+    rows = [{"t": 5.0 + 0.01 * k, "id": 7, **state, "q": 0} for k in range(3)]
+    pd.DataFrame(rows, columns=["t", "id", *COLUMNS]).to_csv(tmp_path / "tracks.csv", index=False)
+    table = {"t": [5.0, 5.1, 5.2], "vx": [1.0, 2.0, 3.0]}
+    pd.DataFrame(table).to_csv(tmp_path / "motion.csv", index=False)
+    out = tmp_path / "a.rrd"
+    view(seen(), tmp_path / "tracks.csv", tmp_path / "motion.csv", out=out)
+    command = [sys.executable, "-m", "rerun", "rrd", "print", out]
+    done = subprocess.run(command, capture_output=True, text=True)
+    told = done.stdout
+    assert done.returncode == 0, done.stderr
+    rows_of = {name: int(n) for n, name in re.findall(r"with (\d+) rows.*? - (/\S+) - ", told)}
+    assert rows_of["/image/events"] == 3 and rows_of["/image/frames"] == 2
+    assert rows_of["/motion/vx"] == 3 and "/image/tracks/7" in rows_of
+    assert told.count("VisualBounds2D:range") == 1 and "/time_panel" in told
