@@ -50,9 +50,13 @@ def install_command(extra: str) -> str:
         origin = {"url": checkout.as_uri(), "dir_info": {"editable": True}}
     url = origin.get("url", "")
     if "vcs_info" in origin:
-        return f"pip install 'jaxevent[{extra}] @ {origin['vcs_info']['vcs']}+{url}'"
-    if "dir_info" not in origin:
+        vcs = origin["vcs_info"]
+        asked = f"@{vcs['requested_revision']}" if vcs.get("requested_revision") else ""
+        return f"pip install 'jaxevent[{extra}] @ {vcs['vcs']}+{url}{asked}'"
+    if "archive_info" in origin and urlsplit(url).scheme != "file":
+        return f"pip install 'jaxevent[{extra}] @ {url}'"
+    if "dir_info" not in origin and "archive_info" not in origin:
         return f"pip install 'jaxevent[{extra}]'"
     folder = Path(url2pathname(urlsplit(url).path))
-    edited = "-e " if origin["dir_info"].get("editable") else ""
+    edited = "-e " if origin.get("dir_info", {}).get("editable") else ""
     return f"pip install {edited}'{'.' if folder == Path.cwd() else folder}[{extra}]'"

@@ -12,7 +12,11 @@ from jaxevent.errors import MissingExtra, install_command, require
     "origin, command",
     [
         (None, "pip install 'jaxevent[plot]'"),
-        ('{"url": "https://f/j.whl", "archive_info": {}}', "pip install 'jaxevent[plot]'"),
+        (
+            '{"url": "https://f/j.whl", "archive_info": {}}',
+            "pip install 'jaxevent[plot] @ https://f/j.whl'",
+        ),
+        ('{"url": "file:///a%20b/j.whl", "archive_info": {}}', "pip install '/a b/j.whl[plot]'"),
         (
             '{"url": "file:///some/where%20else", "dir_info": {"editable": true}}',
             "pip install -e '/some/where else[plot]'",
@@ -21,6 +25,11 @@ from jaxevent.errors import MissingExtra, install_command, require
         (
             '{"url": "https://host/j.git", "vcs_info": {"vcs": "git", "commit_id": "a"}}',
             "pip install 'jaxevent[plot] @ git+https://host/j.git'",
+        ),
+        (
+            '{"url": "https://host/j.git", "vcs_info": {"vcs": "git", "requested_revision": "v1", '
+            '"commit_id": "a"}}',
+            "pip install 'jaxevent[plot] @ git+https://host/j.git@v1'",
         ),
     ],
 )  # fmt: skip
