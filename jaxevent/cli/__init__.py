@@ -12,6 +12,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import jaxevent
@@ -207,8 +208,19 @@ class _PrintCompletion(argparse.Action):
             shtab = require("shtab", "completion")
         except InputError as error:
             parser.error(str(error))
+        _complete_files(parser, shtab.FILE)
         print(shtab.complete(parser, values))
         parser.exit()
+
+
+def _complete_files(parser: argparse.ArgumentParser, how: Any) -> None:
+    """Have all words that are paths completed by the names of files, of commands too."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for one in action.choices.values():
+                _complete_files(one, how)
+        elif action.type is Path:
+            setattr(action, "complete", how)  # noqa: B010 (shtab looks for it)
 
 
 def _parser() -> argparse.ArgumentParser:

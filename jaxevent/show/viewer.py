@@ -39,8 +39,8 @@ def view(
     A result is a reconstruction (shown at the frames' times), tracks, a motion, or a path: images
     with times, as `jaxevent reconstruct` writes in HDF5, or the folder or table (CSV) of `jaxevent
     track` and `jaxevent motion`. Events are shown in windows of `window` s. With `out`, a file
-    .rrd, no viewer is opened. Time begins with the recording. Every sequence of images has a view of
-    its own, with events and tracks over it; motions have one of curves.
+    .rrd, no viewer is opened. Time begins with the recording. Every sequence of images has a view
+    of its own, with events and tracks over it; motions have one of curves.
 
     Raises `MissingExtra` without the extra "view" and `InputError` for a result that is neither.
     """

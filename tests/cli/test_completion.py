@@ -13,6 +13,7 @@ from jaxevent.errors import install_command
 def test_the_script_is_that_of_shtab(capsys, monkeypatch):
     made = types.ModuleType("shtab")
     made.complete = lambda parser, shell: f"{parser.prog} for {shell}"
+    made.FILE = {}
     monkeypatch.setitem(sys.modules, "shtab", made)
     with pytest.raises(SystemExit) as stop:
         cli.main(["--print-completion", "zsh"])
@@ -28,7 +29,14 @@ def test_bash_completes_options(tmp_path):
     command = [sys.executable, "-m", "jaxevent.cli", "--print-completion", "bash"]
     script = tmp_path / "completion.bash"
     script.write_text(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
-    words = "COMP_WORDS=(jaxevent filter --back); COMP_CWORD=2"
-    ask = f"source {script}; {words}; _shtab_jaxevent; echo ${{COMPREPLY[@]}}"
-    done = subprocess.run(["bash", "-c", ask], capture_output=True, text=True, check=True)
-    assert "--background" in done.stdout
+    (tmp_path / "street.aedat4").touch()
+    for words, number, expected in (
+        ("jaxevent filter --back", 2, "--background"),
+        ("jaxevent info str", 2, "street.aedat4"),
+    ):
+        ask = f"source {script}; COMP_WORDS=({words}); COMP_CWORD={number}; _shtab_jaxevent"
+        done = subprocess.run(
+            ["bash", "-c", f"{ask}; echo ${{COMPREPLY[@]}}"],
+            capture_output=True, text=True, check=True, cwd=tmp_path,
+        )  # fmt: skip
+        assert expected in done.stdout.split()
