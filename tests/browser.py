@@ -46,7 +46,8 @@ class Browser:
             ],
             pass_fds=(theirs, back), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
-        os.close(theirs), os.close(back)
+        os.close(theirs)
+        os.close(back)
         self._session = None
         try:
             target = self.call("Target.createTarget", url="about:blank")["targetId"]

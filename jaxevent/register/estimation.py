@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxevent.errors import InputError
+from jaxevent.progress import stage
 from jaxevent.recording import Recording
 from jaxevent.register.clocks import clock_offsets
 from jaxevent.register.geometry import Grid, check_homography, grid_between
@@ -62,12 +63,20 @@ def estimate(
             f"{other.name}: holds {len(other.frames)} frames, and estimating needs 3; give the "
             "offset and the homography or calibration"
         )
-    offsets = [float(offset)] if offset is not None else clock_offsets(recording, other, search)
+    if offset is not None:
+        offsets = [float(offset)]
+    else:
+        with stage("compare clocks", progress):
+            offsets = clock_offsets(recording, other, search)
     best, problem = None, None
     for candidate in offsets:
         try:
-            starts = None if grid is not None else match(recording, other, candidate, progress)
-            now = refine(recording, other, candidate, grid, starts, keep_offset=offset is not None)
+            with stage("match features", progress):
+                starts = None if grid is not None else match(recording, other, candidate, progress)
+            with stage("refine", progress):
+                now = refine(
+                    recording, other, candidate, grid, starts, keep_offset=offset is not None
+                )
         except InputError as error:
             problem = problem or error
             continue

@@ -56,6 +56,7 @@ import jax
 from jaxevent import devices
 from jaxevent.errors import InputError, require
 from jaxevent.io import load, toml
+from jaxevent.progress import stage
 from jaxevent.recording import Recording
 from jaxevent.runs import findings
 from jaxevent.runs.checkpoint import finished_rows, restore, save
@@ -230,7 +231,8 @@ def _fit_tasks(
                     keep(None, True)
             except InputError as error:
                 raise InputError(f"{plan.config}: {task.label}: {error}") from None
-            found += findings.find(task, done[number], problem)
+            with stage(f"{task.label}: intervals", progress):
+                found += findings.find(task, done[number], problem)
         new.close()
     return done, found, write
 

@@ -139,7 +139,8 @@ def test_results_of_a_configuration(folder, monkeypatch):
     keys = "recording method mse ssim frames events seconds params per_frame".split()
     assert list(rows[0]) == keys
     assert list(rows[0]["per_frame"]) == ["t", "mse", "ssim"]
-    assert (out / "results.md").read_text().count("\n") == 2 + len(rows)
+    table, _, explained = (out / "results.md").read_text().partition("\n\n")
+    assert table.count("\n") == 1 + len(rows) and "- SSIM: structural" in explained
     assert (out / "config.toml").read_bytes() == config.read_bytes()
 
     again = evaluate(config, out)  # replaces the results
@@ -358,10 +359,10 @@ def test_the_authors_metrics_of_references(folder):
     assert all(title in table for title in ("authors' SSIM", "MATLAB SSIM", "masked MSE x 1e-2"))
     with pytest.raises(jaxevent.InputError, match="did you mean 'masked_mse'"):
         evaluate(config, metrics=["masked"])
-    # A panel of boxes for each measure of single images.
+    # A plot of boxes for each measure of single images.
     page = (folder / "out" / "report.html").read_text()
-    boxes = page.split("<h2>All images</h2>")[1].split("base64,")[1].split('"')[0]
-    drawn = base64.b64decode(boxes).decode()
+    boxes = page.split("<h2>All images</h2>")[1].split("<h2>")[0].split("base64,")[1:]
+    drawn = "".join(base64.b64decode(box.split('"')[0]).decode() for box in boxes)
     for label in ("log MSE", "log SSIM", "authors' SSIM", "MATLAB SSIM", "masked MSE"):
         assert label in drawn
 
@@ -488,7 +489,7 @@ def test_results_against_references_show_their_columns(folder):
     text = 'protocol = "reference"\n' + ONE.replace("small", "hdr")
     (row,) = evaluate(write_config(folder, text), folder / "out")
     assert json.loads((folder / "out" / "results.json").read_text()) == {"rows": [row]}
-    titles, _, cells = (folder / "out" / "results.md").read_text().splitlines()
+    titles, _, cells = (folder / "out" / "results.md").read_text().splitlines()[:3]
     shown = dict(
         zip(*([cell.strip() for cell in line.split("|")] for line in (titles, cells)), strict=True)
     )
