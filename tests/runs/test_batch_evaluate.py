@@ -242,8 +242,9 @@ def test_the_page_holds_everything_itself(tmp_path, monkeypatch):
     text = (tmp_path / "out" / "report.html").read_text()
     page = Page(text)
     kinds = Counter(link.partition(",")[0] for link in page.links)
-    # The truth, the frame before, each method's image and error; means, boxes, errors over time.
-    assert kinds == {"data:image/png;base64": 6, "data:image/svg+xml;base64": 3}
+    # The truth, the frame before, each method's image and error; means and boxes of two measures
+    # each, errors over time.
+    assert kinds == {"data:image/png;base64": 6, "data:image/svg+xml;base64": 5}
     assert "url(" not in text and "@import" not in text and "<script src" not in text
     for row in rows:
         at = page.cells.index("small.h5", page.cells.index("small.h5") + 1)
