@@ -10,7 +10,7 @@ import pytest
 import jaxevent
 from jaxevent.blob import Tracks, moment
 from jaxevent.blob.prepare import Packing
-from jaxevent.blob.tracks import _begin, _run
+from jaxevent.blob.run import run_compiled
 from jaxevent.recording import Events, Recording
 
 SCRIPT = Path(__file__).parents[2] / "experiments" / "blob_real.py"
@@ -84,8 +84,7 @@ def test_tail_of_the_dot_begins_no_track(real, dot, float32):
         mark, state = packing.first, None
         while mark is not None:  # in the program of `follow`
             stretch = packing.pack(mark)
-            state = _begin(moment.filter, params, stretch.features) if state is None else state
-            state, _ = _run(moment.filter, params, state, stretch.features, wanted="begins")
+            state, _ = run_compiled(moment.filter, params, state, stretch.features, wanted="begins")
             mark = stretch.next
         begun[surround] = int(state.next_id)
     assert begun[2.0] == 1 < begun[1.0]
