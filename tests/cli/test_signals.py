@@ -64,8 +64,8 @@ sys.exit(cli.main())
 def folder(tmp_path: Path) -> Path:
     jaxevent.save(small(), tmp_path / "small.h5")
     write_config(tmp_path, ONE)
-    fit = ONE.replace('"blend"', '"akf"') + 'fit = ["c_on"]\n'
-    (tmp_path / "fit.toml").write_text("iterations = 3\nsplit = [1, 0, 1]\n" + fit)
+    fit = ONE.replace('"blend"', '"edi"') + 'fit = ["c_on"]\n'
+    (tmp_path / "fit.toml").write_text("iterations = 1\nrounds = 1\nsplit = [1, 0, 1]\n" + fit)
     return tmp_path
 
 
