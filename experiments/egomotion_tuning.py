@@ -1,6 +1,6 @@
 """Parameters of voting fitted from wrong ones: is what comes out better on sequences not seen?
 
-    python experiments/egomotion_tuning.py --out docs/results [--seeds 3] [--size 64 48]
+    python experiments/egomotion_tuning.py --out docs/results [--seeds 3] [--only soft]
 
 The penalty of time r_t of the thesis' literal likelihood, by gradient against the true motion in
 the formulations where it acts: planar with the predecessor when the hypothesis was one pixel back
@@ -199,14 +199,24 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for r_t.png")
     parser.add_argument("--seeds", type=int, default=3, help="sequences to fit to, and to test on")
     parser.add_argument("--size", type=int, nargs=2, default=(64, 48), metavar=("W", "H"))
+    parser.add_argument("--only", choices=("literal", "soft"), help="one of the two votes")
     arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
     size = tuple(arguments.size)
     print(f"{machine()}; {arguments.seeds} sequences to fit to, as many unseen\n")
     print("| | start | found | 95 % interval | | error before, % | after |")
     print("|---|---|---:|---:|---|---:|---:|")
+    if arguments.only != "soft":
+        fit_literal(arguments.seeds, size, arguments.out)
+    if arguments.only != "literal":
+        fit_soft(arguments.seeds, size)
+
+
+def fit_literal(seeds: int, size: tuple[int, int], out: Path) -> None:
+    """Rows and curves of `r_t`."""
     curves = {}
     for label, (make, model, given) in WAYS.items():
-        problem = Problem(make, arguments.seeds, size, model)
+        problem = Problem(make, seeds, size, model)
         curves[label] = curve(problem, given)
         best = float(GRID[np.argmin(curves[label][0])])
         told = f"{min(curves[label][0]):.1f} fitted to, "
@@ -214,8 +224,15 @@ def main() -> None:
         print(f"| {label}, best of the grid | | {best:.3g} | | {told} | | |", flush=True)
         for factor in (10.0, 0.1):
             fitted(problem, label, {**given, "r_t": best * factor}, ["r_t"])
-    draw(curves, arguments.out / "r_t.png")
-    problem, default = Problem(wall, arguments.seeds, size), Params.of({})
+    draw(curves, out / "r_t.png")
+
+
+def fit_soft(seeds: int, size: tuple[int, int]) -> None:
+    """Rows of the soft vote's numbers."""
+    problem, default = Problem(wall, seeds, size), Params.of({})
+    params = Params.of(SMALL)
+    loss, _, unseen = problem(params)
+    print(f"| soft vote, defaults | | | | | {percent(loss, params, unseen):.1f} | |", flush=True)
     for factor in (10.0, 0.1):
         given = {name: factor * float(getattr(default, name)) for name in ("noise", "alpha")}
         fitted(problem, f"soft vote, x {factor:g}", given, ["noise", "alpha"])
