@@ -10,16 +10,16 @@ Nothing is downloaded. A recording is found in any folder below, where `LAYOUTS`
 
     name     files                                  ground truth
     ijrr     folders with events.txt, *.zip         poses, IMU
-    dsec     events/left/events.h5, events_left     `flow` (needs the extra `vision`)
+    dsec     events/left/events.h5, events_left     `disparity`, `flow` (extra `vision`)
     mvsec    *_data.hdf5                            poses, IMU, `depth`, `flow`
     m3ed     *_data.h5                              poses, `depth`
     hdr      *.mat of the AKF's authors             `HDR_mat`, where it is there
     ahdr     the same                               `HDR_mat`
     evimo2   folders with dataset_events_t.npy      none: see `jaxevent.io.evimo`
 
-`depth` and `flow` are in `Recording.extra`, as `jaxevent.io.truth` describes, with the layouts'
-sources; the readers of `jaxevent.io` describe the recordings' own. In configurations of `fit` and
-`evaluate`, "mvsec:/data/mvsec" stands for all recordings of a folder.
+`depth`, `disparity` and `flow` are in `Recording.extra`, as `jaxevent.io.truth` describes, with the
+layouts' sources; the readers of `jaxevent.io` describe the recordings' own. In configurations of
+`fit` and `evaluate`, "mvsec:/data/mvsec" stands for all recordings of a folder.
 """
 
 import dataclasses

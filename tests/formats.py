@@ -722,16 +722,16 @@ def m3ed_truth(matrices, t, depth=None) -> bytes:
 
 
 def png16(image) -> bytes:
-    """A PNG of (height, width, 3) uint16, red first."""
+    """A PNG of (height, width) or (height, width, 3) uint16, red first."""
 
     def chunk(kind, data):
         crc = zlib.crc32(kind + data)
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc)
 
-    height, width, _ = image.shape
+    height, width = image.shape[:2]
     rows = image.astype(">u2").reshape(height, -1).view(np.uint8)
     data = zlib.compress(np.insert(rows, 0, 0, axis=1).tobytes())  # no filter
-    head = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
+    head = struct.pack(">IIBBBBB", width, height, 16, 2 if image.ndim == 3 else 0, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
@@ -746,3 +746,12 @@ def dsec_flow(folder: Path, flow, t):
         stored = np.where(known, 2**15 + 128 * one, 0)
         image = np.stack([*stored, known], axis=-1).astype(np.uint16)
         (folder / f"forward/{2 * i + 4:06d}.png").write_bytes(png16(image))
+
+
+def dsec_disparity(folder: Path, disparity, t):
+    """The folder disparity of DSEC: disparity (n, height, width) in px, NaN where unknown."""
+    (folder / "event").mkdir(parents=True)
+    (folder / "timestamps.txt").write_text("".join(f"{one}\n" for one in t))
+    for i, one in enumerate(disparity):
+        image = np.where(np.isfinite(one), 256 * one, 0).astype(np.uint16)
+        (folder / f"event/{2 * i:06d}.png").write_bytes(png16(image))

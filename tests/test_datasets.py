@@ -21,6 +21,7 @@ QUATERNIONS = RANDOM.normal(size=(3, 4))
 QUATERNIONS /= np.linalg.norm(QUATERNIONS, axis=1, keepdims=True)
 QUATERNIONS *= np.sign(QUATERNIONS[:, 3:])
 DEPTH = RANDOM.random((3, 30, 40)).astype(np.float32)
+DISPARITY = RANDOM.integers(1, 2**16, (3, 30, 40)) / np.float32(256)
 FLOW = (RANDOM.integers(-500, 500, (3, 2, 30, 40)) / 128).astype(np.float32)
 
 
@@ -79,6 +80,7 @@ def dsec(root):
         (folder / "events.h5").write_bytes(formats.dsec(EVENTS, SIZE, start))
     t = [(start + a, start + a + 100_000) for a in (0, 100_000, 200_000)]
     formats.dsec_flow(root / "thun_00_a/flow", FLOW, t)
+    formats.dsec_disparity(root / "thun_00_a/disparity", DISPARITY, [a for a, _ in t])
     return ["thun_00_a", "zurich_city_02_a"]
 
 
@@ -107,7 +109,7 @@ SETS = {
     "ijrr": (ijrr, {"poses"}),
     "mvsec": (mvsec, {"poses", "depth", "flow"}),
     "m3ed": (m3ed, {"poses", "depth"}),
-    "dsec": (dsec, {"flow"}),
+    "dsec": (dsec, {"disparity", "flow"}),
     "hdr": (hdr, {"HDR_mat"}),
     "ahdr": (hdr, {"HDR_mat"}),
     "evimo2": (evimo2, set()),
@@ -144,7 +146,9 @@ def test_a_folder_iterates_as_recordings_with_truth(name, in_memory, tmp_path):
         start = 50_000_000
         np.testing.assert_array_equal(recording.extra["flow_t"][:, 0] - start, [0, 100000, 200000])
         assert recording.extra["flow"].shape == FLOW.shape
-        assert "flow" not in found[1].extra
+        np.testing.assert_array_equal(recording.extra["disparity_t"] - start, [0, 100000, 200000])
+        assert recording.extra["disparity"].shape == DISPARITY.shape
+        assert not {"disparity", "flow"} & set(found[1].extra)
     if "HDR_mat" in truth:
         np.testing.assert_array_equal(recording.extra["HDR_mat"], DEPTH[:2])
 
@@ -161,6 +165,29 @@ def test_flow_of_dsec_is_in_pixels(tmp_path):
     found = datasets.open("dsec", tmp_path / "train_events", size=SIZE)
     np.testing.assert_array_equal(np.asarray(found["thun_00_a"].extra["flow"]), FLOW)
     np.testing.assert_array_equal(np.asarray(found["zurich_city_02_a"].extra["flow"]), flow)
+
+
+def test_disparity_of_dsec_is_in_pixels(tmp_path):
+    pytest.importorskip("cv2")
+    unknown = DISPARITY.copy()
+    unknown[:, 3:5] = np.nan
+    dsec(tmp_path / "set")
+    formats.dsec_disparity(
+        tmp_path / "train_disparity/zurich_city_02_a/disparity", unknown, [7, 8, 9]
+    )
+    (tmp_path / "set").rename(tmp_path / "train_events")
+    found = datasets.open("dsec", tmp_path / "train_events", size=SIZE)
+    np.testing.assert_array_equal(np.asarray(found["thun_00_a"].extra["disparity"]), DISPARITY)
+    extra = found["zurich_city_02_a"].extra
+    np.testing.assert_array_equal(np.asarray(extra["disparity"]), unknown)
+    np.testing.assert_array_equal(extra["disparity_t"], [7, 8, 9])
+    folder = tmp_path / "train_events/thun_00_a/disparity"
+    (folder / "event/000002.png").write_bytes(formats.png16(DISPARITY[:1, :4].astype(np.uint16)))
+    with pytest.raises(InputError, match=r"000002.png: is no such image; store 40x30 pixels of 16"):
+        np.asarray(found["thun_00_a"].extra["disparity"])
+    (folder / "timestamps.txt").write_text("1\n2\n")
+    with pytest.raises(InputError, match=r"timestamps.txt: holds times of shape \(2,\)"):
+        found["thun_00_a"]
 
 
 def test_flow_without_opencv_names_the_extra(tmp_path, monkeypatch):
@@ -229,7 +256,8 @@ def test_damaged_truth_is_refused(how, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_data_set_is_evaluated_and_fitted(tmp_path):
+def test_a_data_set_is_evaluated_and_fitted(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     images = RANDOM.integers(0, 256, (8, 30, 40)).astype(np.uint8)
     whole = formats.mvsec(
         EVENTS, SIZE, images, range(5_000, 85_000, 10_000), sides=("left", "right")
@@ -245,5 +273,5 @@ def test_a_data_set_is_evaluated_and_fitted(tmp_path):
     (row,) = jaxevent.evaluate(config, tmp_path / "out")
     assert row["recording"] == "mvsec:a" and np.isfinite(row["mse"])
     config.write_text(text.format('stream = "left"\niterations = 2\n') + 'fit = ["c_on"]\n')
-    jaxevent.fit(config, tmp_path / "fitted")
+    jaxevent.fit(config, tmp_path / "fitted", ["mvsec:set"])
     assert (tmp_path / "fitted/params.toml").is_file()

@@ -36,7 +36,8 @@ def add(commands: Any) -> None:
         metavar="PATH",
         dest="recordings",
         action="append",
-        help="fitted to instead of those in the file; may be repeated",
+        help="fitted to instead of those in the file: a path, a pattern, or NAME:FOLDER for all of "
+        "a data set; may be repeated",
     )
     one.add_argument("--resume", action="store_true", help="go on from the checkpoint in DIR")
     one.add_argument(

@@ -8,20 +8,23 @@
             where unknown; ts
     DSEC    SEQUENCE/flow beside SEQUENCE/events/left/events.h5: forward_timestamps.txt, two times
             in us a line, and forward/*.png of 16 bits: x and y as 2^15 + 128 px, and 1 where known.
-            In place of SEQUENCE/flow also train_optical_flow/SEQUENCE/flow, as it is downloaded
+            In place of SEQUENCE/flow also train_optical_flow/SEQUENCE/flow, as it is downloaded.
+            SEQUENCE/disparity, or train_disparity/SEQUENCE/disparity: timestamps.txt, a time in us
+            a line, and event/*.png of 16 bits, 256 times the disparity in px, 0 where unknown
 
 `load` takes poses from these files, as `Recording.poses`. `read_images` gives, by name as
-`Recording.extra` keeps them, `depth` (n, H, W) in m with its times `depth_t` (n,), and `flow`
-(n, 2, H, W), x and y in px, with `flow_t` (n, 2), from when to when. All times are us. Images stay
-in their files until they are asked for. DSEC's flow is that of the rectified image, see
-`rectify_map`, and NaN where unknown; what else is unknown is as stored.
+`Recording.extra` keeps them, `depth` (n, H, W) in m with its times `depth_t` (n,), `disparity`
+(n, H, W) in px with `disparity_t` (n,), and `flow` (n, 2, H, W), x and y in px, with `flow_t`
+(n, 2), from when to when. All times are us. Images stay in their files until they are asked for.
+DSEC's disparity and flow are those of the rectified image, see `rectify_map`, and NaN where
+unknown; what else is unknown is as stored.
 
 Sources: daniilidis-group/mvsec, website/content/data_format/index.md, and readers of its HDF5
 files; daniilidis-group/m3ed, build_system/lidar_depth/fasterlio_gt.py; uzh-rpg/DSEC and its page
 dsec.ifi.uzh.ch/data-format. Checked against files written by these layouts.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +47,7 @@ def beside(path: Path) -> list[Path]:
     for end, others in _SUFFIXES.items():
         if path.name.endswith(end):
             found += [path.with_name(path.name.removesuffix(end) + other) for other in others]
-    flow = _flow_folder(path)
-    found += [] if flow is None else [flow / "forward_timestamps.txt"]
+    found += [folder / stamps for folder, stamps in _folders_dsec(path)]
     return [file for file in found if file.is_file()]
 
 
@@ -73,7 +75,9 @@ def read_images(path: Path, side: str = "left") -> dict[str, Any]:
             elif file.name.endswith("_depth_gt.h5"):
                 found |= _depth_m3ed(file, side)
             elif file.name == "forward_timestamps.txt" and side == "left":
-                found |= _flow_dsec(file.parent)
+                found |= _flow_dsec(file)
+            elif file.name == "timestamps.txt" and side == "left":
+                found |= _disparity_dsec(file)
     return found
 
 
@@ -141,52 +145,85 @@ def _depth_m3ed(file: Path, side: str) -> dict[str, Any]:
     return {"depth": _stored(opened, name, 3, len(t), file), "depth_t": t}
 
 
-def _flow_folder(path: Path) -> Path | None:
-    """Where the flow of DSEC's left camera lies, whose events are in `path`; None elsewhere."""
+def _folders_dsec(path: Path) -> list[tuple[Path, str]]:
+    """Where the truth of DSEC's left camera lies, whose events are in `path`, and its times."""
     if path.name != "events.h5":
-        return None
+        return []
     if path.parts[-3:-1] == ("events", "left"):
         sequence = path.parents[2]
     elif path.parent.name == "events_left":
         sequence = path.parents[1]
     else:
-        return None
-    places = (sequence, sequence.parents[1] / "train_optical_flow" / sequence.name)
-    return next((place / "flow" for place in places if (place / "flow").is_dir()), None)
+        return []
+    found = []
+    for kind, apart, stamps in (
+        ("flow", "train_optical_flow", "forward_timestamps.txt"),
+        ("disparity", "train_disparity", "timestamps.txt"),
+    ):
+        places = [place / kind for place in (sequence, sequence.parents[1] / apart / sequence.name)]
+        found += [(place, stamps) for place in places if place.is_dir()][:1]
+    return found
 
 
-def _flow_dsec(folder: Path) -> dict[str, Any]:
+def _flow_dsec(stamps: Path) -> dict[str, Any]:
+    t = np.loadtxt(stamps, np.int64, delimiter=",", ndmin=2)
+    flow = _images_dsec(stamps, "forward", t, (2,), _flow_of)
+    return {} if flow is None else {"flow": flow, "flow_t": t}
+
+
+def _disparity_dsec(stamps: Path) -> dict[str, Any]:
+    t = np.loadtxt(stamps, np.int64, ndmin=1)
+    disparity = _images_dsec(stamps, "event", t, (), _disparity_of)
+    return {} if disparity is None else {"disparity": disparity, "disparity_t": t}
+
+
+def _flow_of(stored: NDArray[np.float32]) -> NDArray[np.float32]:
+    known, y, x = np.moveaxis(stored, 2, 0)  # OpenCV has blue first
+    return np.where(known == 1, (np.stack([x, y]) - 2**15) / 128, np.nan)
+
+
+def _disparity_of(stored: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.where(stored > 0, stored / 256, np.nan)
+
+
+def _images_dsec(
+    stamps: Path,
+    name: str,
+    t: NDArray[np.int64],
+    parts: tuple[int, ...],
+    value: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+) -> DecodedImages | None:
+    """The images of a folder beside their times, (n, *parts, H, W); None where it has none."""
     from PIL import Image
 
-    file = folder / "forward_timestamps.txt"
-    t = np.loadtxt(file, np.int64, delimiter=",", ndmin=2)
-    images = sorted((folder / "forward").glob("*.png"))
-    if t.shape != (len(images), 2):
+    folder = stamps.parent / name
+    images = sorted(folder.glob("*.png"))
+    expected = (len(images), 2) if parts else (len(images),)
+    if t.shape != expected:
         raise InputError(
-            f"{file}: holds times of shape {t.shape} but {folder / 'forward'} has {len(images)} "
-            "images; each image needs a line of two times"
+            f"{stamps}: holds times of shape {t.shape} but {folder} has {len(images)} images; each "
+            f"image needs a line of {'two times' if parts else 'one time'}"
         )
     if not images:
-        return {}
+        return None
     with Image.open(images[0]) as first:
         width, height = first.size
-    flow = DecodedImages(
-        lambda row: _flows_of(images[row:], (height, width)),
-        (len(images), 2, height, width),
+    shape = (height, width, 3) if parts else (height, width)
+    return DecodedImages(
+        lambda row: (value(_stored_png(image, shape)).astype(np.float32) for image in images[row:]),
+        (len(images), *parts, height, width),
         np.dtype(np.float32),
         str(folder),
     )
-    return {"flow": flow, "flow_t": t}
 
 
-def _flows_of(images: Sequence[Path], shape: tuple[int, int]) -> Iterator[NDArray[np.float32]]:
-    # Pillow reads 8 of the 16 bits.
+def _stored_png(image: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    # Of images with colours Pillow reads 8 of the 16 bits.
     cv2 = require("cv2", "vision")
-    for image in images:
-        stored = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
-        if stored is None or stored.dtype != np.uint16 or stored.shape != (*shape, 3):
-            raise InputError(
-                f"{image}: is no flow; store {shape[1]}x{shape[0]} pixels of 3 x 16 bits"
-            )
-        known, y, x = np.moveaxis(stored.astype(np.float32), 2, 0)  # OpenCV has blue first
-        yield np.where(known == 1, (np.stack([x, y]) - 2**15) / 128, np.nan).astype(np.float32)
+    stored = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
+    if stored is None or stored.dtype != np.uint16 or stored.shape != shape:
+        bits = "3 x 16" if len(shape) == 3 else "16"
+        raise InputError(
+            f"{image}: is no such image; store {shape[1]}x{shape[0]} pixels of {bits} bits"
+        )
+    return stored.astype(np.float32)

@@ -78,8 +78,8 @@ def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path]]:
         if unset and not (folder / expanded).exists():
             name = unset.group(1).strip("{}")
             raise InputError(f"the recording {text!r} needs the variable {name}, which is not set")
-        name, _, rest = expanded.partition(":")
-        if rest and name in datasets.LAYOUTS and not (folder / expanded).exists():
+        name, rest = _data_set(expanded, folder)
+        if name:
             for one, path in datasets.open(name, folder / rest).paths.items():
                 found.setdefault(path, f"{name}:{one}")
             continue
@@ -92,6 +92,20 @@ def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path]]:
         for match in matches:
             found.setdefault(folder / match, match)
     return [(text, path) for path, text in found.items()]
+
+
+def _data_set(text: str, folder: Path) -> tuple[str, str]:
+    """The name and the folder of "NAME:FOLDER"; an empty name where it is a path."""
+    name, _, rest = text.partition(":")
+    known = rest and name in datasets.LAYOUTS and not (folder / text).exists()
+    return (name, rest) if known else ("", text)
+
+
+def from_anywhere(given: str) -> str:
+    """A recording as given in the working directory, named so that any configuration finds it."""
+    name, rest = _data_set(given, Path.cwd())
+    path = str(Path(rest).expanduser().absolute())
+    return f"{name}:{path}" if name else path
 
 
 def named_files(config: Path) -> list[Path]:

@@ -25,6 +25,7 @@ from jaxevent.runs.config import (
     Check,
     check,
     find_recordings,
+    from_anywhere,
     is_number,
     is_texts,
     named_files,
@@ -158,7 +159,8 @@ _METHOD: dict[str, Check] = {
 def read_plan(config: Path, recordings: Sequence[str | Path] | None = None) -> Plan:
     """Read and check a configuration; raises `InputError` naming the file and the setting.
 
-    `recordings` take the place of those that it names, relative to the working directory.
+    `recordings` take the place of those that it names, written like them but relative to the
+    working directory.
     """
     table = read_toml(config)
     try:
@@ -168,7 +170,7 @@ def read_plan(config: Path, recordings: Sequence[str | Path] | None = None) -> P
         text = config.read_bytes()
         folders = dict.fromkeys(SPLITS, config.parent)
         if recordings:
-            table = {**table, "recordings": [str(Path(one).absolute()) for one in recordings]}
+            table = {**table, "recordings": [from_anywhere(str(one)) for one in recordings]}
             text = toml.dump(table).encode()
         found = {
             split: find_recordings(table[key], folders[split]) if table.get(key) else []
