@@ -123,6 +123,19 @@ def hdf5_heaps_one_inside_the_other(folder):
     return _inside(folder, p=make)
 
 
+def hdf5_string_of_gigabytes(folder):
+    """It claims 4 GB, which libhdf5 takes before it looks; its space is damaged too."""
+    path = folder / "a.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs["format"] = "jaxevent"
+    content = bytearray(path.read_bytes())
+    length_and_heap = struct.pack("<IQ", len("jaxevent"), content.index(b"GCOL"))
+    at = content.index(length_and_heap)
+    content[at - 4 : at + 4] = b"\xff" * 8
+    path.write_bytes(content)
+    return path
+
+
 def hdf5_one_image_many_times(folder):
     path = folder / "a.h5"
     path.write_bytes(formats.event_utils(EVENTS, SIZE))
@@ -270,6 +283,7 @@ FILES = {  # what the refusal says
     hdf5_chunk_of_gzip: "events/t: the chunk at .0,. unfolds to more than a chunk",
     hdf5_data_of_gzip: "claim to hold 167,772,160, over 100 times",
     hdf5_heaps_one_inside_the_other: "p have shapes|is damaged",
+    hdf5_string_of_gigabytes: "a string or its heap is damaged",
     hdf5_one_image_many_times: "images: .* over 100 times",
     text_zip: "over 100 times",
     text_images_named_many_times: "images.txt: .* over 100 times",

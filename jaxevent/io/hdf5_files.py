@@ -25,8 +25,12 @@ _COPY = (
     "only what a file itself holds is read, so copy all into one file: h5repack, or h5py's "
     "create_dataset(name, data=dataset[()])"
 )
-# An attribute that is one string: its type, its space, then its length, heap and place in that.
-_STRING = re.compile(rb"\x19.[\x00\x01]\x00\x10\x00\x00\x00\x10.{15}\x01\x00{7}(.{16})", re.DOTALL)
+# An attribute that is one string: its type, its space, then its length, heap and place in that. The
+# type and the space are padded in the older format, not in that of HDF5 1.8.
+_STRING = re.compile(
+    rb"\x19.[\x00\x01]\x00\x10\x00\x00\x00\x10.{11}(?:.{4})?(?:\x01\x00.{6}|\x02\x00.{2})(.{16})",
+    re.DOTALL,
+)
 
 
 def open_file(path: Path) -> h5py.File:

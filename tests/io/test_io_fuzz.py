@@ -37,6 +37,7 @@ fuzz = _script()
 @example(seed=3282)  # hdf5: the size of a string in its heap, from which libhdf5 goes on for ever
 @example(seed=1300)  # hdf5: free space of size 0 in the heap of strings
 @example(seed=3637)  # hdf5: a string's heap far past the end, for which libhdf5 takes 4 GB
+@example(seed=3205)  # hdf5: the same, and the attribute's space is damaged
 @example(seed=1442)  # hdf5: an attribute of a type that is none
 @example(seed=2163)  # mat: complex, without imaginary numbers
 @example(seed=20261929)  # aedat4: a line break for the version
