@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from jaxevent.kernels.expressions import Graph, Level, Node, Untranslatable, needed
 from jaxevent.kernels.host import HostProgram
-from jaxevent.kernels.text import Writer
+from jaxevent.kernels.text import Place, Writer
 from jaxevent.kernels.translate import FOLDS, KINDS, Known, OfParameters, Translation, Value
 
 MARK = 7919  # elements in a trace: a prime that no other axis has
@@ -230,22 +230,24 @@ def _inputs(graph: Graph, name: str, leaf: Any, single: bool) -> Value:
 
 
 class LoopWriter(Writer):
-    """Writes functions whose inputs are at places that a family knows by their names.
+    """Writes functions whose inputs a family knows by their names.
 
     Args:
-        places: Texts that read an input.
+        places: Where an input lies, or a text that reads it.
     """
 
-    def __init__(self, places: Mapping[str, str]):
+    def __init__(self, places: Mapping[str, str | Place]):
         super().__init__()
         self.places = places
         self.loops: list[str] = []  # functions of one loop each
 
+    def place(self, node: Node) -> Place | None:
+        found = self.places.get(node.args[0]) if node.op == "input" else None
+        return None if isinstance(found, str) else found
+
     def input(self, node: Node) -> str:
-        name = node.args[0]
-        if name not in self.places:
-            raise Untranslatable(f"the use of {name!r}")
-        return self.places[name]
+        found = self.places.get(node.args[0])
+        return found if isinstance(found, str) else super().input(node)
 
     def body(
         self,
@@ -263,7 +265,9 @@ class LoopWriter(Writer):
         out, known = [], set[Node]()
         for phase in range(last + 1):
             now = [n for n in scalars if phases[n] <= phase and n not in known]
-            out += self._scalars(now, known, indent)
+            used = {a for n in phases if n not in now for a in n.args if isinstance(a, Node)}
+            out += self.assign(now, used | {*wanted.values()}, indent)
+            known |= set(now)
             gathered = [n for n in phases if n.op in GATHERED and phases[n] == phase + 1]
             elements = {}
             if phase == last:
@@ -274,14 +278,6 @@ class LoopWriter(Writer):
         for key, node in wanted.items():
             if node.level < Level.ELEMENT:
                 out.append(f"{' ' * indent}{store[key].format(self.name(node))}")
-        return out
-
-    def _scalars(self, nodes: list[Node], known: set[Node], indent: int) -> list[str]:
-        out = []
-        for node in sorted(nodes, key=lambda n: n.number):
-            if node.op != "constant":
-                out.append(f"{' ' * indent}{self.name(node)} = {self._expression(node)}")
-            known.add(node)
         return out
 
     def _loop(
@@ -305,7 +301,7 @@ class LoopWriter(Writer):
             if node.op == "place":
                 out.append(f"    m{node.number} = -REAL(np.inf)")
         out.append(f"    for {loop.index} in range({loop.count}):")
-        out += self.lines_of([n for n in rest if n not in known], 8)
+        out += self.assign([n for n in rest if n not in known], results, 8)
         for node in gathered:
             value, r = self.name(node.args[0]), f"r{node.number}"
             if node.op == "total":
@@ -324,14 +320,6 @@ class LoopWriter(Writer):
         call = f"{name}({arguments})"
         targets = ", ".join(self.name(n) for n in gathered)
         return [f"{' ' * indent}{targets + ' = ' if names else ''}{call}"]
-
-    def lines_of(self, nodes: list[Node], indent: int) -> list[str]:
-        """Assignments of these nodes alone."""
-        return [
-            f"{' ' * indent}{self.name(n)} = {self._expression(n)}"
-            for n in sorted(nodes, key=lambda n: n.number)
-            if n.op != "constant"
-        ]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,11 +1,14 @@
-"""Expressions as lines of Python that numba compiles."""
+"""Expressions as lines of Python that numba compiles; arithmetic in blocks (`blocks`)."""
 
 import dataclasses
+import re
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.kernels.blocks import OPERATIONS
 from jaxevent.kernels.expressions import Node, Untranslatable, needed
 
 INFIX = {
@@ -31,6 +34,11 @@ FORMS = {
 }
 FUNCTIONS = ("exp", "log", "log1p", "logistic", "sin", "cos")  # of `numeric`, or the header
 LIBRARY = ("expm1", "sqrt", "tanh", "floor", "ceil", "abs")
+LEAST = 3  # operations that are worth a block
+Place = tuple[str, str, int]  # pointer, index and offset: pointer[index + offset]
+
+
+TABLES = re.compile(r"ENTRIES\d+")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,28 +59,87 @@ class Numbers:
 
 
 class Writer:
-    """Writes expressions. Families say where their inputs are (`input`, `special`)."""
+    """Writes expressions. Families say where their inputs are (`place`, `input`)."""
 
     def __init__(self):
         self.constants: dict[str, str] = {}
         self.numbers: dict[tuple[int, int], int] = {}  # place of numbers of the host program
         self.entries: dict[int, str] = {}  # names of the arrays that are looked up
         self.arrays: list[tuple[int, int]] = []  # the numbers in order of their places
+        self.blocks: list[str] = []  # their definitions, but for where tables begin
 
-    def input(self, node: Node) -> str:
-        raise Untranslatable(f"the use of {node.args[0]!r}")
-
-    def special(self, node: Node) -> str | None:
-        """The text of an operation that is a family's own."""
+    def place(self, node: Node) -> Place | None:
+        """Where a number lies that is read."""
         return None
 
+    def input(self, node: Node) -> str:
+        """The text of an input that has no such place."""
+        raise Untranslatable(f"the use of {node.args[0]!r}")
+
     def lines(self, nodes: list[Node], indent: int, stop: set[Node] | None = None) -> list[str]:
-        """Assignments to a variable for each node that the nodes rest on."""
-        out = []
-        for node in needed(nodes, stop):
-            if node.op != "constant":
-                out.append(f"{' ' * indent}{self.name(node)} = {self._expression(node)}")
-        return out
+        """Lines after which the nodes are known by their names; those of `stop` are already."""
+        known = set() if stop is None else stop
+        return self.assign([n for n in needed(nodes, stop) if n not in known], nodes, indent)
+
+    def assign(self, nodes: Iterable[Node], wanted: Iterable[Node], indent: int) -> list[str]:
+        """Lines that compute the nodes, all of which the wanted ones rest on that is not known.
+
+        What is no plain arithmetic, such as a logarithm, is a line of its own between two blocks.
+        """
+        order = sorted((n for n in nodes if n.op != "constant"), key=lambda n: n.number)
+        wanted = set(wanted)
+        turn: dict[Node, int] = {}  # of lines, and of the block after them
+        for node in order:
+            before = [turn.get(a, 0) for a in node.args if isinstance(a, Node)]
+            turn[node] = max(before, default=0) + (bool(before) and not self._in_block(node))
+        last, out = max(turn.values(), default=0), []
+        for now in range(last + 1):
+            mine = [n for n in order if turn[n] == now]
+            inside = [n for n in mine if self._in_block(n)]
+            out += [self._line(n) for n in mine if not self._in_block(n)]
+            later = {a for n in order if turn[n] > now for a in n.args if isinstance(a, Node)}
+            found = [n for n in inside if n in later or n in wanted]
+            if len(inside) < LEAST:
+                out += [self._line(n) for n in inside]
+            else:
+                out.append(self._block(inside, found))
+        return [f"{' ' * indent}{line}" for line in out]
+
+    def _in_block(self, node: Node) -> bool:
+        if node.op in ("number", "entry"):
+            return True
+        if self.place(node) is not None:
+            return True
+        of = [a for a in node.args if isinstance(a, Node)]
+        return bool(of) and node.op in OPERATIONS[of[0].kind]
+
+    def _line(self, node: Node) -> str:
+        return f"{self.name(node)} = {self._expression(node)}"
+
+    def _block(self, nodes: list[Node], results: list[Node]) -> str:
+        """The line that calls the block of these nodes, which is written."""
+        made, given, lines = set(nodes), dict[str, str](), []
+        for node in nodes:
+            what, place = [node.op], self.place(node)
+            if place is not None:
+                what = ["read", *map(str, place)]
+                given |= {place[0]: "p", place[1]: "i"}
+            elif node.op in ("number", "entry"):
+                given["numbers"] = "p"
+                number = node.op == "number"
+                what.append(str(self._at(node.args)) if number else self._table(node.args[0]))
+            if node.op != "number":
+                for a in (a for a in node.args if isinstance(a, Node)):
+                    constant = a.op == "constant"
+                    what.append(f"{a.kind}:{a.args[0]}" if constant else self.name(a))
+                    if a not in made and not constant:
+                        given[self.name(a)] = a.kind
+            lines.append(f"{self.name(node)}:{node.kind} = {' '.join(what)}")
+        name, names = f"block{len(self.blocks)}", [self.name(n) for n in results]
+        of = " ".join(f"{argument}:{kind}" for argument, kind in given.items())
+        text = "\n".join(lines)
+        self.blocks.append(f'{name} = block(F, "{of}", """\n{text}\n""", "{" ".join(names)}")')
+        return f"{', '.join(names)} = {name}(({', '.join(given)},))"
 
     def name(self, node: Node) -> str:
         if node.op != "constant":
@@ -85,19 +152,22 @@ class Writer:
         return self.constants[text]
 
     def finish(self, values: list[Any]) -> tuple[Numbers, list[str]]:
-        """What the numbers are, and the constants' lines."""
+        """What the numbers are, and the lines of constants and blocks."""
         lines = [f"{name} = REAL({_literal(text)})" for text, name in self.constants.items()]
-        at, arrays = len(self.arrays), []
+        at, arrays, begins = len(self.arrays), [], dict[str, str]()
         for array, name in self.entries.items():
             arrays.append((array, at))
             lines.append(f"{name} = {at}, {len(values[array]) - 1}")
+            begins[name] = f"{at} {len(values[array]) - 1}"
             at += len(values[array])
+        lines += [TABLES.sub(lambda found: begins[found[0]], text) for text in self.blocks]
         return Numbers(self.arrays, arrays, at), lines
 
     def _expression(self, node: Node) -> str:
-        op, own = node.op, self.special(node)
-        if own is not None:
-            return own
+        op, place = node.op, self.place(node)
+        if place is not None:
+            text = f"{place[0]}[{place[1]} + {place[2]}]"
+            return f"{text} != 0" if node.kind == "b" else text
         if op == "input":
             return self.input(node)
         if op == "number":
@@ -117,18 +187,23 @@ class Writer:
             return f"np.{op}({names[0]})"
         raise Untranslatable(f"the operation {op!r}")
 
-    def _number(self, key: tuple[int, int], kind: str) -> str:
+    def _at(self, key: tuple[int, int]) -> int:
+        """Where a number of the host program is among the kernel's."""
         if key not in self.numbers:
             self.numbers[key] = len(self.arrays)
             self.arrays.append(key)
-        text = f"numbers[{self.numbers[key]}]"
+        return self.numbers[key]
+
+    def _table(self, array: int) -> str:
+        """The name of where an array begins that is looked up, and of its last place."""
+        return self.entries.setdefault(array, f"ENTRIES{len(self.entries)}")
+
+    def _number(self, key: tuple[int, int], kind: str) -> str:
+        text = f"numbers[{self._at(key)}]"
         return f"int({text})" if kind == "i" else text
 
     def _entry(self, node: Node) -> str:
-        array, index = node.args
-        if array not in self.entries:
-            self.entries[array] = f"ENTRIES{len(self.entries)}"
-        name, at = self.entries[array], self.name(index)
+        name, at = self._table(node.args[0]), self.name(node.args[1])
         return f"numbers[{name}[0] + min(max({at}, 0), {name}[1])]"
 
 

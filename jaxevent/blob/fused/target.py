@@ -49,7 +49,7 @@ from jaxevent.kernels.loops import (
     translate,
 )
 from jaxevent.kernels.modules import module_of
-from jaxevent.kernels.text import FUNCTIONS, Numbers
+from jaxevent.kernels.text import FUNCTIONS, Numbers, Place
 
 MOST_NODES = 4000  # of a program: beyond, numba compiles longer than the scan takes
 
@@ -59,6 +59,7 @@ import numba
 import numpy as np
 from numba import types
 
+from jaxevent.kernels.blocks import block
 from jaxevent.kernels.kept import callback
 from jaxevent.kernels.numeric import {imports}
 
@@ -96,14 +97,11 @@ class Layout:
 
     cells: dict[str, int]
     whole: dict[str, int]
-    truths: frozenset[str]  # which of `whole` are truth values
 
-    def places(self) -> dict[str, str]:
-        """Texts that read the numbers."""
-        places = {name: f"cells[of_cells + {at}]" for name, at in self.cells.items()}
-        for name, at in self.whole.items():
-            places[name] = f"whole[of_whole + {at}]" + (" != 0" if name in self.truths else "")
-        return places
+    def places(self) -> dict[str, Place]:
+        """Where the numbers are read."""
+        places = {name: ("cells", "of_cells", at) for name, at in self.cells.items()}
+        return places | {name: ("whole", "of_whole", at) for name, at in self.whole.items()}
 
     def stores(self) -> dict[str, str]:
         """Texts that write them."""
@@ -227,7 +225,6 @@ def _aged(batch: Batch, single: bool) -> Batch:
 def _layout(trees: dict[str, Any]) -> Layout:
     """The driver's own numbers first, then all others of one target."""
     cells, whole = ({name: k for k, name in enumerate(names)} for names in (CELLS, WHOLE))
-    truths = {"slot.confirmed.0", "inside.0", "found.0", "verdict.confirmed.0"}
     for name, tree in trees.items():
         for leaf_name, leaf in leaves_of(name, tree).items():
             if MARK in leaf.shape:
@@ -235,9 +232,7 @@ def _layout(trees: dict[str, Any]) -> Layout:
             real = leaf.dtype.kind == "f"
             for number in numbers_of(leaf_name, leaf):
                 (cells if real else whole).setdefault(number, len(cells if real else whole))
-                if leaf.dtype.kind == "b":
-                    truths.add(number)
-    return Layout(cells, whole, frozenset(truths))
+    return Layout(cells, whole)
 
 
 def _elements(single: bool) -> tuple[dict[str, str], dict[str, str]]:

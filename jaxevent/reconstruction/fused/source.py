@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.kernels.expressions import ELEMENTWISE, Level, Node, Untranslatable, needed, value_of
-from jaxevent.kernels.text import FUNCTIONS, Numbers, Writer
+from jaxevent.kernels.text import FUNCTIONS, Numbers, Place, Writer
 from jaxevent.reconstruction.fused.loop import Places
 from jaxevent.reconstruction.fused.pixel import ROWS, PixelProgram, pieces
 
@@ -110,22 +110,19 @@ class PixelWriter(Writer):
         super().__init__()
         self.fields = fields
 
-    def special(self, node: Node) -> str | None:
-        return self._cell(self.fields.slots[node.args[0]]) if node.op == "slot" else None
-
-    def _cell(self, field: str) -> str:
-        return f"cells[{self.fields.cells[field]} * STRIDE + z]"
+    def place(self, node: Node) -> Place | None:
+        fields = self.fields
+        if node.op not in ("input", "slot"):
+            return None
+        name = fields.slots[node.args[0]] if node.op == "slot" else node.args[0]
+        for pointer, known in (("cells", fields.cells), ("whole", fields.whole)):
+            if name in known:
+                return pointer, "z", known[name] * fields.stride
+        uniform = fields.uniform(name)
+        return None if uniform is None else ("uniform", "at", uniform)
 
     def input(self, node: Node) -> str:
         name = node.args[0]
-        if name in self.fields.whole:
-            text = f"whole[{self.fields.whole[name]} * STRIDE + z]"
-            return f"{text} != 0" if node.kind == "b" else text
-        if name in self.fields.cells:
-            return self._cell(name)
-        place = self.fields.uniform(name)
-        if place is not None:
-            return f"uniform[at + {place}]"
         points = ("since", "near", "polarity", "weight", "blend", "share", "edge")
         if name in (*points, "segment_on", "segment_off"):
             return name.removeprefix("segment_")
@@ -146,6 +143,7 @@ HEAD = '''"""The functions of a kernel (`jaxevent.reconstruction.fused`)."""
 import numpy as np
 from numba import types
 
+from jaxevent.kernels.blocks import block
 from jaxevent.kernels.kept import callback
 {imports}
 
