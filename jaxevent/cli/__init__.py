@@ -132,39 +132,77 @@ class _Signal(BaseException):
 
 @contextlib.contextmanager
 def _terminable() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP unwind the block, so that nothing incomplete is left behind.
+    """Let SIGINT, SIGTERM and SIGHUP unwind the block, so that nothing incomplete is left behind.
 
-    Python drops what is raised in callbacks, as JAX has one in garbage collection: such a signal,
-    or interrupt, is sent again.
+    Compiled modules drop what is raised while they are imported, or crash, and Python drops what is
+    raised in callbacks, as JAX has one in garbage collection. So a signal waits for the end of an
+    import, and is raised again, twenty times a second, until the block unwinds.
     """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
     told = sys.unraisablehook
+    came: list[int] = []
 
     def leave(number: int, frame: Any) -> None:
-        raise _Signal(number)
+        came.append(number)
+        again(number, frame)
 
-    def again(dropped: Any) -> None:
-        error = dropped.exc_value
-        if isinstance(error, _Signal | KeyboardInterrupt) and hasattr(signal, "pthread_kill"):
-            number = error.number if isinstance(error, _Signal) else signal.SIGINT
-            # To this thread, so that it wakes up.
-            thread = threading.get_ident()
-            threading.Timer(0.02, signal.pthread_kill, (thread, number)).start()
-        else:
+    def again(number: int, frame: Any) -> None:
+        if not came:
+            if callable(alarmed := before[number]):
+                alarmed(number, frame)
+            return
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, 0.05)
+            if _imports(frame) or _unwinds(sys.exc_info()[1]):
+                return
+        raise _Signal(came[0])
+
+    def drop(dropped: Any) -> None:
+        if not isinstance(dropped.exc_value, _Signal):
             told(dropped)
 
-    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     before: dict[int, Any] = {}
-    if threading.current_thread() is threading.main_thread():
-        for number in numbers:
-            if signal.getsignal(number) != signal.SIG_IGN:  # of nohup
-                before[number] = signal.signal(number, leave)
-        sys.unraisablehook = again
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        # They are ignored under nohup.
+        if number and signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+            before[number] = signal.signal(number, leave)
+    if hasattr(signal, "SIGALRM"):
+        before[signal.SIGALRM] = signal.signal(signal.SIGALRM, again)
+    sys.unraisablehook = drop
     try:
         yield
+    except Exception as error:
+        # What compiled code made of it.
+        if came:
+            raise _Signal(came[0]) from error
+        raise
     finally:
+        if hasattr(signal, "setitimer") and came:
+            signal.setitimer(signal.ITIMER_REAL, 0)
         sys.unraisablehook = told
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _imports(frame: Any) -> bool:
+    """Whether a module is being imported where a signal came."""
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _unwinds(error: BaseException | None) -> bool:
+    """Whether a signal's exception is being handled."""
+    while error is not None:
+        if isinstance(error, _Signal):
+            return True
+        error = error.__context__
+    return False
 
 
 def _mend_streams() -> None:

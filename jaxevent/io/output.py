@@ -165,7 +165,7 @@ def _signals_outside(*callbacks: Callable) -> Iterator[Callable[[], None]]:
             before[number](number, None)
 
     if threading.current_thread() is threading.main_thread():
-        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGALRM"):
             number = getattr(signal, name, None)
             if number is not None and callable(handler := signal.getsignal(number)):
                 before[number] = handler

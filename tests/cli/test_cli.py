@@ -297,6 +297,36 @@ sys.exit(cli.main(["info", "a"]))
     assert (done.returncode, done.stdout, done.stderr) == (128 + number, b"", b"")
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_waits_for_an_import_and_outlives_who_drops_it(number, tmp_path):
+    """Compiled modules crash, or are left half made, by what is raised while they are imported."""
+    (tmp_path / "compiled.py").write_text(
+        "import os, sys, time\nos.kill(os.getpid(), int(sys.argv[-1]))\n"
+        "for _ in range(100): pass\nprint('imported')\n"
+    )
+    code = f"""
+import signal, sys, time
+import jaxevent.io
+from jaxevent import cli
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.path.insert(0, {str(tmp_path)!r})
+
+def load(*words, **options):
+    import compiled
+    try:
+        time.sleep(20)
+    except BaseException:
+        print("dropped")
+    time.sleep(20)
+
+jaxevent.io.load = load
+sys.exit(cli.main(["info", "a"]))
+"""
+    done = subprocess.run([sys.executable, "-c", code, str(int(number))], capture_output=True)
+    assert (done.returncode, done.stderr) == (128 + number, b"")
+    assert done.stdout.split() == [b"imported", b"dropped"]
+
+
 @contextlib.contextmanager
 def room(size: int):
     """Files cannot grow beyond so many bytes."""
