@@ -26,6 +26,7 @@ from jaxevent.recording import Events, Frames, Recording, Times, microseconds
 
 REC709 = (0.2126, 0.7152, 0.0722)  # luminance of linear red, green and blue; the sum is 1
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")  # of a 2 x 2 cell, row by row
+_HIDDEN = 1e-3  # what a frame counts where it does not show a point, so that something does
 _SHOULDER = 0.02  # of white: colours fade to grey over the last 2 % below it
 
 
@@ -94,8 +95,10 @@ def colour_video(
     `extra["rgb"]`, (frames, H, W, 3) uint8, holds the colours of every one of `recording.frames`,
     on the same camera response. Returns a function that gives linear colours (T, H, W, 3) at times
     as `video` takes them: its image as luminance, with the chrominance of the frames before and
-    after, linear between them and constant outside. Raises `InputError` for a recording without
-    colour frames and for frames of another number, size or type.
+    after, linear between them and constant outside. Where the video knows how points move (`mc`),
+    chrominance is that of the points, and a frame that does not show a point does not count. Raises
+    `InputError` for a recording without colour frames and for frames of another number, size or
+    type.
     """
     name, frames, rgb = recording.name, recording.frames, recording.extra.get("rgb")
     if frames is None or rgb is None:
@@ -123,16 +126,24 @@ def colour_video(
         colours = np.asarray(rgb[frame : frame + 1])[0]  # of a file, perhaps
         return chrominance(table[colours], black=black, white=white)
 
+    def mixed(t: int) -> NDArray[np.floating]:
+        place = float(np.interp(t, frame_t, np.arange(len(frame_t))))
+        before = int(place)
+        after, share = min(before + 1, len(frame_t) - 1), place - before
+        pair = np.stack([chroma(before), chroma(after)])
+        seen, shown = video.carry(pair, frame_t[[before, after]], t)
+        weight = np.array([1 - share, share], seen.dtype)[:, None, None] * (shown + _HIDDEN)
+        return (weight[..., None] * seen).sum(0) / weight.sum(0)[..., None]
+
     def colours(times: Times, extrapolate: bool = False) -> NDArray[np.floating]:
-        image = video(times, extrapolate).mean
         t = np.atleast_1d(microseconds(times))
-        place = np.interp(t, frame_t, np.arange(len(frame_t)))
-        out = np.empty((*image.shape, 3), image.dtype)
-        for row in np.argsort(t, kind="stable"):
-            before = int(place[row])
-            after, share = min(before + 1, len(frame_t) - 1), place[row] - before
-            mixed = chroma(before) + np.float32(share) * (chroma(after) - chroma(before))
-            out[row] = apply_chrominance(image[row], mixed)
+        order = np.argsort(t, kind="stable")
+        out = np.empty((len(t), *wanted[1:]), video.dtype)
+        done = 0
+        for batch, images in video.batches(t[order], extrapolate):
+            for row, time, image in zip(order[done:], batch.tolist(), images.mean, strict=False):
+                out[row] = apply_chrominance(image, mixed(time))
+            done += len(batch)
         return out
 
     return colours

@@ -159,6 +159,16 @@ class ImageSequence(abc.ABC, Generic[P]):
             done += len(batch)
         return whole
 
+    def carry(
+        self, images: NDArray[np.floating], at: NDArray[np.int64], to: int
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """Images (n, H, W, channels) taken `at` (us), as they are seen at the time `to` (us).
+
+        And how far each shows the points visible then, (n, H, W), 0 to 1. A sequence that does not
+        know how points move leaves them in place.
+        """
+        return images, np.ones(images.shape[:3], images.dtype)
+
     def to_xarray(self, times: Times) -> Any:
         """The images at `times` as an `xarray.Dataset`, for labelled axes, netCDF and Dask.
 

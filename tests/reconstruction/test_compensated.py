@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 import jaxevent
 from jaxevent.errors import InputError
 from jaxevent.methods import find
+from jaxevent.reconstruction.colour import chrominance, colour_video, luminance
 from jaxevent.reconstruction.compensated import (
     agreement,
     fusion,
@@ -328,6 +329,34 @@ def test_sources_say_where_pixels_come_from():
     total = sum(shares[name] for name in fusion.SOURCES)
     np.testing.assert_allclose(total, 1, atol=1e-4)
     assert shares["visible_before"].mean() > 0.5
+
+
+@pytest.mark.slow
+def test_colours_move_with_their_points():
+    recording = slide()
+    hue, frames, table = texture(40, 48, 9), recording.frames, np.arange(256) / 255
+    y, x = np.mgrid[:40, :48].astype(float)
+    u, v = Slide.velocity
+
+    def chroma(t):
+        part = 0.5 + 0.4 * np.sin(3 * hue(y - v * t * 1e-6, x - u * t * 1e-6))
+        rgb = np.stack([part, 0.9 - 0.5 * part, 1.2 - part], -1)
+        return rgb / luminance(rgb)[..., None]
+
+    linear = 0.25 * np.stack([chroma(t) for t in frames.t])
+    rgb = np.interp(linear, table, np.arange(256)).round().astype(np.uint8)
+    response = {"response": table, "rgb": rgb}
+    coloured = dataclasses.replace(recording, extra={**recording.extra, **response})
+    t = np.array([300_000, 126_000, 226_000])
+    truth = np.stack([chroma(one) for one in t])
+
+    def error(made):
+        got = colour_video(made, coloured)(t)
+        assert np.allclose(luminance(got), made(t).mean, rtol=1e-5)
+        return np.square(chrominance(got, white=np.inf) - truth)[:, 5:-5, 5:-5].mean()
+
+    in_place = error(find("aks").estimate(recording, progress=False))
+    assert error(video()) < 0.15 * in_place
 
 
 @pytest.mark.slow

@@ -134,6 +134,14 @@ def agree_purely(params: Params, L: Float[Array, "k h w"], along: Along, place: 
     )
 
 
+def shown(params: Params, M: Float[Array, "h w"], along: Along) -> Float[Array, "k h w"]:
+    """How far images along trajectories show the points of an image M of log intensity, 0..1."""
+    p = params
+    V = along.V + p.floor + p.sigma_place**2 * steepness(M) + p.sigma_between**2
+    misfit = blur((along.L - M) ** 2 / V, MISFIT)
+    return along.inside / (1 + (misfit / p.tolerance) ** 2)
+
+
 class _Settings(NamedTuple):
     """Numbers of `agree` for its loops."""
 

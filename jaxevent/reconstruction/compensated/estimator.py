@@ -22,7 +22,7 @@ from jaxevent.errors import InputError
 from jaxevent.estimator import Described, Estimate
 from jaxevent.reconstruction.clock import Clock, Timing, time_span
 from jaxevent.reconstruction.compensated import trajectories
-from jaxevent.reconstruction.compensated.agreement import Agreement, Place, agree
+from jaxevent.reconstruction.compensated.agreement import Agreement, Place, agree, shown
 from jaxevent.reconstruction.compensated.evidence import Evidence
 from jaxevent.reconstruction.compensated.fusion import (
     SOURCES,
@@ -36,7 +36,7 @@ from jaxevent.reconstruction.compensated.fusion import (
 from jaxevent.reconstruction.compensated.implicit import Numbers, Seen, depending
 from jaxevent.reconstruction.compensated.instants import ROOM, Instants, Schedule, speed_of
 from jaxevent.reconstruction.compensated.parameters import Params
-from jaxevent.reconstruction.compensated.warping import warp, warp_purely
+from jaxevent.reconstruction.compensated.warping import places, sample, warp, warp_purely
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.features import Features, Numeric, ReadOut
 from jaxevent.reconstruction.video import ImageSequence, Video
@@ -250,6 +250,16 @@ def fuse_images(params: Params, target: Followed) -> Fused:
     return _decide(params, *look(params, target))
 
 
+@jax.jit
+def _carry(images: Array, s: Array, p: Array) -> Array:
+    """Images (n, h, w, channels) at s (n,) along trajectories."""
+    Y, X = places(p, s, *images.shape[1:3])
+    return jax.vmap(lambda one: sample(one, Y, X), -1, -1)(images)
+
+
+_shown = jax.jit(shown)
+
+
 class CompensatedVideo(ImageSequence[Params]):
     """Images of `mc`: `image, variance, valid = video(times)`; also `flow` and `sources`.
 
@@ -271,6 +281,7 @@ class CompensatedVideo(ImageSequence[Params]):
         super().__init__(estimator, recording, params, progress=progress)
         self._images = Images(recording, params, window_events)
         self._follower: Follower | None = None
+        self._latest: tuple[int, Followed, Fused] | None = None
 
     @property
     def dtype(self) -> np.dtype:
@@ -284,8 +295,10 @@ class CompensatedVideo(ImageSequence[Params]):
         return self._follower
 
     def _target(self, t: int) -> tuple[Followed, Fused]:
-        target = self.follow(t)
-        return target, fuse_images(self.params, target)
+        if self._latest is None or self._latest[0] != t:
+            target = self.follow(t)
+            self._latest = t, target, fuse_images(self.params, target)
+        return self._latest[1:]
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         for n, t in enumerate(times.tolist()):
@@ -301,6 +314,18 @@ class CompensatedVideo(ImageSequence[Params]):
             self.estimator.check_span(self.recording, wanted, self.params)
         for t in wanted.tolist():
             yield self._target(t)
+
+    def carry(
+        self, images: NDArray[np.floating], at: NDArray[np.int64], to: int
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """As `ImageSequence.carry`, along trajectories."""
+        target, fused = self._target(to)
+        s = ((at - to) * 1e-6 / target.instants.unit).astype(np.float32)
+        order = np.argsort(at, kind="stable")
+        L, V, clear = (part[np.argsort(order)] for part in self._images(at[order]))
+        along = warp(L, V, clear, s, target.p)
+        seen = _carry(np.asarray(images, np.float32), s, target.p)
+        return np.asarray(seen), np.asarray(_shown(self.params, fused.L, along))
 
     def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.float32]:
         """Optical flow (T, H, W, 2) at `times`, of x and y in px/s, of the points visible then.
