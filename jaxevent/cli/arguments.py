@@ -79,6 +79,7 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
     if any(outputs.values()):
         yield {**taken, "force": force}
     elif outputs:
+        from jaxevent.io.companions import companions
         from jaxevent.io.description import Command, running
         from jaxevent.io.output import into_folders
         from jaxevent.io.places import check
@@ -92,7 +93,8 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
             if isinstance(one, Path)
         ]
         check(named, inputs, force=force)
-        with into_folders(force), running(Command(words, inputs)):
+        read = [file for path in inputs for file in (path, *companions(path))]
+        with into_folders(force), running(Command(words, read)):
             yield taken
     else:
         yield taken

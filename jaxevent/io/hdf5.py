@@ -41,6 +41,7 @@ from jaxevent.errors import InputError
 from jaxevent.io import (
     check_unfolded,
     checked_events,
+    companions,
     pinhole,
     reading,
     times,
@@ -376,8 +377,8 @@ def _is_dsec(file: Any) -> bool:
 
 def _rectify_map(path: Path) -> NDArray | None:
     """Where each pixel of a DSEC camera lies in the rectified image, (height, width, 2)."""
-    beside = path.with_name("rectify_map.h5")
-    if not beside.is_file():
+    beside = companions.rectify_map(path)
+    if beside is None:
         return None
     with open_file(beside) as file:
         values = array(file, "rectify_map", str(beside))

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from jaxevent.errors import InputError
+from jaxevent.io.companions import companions
 
 try:
     import fcntl
@@ -33,7 +34,7 @@ def check(
 
     Args:
         outputs: Files or folders to be written as a whole.
-        inputs: Files or folders that are read.
+        inputs: Files or folders that are read, with those that are read beside them.
         force: Whether existing files, and files in existing folders, are to be replaced.
         inside: Outputs to be written although they exist: those of a run that goes on.
     """
@@ -42,7 +43,8 @@ def check(
             if _same(out, other):
                 raise InputError(f"{out}: is named for two outputs; give each a name of its own")
         for source in inputs:
-            _check_against(out, source)
+            for one in (source, *companions(source)):
+                _check_against(out, one)
         if out in inside:
             continue
         if out.is_file() and not force:

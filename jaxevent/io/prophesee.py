@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, require
-from jaxevent.io import reading
+from jaxevent.io import companions, reading
 from jaxevent.io.decoded import BLOCK, Columns, Decoder, TriggerList, decoded
 from jaxevent.recording import Recording
 
@@ -302,8 +302,8 @@ def _dat(
             "00 and 0c, 8 bytes) can be read"
         )
     fields = (14, 14) if header["version"] != "1" else (9, 8)
-    beside = path.with_name(re.sub("_(cd|td)$", "_trigger", path.stem) + path.suffix)
-    if beside != path and beside.is_file():
+    beside = companions.triggers(path)
+    if beside is not None:
         _dat_triggers(beside, triggers)
     return functools.partial(_dat_events, path, start + 2, fields), start + 2
 

@@ -32,28 +32,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, require
-from jaxevent.io import reading, times
+from jaxevent.io import companions, reading, times
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.hdf5 import StoredImages
 from jaxevent.io.hdf5_files import array, dataset, open_file
 from jaxevent.recording import Poses
 
-_SUFFIXES = {"_data.hdf5": ("_gt.hdf5",), "_data.h5": ("_pose_gt.h5", "_depth_gt.h5")}
-
-
-def beside(path: Path) -> list[Path]:
-    """The files of ground truth that exist beside a recording's."""
-    found = []
-    for end, others in _SUFFIXES.items():
-        if path.name.endswith(end):
-            found += [path.with_name(path.name.removesuffix(end) + other) for other in others]
-    found += [folder / stamps for folder, stamps in _folders_dsec(path)]
-    return [file for file in found if file.is_file()]
-
 
 def read_poses(path: Path, camera: str) -> Poses | None:
     """Poses of a camera in the world; `camera` is its group in the file, as "davis/left"."""
-    for file in beside(path):
+    for file in companions.truth(path):
         with reading(str(file)):
             if file.name.endswith("_gt.hdf5"):
                 return _poses_mvsec(file, camera)
@@ -68,7 +56,7 @@ def read_images(path: Path, side: str = "left") -> dict[str, Any]:
     Raises `InputError` where they are damaged.
     """
     found: dict[str, Any] = {}
-    for file in beside(path):
+    for file in companions.truth(path):
         with reading(str(file)):
             if file.name.endswith("_gt.hdf5"):
                 found |= _images_mvsec(file, f"davis/{side}")
@@ -143,26 +131,6 @@ def _depth_m3ed(file: Path, side: str) -> dict[str, Any]:
         return {}
     t = times(array(opened, "ts", str(file)), str(file), "depth", scale=1.0)
     return {"depth": _stored(opened, name, 3, len(t), file), "depth_t": t}
-
-
-def _folders_dsec(path: Path) -> list[tuple[Path, str]]:
-    """Where the truth of DSEC's left camera lies, whose events are in `path`, and its times."""
-    if path.name != "events.h5":
-        return []
-    if path.parts[-3:-1] == ("events", "left"):
-        sequence = path.parents[2]
-    elif path.parent.name == "events_left":
-        sequence = path.parents[1]
-    else:
-        return []
-    found = []
-    for kind, apart, stamps in (
-        ("flow", "train_optical_flow", "forward_timestamps.txt"),
-        ("disparity", "train_disparity", "timestamps.txt"),
-    ):
-        places = [place / kind for place in (sequence, sequence.parents[1] / apart / sequence.name)]
-        found += [(place, stamps) for place in places if place.is_dir()][:1]
-    return found
 
 
 def _flow_dsec(stamps: Path) -> dict[str, Any]:

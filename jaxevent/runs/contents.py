@@ -12,8 +12,8 @@ from typing import Any
 
 from jaxevent.errors import InputError
 from jaxevent.io import load
+from jaxevent.io.companions import companions
 from jaxevent.io.output import complete
-from jaxevent.io.truth import beside
 from jaxevent.progress import bar
 from jaxevent.recording import Recording
 
@@ -31,7 +31,7 @@ class Opened(threading.local):
         self, path: Path, size: tuple[int, int] | None, stream: str | None, progress: bool | None
     ) -> Recording:
         size = None if size is None else (size[0], size[1])
-        files = [*_files(path), *beside(path)]
+        files = [*_files(path), *companions(path)]
         what = (path, size, stream, [_stamp(file) for file in files])
         before, loaded = self._last
         if loaded is None or before != what:

@@ -67,8 +67,8 @@ import jax.numpy as jnp
 import jaxevent
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
+from jaxevent.io.companions import companions
 from jaxevent.io.output import values_of
-from jaxevent.io.truth import beside
 from jaxevent.methods import find
 from jaxevent.parameters import Parameters, read_toml
 from jaxevent.runs.config import (
@@ -209,7 +209,7 @@ def _tasks(plan: "Plan", folder: Path | None, progress: bool | None, here: bool)
             # What cannot be read has no key; computing it says why.
             with contextlib.suppress(OSError, InputError):
                 whole = {**about, "content": contents.of(path)}
-                files = [*beside(path), *plan.protocol.files(path, plan.options)]
+                files = [*companions(path), *plan.protocol.files(path, plan.options)]
                 if isinstance(entry.method, Source):
                     files = [*files, *entry.method.files(_name(path))]
                     whole["params"] = entry.method.values()

@@ -32,6 +32,9 @@ COMMANDS = {
     "frames": "register other.h5 --frames {source} --out {out}",
     "homography": "register other.h5 --frames other.h5 --homography {source} --out {out}",
     "calibration": "register other.h5 --frames other.h5 --calibration {source} --out {out}",
+    "filter": "filter {source} {out}",
+    "view": "view {source} --out {out}",
+    "response": "camera attach other.h5 --response {source} --out {out}",
     "depth": "register other.h5 --frames other.h5 --depth {source} --out {out}",
 }
 
@@ -60,6 +63,23 @@ def test_no_command_writes_onto_its_input(name, folder, capsys):
         for more in ([], ["--force"]):
             argv = [word.format(source="source.h5", out=out) for word in COMMANDS[name].split()]
             fails(capsys, [*argv, *more], out, "is an input too")
+    assert state(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "other"),
+    [
+        ("a_cd.dat", "a_trigger.dat"),
+        ("a_data.hdf5", "a_gt.hdf5"),
+        ("a_data.h5", "a_depth_gt.h5"),
+        ("a.h5", "rectify_map.h5"),
+    ],
+)
+def test_what_is_read_beside_an_input_is_an_input_too(name, other, folder, capsys):
+    for file in (name, other):
+        (folder / file).write_bytes(b"kept")
+    before = state(folder)
+    fails(capsys, ["convert", name, other, "--force"], other, "is an input too")
     assert state(folder) == before
 
 
