@@ -332,10 +332,11 @@ def checked_events(
     `t` is int64 us. Coordinates count from `origin`. Polarity is bool, 0/1 or -1/1. `first_row` is
     the row of the first event in `source`. Raises `InputError` for the first bad event.
     """
-    if max(size) > _MOST_PIXELS:
+    if min(size) < 1 or max(size) > _MOST_PIXELS:
         raise InputError(
             f"{source}: the sensor has {size[0]}x{size[1]} pixels, but at most {_MOST_PIXELS} of a "
-            "side can be read; correct its size with size=(width, height) or --size"
+            "side, and at least one, can be read; correct its size with size=(width, height) or "
+            "--size"
         )
     if not len(t) == len(x) == len(y) == len(p):
         raise InputError(

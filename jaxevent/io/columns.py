@@ -136,7 +136,7 @@ def read_npy(
         records = np.load(path, mmap_mode="r", allow_pickle=False)
     plain = records.ndim == 2 and records.shape[1] == 4 and records.dtype.kind in "iuf"
     if not plain:
-        of_records(records[:0] if records.ndim else records, source)
+        of_records(records, source)
     if size is None:
         raise InputError(
             f"{path}: an array does not tell the sensor's size; give size=(width, height) or --size"

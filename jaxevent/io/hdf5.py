@@ -131,6 +131,7 @@ class Microseconds:
         count = seconds.shape[0] if len(seconds.shape) == 1 else 0
         ends = [seconds[:_CHUNK], seconds[max(count - 1, 0) :]] if count else [np.empty(0)]
         self._scale = time_scale(np.concatenate(ends), source)
+        self.in_seconds = self._scale != 1
 
     def __getitem__(self, rows: Any) -> Any:
         values = np.asarray(self._seconds[rows], np.float64)
@@ -356,6 +357,13 @@ def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Rec
     offset = 0
     if "t_offset" in file:
         offset = whole_number(array(file, "t_offset", source), source, "t_offset")
+    if columns["t"].dtype.kind == "f":
+        columns["t"] = Microseconds(columns["t"], f"{source}: events/t")
+        if columns["t"].in_seconds and offset:
+            raise InputError(
+                f"{source}: events/t is in seconds and t_offset in microseconds; store all times "
+                "in integer microseconds"
+            )
     table = dataset(file, "ms_to_idx", source) if "ms_to_idx" in file else None
     events = StoredEvents(columns, size, source, offset, table)
     return Recording(name, *size, events, frames, camera, poses, imu, extra, triggers)

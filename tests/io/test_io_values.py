@@ -67,6 +67,21 @@ def test_sizes_are_whole_numbers(value, tmp_path):
         load(path)
 
 
+def test_sizes_are_positive(tmp_path):
+    path = tmp_path / "a.h5"
+    path.write_bytes(formats.dsec(EVENTS, SIZE))
+    with h5py.File(path, "r+") as file:
+        file.attrs["width"], file.attrs["height"] = -40, 30
+    with pytest.raises(InputError, match="the sensor has -40x30 pixels"):
+        load(path)
+
+
+def test_an_array_of_another_shape_is_named_by_it(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((5, 50)))
+    with pytest.raises(InputError, match=r"float64 of shape \(5, 50\)"):
+        load(tmp_path / "a.npy", SIZE)
+
+
 # Times
 
 
@@ -128,8 +143,12 @@ def test_float_times_are_seconds_or_whole_microseconds(tmp_path):
         with h5py.File(tmp_path / "a.h5", "w") as file:
             for name, values in {"ts": t, **columns}.items():
                 file[f"events/{name}"] = values
+        with h5py.File(tmp_path / "b.h5", "w") as file:
+            for name, values in {"t": t, **columns}.items():
+                file[f"events/{name}"] = values
         for in_memory in (True, False):
             same(load(tmp_path / "a.h5", SIZE, in_memory).events, EVENTS)
+            same(load(tmp_path / "b.h5", SIZE, in_memory).events, EVENTS)
     np.savez(tmp_path / "a.npz", t=EVENTS.t * 1e3 + 0.5, **columns)
     with pytest.raises(InputError, match="span .* days; store them as integer microseconds"):
         load(tmp_path / "a.npz", SIZE)
