@@ -1,6 +1,6 @@
 """Tracking without settings: simulated scenes and what simple trackers make of them.
 
-    python experiments/blob_finding.py --out finding --first 10 [--scenes NAME ...] [--data DIR]
+    python experiments/blob_finding.py --out finding --first 10 [--varied] [--data DIR]
 
 Every scene is tracked as a new user does it, `moment.estimate(recording)`, whose states rest on all
 events. Beside it: `filter`, the same tracks from the events up to each time; the targets that
@@ -16,13 +16,13 @@ nearer than 2 sizes and 3 px.
 
 import argparse
 import json
-import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from blob_scenes import SCENES, VARIED
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
@@ -33,16 +33,8 @@ from jaxevent.blob.finding.stream import Stream
 from jaxevent.blob.scores import score_tracks
 from jaxevent.io import load
 from jaxevent.recording import Recording
-from jaxevent.simulate.blobs import (
-    Circle,
-    Line,
-    Target,
-    Truth,
-    blob_scene,
-    simulate_blobs,
-)
+from jaxevent.simulate.blobs import Truth
 
-VGA = (640, 480)
 TIMES = 200
 DOT_CENTRE = (314.29, 202.35)  # px, of a circle fitted to the same events
 
@@ -51,147 +43,6 @@ class Answer(NamedTuple):
     """Positions of tracks at the times scored: (times, tracks, 2), NaN where a track is not."""
 
     positions: NDArray[np.float64]
-
-
-def _drifting(
-    count: int,
-    rate: float,
-    speed: float,
-    size: float,
-    duration: float,
-    noise: float,
-    seed: int,
-    shape: str = "gaussian",
-) -> tuple[Recording, Truth]:
-    """Targets that circle with random phases, so that they stay on the sensor."""
-    rng = np.random.default_rng([seed, count])
-    targets = []
-    columns = math.ceil(math.sqrt(count * 4 / 3))
-    rows = math.ceil(count / columns)
-    cell = np.array(VGA) / (columns, rows)
-    for k in range(count):
-        centre = (np.array([k % columns, k // columns]) + 0.5) * cell
-        radius = float(max(0.35 * cell.min() - size, 2.0))
-        turn = speed / radius * rng.choice([-1, 1])
-        motion = Circle(
-            tuple(centre), radius, turn, rng.uniform(0, 2 * np.pi), size=(size, 0.7 * size),
-            theta=rng.uniform(0, np.pi),
-        )  # fmt: skip
-        targets.append(Target(motion, rate, shape))
-    return simulate_blobs(targets, VGA, duration, noise, seed)
-
-
-def _mixed(seed: int) -> tuple[Recording, Truth]:
-    rng = np.random.default_rng([seed, 77])
-    kinds = [(200, 15, 2.0)] * 2 + [(5e3, 250, 6.0)] * 2 + [(1e5, 2500, 14.0)]
-    targets = []
-    for k, (rate, speed, size) in enumerate(kinds):
-        centre = (110 + 105 * k, 120 + 60 * (k % 4))
-        radius = 25.0 + 12 * (k % 3) if k < 4 else 90.0
-        motion = Circle(centre, radius, speed / radius, rng.uniform(0, 6), size=(size, 0.7 * size))
-        targets.append(Target(motion, rate))
-    return simulate_blobs(targets, VGA, 2.0, 5e3, seed)
-
-
-def _passing_discs(seed: int) -> tuple[Recording, Truth]:
-    """Two discs that touch for 0.1 s while they pass each other."""
-    rng = np.random.default_rng([seed, 5])
-    shift = rng.uniform(-20, 20)
-    targets = [
-        Target(
-            Line((320 - s * 120 + shift, 240 - s * 12.5), (s * 240.0, s * 10.0), size=(9.8, 9.8)),
-            3e4,
-            "disc",
-        )
-        for s in (1, -1)
-    ]
-    return simulate_blobs(targets, VGA, 1.0, 5e3, seed)
-
-
-class _Meeting(NamedTuple):
-    """One of two that come from apart, touch for half a second, turning, and part again."""
-
-    sign: int
-    phase: float
-
-    def path(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        apart = 23 + 60 * np.maximum(np.abs(t - 1.0) - 0.25, 0)
-        angle = self.phase + 2.0 * t
-        centre = np.stack([320 + 90 * np.sin(1.9 * t), 240 + 60 * np.cos(1.3 * t)], 1)
-        half = np.stack([np.cos(angle), np.sin(angle)], 1) * apart[:, None] / 2
-        return centre + self.sign * half
-
-    def state(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        out = np.zeros((len(t), 8))
-        out[:, :2] = self.path(t)
-        out[:, 2:4] = (self.path(t + 1e-5) - self.path(t - 1e-5)) / 2e-5
-        out[:, 4:6] = 8.0
-        return out
-
-
-def _turning_pair(seed: int) -> tuple[Recording, Truth]:
-    """Two rings that touch, turn about each other and part."""
-    phase = np.random.default_rng([seed, 6]).uniform(0, 6)
-    targets = [Target(_Meeting(s, phase), 3e4, "ring") for s in (1, -1)]
-    return simulate_blobs(targets, VGA, 2.0, 5e3, seed)
-
-
-def _stop_and_go(seed: int) -> tuple[Recording, Truth]:
-    """One target that stands still, without events, for a second."""
-    motion = _Stopping()
-    return simulate_blobs([Target(motion, 2e4, dropouts=((1.0, 2.0),))], VGA, 3.0, 2e4, seed)
-
-
-class _Stopping:
-    """Along a line, at rest from 1 to 2 s, then back at an angle."""
-
-    def state(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        first, then = np.minimum(t, 1.0), np.maximum(t - 2.0, 0.0)
-        out = np.zeros((len(t), 8))
-        out[:, 0] = 150 + 250 * first - 120 * then
-        out[:, 1] = 200 + 30 * first + 160 * then
-        out[:, 2] = np.where(t < 1, 250, np.where(t < 2, 0, -120))
-        out[:, 3] = np.where(t < 1, 30, np.where(t < 2, 0, 160))
-        out[:, 4:6] = 7.0, 5.0
-        return out
-
-
-def _noise_only(seed: int) -> tuple[Recording, Truth]:
-    """Background and hot pixels; the one target is gone before the first time scored."""
-    rng = np.random.default_rng([seed, 8])
-    hot = [
-        Target(Line((int(x), int(y)), size=(0.05, 0.05)), 500.0)
-        for x, y in rng.uniform((0, 0), VGA, (8, 2))
-    ]
-    return simulate_blobs(hot, VGA, 2.0, 2e4, seed)
-
-
-def _crossing(seed: int) -> tuple[Recording, Truth]:
-    return blob_scene("crossing", seed)
-
-
-SCENES: dict[str, Callable[[int], tuple[Recording, Truth]]] = {
-    "4 x 100/s, 10 px/s, 1.5 px": lambda s: _drifting(4, 100, 10, 1.5, 6.0, 2e3, s),
-    "6 x 1k/s, 100 px/s, 3 px": lambda s: _drifting(6, 1e3, 100, 3, 3.0, 5e3, s),
-    "8 x 300/s, 40 px/s, 4 px": lambda s: _drifting(8, 300, 40, 4, 4.0, 2e3, s),
-    "3 x 10k/s, 500 px/s, 8 px": lambda s: _drifting(3, 1e4, 500, 8, 1.5, 2e4, s),
-    "2 x 100k/s, 2,000 px/s, 15 px": lambda s: _drifting(2, 1e5, 2e3, 15, 0.5, 2e4, s),
-    "1 x 1M/s, 10,000 px/s, 20 px": lambda s: _drifting(1, 1e6, 1e4, 20, 0.15, 2e4, s),
-    "1 x 1M/s, 20,000 px/s, 40 px": lambda s: _drifting(1, 1e6, 2e4, 40, 0.15, 2e4, s),
-    "1 x 20k/s, 100 px/s, 60 px": lambda s: _drifting(1, 2e4, 100, 60, 2.0, 5e3, s, "ring"),
-    "50 x 2k/s, 60 px/s, 3 px": lambda s: _drifting(50, 2e3, 60, 3, 1.5, 5e3, s),
-    "flock (8)": lambda s: blob_scene("flock", s),
-    "disc": lambda s: blob_scene("disc", s, rate=3e4),
-    "lissajous": lambda s: blob_scene("lissajous", s, rate=3e4),
-    "lissajous, 10 x background": lambda s: blob_scene("noise", s, rate=3e4, ratio=10.0),
-    "lissajous, 50 ms dropout": lambda s: blob_scene("dropout", s, rate=3e4),
-    "crossing, 0 px": _crossing,
-    "two discs that pass": _passing_discs,
-    "two rings that meet": _turning_pair,
-    "stop and go": _stop_and_go,
-    "mixed 2 x 200/s, 2 x 5k/s, 1 x 100k/s": _mixed,
-    "noise and 8 hot pixels": _noise_only,
-}  # fmt: skip
 
 
 def found_paths(found: Found, times: NDArray[np.int64]) -> Answer:
@@ -313,15 +164,16 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES))
+    parser.add_argument("--scenes", nargs="+", help="default: all of SCENES")
+    parser.add_argument("--varied", action="store_true", help="all of VARIED instead")
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--data", type=Path, help="folder of real recordings")
     args = parser.parse_args()
-    rows = []
-    for name in args.scenes:
+    rows, scenes = [], SCENES | VARIED
+    for name in args.scenes or (VARIED if args.varied else SCENES):
         for seed in range(args.first, args.first + args.seeds):
-            recording, truth = SCENES[name](seed)
+            recording, truth = scenes[name](seed)
             times = np.linspace(0, truth.duration * 1e6 - 1, TIMES + 2)[1:-1].astype(np.int64)
             clock = time.process_time()
             found = find(recording, progress=False)

@@ -10,6 +10,7 @@ from jaxevent.blob.finding.stream import Part
 from jaxevent.kernels import compiled
 
 FALSE_ALARMS = 0.1  # per recording
+CONTACT = 2.0  # what is nearer than this many times the sum of both sizes touches
 
 
 class Scale(NamedTuple):
@@ -128,3 +129,12 @@ def _moments(x: Any, y: Any, labels: Any, number: int) -> Any:
         C[k] /= max(n[k], 1.0)
         C[k, 1, 0] = C[k, 0, 1]
     return n, p, C
+
+
+def touching(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> Any:
+    """Distances over the sum of both ellipses' reach along the line between them."""
+    d = pb - pa
+    length = np.hypot(d[..., 0], d[..., 1])
+    u = d / np.maximum(length, 1e-9)[..., None]
+    reach = [np.sqrt(np.einsum("...i,...ij,...j", u, C, u)) for C in (Ca, Cb)]
+    return length / np.maximum(reach[0] + reach[1], 1e-9)

@@ -7,16 +7,21 @@ motion.
 """
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob.finding.agility import fit_agility
 from jaxevent.blob.finding.background import Background, evidence
-from jaxevent.blob.finding.detection import FALSE_ALARMS, Scale, detect, measure_blobs
+from jaxevent.blob.finding.detection import (
+    CONTACT,
+    FALSE_ALARMS,
+    Scale,
+    detect,
+    measure_blobs,
+    touching,
+)
 from jaxevent.blob.finding.paths import STILL, Path
-from jaxevent.blob.finding.scale import CONTACT
 from jaxevent.blob.finding.stream import Part, Stream
 from jaxevent.progress import bar
 
@@ -103,15 +108,6 @@ def _larger(C: NDArray) -> NDArray[np.float64]:
     """Larger eigenvalues of (..., 2, 2)."""
     half = (C[..., 0, 0] - C[..., 1, 1]) / 2
     return (C[..., 0, 0] + C[..., 1, 1]) / 2 + np.hypot(half, C[..., 0, 1])
-
-
-def touching(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> Any:
-    """Distances over the sum of both ellipses' reach along the line between them."""
-    d = pb - pa
-    length = np.hypot(d[..., 0], d[..., 1])
-    u = d / np.maximum(length, 1e-9)[..., None]
-    reach = [np.sqrt(np.einsum("...i,...ij,...j", u, C, u)) for C in (Ca, Cb)]
-    return length / np.maximum(reach[0] + reach[1], 1e-9)
 
 
 @dataclasses.dataclass

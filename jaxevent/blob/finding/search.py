@@ -10,11 +10,11 @@ import dataclasses
 import numpy as np
 
 from jaxevent.blob.finding.background import CELL, Background, evidence, measure_background
-from jaxevent.blob.finding.detection import Scale
+from jaxevent.blob.finding.detection import CONTACT, Scale, touching
 from jaxevent.blob.finding.found import Found, Pass
-from jaxevent.blob.finding.links import FAINT, GATE, HOLD, SEEN, Links, touching
+from jaxevent.blob.finding.links import FAINT, GATE, HOLD, SEEN, Links
 from jaxevent.blob.finding.paths import Path
-from jaxevent.blob.finding.scale import CONTACT, choose_scale
+from jaxevent.blob.finding.scale import choose_scale
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.blob.seeds import span_of
 from jaxevent.progress import stage
@@ -28,6 +28,9 @@ FILL = 0.5  # share of its windows in which a target was seen
 JOINS = 1.5  # ellipses' distances, as `touching`, of a target's end and its new beginning
 PAUSE = 4 * HOLD  # windows between them at most; or, at rest,
 REST = 2.0  # times the life of the shorter of both
+TOGETHER = 0.9  # share of the longer life that two parts of one object have in common
+RIGID, MOVED, FAR = 0.25, 2.0, 4.0  # of the sum of their sizes: change of distance, and the
+# paths on which parts keep theirs, or slide along each other
 EDGE = 2.0  # sizes from the sensor's edge, where others come and go
 SAME = 0.5  # share of a target's life near one of an earlier pass that makes it a part of that
 
@@ -69,6 +72,7 @@ def find(
         if not confirmed:
             passes.append(Pass(choice, 0))
             break
+        confirmed = _join_rigid(confirmed)
         near += confirmed
         with stage(f"find, pass {number + 1}: beginnings", progress):
             rest = stream.without(near, GATE)
@@ -96,6 +100,52 @@ def _lasting(path: Path) -> bool:
     windows = (path.t[-1] - path.t[0]) / path.window + 1
     size = np.median(np.trace(path.C, axis1=1, axis2=2))
     return bool(size > 2 * ONE_PIXEL**2 and len(path.t) >= FILL * windows)
+
+
+def _join_rigid(paths: list[Path]) -> list[Path]:
+    """Make one of paths that are in contact for all their lives and keep their distances.
+
+    Such are the two edges of an object, and pieces of its outline.
+    """
+    paths, k = sorted(paths, key=lambda path: path.n.sum(), reverse=True), 0
+    while k < len(paths):
+        part = next((i for i in range(k + 1, len(paths)) if _rigid(paths[k], paths[i])), None)
+        if part is None:
+            k += 1
+        else:
+            paths[k], k = _both(paths[k], paths.pop(part)), 0
+    return paths
+
+
+def _rigid(one: Path, other: Path) -> bool:
+    """Whether two paths are those of parts of one object."""
+    begin, end = max(one.begin, other.begin), min(one.end, other.end)
+    if end - begin < TOGETHER * max(one.end - one.begin, other.end - other.begin):
+        return False
+    t = one.t[(one.t >= begin) & (one.t < end)]
+    p, q = one.at(t), other.at(t)
+    apart = np.hypot(*(p - q).T)
+    reach = sum(np.interp(t, path.t, path.size[:, 0]) for path in (one, other))
+    if np.quantile(apart / reach, 0.9) >= CONTACT:
+        return False
+    far = min(float(np.ptp(path, axis=0).max()) for path in (p, q)) / np.median(reach)
+    rigid = np.ptp(np.quantile(apart, (0.02, 0.98))) < RIGID * np.median(reach)
+    return bool(far > (MOVED if rigid else FAR))
+
+
+def _both(one: Path, other: Path) -> Path:
+    """One path of two parts: the moments of the events of both, at the times of the first."""
+    t = one.t
+    share = np.median(one.n) / (np.median(one.n) + np.median(other.n))
+    row = np.clip(np.searchsorted(other.t, t), 0, len(other.t) - 1)
+    d = other.at(t) - one.p
+    C = share * one.C + (1 - share) * other.C[row]
+    C += share * (1 - share) * np.einsum("ti,tj->tij", d, d)
+    v = share * one.v + (1 - share) * other.v[row]
+    return dataclasses.replace(
+        one, p=one.p + (1 - share) * d, v=v, C=C, n=one.n + other.n[row],
+        agility=min(one.agility, other.agility),
+    )  # fmt: skip
 
 
 def _look_back(path: Path, rest: Stream, background: Background, scale: Scale) -> Path:
