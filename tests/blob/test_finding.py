@@ -13,6 +13,7 @@ from jaxevent.blob.finding.agility import GRID, _log_likelihood, fit_agility
 from jaxevent.blob.finding.background import evidence, find_hot_pixels, measure_background
 from jaxevent.blob.finding.paths import ANYBODY, NOBODY, candidates, join
 from jaxevent.blob.finding.paths import Path as TargetPath
+from jaxevent.blob.finding.search import _join_rigid
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.errors import InputError
 from jaxevent.io import load
@@ -79,6 +80,44 @@ def test_noise_and_hot_pixels_are_no_targets():
     assert 0.8 * 2e4 < found.background < 1.4 * 2e4
     tracks = blob.moment.estimate(recording, found=found, progress=False)
     assert len(tracks) == 0 and tracks([0.1]).mean.shape == (1, 0, 8)
+
+
+def test_a_ring_and_a_pair_of_edges_are_one_target_each():
+    ring = [Target(Line((44, 48), (100.0, 0.0), size=(25, 25)), 2e4, "ring")]
+    edges = [
+        Target(Line((x, 48), (120.0, 0.0), size=(9.0, 0.6), theta=np.pi / 2), 1e4) for x in (20, 40)
+    ]
+    for targets, middle, size, duration in ((ring, 44, 25, 0.4), (edges, 30, 10, 0.5)):
+        recording, truth = scene(targets, duration)
+        found = blob.find(recording, progress=False)
+        assert len(found) == 1
+        (path,) = found.paths
+        speed = truth(np.array([0]))[0, 0, 2]
+        apart = path.p - np.stack([middle + speed * path.t * 1e-6, np.full(len(path.t), 48)], 1)
+        assert np.sqrt((apart**2).sum(1).mean()) < 0.2 * size
+        assert np.median(path.size[:, 0]) == pytest.approx(size, rel=0.1)
+
+
+def _path(t, x, y, size, n):
+    t = np.asarray(t, np.int64)
+    p = np.stack([np.broadcast_to(np.asarray(value, float), t.shape) for value in (x, y)], 1)
+    C = np.broadcast_to(size**2 * np.eye(2), (len(t), 2, 2))
+    return TargetPath(t, p, np.zeros_like(p), C, np.full(len(t), float(n)), 1000, 1.0)
+
+
+def test_paths_in_contact_all_their_lives_are_one():
+    t = np.arange(0, 50_000, 1000)
+    x = 20 + 1e-3 * t
+    one, other = _path(t, x, 30.0, 3.0, 30), _path(t, x, 39.0, 3.0, 10)
+    far, late = _path(t, x, 45.0, 3.0, 10), _path(t[25:], x[25:], 39.0, 3.0, 10)
+    resting = [_path(t, 20.0, y, 3.0, 10) for y in (30.0, 39.0)]
+    for pair in ([one, far], [one, late], resting):
+        assert len(_join_rigid(pair)) == 2
+    (both,) = _join_rigid([other, one])
+    np.testing.assert_allclose(both.p, np.stack([x, np.full(len(t), 32.25)], 1))
+    weight = np.array([0.75, 0.25])
+    spread = np.cov([30.0, 39.0], aweights=weight, ddof=0)  # and that of each part
+    np.testing.assert_allclose(both.C, np.broadcast_to(np.diag([9.0, 9 + spread]), both.C.shape))
 
 
 @pytest.mark.parametrize("count", [0, 1, 99])
