@@ -23,7 +23,7 @@ ZEROS = bytes(1 << 20)
 MOST = 160  # MB to which a bomb unfolds
 
 
-def _inside(folder: Path, **replaced) -> Path:
+def inside(folder: Path, **replaced) -> Path:
     """A file of DSEC's layout, with one dataset of events replaced by a function of its group."""
     path = folder / "a.h5"
     path.write_bytes(formats.dsec(EVENTS, SIZE))
@@ -39,7 +39,7 @@ def _inside(folder: Path, **replaced) -> Path:
 def hdf5_external_link(folder):
     os.mkfifo(folder / "pipe")
     link = h5py.ExternalLink(str(folder / "pipe"), "/t")
-    return _inside(folder, t=lambda group, name: group.__setitem__(name, link))
+    return inside(folder, t=lambda group, name: group.__setitem__(name, link))
 
 
 def hdf5_soft_link_to_an_external_one(folder):
@@ -47,14 +47,14 @@ def hdf5_soft_link_to_an_external_one(folder):
         group.file["other"] = h5py.ExternalLink("/dev/zero", "/t")
         group[name] = h5py.SoftLink("/other")
 
-    return _inside(folder, t=make)
+    return inside(folder, t=make)
 
 
 def hdf5_external_storage(folder):
     """Any file that the reader's user may read."""
     (folder / "secret").write_bytes(bytes(400))
     files = [(str(folder / "secret"), 0, h5py.h5f.UNLIMITED)]
-    return _inside(
+    return inside(
         folder, p=lambda group, name: group.create_dataset(name, (400,), "u1", external=files)
     )
 
@@ -69,16 +69,16 @@ def _virtual(of: str, at: str, count=400):
 
 
 def hdf5_virtual_of_itself(folder):
-    return _inside(folder, t=_virtual(".", "events/t"))
+    return inside(folder, t=_virtual(".", "events/t"))
 
 
 def hdf5_virtual_of_a_pipe(folder):
     os.mkfifo(folder / "pipe")
-    return _inside(folder, t=_virtual(str(folder / "pipe"), "t"))
+    return inside(folder, t=_virtual(str(folder / "pipe"), "t"))
 
 
 def hdf5_virtual_of_a_thousand_million(folder):
-    return _inside(folder, **{name: _virtual(".", "t", 10**9) for name in "txyp"})
+    return inside(folder, **{name: _virtual(".", "t", 10**9) for name in "txyp"})
 
 
 def hdf5_virtual_events_in_four_columns(folder):
@@ -100,7 +100,7 @@ def hdf5_chunk_of_gzip(folder):
         pieces += [packer.compress(ZEROS) for _ in range(MOST)]
         stored.id.write_direct_chunk((0,), b"".join(pieces) + packer.flush())
 
-    return _inside(folder, t=make)
+    return inside(folder, t=make)
 
 
 def hdf5_data_of_gzip(folder):
@@ -109,7 +109,7 @@ def hdf5_data_of_gzip(folder):
         group.create_dataset(name, (count,), "u1", chunks=(1 << 22,), compression="gzip", data=None)
         group[name][:: 1 << 22] = 0
 
-    return _inside(folder, p=make)
+    return inside(folder, p=make)
 
 
 def hdf5_heaps_one_inside_the_other(folder):
@@ -120,7 +120,7 @@ def hdf5_heaps_one_inside_the_other(folder):
         pieces = (b"GCOL\x01\0\0\0" + struct.pack("<Q", 16)) * (1 << 16)
         group[name] = np.frombuffer(heap + pieces, "u1")
 
-    return _inside(folder, p=make)
+    return inside(folder, p=make)
 
 
 def hdf5_string_of_gigabytes(folder):

@@ -19,6 +19,11 @@ def add(commands: Any) -> None:
     one.add_argument("source", metavar="SRC", type=Path, help="a recording")
     arguments.add_output(one, "target", metavar="DST", help="the HDF5 file to write")
     one.add_argument("--compression", choices=["gzip"], help="smaller, but slower to read")
+    one.add_argument(
+        "--trust",
+        action="store_true",
+        help="read HDF5 that is made of other files; it could name any file of yours",
+    )
     arguments.add_size(one)
     arguments.add_stream(one)
 
@@ -27,11 +32,14 @@ def run(
     source: Path,
     target: Path,
     compression: str | None,
+    trust: bool,
     size: tuple[int, int] | None,
     stream: str | None,
 ) -> None:
     from jaxevent.io import load, save
 
-    recording = load(source, size, in_memory=False, progress=show_progress(), stream=stream)
+    recording = load(
+        source, size, in_memory=False, progress=show_progress(), stream=stream, trust=trust
+    )
     save(recording, target, compression, progress=show_progress())
     print_stored(recording, target)

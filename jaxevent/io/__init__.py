@@ -45,6 +45,7 @@ def load(
     in_memory: bool = True,
     progress: bool | None = None,
     stream: str | None = None,
+    trust: bool = False,
 ) -> Recording:
     """Read and check a recording; its format is told by its content, not by its name.
 
@@ -60,6 +61,8 @@ def load(
             somebody looks on.
         stream: Which camera, of a file that holds the events of several: a topic of a ROS bag,
             "left" or "right" of MVSEC and M3ED, the number of a stream of AEDAT 4.
+        trust: Whether HDF5 may be made of other files, by links, external storage or virtual
+            datasets. Such a file can have any file read that you may read, or never end.
 
     Raises:
         InputError: The file is missing, damaged or of another format, or what it holds is not a
@@ -71,7 +74,12 @@ def load(
             f"size = {size} must be two positive numbers of pixels, (width, height), of at most "
             f"{_MOST_PIXELS}"
         )
-    return _reader(path, in_memory, progress, stream)(path, size).check(str(path))
+    with contextlib.ExitStack() as stack:
+        if trust:
+            from jaxevent.io.hdf5_files import trusting
+
+            stack.enter_context(trusting())
+        return _reader(path, in_memory, progress, stream)(path, size).check(str(path))
 
 
 def save(

@@ -1,14 +1,17 @@
 """HDF5 files that need not be trusted: opened, and their datasets checked, before they are read.
 
 Links to other files, datasets made of other files and heaps that libhdf5 would never leave are
-refused, and so is a dataset that claims more values than its bytes can hold.
+refused, and so is a dataset that claims more values than its bytes can hold. Within `trusting`,
+files may be made of others.
 """
 
+import contextlib
+import contextvars
 import math
 import re
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +25,26 @@ from jaxevent.io import check_unfolded, most_unfolded, reading
 _MOST_COMPRESSED = 4096  # times smaller than in memory that any filter makes real events
 _HEAPS = 1 << 24
 _COPY = (
-    "only what a file itself holds is read, so copy all into one file: h5repack, or h5py's "
-    "create_dataset(name, data=dataset[()])"
+    "only what a file itself holds is read, so copy all into one file: if you trust it, by "
+    "jaxevent convert --trust"
 )
+_trusted = contextvars.ContextVar("trusted", default=False)
 # An attribute that is one string: its type, its space, then its length, heap and place in that. The
 # type and the space are padded in the older format, not in that of HDF5 1.8.
 _STRING = re.compile(
     rb"\x19.[\x00\x01]\x00\x10\x00\x00\x00\x10.{11}(?:.{4})?(?:\x01\x00.{6}|\x02\x00.{2})(.{16})",
     re.DOTALL,
 )
+
+
+@contextlib.contextmanager
+def trusting() -> Iterator[None]:
+    """Within the block, open files that are made of others: links, external storage, views."""
+    token = _trusted.set(True)
+    try:
+        yield
+    finally:
+        _trusted.reset(token)
 
 
 def open_file(path: Path) -> h5py.File:
@@ -43,7 +57,7 @@ def open_file(path: Path) -> h5py.File:
         link = file.id.links.visit(
             lambda name, info: None if info.type in known else name, info=True
         )
-        if link is not None:
+        if link is not None and not _trusted.get():
             file.close()
             raise InputError(f"{path}: {link.decode()} is a link to another file; {_COPY}")
         return file
@@ -138,6 +152,8 @@ def dataset(file: h5py.File, name: str, source: str, undone: Sequence[int] = ())
         properties = found.id.get_create_plist()
         layout = properties.get_layout()
         if layout == h5py.h5d.VIRTUAL or properties.get_external_count():
+            if _trusted.get():
+                return found
             raise InputError(f"{source}: {name} is made of other data sets or files; {_COPY}")
         filters = filters_of(found)
         stored = found.id.get_storage_size()

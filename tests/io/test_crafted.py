@@ -3,12 +3,37 @@
 import resource
 
 import crafted
+import h5py
+import numpy as np
 import pytest
 
-from jaxevent import io
+from jaxevent import cli, io
 from jaxevent.errors import InputError
 
 NEEDS = {"bag": "rosbags", "aedat4": "aedat"}
+
+
+@pytest.mark.parametrize("name", ["link", "storage", "virtual"])
+def test_what_is_trusted_may_be_made_of_other_files(name, tmp_path, capsys):
+    other = tmp_path / "other.h5"
+    p = crafted.EVENTS.p.astype("u1")
+    with h5py.File(other, "w") as file:
+        file["p"] = p
+    p.tofile(tmp_path / "p.bin")
+    layout = h5py.VirtualLayout(p.shape, "u1")
+    layout[:] = h5py.VirtualSource(str(other), "p", p.shape)
+    make = {
+        "link": lambda group, name: group.__setitem__(name, h5py.ExternalLink(str(other), "/p")),
+        "storage": lambda group, name: group.create_dataset(
+            name, p.shape, "u1", external=[(str(tmp_path / "p.bin"), 0, p.size)]
+        ),
+        "virtual": lambda group, name: group.create_virtual_dataset(name, layout),
+    }[name]
+    path, out = crafted.inside(tmp_path, p=make), tmp_path / "out.h5"
+    words = ["convert", str(path), str(out), "--size", "40,30"]
+    assert cli.main(words) == 2 and "jaxevent convert --trust" in capsys.readouterr().err
+    assert cli.main([*words, "--trust"]) == 0
+    np.testing.assert_array_equal(io.load(out).events.p, crafted.EVENTS.p)
 
 
 @pytest.mark.slow
