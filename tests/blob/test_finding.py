@@ -117,7 +117,9 @@ def test_paths_in_contact_all_their_lives_are_one():
     np.testing.assert_allclose(both.p, np.stack([x, np.full(len(t), 32.25)], 1))
     weight = np.array([0.75, 0.25])
     spread = np.cov([30.0, 39.0], aweights=weight, ddof=0)  # and that of each part
-    np.testing.assert_allclose(both.C, np.broadcast_to(np.diag([9.0, 9 + spread]), both.C.shape))
+    np.testing.assert_allclose(
+        both.C, np.broadcast_to(np.diag([9.0, 9 + float(spread)]), both.C.shape)
+    )
 
 
 @pytest.mark.parametrize("count", [0, 1, 99])

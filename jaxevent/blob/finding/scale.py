@@ -81,7 +81,8 @@ def choose_scale(stream: Stream, background: Background) -> Choice | None:
         return None
     # Of what is equally good the coarsest cells, and with them the longest windows.
     good = scores >= best - PLATEAU * best
-    sharp = raw >= SHARP * raw.max(0)
+    most = raw.max(0)
+    sharp = raw >= most - (1 - SHARP) * abs(most)
     longest = [float(windows[np.flatnonzero(column).max()]) for column in sharp.T]
     for j in range(len(CELLS))[::-1]:
         for i in np.flatnonzero(good[:, j]):
