@@ -7,7 +7,7 @@ among the frames, `features.Points`) it looks them up.
 """
 
 import functools
-from typing import ClassVar
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -85,13 +85,28 @@ def event_change(params: FrameParams, polarity: Array, since: Array) -> Array:
     return brightness(params, polarity > 0, polarity < 0) * jnp.where(rho > 0, events, 1)
 
 
-def unclipped(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
+@runtime_checkable
+class Greys(Protocol):
+    """Frames as the camera gave them, as `FrameFeatures` has them."""
+
+    @property
+    def grey(self) -> Any: ...
+
+    @property
+    def response(self) -> Any: ...
+
+    @property
+    def gain(self) -> Any: ...
+
+
+def unclipped(params: CertaintyParams, frames: Greys) -> Float[Array, "frames pixels"]:
     """1 where a grey value says what the intensity was, 0 where it is black or white.
 
     A clipped pixel with noise reads a few grey values from the end; the edge at `margin` is soft, a
     tenth of a grey value wide, so that the margin can be tuned by gradient.
     """
-    distance = 255 * jnp.minimum(frames.grey, 1 - frames.grey)
+    grey = jnp.asarray(frames.grey)
+    distance = 255 * jnp.minimum(grey, 1 - grey)
     inside = jax.nn.sigmoid(10 * (distance - params.margin))
     return jnp.where(params.margin > 0, inside, 1)
 
@@ -117,12 +132,12 @@ def belief(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "fram
     return clear * certainty(params, frames) + (1 - clear) * params.w_min
 
 
-def clipped_side(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
+def clipped_side(params: CertaintyParams, frames: Greys) -> Float[Array, "frames pixels"]:
     """+1 where a frame is clipped at white, -1 where at black, 0 where it is not."""
     return jnp.where(jnp.asarray(frames.grey) > 0.5, 1, -1) * (1 - unclipped(params, frames))
 
 
-def clipping_bound(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
+def clipping_bound(params: CertaintyParams, frames: Greys) -> Float[Array, "frames pixels"]:
     """The log intensity at which pixels begin to clip: that of a grey `margin` from the end."""
     greys, response = jnp.arange(256), jnp.asarray(frames.response)
     margin = jnp.clip(params.margin, 0, 127)

@@ -18,7 +18,7 @@ reference: all parameters can be fitted with it.
 """
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -147,6 +147,17 @@ class Rows(eqx.Module):
     q: Float[Array, "frames pixels"]  # variance that is added until then
 
 
+@runtime_checkable
+class Sided(Protocol):
+    """Clipped pixels, as `Rows` has them."""
+
+    @property
+    def side(self) -> Any: ...
+
+    @property
+    def bound(self) -> Any: ...
+
+
 class Passage(Described):
     """A smoothed window: enough to read an image at any time inside it."""
 
@@ -223,7 +234,7 @@ def added_variance(params: Params, on: Array, off: Array, seconds: Array) -> Arr
     return params.sigma_event**2 * events + params.sigma_bg**2 * seconds
 
 
-def one_sided_message(state: Gaussian, row: Rows, floor: Array) -> tuple[Message, Array]:
+def one_sided_message(state: Gaussian, row: Sided, floor: Array) -> tuple[Message, Array]:
     """One-sided evidence as the message that keeps the first two moments; its log likelihood.
 
     L is above the bound (side 1) with probability Phi(d), d = (m - bound) / sqrt(P + floor). The

@@ -15,6 +15,7 @@ from jaxevent.methods import find
 from jaxevent.reconstruction.colour import chrominance, colour_video, luminance
 from jaxevent.reconstruction.compensated import (
     agreement,
+    exposures,
     fusion,
     implicit,
     instants,
@@ -256,6 +257,107 @@ def test_instants():
     assert (first.t >= 0).all()
 
 
+SHIFT = (6.0, -4.0)  # px per unit
+
+
+@functools.cache
+def exposed(half=0.5):
+    """Two frames of a texture that goes by while they are exposed, and its sharp image."""
+    level = texture(18, 23, 8)
+    y, x = np.mgrid[:18, :23].astype(float)
+
+    def seen(s):
+        return np.exp(2 * level(y - SHIFT[1] * s, x - SHIFT[0] * s))
+
+    frames = np.stack(
+        [np.mean([seen(s + h) for h in np.linspace(-half, half, 401)], 0) for s in (-0.5, 0.4)]
+    )
+    taken = exposures.Taken(
+        np.int32([0, 1]), np.float32([-0.5, 0.4]), np.float32([half, half]), np.ones(2, np.float32)
+    )
+    shots = exposures.Shots(
+        np.full((2, 18 * 23), 0.5, np.float32),
+        frames.reshape(2, -1).astype(np.float32),
+        np.linspace(0, 1, 256, dtype=np.float32),
+        np.ones(2, np.float32),
+    )
+    p = np.zeros((9, 12, 4), np.float32)
+    p[..., :2] = SHIFT
+    I0 = float(Params().I0)
+    return np.log(seen(0) + I0).astype(np.float32), taken, shots, p
+
+
+def held(params, L, P, case, samples):
+    """`constrain`, which is `constrain_purely`."""
+    _, taken, shots, p = case
+    ones = jnp.ones((7, *L.shape), np.float32)
+    fused = fusion.Fused(jnp.asarray(L), jnp.asarray(P), ones[:5], ones[:2])
+    rest: tuple = (taken, shots, samples)
+    quick = exposures.constrain(params, fused, p, *rest)
+    pure = exposures.constrain_purely(params, fused, jnp.asarray(p), *rest)
+    for one, other in ((quick.L, pure.L), (quick.P, pure.P)):
+        np.testing.assert_allclose(one, other, rtol=2e-4, atol=2e-4)
+    return np.asarray(quick.L), np.asarray(quick.P)
+
+
+def test_an_exposure_is_the_mean_along_trajectories():
+    L, taken, shots, p = exposed()
+    I0 = float(Params().I0)
+    D = exposures._shifts(taken, jnp.asarray(p), 15, L.shape)
+    B, shares = exposures.smeared(jnp.asarray(L), D)
+    np.testing.assert_allclose(shares.sum(1), 1, atol=1e-5)
+    Y, X = (np.asarray(v) for v in warping.places(jnp.asarray(p), jnp.asarray(taken.s), 18, 23))
+    for k in range(2):
+        seen = map_coordinates(shots.intensity[k].reshape(18, 23), [Y[k], X[k]], order=3)
+        expected = np.log(seen + I0)  # exp L is I + I0, whose mean is that of I, plus I0
+        error = (np.asarray(B[k]) - expected)[6:-6, 7:-7]
+        assert np.abs(error).max() < 0.01 and np.abs(expected - L)[6:-6, 7:-7].max() > 0.06
+    # What is brought back is the adjoint where motion is even: <q, B(L)> grows as <back(q), L>.
+    rng = np.random.default_rng(1)
+    q, dL = np.zeros((2, 18, 23), np.float32), np.zeros((18, 23), np.float32)
+    q[:, 7:11, 8:14], dL[5:13, 6:16] = rng.normal(size=(2, 4, 6)), rng.normal(size=(8, 10))
+    back = exposures._quickly_returned(q, np.asarray(shares), np.asarray(D))
+    slope = jax.jvp(lambda L: exposures.smeared(L, D)[0], (jnp.asarray(L),), (jnp.asarray(dL),))[1]
+    np.testing.assert_allclose((back * dL).sum(), (q * slope).sum(), rtol=0.1)
+
+
+def test_images_are_held_to_blurred_frames():
+    case = exposed()
+    truth = case[0]
+    blurred = gaussian_filter(truth, 1.5).astype(np.float32)
+    P = np.full_like(truth, 0.02)
+    L, after = held(Params(smear=0.3), blurred, P, case, 7)
+
+    def error(image):
+        return float(((image - truth)[4:-4, 6:-6] ** 2).mean())
+
+    assert error(L) < 0.6 * error(blurred)  # what blurs across the motion is lost on frames
+    assert (after >= P).all() and after.max() > 1.1 * 0.02
+    same, _ = held(Params(), truth, P, case, 7)
+    assert error(same) < 0.02 * error(blurred)
+    sharp = case[:1] + (case[1]._replace(half=np.float32([0.01, 0.01])),) + case[2:]
+    unchanged, _ = held(Params(), blurred, P, sharp, 7)
+    np.testing.assert_allclose(unchanged, blurred, atol=1e-6)
+
+
+def test_clipped_pixels_tell_their_side():
+    truth, taken, shots, p = exposed()
+    white = shots._replace(grey=np.ones_like(shots.grey))
+    params = Params(margin=2.0, sigma_floor=1e-3)
+    bound = float(np.log((255 - 2) / 255 + float(params.I0)))
+    L, P = np.full_like(truth, bound - 0.6), np.full_like(truth, 0.04)
+    alone = taken._replace(present=np.float32([1, 0]))
+    got, _ = held(params, L, P, (truth, alone, white, p), 1)
+    grid = np.linspace(bound, bound + 3, 20_000)
+    density = np.exp(-0.5 * (grid - (bound - 0.6)) ** 2 / 0.04)
+    expected = (grid * density).sum() / density.sum()
+    np.testing.assert_allclose(got[6:-6, 8:-8], expected, atol=0.01)
+    above, _ = held(params, L + 1.2, P, (truth, alone, white, p), 1)
+    np.testing.assert_allclose(above, L + 1.2, atol=0.01)
+    off, _ = held(params.replace(one_sided=False), L, P, (truth, alone, white, p), 1)
+    np.testing.assert_array_equal(off, L)
+
+
 class Slide:
     """A texture that slides by: a source for the simulated sensor."""
 
@@ -281,7 +383,7 @@ def slide():
 
 
 def params():
-    return Params(c_on=0.2, c_off=0.18, I0=0.03, rho_ref=5e-4, exposure=1e-3)
+    return Params(c_on=0.2, c_off=0.18, I0=0.03, rho_ref=5e-4, exposure=1e-3, margin=2.0)
 
 
 @functools.cache

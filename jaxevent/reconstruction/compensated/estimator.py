@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +25,13 @@ from jaxevent.reconstruction.clock import Clock, Timing, time_span
 from jaxevent.reconstruction.compensated import trajectories
 from jaxevent.reconstruction.compensated.agreement import Agreement, Place, agree, shown
 from jaxevent.reconstruction.compensated.evidence import Evidence
+from jaxevent.reconstruction.compensated.exposures import (
+    Shots,
+    Taken,
+    constrain,
+    constrain_purely,
+    samples_for,
+)
 from jaxevent.reconstruction.compensated.fusion import (
     SOURCES,
     Fused,
@@ -39,6 +47,7 @@ from jaxevent.reconstruction.compensated.parameters import Params
 from jaxevent.reconstruction.compensated.warping import places, sample, warp, warp_purely
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.features import Features, Numeric, ReadOut
+from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.reconstruction.video import ImageSequence, Video
 from jaxevent.reconstruction.windows import WINDOW_EVENTS, prepare
 from jaxevent.recording import Recording, Times, microseconds
@@ -49,6 +58,7 @@ FADE = 0.35  # of variances from one resolution to the half of it
 APART = 8  # steps of the schedule between anchors
 ANCHORS = 2  # whose motion is remembered
 STEPS = 2  # with which a target's motion is found at half and at full resolution
+FASTEST = 2.0  # times as fast as what moves on the whole: what exposures are sampled for
 INFLATE = 3.0  # of the variance of an image that motion is refined with
 
 evidence = Evidence("evidence", Params)  # reads images at single instants
@@ -61,11 +71,15 @@ class Targets(Described):
     rows: Int[Numeric, "times k"]  # of each target's instants
     place: Place  # each (times, k) or (times,)
     p: Float[Numeric, "times rows columns 4"]  # trajectories
+    taken: Taken  # each (times, n)
+    # Of exposures; None: these are not looked at.
+    samples: int | None = eqx.field(static=True, default=None)
 
     def images(self, rows: NDArray) -> "Targets":
         """Those of its images, in that order."""
-        chosen = jax.tree.map(lambda leaf: leaf[rows], (self.rows, self.place, self.p))
-        return Targets(self.instants, *chosen)
+        each = (self.rows, self.place, self.p, self.taken)
+        chosen = jax.tree.map(lambda leaf: leaf[rows], each)
+        return Targets(self.instants, *chosen, samples=self.samples)
 
     def over(self, devices: Sequence[Any]) -> "Targets":
         """The same: pixels read each other and are not shared out."""
@@ -129,6 +143,36 @@ def schedule_of(recording: Recording, params: Params, images: Images) -> Schedul
     return Schedule(frames, (first, last), speed)
 
 
+class Shutter:
+    """When frames were taken, and for how long they were exposed."""
+
+    def __init__(self, recording: Recording, params: Params, speed: float):
+        clock = Clock.of(recording, Timing.of(params))
+        self.mid = np.ceil(clock.mid).astype(np.int64) + clock.origin
+        self._half = (clock.right - clock.left) / 2e6  # s
+        moved = FASTEST * speed * 2 * float(self._half.max(initial=0))
+        samples = samples_for(moved) if params.deblur else 1
+        wanted = samples > 1 or (float(params.margin) > 0 and params.one_sided)
+        self.samples = samples if params.integrate and wanted else None
+
+    def __call__(self, t: int, unit: float) -> Taken:
+        """The frames next to a time (us), on a clock of that unit (s)."""
+        after = int(np.searchsorted(self.mid, t, "right"))
+        here = int(np.searchsorted(self.mid, t, "left"))
+        frame, present = np.array([here - 1, after]), np.array([here > 0, after < len(self.mid)])
+        if here < after:  # the farther one gives way to that at this time
+            far = np.where(present, np.abs(self.mid[frame.clip(0, len(self.mid) - 1)] - t), 1 << 62)
+            frame[far.argmax()], present[far.argmax()] = here, True
+        frame = frame.clip(0, max(len(self.mid) - 1, 0)).astype(np.int32)
+        s = (self.mid[frame] - t) * 1e-6 / unit
+        return Taken(
+            frame,
+            np.where(present, s, 0).astype(np.float32),
+            (self._half[frame] / unit).astype(np.float32),
+            present.astype(np.float32),
+        )
+
+
 class Followed(NamedTuple):
     """A target, the images at its instants, and how its points move."""
 
@@ -150,6 +194,7 @@ class Follower:
     def __init__(self, recording: Recording, params: Params, images: Images):
         self.params, self.images = params, images
         self.schedule = schedule_of(recording, params, images)
+        self.shutter = Shutter(recording, params, self.schedule.speed)
         self._anchors: collections.OrderedDict[int, tuple[Instants, NDArray[np.float32]]]
         self._anchors = collections.OrderedDict()
         caution, floor, nu = (float(v) for v in (params.caution, params.floor, params.robust))
@@ -282,6 +327,8 @@ class CompensatedVideo(ImageSequence[Params]):
         self._images = Images(recording, params, window_events)
         self._follower: Follower | None = None
         self._latest: tuple[int, Followed, Fused] | None = None
+        self._frames = FrameImages(recording, np.dtype(np.float32))
+        self._response = self._frames.response()
 
     @property
     def dtype(self) -> np.dtype:
@@ -297,8 +344,20 @@ class CompensatedVideo(ImageSequence[Params]):
     def _target(self, t: int) -> tuple[Followed, Fused]:
         if self._latest is None or self._latest[0] != t:
             target = self.follow(t)
-            self._latest = t, target, fuse_images(self.params, target)
+            self._latest = t, target, self._held(t, target)
         return self._latest[1:]
+
+    def _held(self, t: int, target: Followed) -> Fused:
+        """What a target's images give, held to the frames next to it."""
+        fused, shutter = fuse_images(self.params, target), self.follow.shutter
+        if shutter.samples is None:
+            return fused
+        taken = shutter(t, target.instants.unit)
+        low, high = int(taken.frame.min()), int(taken.frame.max()) + 1
+        grey, intensity, _, gain = self._frames.read(slice(low, high), high - low)
+        rows = taken.frame - low
+        shots = Shots(grey[rows], intensity[rows], self._response, gain[rows])
+        return constrain(self.params, fused, target.p, taken, shots, shutter.samples)
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         for n, t in enumerate(times.tolist()):
@@ -390,13 +449,17 @@ class MotionCompensated(ImageEstimator[Params]):
         features, instants = prepare(recording, every, Timing.of(params), filtering=False)
         shape = (len(chosen), *trajectories.nodes(recording.height, recording.width, 0), 4)
         rows, p = np.zeros((len(chosen), room), np.int32), np.zeros(shape, np.float32)
-        places = []
+        places, taken = [], []
         for n, one in enumerate(chosen):
             _, _, _, clear, p[n] = follow(int(wanted[n]))
             rows[n, : len(one)] = np.searchsorted(every, one.t)
             places.append(place_of(one, clear, room))
-        place = jax.tree.map(lambda *leaves: np.stack(leaves), *places)
-        return features, jax.device_put(Targets(instants, rows, place, p))
+            taken.append(follow.shutter(int(wanted[n]), one.unit))
+        place, taken = (
+            jax.tree.map(lambda *leaves: np.stack(leaves), *parts) for parts in (places, taken)
+        )
+        targets = Targets(instants, rows, place, p, taken, follow.shutter.samples)
+        return features, jax.device_put(targets)
 
     def run(self, params: Params, features: Features, state: Any = None) -> tuple[Any, Any]:
         """Smooth each pixel; pure. `state` is what the window before returned."""
@@ -405,20 +468,25 @@ class MotionCompensated(ImageEstimator[Params]):
     def read(self, params: Params, trajectory: Any, out: Targets) -> Estimate:
         """The images prepared in `out`; the motion is what `prepare` found."""
         L, V, clear = evidence.read(params, trajectory, out.instants)
-        width = trajectory.passage.frames.width
+        frames = jax.tree.map(jnp.asarray, trajectory.passage.frames)
+        width = frames.width
         L, V, clear = (v.reshape(len(v), -1, width) for v in (L, V, clear.astype(L.dtype)))
 
         @jax.checkpoint
         def one(target: tuple) -> tuple[Array, Array]:
-            rows, place, p = target
+            rows, place, p, taken = target
             images = (L[rows], V[rows], clear[rows])
             if self.through_motion:
                 p = self._moved(params, images, place, p)
             along = warp_purely(*images, place.s, p)
             fused = fuse(params, images[0], images[1], along, place)
+            if out.samples is not None:
+                at = taken.frame
+                seen = (frames.grey[at], frames.intensity[at], frames.response, frames.gain[at])
+                fused = constrain_purely(params, fused, p, taken, Shots(*seen), out.samples)
             return fused.L, fused.P
 
-        found, P = jax.lax.map(one, (out.rows, out.place, out.p))
+        found, P = jax.lax.map(one, (out.rows, out.place, out.p, out.taken))
         image = (jnp.exp(found) - params.I0).reshape(len(found), -1)
         P = P.reshape(image.shape)
         return Estimate(image, P, jnp.isfinite(image) & (jnp.sqrt(P) < params.vague))

@@ -42,7 +42,7 @@ class Schedule:
     def __init__(self, frames: NDArray[np.int64], span: tuple[int, int], speed: float):
         self.frames, self.span = frames, span
         gap = float(np.median(np.diff(frames))) if len(frames) > 1 else float(span[1] - span[0])
-        speed = max(speed, 1e-3)
+        self.speed = speed = max(speed, 1e-3)
         self.step = max(round(min(STEP / speed * 1e6, gap / 2)), 200)
         self.reach = NEAR / speed * 1e6
 

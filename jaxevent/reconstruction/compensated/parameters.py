@@ -1,6 +1,6 @@
 """Parameters of the motion-compensated reconstruction."""
 
-from jaxevent.parameters import Number, Positive, Share
+from jaxevent.parameters import Choice, Number, Positive, Share
 from jaxevent.reconstruction import smoother
 
 # What the choice between the ingredients looks at; `fusion.compare` computes them.
@@ -79,6 +79,10 @@ class Params(smoother.Params):
         "how signs choose smoother and blend instead of the mean along trajectories",
     )
     doubt = Number(DOUBT, "1", "how signs tell the logarithm of the result's variance")
+    integrate = Choice(
+        (True, False), "whether images are held to what exposures and clipped pixels tell of them"
+    )
+    smear = Positive(1.2, "1", "part of what an exposure smears, squared, that is in doubt")
     vague = Positive(
         0.2, "ln I", "standard deviation from which an image is not valid", gradient=False
     )

@@ -79,8 +79,8 @@ def warp(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, p: NDArray) -> Alon
     return out
 
 
-def places(p: Array, s: Array, height: int, width: int) -> tuple[Array, Array]:
-    """Where points are at instants: y and x, (K, h, w)."""
+def displaced(p: Array, s: Array, height: int, width: int) -> Array:
+    """How far points have gone at s (K,): x and y, (K, h, w, 2)."""
     rows, columns, _ = p.shape
 
     def upsampled(nodes: int, size: int) -> tuple[Array, Array, Array]:
@@ -94,10 +94,14 @@ def places(p: Array, s: Array, height: int, width: int) -> tuple[Array, Array]:
     top = (1 - fx) * p[i][:, j] + fx * p[i][:, j1]
     bottom = (1 - fx) * p[i1][:, j] + fx * p[i1][:, j1]
     full = (1 - fy) * top + fy * bottom
-    s = s[:, None, None]
-    Y = jnp.arange(height)[:, None] + (full[..., 1] + full[..., 3] * s) * s
-    X = jnp.arange(width) + (full[..., 0] + full[..., 2] * s) * s
-    return Y, X
+    s = s[:, None, None, None]
+    return (full[..., :2] + full[..., 2:] * s) * s
+
+
+def places(p: Array, s: Array, height: int, width: int) -> tuple[Array, Array]:
+    """Where points are at instants: y and x, (K, h, w)."""
+    gone = displaced(p, s, height, width)
+    return jnp.arange(height)[:, None] + gone[..., 1], jnp.arange(width) + gone[..., 0]
 
 
 def sample(images: Array, Y: Array, X: Array) -> Array:
