@@ -48,10 +48,10 @@ class Candidates(eqx.Module):
     than C, these are C of them in even steps, and `scale` says how many each stands for.
     """
 
-    d: Float[Numeric, "*batches 2 C K"]  # px, x and y: the event's position less the candidate's
-    age: Float[Numeric, "*batches C K"]  # s
+    d: Float[Numeric, "*batches K C 2"]  # px, x and y: the event's position less the candidate's
+    age: Float[Numeric, "*batches K C"]  # s
     xi: Float[Numeric, "*batches K 2"]  # px, of the event; see `coordinates`
-    room: Float[Numeric, "*batches 2 2 K"]  # px, x and y: least and largest d within the sensor
+    room: Float[Numeric, "*batches K 2 2"]  # px, least and largest d in the sensor, x and y
     valid: Bool[Numeric, "*batches K"]  # an event; others only fill up
     scale: Float[Numeric, "*batches K"]
     rate: Float[Numeric, "*batches K"]  # 1/s of age, candidates wherever in the window
@@ -60,7 +60,7 @@ class Candidates(eqx.Module):
     reach: int = eqx.field(static=True)  # candidates are at most so many pixels away, in x and y
 
     @property
-    def mask(self) -> Bool[Numeric, "*batches C K"]:
+    def mask(self) -> Bool[Numeric, "*batches K C"]:
         """Which candidates are there."""
         return self.age > 0
 
@@ -147,10 +147,10 @@ class Gatherer:
         """
         real = np.dtype(jnp.result_type(float))
         size, most = self.batch, self.most
-        d, age = np.zeros((batches, 2, most, size), real), np.zeros((batches, most, size), real)
+        d, age = np.zeros((batches, size, most, 2), real), np.zeros((batches, size, most), real)
         xi, scale = np.zeros((batches, size, 2), real), np.ones((batches, size), real)
         rate = np.zeros((batches, size), real)
-        room = np.zeros((batches, 2, 2, size), real)
+        room = np.zeros((batches, size, 2, 2), real)
         row, t = np.full((batches, size), -1), np.zeros(batches, np.int64)
         history = np.zeros(batches, real)
         young, old = np.broadcast_arrays(np.atleast_2d(youngest), np.atleast_2d(oldest))
@@ -262,7 +262,7 @@ def _gather(stream, rules, latest, limits, gate, out, state, clock, scratch):
     batch, fill, first, until = state
     parts_y, parts_x = limits.shape[1:]
     gates_y, gates_x = gate.shape[1:]
-    batches, most, size = age.shape
+    batches, size, most = age.shape
     height, width, kept = ring.shape[1], ring.shape[2], ring.shape[3]
     for i in range(len(t_in)):
         now, column, line, sign = t_in[i], int(x[i]), int(y[i]), int(p[i])
@@ -307,19 +307,19 @@ def _gather(stream, rules, latest, limits, gate, out, state, clock, scratch):
             offset = ((row_in + i) * 0.6180339887498949) % 1.0
             for c in range(taken):
                 j = c if found <= most else min(int((c + offset) * found / most), found - 1)
-                d[batch, 0, c, fill] = scratch[0, j]
-                d[batch, 1, c, fill] = scratch[1, j]
-                age[batch, c, fill] = scratch[2, j]
+                d[batch, fill, c, 0] = scratch[0, j]
+                d[batch, fill, c, 1] = scratch[1, j]
+                age[batch, fill, c] = scratch[2, j]
             scale[batch, fill] = found / most if found > most else 1.0
             ages = min(oldest, now - clock[0]) - youngest
             rate[batch, fill] = number / (ages * 1e-6) if ages > 0 else 0.0
             xi[batch, fill, 0] = here_x
             xi[batch, fill, 1] = here_y
             # d is the event's position less the candidate's: the least at the far side.
-            room[batch, 0, 0, fill] = here_x - position[line, width - 1, 0]
-            room[batch, 1, 0, fill] = here_x - position[line, 0, 0]
-            room[batch, 0, 1, fill] = here_y - position[height - 1, column, 1]
-            room[batch, 1, 1, fill] = here_y - position[0, column, 1]
+            room[batch, fill, 0, 0] = here_x - position[line, width - 1, 0]
+            room[batch, fill, 1, 0] = here_x - position[line, 0, 0]
+            room[batch, fill, 0, 1] = here_y - position[height - 1, column, 1]
+            room[batch, fill, 1, 1] = here_y - position[0, column, 1]
             row[batch, fill] = row_in + i
             t[batch] = now
             history[batch] = (now - clock[0]) * 1e-6

@@ -194,7 +194,7 @@ def _flows(
         d, age, xi, mean = batch
         base = jax.vmap(model.flow)(xi, mean)
         a = jax.vmap(model.line)(xi, mean) if model.half_line else jnp.zeros_like(base)
-        q = jnp.moveaxis(d, 0, -1) - age[..., None] * base  # C K 2
+        q = d - age[..., None] * base  # C K 2
         along = (q * a).sum(-1)
         off = ((q - along[..., None] * a) ** 2).sum(-1)
         rho = jnp.zeros_like(along[0])
@@ -205,7 +205,8 @@ def _flows(
         nearest = jnp.sqrt(off + (along - rho * age) ** 2)
         return U, jnp.where(moved, nearest, jnp.inf).min(0)
 
-    d, age, xi = (jnp.asarray(part) for part in (candidates.d, candidates.age, candidates.xi))
+    d, age = (jnp.swapaxes(jnp.asarray(part), 1, 2) for part in (candidates.d, candidates.age))
+    xi = jnp.asarray(candidates.xi)
     return lax.map(one, (d, age, xi, jnp.asarray(mean)))
 
 

@@ -40,7 +40,7 @@ def B(x: Scalars, y: Scalars, f: Scalars) -> Float[Array, "... 2 3"]:
 
 
 def rotation_basis(
-    xi: Float[Array | np.ndarray, "*places 2"], f: float
+    xi: Float[Array | np.ndarray, "*places 2"], f: float | Float[Array, ""]
 ) -> Float[Array | np.ndarray, "*places 2 3"]:
     """`B` at places xi (px): of NumPy arrays in NumPy, in their precision, else in JAX."""
     if not isinstance(xi, np.ndarray):

@@ -449,7 +449,7 @@ def _six(heading: Array, turning: Array) -> Float[Array, "6"]:
     return jnp.concatenate([jnp.broadcast_to(v, (3,)) for v in (heading, turning)])
 
 
-def _turned(xi: Numeric, way: Numeric, f: float) -> Float[Array, "*places 2"]:
+def _turned(xi: Numeric, way: Numeric, f: float | Float[Array, ""]) -> Float[Array, "*places 2"]:
     """Places after rotations of the rays, exp(way)."""
     R = rotation_exp(way)
     x, y, z = (

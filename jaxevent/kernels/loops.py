@@ -62,6 +62,8 @@ class LoopTranslation(Translation):
         along = getattr(eqn, "along", ())
         if not along:
             return None
+        if name == "dot_general":
+            return self._gathered_product(eqn, values)
         if name not in (*FOLDS, "argmax"):
             raise Untranslatable(f"the operation {name!r} over elements")
         array = self.nodes(values[0])
@@ -78,9 +80,21 @@ class LoopTranslation(Translation):
             along = [a - sum(b < a for b in axes) for a in along]
         return array.squeeze(tuple(along))
 
+    def _gathered_product(self, eqn: Any, values: list[Value]) -> NDArray:
+        """A matrix product that sums over elements."""
+        product = self._dot(eqn, *(self.nodes(v) for v in values))
+        if self.single:
+            return product
+        out = np.empty(product.shape, object)
+        for place in np.ndindex(*product.shape):
+            out[place] = self._gather("reduce_sum", product[place])  # pyright: ignore
+        return out
+
     def _gather(self, name: str, node: Node) -> Node:
         """A node that says something of all elements."""
         apply = self.graph.apply
+        if name in ("reduce_max", "reduce_min") and node.level < Level.ELEMENT:
+            return node
         if name == "reduce_sum":
             factor, rest = self._factors(node)
             if rest is None:
@@ -133,17 +147,17 @@ def _without_mark(eqn: Any) -> Any:
                 raise Untranslatable("single elements")
     if name == "concatenate" and any(shape[p["dimension"]] == MARK for shape in shapes):
         raise Untranslatable("elements joined to others")
-    if name in ("gather", "scatter", "dynamic_slice", "rev", "pad", "sort", "dot_general"):
-        if name != "dot_general" and any(MARK in shape for shape in shapes[1:]):
+    if name in ("gather", "scatter", "dynamic_slice", "rev", "pad", "sort"):
+        table = shapes[0] if name != "gather" else ()
+        if any(MARK in shape for shape in (table, *shapes[1:])):
             raise Untranslatable(f"the operation {name!r} over elements")
-        if name != "gather" and MARK in shapes[0]:
-            raise Untranslatable(f"the operation {name!r} over elements")
-        if name == "dot_general" and any(MARK in shape for shape in shapes):
-            raise Untranslatable("a matrix product over elements")
+    if name == "dot_general" and np.shape(eqn.outvars[0].aval).count(MARK) > 1:
+        raise Untranslatable("a matrix product of elements with elements")
     for key in SHAPES:
         if key in p and p[key] is not None:
             p[key] = tuple(1 if size == MARK else size for size in p[key])
-    along = [int(a) for a in p.get("axes", ()) if shapes and shapes[0][a] == MARK]
+    axes = p["dimension_numbers"][0][0] if name == "dot_general" else p.get("axes", ())
+    along = [int(a) for a in axes if shapes and shapes[0][a] == MARK]
     outs = [
         types.SimpleNamespace(
             aval=types.SimpleNamespace(
@@ -232,6 +246,8 @@ def _inputs(graph: Graph, name: str, leaf: Any, single: bool) -> Value:
 class LoopWriter(Writer):
     """Writes functions whose inputs a family knows by their names.
 
+    Numbers of parameters are in double precision.
+
     Args:
         places: Where an input lies, or a text that reads it.
     """
@@ -244,6 +260,10 @@ class LoopWriter(Writer):
     def place(self, node: Node) -> Place | None:
         found = self.places.get(node.args[0]) if node.op == "input" else None
         return None if isinstance(found, str) else found
+
+    def _number(self, key: tuple[int, int], kind: str) -> str:
+        text = super()._number(key, kind)
+        return f"REAL({text})" if kind == "f" else text
 
     def input(self, node: Node) -> str:
         found = self.places.get(node.args[0])

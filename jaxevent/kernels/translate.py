@@ -87,6 +87,9 @@ class Translation:
 
     def _equation(self, eqn: Any, values: list[Value]) -> list[Value]:
         called = inner(eqn)
+        chosen = values[0] if eqn.primitive.name == "cond" else None
+        if isinstance(chosen, Known):
+            called, values = eqn.params["branches"][int(chosen.value)], values[1:]
         if called is not None:
             return self.run(called, values)
         if all(isinstance(v, Known) for v in values):

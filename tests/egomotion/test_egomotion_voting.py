@@ -60,7 +60,7 @@ def test_candidates_are_the_recent_neighbours(every, batch, pieces, per_pixel):
         c = made.candidates
         for b, k in zip(*np.nonzero(made.row >= 0), strict=True):
             rows.append(made.row[b, k])
-            np.testing.assert_array_equal(c.mask[b, :, k], c.age[b, :, k] > 0)
+            np.testing.assert_array_equal(c.mask[b, k], c.age[b, k] > 0)
             expected = slow(recording, rows[-1], 2, per_pixel, 40, 2000)
             assert listed(c, b, k) == expected
             assert c.scale[b, k] == 1
@@ -84,13 +84,13 @@ def test_too_many_candidates_are_thinned_evenly():
     some = candidates.Gatherer(recording, radius=2, per_pixel=4, most=10, every=1, batch=50)
     every = candidates.Gatherer(recording, radius=2, per_pixel=4, most=200, every=1, batch=50)
     few, all_ = (g.whole(1e-6, 1e-2).candidates for g in (some, every))
-    number = all_.mask.sum(-2)
+    number = all_.mask.sum(-1)
     np.testing.assert_allclose(few.scale, np.maximum(number / 10, 1))
-    np.testing.assert_array_equal(few.mask.sum(-2), np.minimum(number, 10))
+    np.testing.assert_array_equal(few.mask.sum(-1), np.minimum(number, 10))
     # Every candidate stands for as many as there were: sums over all are kept on average.
-    for value in (lambda c: c.age, lambda c: c.d[:, 0] ** 2, lambda c: c.d[:, 1] > 0):
+    for value in (lambda c: c.age, lambda c: c.d[..., 0] ** 2, lambda c: c.d[..., 1] > 0):
         total = (value(all_) * all_.mask).sum()
-        thinned = ((value(few) * few.mask).sum(-2) * few.scale).sum()
+        thinned = ((value(few) * few.mask).sum(-1) * few.scale).sum()
         assert abs(thinned / total - 1) < 0.02
 
 
@@ -123,8 +123,8 @@ def test_candidates_about_an_expected_flow():
 
 def listed(c, b, k):
     """(dx, dy, age in us) of an event's candidates."""
-    there = c.age[b, :, k] > 0
-    columns = *c.d[b, :, there, k].T, 1e6 * c.age[b, there, k]
+    there = c.age[b, k] > 0
+    columns = *c.d[b, k, there].T, 1e6 * c.age[b, k, there]
     return sorted(tuple(int(v) for v in np.rint(one)) for one in zip(*columns, strict=True))
 
 
@@ -158,10 +158,10 @@ def test_displacements_are_undistorted():
     recording = recorded([0, 1000], [110, 113], [80, 78], [1, 1])
     c = candidates.Gatherer(recording, camera, every=1).whole(0.0, 1.0).candidates
     xi: np.ndarray = np.asarray(c.xi)[0, :2]
-    np.testing.assert_allclose(c.d[0, :, 0, 1], xi[1] - xi[0])
+    np.testing.assert_allclose(c.d[0, 1, 0], xi[1] - xi[0])
     x, y = np.transpose(xi) / 80
     r2 = x**2 + y**2
-    rooms = np.asarray(c.room)[0, :, :, 0]  # from the first column to the last, at its row
+    rooms = np.asarray(c.room)[0, 0]  # from the first column to the last, at its row
     edge, _ = candidates.coordinates(WIDTH, HEIGHT, camera)
     here = np.asarray(c.xi)[0, 0]
     np.testing.assert_allclose(rooms[:, 0], here[0] - edge[80, [WIDTH - 1, 0], 0])
@@ -169,7 +169,7 @@ def test_displacements_are_undistorted():
     radial = 1 - 0.3 * r2 + 0.1 * r2**2
     back_x = x * radial + 2 * 0.001 * x * y - 0.002 * (r2 + 2 * x**2)
     np.testing.assert_allclose(80 * back_x + 60, [110, 113], atol=1e-6)
-    assert np.abs(np.asarray(c.d)[0, :, 0, 1] - [3, -2]).max() > 0.5
+    assert np.abs(np.asarray(c.d)[0, 1, 0] - [3, -2]).max() > 0.5
 
 
 def prepared(likelihood="soft", model="planar", number=500, **settings):
@@ -197,7 +197,7 @@ def by_hand(params, model, batch, particles, weights, searching):
     sigma = float(params.sigma_x) * (2 if searching else 1)
     for k in np.flatnonzero(batch.valid):
         x, y = batch.xi[k]
-        least_d, most_d = batch.room[:, :, k]
+        least_d, most_d = batch.room[k]
         f, general = model.f, model.name == "general"
         rows = np.array([[x * y / f, -(f + x * x / f), y], [f + y * y / f, -x * y / f, -x]])
         flows = [q if model.name == "planar" else rows @ q[-3:] for q in particles]
@@ -218,8 +218,8 @@ def by_hand(params, model, batch, particles, weights, searching):
             continue
         for i, (U, speed) in enumerate(zip(flows, speeds, strict=True)):
             S, least, own = 0.0, np.inf, []
-            for c in range(batch.age.shape[0]):
-                age, d = batch.age[c, k], batch.d[:, c, k]
+            for c in range(batch.age.shape[1]):
+                age, d = batch.age[k, c], batch.d[k, c]
                 if age <= 0:
                     continue
                 oldest = min(b / speed, tau_max) if band else tau
@@ -232,8 +232,8 @@ def by_hand(params, model, batch, particles, weights, searching):
                     S += np.exp(-(distance**2).sum() / (2 * sigma**2))
                 if not d.any():
                     own.append(age)
-            for c in range(batch.age.shape[0]):
-                age, d = batch.age[c, k], batch.d[:, c, k]
+            for c in range(batch.age.shape[1]):
+                age, d = batch.age[k, c], batch.d[k, c]
                 if age <= 0:
                     continue
                 if model.name == "planar":

@@ -269,19 +269,11 @@ def _of_targets(row: str, i: str) -> tuple[dict[str, str], dict[str, str]]:
     return read, {"weight.0": f"work[({row} + {WEIGHT}) * room + {i}] = {{}}"}
 
 
-class TargetWriter(LoopWriter):
-    """Writes a target's functions; numbers of parameters are in double precision."""
-
-    def _number(self, key: tuple[int, int], kind: str) -> str:
-        text = super()._number(key, kind)
-        return f"REAL({text})" if kind == "f" else text
-
-
 def write(program: Program) -> tuple[str, Numbers]:
     """The text of a program's module."""
     read, store = _elements(program.single)
     places, stores = program.layout.places(), program.layout.stores()
-    writer = TargetWriter(places | read)
+    writer = LoopWriter(places | read)
     out = []
     for name, function in program.functions.items():
         if name == "alone":

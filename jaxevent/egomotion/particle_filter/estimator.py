@@ -1,6 +1,7 @@
 """Motion by voting as an estimator: `voting`."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -20,11 +21,13 @@ from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import Calibration, Motion
 from jaxevent.egomotion.particle_filter import filtering
 from jaxevent.egomotion.particle_filter.filtering import Info, Noise, State
+from jaxevent.egomotion.particle_filter.fused.running import FusedRun
 from jaxevent.egomotion.particle_filter.parameters import Params
 from jaxevent.egomotion.particle_filter.smoothing import smoothed
 from jaxevent.egomotion.patches import Speed
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
+from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.progress import bar
 from jaxevent.recording import Recording, Times, check_times, microseconds
 
@@ -36,6 +39,7 @@ CELL = 16  # px: which candidates are looked at is chosen for parts of the senso
 AGES, OLDEST = 1.2, 1.0  # of the oldest candidates: in baselines of the usual speed, s at most
 PLANAR, OTHERS = Calibration(change=0.12), Calibration(factor=0.7, change=0.05)
 FASTEST = 2.5  # usual speeds, that a search goes to at least
+KERNEL_EVENTS = 100_000  # scored ones, from which on a kernel is compiled
 SPREAD = 0.2  # of the first particles of a fit, in shares of the true motion
 
 _run = eqx.filter_jit(filtering.run)
@@ -167,6 +171,7 @@ class Voting(MotionEstimator[Params]):
         progress: bool | None = None,
         smooth: bool = False,
         cloud: int = 0,
+        compiler: str | None = None,
     ) -> Motion:
         """The motion of a camera, batch by batch, as events arrive.
 
@@ -180,15 +185,24 @@ class Voting(MotionEstimator[Params]):
             progress: Show a bar on stderr; None: where somebody looks on.
             smooth: `smoothed` by later events, for use after the recording.
             cloud: So many particles of each batch, drawn by weight, are the motion's `cloud`.
+            compiler: "numba" runs a kernel made of the filter's own functions, "xla" the `run` that
+                is differentiated. Log-likelihoods of the two are the same to rounding, and weights
+                to `params.off` where the kernel interpolates; which particles are resampled may
+                differ then, as with another seed. None: on CPUs, in single precision and from
+                100,000 scored events on (one in `params.every` is), numba, where there is a kernel:
+                for all but the literal likelihood.
 
         Raises:
-            InputError: The model is unknown, or it needs a camera and there is none.
+            InputError: The model is unknown, or it needs a camera and there is none, or numba is
+                asked for and has no kernel.
         """
         if params is None:
             found, _ = self.place(recording, model, camera)
             params, _ = self.suit(recording, self.start(found), camera=camera)
         kind, gatherer = self.gatherer(recording, params, model, camera)
         batches = -(-CHUNK // params.batch)
+        events = len(recording.events) // params.every
+        run = self._kernel(params, kind, compiler, events) or functools.partial(_run, params, kind)
         key, corners = jax.random.key(seed), _corners(kind, gatherer)
         state, parts, number, span = None, [], 0, SPAN * float(params.tau_max)
         with bar(
@@ -206,7 +220,7 @@ class Voting(MotionEstimator[Params]):
                 made = gatherer.gather(
                     batches, looked.youngest, looked.oldest, span, looked.expected
                 )
-                state, info = _run(params, kind, made.candidates, noise, state, cloud)
+                state, info = run(made.candidates, noise, state, cloud)
                 used = int((made.row >= 0).any(1).sum())
                 info = jax.tree.map(lambda a, n=used: np.asarray(a)[:n], info)
                 parts.append((made.t[:used], info))
@@ -231,6 +245,25 @@ class Voting(MotionEstimator[Params]):
         ).within(recording)
         by = PLANAR if kind.uniform else OTHERS
         return (smoothed(motion, params) if smooth else motion).calibrated(by, 2 * motion.lag)
+
+    def _kernel(
+        self, params: Params, model: Model, compiler: str | None, events: int
+    ) -> FusedRun | None:
+        """The filter as a kernel; None where XLA compiles it."""
+        if compiler not in (None, "numba", "xla"):
+            raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
+        on_host = jnp.result_type(float) == np.float32 and jax.default_backend() == "cpu"
+        if compiler == "xla" or (compiler is None and not (on_host and events >= KERNEL_EVENTS)):
+            return None
+        try:
+            return FusedRun(params, model)
+        except Untranslatable as reason:
+            if compiler == "numba":
+                raise InputError(
+                    f"numba has no kernel for voting with these parameters ({reason}); leave out "
+                    "the compiler"
+                ) from reason
+            return None
 
     def follow(
         self,
@@ -421,7 +454,7 @@ voting = Voting(
     "voting",
     Params,
     lengths=lengths,
-    options=COMMON | {"smooth", "cloud"},
+    options=COMMON | {"smooth", "cloud", "compiler"},
     about="Motion by voting: a particle filter whose likelihood asks the earlier neighbours of "
     "events (Egomotion thesis, chapters 5 and 6, with all neighbours voting, softly).",
 )

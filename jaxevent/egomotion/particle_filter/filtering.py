@@ -51,6 +51,41 @@ class Info(eqx.Module):
     cloud: Float[Array, "*batches thinned d"]  # some particles, in proportion to weights
 
 
+class Passed(eqx.Module):
+    """A batch's times, and whether it holds an event."""
+
+    elapsed: Float[Array, ""]
+    history: Float[Array, ""]
+    some: Bool[Array, ""]
+
+
+class Told(eqx.Module):
+    """What all events of a batch say: see `Score`."""
+
+    log_likelihood: Float[Array, " N"]
+    votes: Float[Array, ""]
+    chance: Float[Array, ""]
+
+
+class Weighed(eqx.Module):
+    """Particles after a batch, and what becomes of the state and of what is told."""
+
+    log_weights: Float[Array, " N"]
+    mean: Float[Array, " d"]
+    covariance: Float[Array, "d d"]
+    contrast: Float[Array, ""]
+    evidence: Float[Array, ""]
+    sound: Bool[Array, ""]  # whether all numbers are finite
+    lost: Bool[Array, ""]
+    searching: Bool[Array, ""]  # as it is told
+    searches: Bool[Array, ""]  # and as it goes on
+    few: Bool[Array, ""]  # whether few particles are effective
+    votes: Float[Array, ""]
+    chance: Float[Array, ""]
+    usual: Float[Array, ""]
+    age: Float[Array, ""]
+
+
 def draw(key: PRNGKeyArray | Array, batches: int, params: Params, model: Model) -> Noise:
     """The random numbers of so many batches, at once: one by one they cost more than all else.
 
@@ -107,6 +142,94 @@ def _drawn(
     return jnp.minimum((edges[None, :] <= points[:, None]).sum(1), len(weights) - 1)
 
 
+def propagate(
+    params: Params,
+    model: Model,
+    state: State,
+    passed: Passed,
+    normal: Float[Array, "N d"],
+) -> tuple[Float[Array, "N d"], Float[Array, " N"]]:
+    """Particles at a batch's end, before it is looked at, and their weights."""
+    weights = jnp.exp(state.log_weights)
+    mean = model.mean(state.particles, weights)
+    apart = jax.vmap(model.apart, (0, None))
+    fixed, far = lax.stop_gradient((weights, apart(state.particles, mean)))
+    spread = model.spreads(_covariance(far, fixed))
+    std = model.diffusion(params, mean) * jnp.sqrt(passed.elapsed)
+    enough = _covered(params, model, passed) & passed.some
+    jitter = JITTER * spread * enough * model.share(state.particles, fixed)
+    noise = jnp.where(state.searching, jitter, std) * normal
+    return jax.vmap(model.moved)(state.particles, noise), weights
+
+
+def _covered(params: Params, model: Model, passed: Passed) -> Bool[Array, ""]:
+    """With less history than slow hypotheses look at, only fast ones find candidates."""
+    return passed.history >= 0.99 * lax.stop_gradient(model.oldest(params))
+
+
+def weigh(
+    params: Params,
+    model: Model,
+    state: State,
+    passed: Passed,
+    particles: Float[Array, "N d"],
+    told: Told,
+) -> Weighed:
+    """What particles are worth after a batch; and whether the motion is found, or lost."""
+    N, searching = params.particles, state.searching
+    covered = _covered(params, model, passed)
+    gain, fixed = told.log_likelihood, lax.stop_gradient(told.log_likelihood)
+    deviation = jnp.sqrt(((fixed - fixed.sum() / N) ** 2).sum() / N + 1e-12)
+    gain = gain * jnp.where(searching, jnp.minimum(1, STEP / deviation) * covered, 1)
+    joint = state.log_weights + gain
+    evidence = logsumexp(joint)
+    log_weights = joint - evidence
+    weights = jnp.exp(log_weights)
+    mean = model.mean(particles, weights)
+    apart = jax.vmap(model.apart, (0, None))
+    covariance = _covariance(apart(particles, mean), weights)
+
+    memory = jnp.exp(-1 / lax.stop_gradient(params.memory))
+    votes, chance = memory * state.votes + told.votes, memory * state.chance + told.chance
+    contrast = jnp.where(chance > 0, votes / jnp.where(chance > 0, chance, 1), 1)
+    counted = told.chance > 0
+    age = state.age + counted
+    sound = jnp.isfinite(evidence) & jnp.isfinite(particles).all()
+    searches = params.likelihood != "literal"
+    certain = model.certain(*lax.stop_gradient((params, mean, covariance)))
+    found = searching & covered & counted & certain
+    forget = (1 - memory) / HISTORY
+    usual = state.usual + jnp.where(counted, forget * (contrast - state.usual), 0)
+    least = lax.stop_gradient(params.drop * usual)
+    if not model.half_line:  # there chance's votes along a half-line are most of them
+        least = jnp.maximum(lax.stop_gradient(params.contrast), least)
+    poor = ~searching & (age > params.memory) & (contrast < least)
+    lost = ~sound | (poor & searches)
+    over = lost | found
+    return Weighed(
+        log_weights,
+        mean,
+        covariance,
+        jnp.where(sound, contrast, 0),
+        jnp.where(sound, evidence, 0),
+        sound,
+        lost,
+        (searching & ~found) | lost,
+        (searching & ~found) | (lost & searches),
+        1 / (weights**2).sum() <= params.resample_below * N,
+        *(jnp.where(over, 0, value) for value in (votes, chance, usual, age)),
+    )
+
+
+def restart(
+    params: Params, model: Model, cloud: Float[Array, "N d"]
+) -> tuple[Float[Array, "N d"], Float[Array, " d"], Float[Array, "d d"]]:
+    """First particles of a search, from even numbers; their mean, and how wide they are."""
+    anew = jax.vmap(functools.partial(model.first, params))(cloud)
+    even = jnp.full(len(anew), 1 / params.particles, anew.dtype)
+    return anew, model.mean(anew, even), jnp.eye(model.dimension) * model.extent(params) ** 2 / 3
+
+
 def step(
     params: Params,
     model: Model,
@@ -122,72 +245,35 @@ def step(
     `cloud` are even numbers, of which a new search makes particles; `thinned` particles, drawn by
     weight, are told.
     """
-    N, searching = params.particles, state.searching
-    weights = jnp.exp(state.log_weights)
-    mean = model.mean(state.particles, weights)
-    apart = jax.vmap(model.apart, (0, None))
-    fixed, far = lax.stop_gradient((weights, apart(state.particles, mean)))
-    spread = model.spreads(_covariance(far, fixed))
-    std = model.diffusion(params, mean) * jnp.sqrt(batch.elapsed)
-    # With less history than slow hypotheses look at, only fast ones find candidates.
-    covered = batch.history >= 0.99 * lax.stop_gradient(model.oldest(params))
-    jitter = JITTER * spread * (covered & batch.valid.any()) * model.share(state.particles, fixed)
-    noise = jnp.where(searching, jitter, std) * normal
-    particles = jax.vmap(model.moved)(state.particles, noise)
+    passed = Passed(*map(jnp.asarray, (batch.elapsed, batch.history, batch.valid.any())))
+    particles, before = propagate(params, model, state, passed, normal)
+    voted = score(params, model, batch, particles, before, state.searching)
+    told = Told(voted.log_likelihood.sum(0), voted.votes, voted.chance)
+    found = weigh(params, model, state, passed, particles, told)
 
-    voted = score(params, model, batch, particles, weights, searching)
-    gain = voted.log_likelihood.sum(0)
-    deviation = jnp.sqrt(lax.stop_gradient(gain).var() + 1e-12)
-    gain = gain * jnp.where(searching, jnp.minimum(1, STEP / deviation) * covered, 1)
-    joint = state.log_weights + gain
-    evidence = logsumexp(joint)
-    log_weights = joint - evidence
-    weights = jnp.exp(log_weights)
-    mean = model.mean(particles, weights)
-    covariance = _covariance(apart(particles, mean), weights)
-
-    memory = jnp.exp(-1 / lax.stop_gradient(params.memory))
-    votes, chance = memory * state.votes + voted.votes, memory * state.chance + voted.chance
-    contrast = jnp.where(chance > 0, votes / jnp.where(chance > 0, chance, 1), 1)
-    counted = voted.chance > 0
-    age = state.age + counted
-    sound = jnp.isfinite(evidence) & jnp.isfinite(particles).all()
-    searches = params.likelihood != "literal"
-    certain = model.certain(*lax.stop_gradient((params, mean, covariance)))
-    found = searching & covered & counted & certain
-    forget = (1 - memory) / HISTORY
-    usual = state.usual + jnp.where(counted, forget * (contrast - state.usual), 0)
-    least = lax.stop_gradient(params.drop * usual)
-    if not model.half_line:  # there chance's votes along a half-line are most of them
-        least = jnp.maximum(lax.stop_gradient(params.contrast), least)
-    poor = ~searching & (age > params.memory) & (contrast < least)
-    lost = ~sound | (poor & searches)
-
-    few = 1 / (weights**2).sum() <= params.resample_below * N
+    weights = jnp.exp(found.log_weights)
     shown = particles[_drawn(weights, thinned, jnp.asarray(0.5))] if thinned else particles[:0]
-    ancestor, renewed = resample(log_weights, uniform)
-    particles = jnp.where(few, particles[ancestor], particles)
-    log_weights = jnp.where(few, renewed, log_weights)
-
-    anew = jax.vmap(functools.partial(model.first, params))(cloud)
-    over = lost | found
+    ancestor, renewed = resample(found.log_weights, uniform)
+    particles = jnp.where(found.few, particles[ancestor], particles)
+    log_weights = jnp.where(found.few, renewed, found.log_weights)
+    anew, middle, widest = restart(params, model, cloud)
     after = State(
-        jnp.where(lost, anew, particles),
-        jnp.where(lost, -jnp.log(N), log_weights),
-        (searching & ~found) | (lost & searches),
-        jnp.where(over, 0, votes),
-        jnp.where(over, 0, chance),
-        jnp.where(over, 0, usual),
-        jnp.where(over, 0, age),
+        jnp.where(found.lost, anew, particles),
+        jnp.where(found.lost, -jnp.log(params.particles), log_weights),
+        found.searches,
+        found.votes,
+        found.chance,
+        found.usual,
+        found.age,
     )
     info = Info(
-        jnp.where(sound, mean, model.mean(anew, jnp.full(N, 1 / N, anew.dtype))),
-        jnp.where(sound, covariance, jnp.eye(model.dimension) * model.extent(params) ** 2 / 3),
-        (searching & ~found) | lost,
-        jnp.where(sound, contrast, 0),
+        jnp.where(found.sound, found.mean, middle),
+        jnp.where(found.sound, found.covariance, widest),
+        found.searching,
+        found.contrast,
         voted.lag,
-        jnp.where(sound, evidence, 0),
-        jnp.where(sound, shown, 0),
+        found.evidence,
+        jnp.where(found.sound, shown, 0),
     )
     return after, info
 

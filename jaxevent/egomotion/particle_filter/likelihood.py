@@ -1,13 +1,13 @@
 """What candidates say of hypotheses: the votes of an event for a motion, and what chance would.
 
 The functions that are equations of the thesis are of one candidate, one event and one particle, in
-scalars; `score` maps them. Shapes there: K events, N particles, which are the last axis, C
+scalars; `ask`, `add_votes` and `answer` map them over the particles of one event, and `score` over
+events (`fused` makes loops of them). Shapes: K events, N particles, which are the last axis, C
 candidates.
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,6 +22,7 @@ from jaxevent.egomotion.particle_filter.parameters import Params
 WIDER = 2.0  # sigma_x while searching, in sigma_x
 LEAST = 0.2  # votes of chance per event; a point that moves alone gets about 1.5
 PAD = 2.0  # sigma_x, how far within the sensor an event must have come from to be asked
+TIE = 1e-6  # of an age
 BLOCK = 8  # candidates per event that are scored together
 
 
@@ -37,8 +38,8 @@ class Score(NamedTuple):
 class Event(eqx.Module):
     """One event, or K, but for candidates; see `Candidates`."""
 
-    xi: Float[Array, "2 *K"]
-    room: Float[Array, "2 2 *K"]
+    xi: Float[Array, "*K 2"]
+    room: Float[Array, "*K 2 2"]
     valid: Bool[Array, "*K"]
     scale: Float[Array, "*K"]
     rate: Float[Array, "*K"]
@@ -75,12 +76,17 @@ def common(params: Params, model: Model, event: Event, usual: Float[Array, "2"])
     return Common(tau, event.valid & there, event.valid & everywhere)
 
 
-def ages(params: Params, common: Common, speed: Float[Array, ""], band: Bool[Array, ""]) -> Ages:
-    """dt_c in [0.7 tau, tau]; in a `band` [0.7 b, b] / |U_i| for a flow of that speed (px/s)."""
+def ages(
+    params: Params, common: Common, speed: Float[Array, ""], band: Bool[Array, ""] | bool
+) -> Ages:
+    """dt_c in [0.7 tau, tau]; in a `band` [0.7 b, b] / |U_i| for a flow of that speed (px/s).
+
+    Times are in whole microseconds, as the limits often are: rounding must not part them.
+    """
     own = params.baseline / speed
     return Ages(
-        params.youngest * jnp.where(band, own, common.tau),
-        jnp.where(band, jnp.minimum(own, params.tau_max), common.tau),
+        (1 - TIE) * params.youngest * jnp.where(band, own, common.tau),
+        (1 + TIE) * jnp.where(band, jnp.minimum(own, params.tau_max), common.tau),
     )
 
 
@@ -118,9 +124,9 @@ def chance(
     params: Params,
     model: Model,
     event: Event,
-    common: Common,
+    tau: Float[Array, ""],
     sigma: Float[Array, ""],
-    reach: int,
+    reach: int | Float[Array, ""],
 ) -> Float[Array, ""]:
     """How many votes an event would get of candidates without order.
 
@@ -128,26 +134,108 @@ def chance(
     (2 R + 1)^2 each, and at least `LEAST`, so that a motion so fast that no candidate is young
     enough counts as one that explains nothing.
     """
-    number = event.rate * (1 - params.youngest) * common.tau
+    number = event.rate * (1 - params.youngest) * tau
     # The area of a vote, (px^2) over that of the window; of a half-line it is a strip's.
     area = jnp.sqrt(2 * jnp.pi) * sigma
     area = area * (area / 2 + reach if model.half_line else area)
     return jnp.maximum(number * (area / (2 * reach + 1) ** 2), LEAST)
 
 
-EVENT, PARTICLE, BOTH, SAME = "event", "particle", "both", "same"
-_INNER = {EVENT: None, PARTICLE: 0, BOTH: -1, SAME: None}
-_OUTER = {EVENT: -1, PARTICLE: None, BOTH: -2, SAME: None}
+class Asked(eqx.Module):
+    """What an event, or K, ask of particles before candidates vote."""
+
+    U: Float[Array, "*K 2 N"]
+    line: Float[Array, "*K 2 N"] | None
+    ages: Ages
+    rate: Float[Array, "*K_N"]  # of votes, in a band; else 1
+    seen: Bool[Array, "*K"]  # whether it counts
+    tau: Float[Array, "*K"]
 
 
-def each(function: Callable[..., Any], *over: str) -> Callable[..., Any]:
-    """The function of an event and a particle, of all: K and N are the last axes of results.
+def ask(
+    params: Params,
+    model: Model,
+    event: Event,
+    particles: Float[Array, "N d"],
+    weights: Float[Array, " N"],
+    searching: Bool[Array, ""] | bool,
+) -> Asked:
+    """What one event asks of all particles."""
+    U = jax.vmap(model.flow, (None, 0), -1)(event.xi, particles)
+    line = jax.vmap(model.line, (None, 0), -1)(event.xi, particles) if model.half_line else None
+    speed = jax.vmap(_speed, -1)(U)
+    fixed, now, usual = lax.stop_gradient((params, speed, (U * weights).sum(-1)))
+    shared = common(fixed, model, event, usual)
+    band = _in_band(params, model, searching)
+    looked = jax.vmap(functools.partial(ages, fixed, shared, band=band))(now)
+    rate = jnp.where(band, speed / jnp.maximum((speed * weights).sum(), 1e-12), 1)
+    seen = jnp.where(band, shared.searched, shared.asked)
+    return Asked(U, line, looked, rate, seen, jnp.where(event.valid, shared.tau, 0))
 
-    An argument is of an EVENT, K its last axis, of a PARTICLE, N its first, of BOTH, K and N its
-    last, or the SAME for all.
-    """
-    inner, outer = ([axes[kind] for kind in over] for axes in (_INNER, _OUTER))
-    return jax.vmap(jax.vmap(function, inner, -1), outer, -2)
+
+def _in_band(
+    params: Params, model: Model, searching: Bool[Array, ""] | bool
+) -> Bool[Array, ""] | bool:
+    """Whether every hypothesis has ages of its own."""
+    if model.half_line:
+        return False
+    return True if params.likelihood == "band" else searching
+
+
+def spread(params: Params, searching: Bool[Array, ""] | bool) -> Float[Array, ""]:
+    """sigma_x of votes (px)."""
+    return params.sigma_x * jnp.where(searching, WIDER, 1.0)
+
+
+def add_votes(
+    params: Params,
+    d: Float[Array, "2"],
+    dt: Float[Array, ""],
+    asked: Asked,
+    S: Float[Array, " N"],
+    searching: Bool[Array, ""] | bool,
+) -> Float[Array, " N"]:
+    """S with the votes of one more candidate of an event."""
+    exponent, rho_max = -0.5 / spread(params, searching) ** 2, lax.stop_gradient(params.rho_max)
+    looked = jax.tree.map(lambda age: jnp.broadcast_to(age, S.shape), asked.ages)
+    line = None if asked.line is None else 1
+    over = jax.vmap(vote, (None, None, 1, line, 0, None, None))
+    return S + over((d[0], d[1]), dt, asked.U, asked.line, looked, exponent, rho_max)
+
+
+class Answer(NamedTuple):
+    """What an event, or K, say of particles after its candidates have voted."""
+
+    log_likelihood: Float[Array, "*K N"]
+    votes: Float[Array, "*K"]
+    chance: Float[Array, "*K"]
+
+
+def answer(
+    params: Params,
+    model: Model,
+    event: Event,
+    asked: Asked,
+    S: Float[Array, " N"],
+    weights: Float[Array, " N"],
+    searching: Bool[Array, ""] | bool,
+    reach: int | Float[Array, ""],
+) -> Answer:
+    """Of one event, and a window that reaches so far (px)."""
+    S = S * event.scale
+    rate = jnp.broadcast_to(asked.rate, S.shape)
+    log_likelihood = jax.vmap(functools.partial(gain, params), (0, 0, None))(S, rate, asked.seen)
+    fixed, sigma = lax.stop_gradient((params, spread(params, searching)))
+    by_chance = chance(fixed, model, event, asked.tau, sigma, reach)
+    votes = (lax.stop_gradient(S) * lax.stop_gradient(weights)).sum()
+    return Answer(
+        log_likelihood, jnp.where(asked.seen, votes, 0), jnp.where(asked.seen, by_chance, 0)
+    )
+
+
+def lag(params: Params, tau: Float[Array, ""]) -> Float[Array, ""]:
+    """Candidates of one age see the mean flow since then, that of half the age ago."""
+    return (1 + lax.stop_gradient(params.youngest)) / 4 * tau
 
 
 def score(
@@ -158,45 +246,21 @@ def score(
     weights: Float[Array, " N"],
     searching: Bool[Array, ""] | bool,
 ) -> Score:
-    """Log-likelihoods of events for all particles, and how much more than chance votes for them."""
-    real = particles.dtype
-    event = Event(
-        jnp.asarray(batch.xi).T, *map(jnp.asarray, (batch.room, batch.valid, batch.scale,
-                                                    batch.rate)),
-    )  # fmt: skip
-    U = each(model.flow, EVENT, PARTICLE)(event.xi, particles)
-    line = each(model.line, EVENT, PARTICLE)(event.xi, particles) if model.half_line else None
-    speed = each(_speed, BOTH)(U)
-    fixed, now, usual = lax.stop_gradient((params, speed, U @ weights))
-    shared = jax.vmap(functools.partial(common, fixed, model), -1)(event, usual)
+    """What a batch says of all particles, and how much more than chance votes for them."""
+    event = Event(*map(jnp.asarray, (batch.xi, batch.room, batch.valid, batch.scale, batch.rate)))
+    asking = functools.partial(ask, params, model, weights=weights, searching=searching)
+    asked = jax.vmap(asking, (0, None))(event, particles)
     number = jnp.maximum(event.valid.sum(), 1)
-    # Candidates of one age see the mean flow since then, that of half the age ago.
-    lag = (1 + fixed.youngest) / 4 * jnp.where(event.valid, shared.tau, 0).sum() / number
+    seen_ago = lag(params, asked.tau.sum() / number)
     if params.likelihood == "literal":
-        one = jnp.ones((), real)
-        return Score(_literal(params, model, batch, U, line, speed), one, one, lag)
-    band = jnp.asarray(searching) | (params.likelihood == "band")
-    band = band & (not model.half_line)
-    looked = each(functools.partial(ages, fixed, band=band), EVENT, BOTH)(shared, now)
-    sigma = params.sigma_x * jnp.where(searching, WIDER, 1.0)
-    S = _sum(batch, U, line, looked, -0.5 / sigma**2, fixed.rho_max)
-    S = S * batch.scale[:, None]
-    rate = jnp.where(band, speed / jnp.maximum(speed @ weights, 1e-12)[:, None], 1)
-    seen = jnp.where(band, shared.searched, shared.asked)
-    log_likelihood = each(functools.partial(gain, params), BOTH, BOTH, EVENT)(S, rate, seen)
-    by_chance = jax.vmap(
-        lambda event, common: chance(
-            fixed, model, event, common, lax.stop_gradient(sigma), batch.reach
-        ),
-        -1,
-    )(event, shared)
-    votes = lax.stop_gradient(S) @ lax.stop_gradient(weights)
-    return Score(
-        log_likelihood,
-        jnp.where(seen, votes, 0).sum(),
-        jnp.where(seen, by_chance, 0).sum(),
-        lag,
+        one = jnp.ones((), particles.dtype)
+        return Score(_literal(params, model, batch, asked.U, asked.line), one, one, seen_ago)
+    S = _sum(params, batch, asked, searching)
+    answering = functools.partial(
+        answer, params, model, weights=weights, searching=searching, reach=batch.reach
     )
+    told = jax.vmap(answering)(event, asked, S)
+    return Score(told.log_likelihood, told.votes.sum(), told.chance.sum(), seen_ago)
 
 
 def _speed(U: Float[Array, "2"]) -> Float[Array, ""]:
@@ -204,33 +268,29 @@ def _speed(U: Float[Array, "2"]) -> Float[Array, ""]:
 
 
 def _sum(
-    batch: Candidates,
-    U: Float[Array, "2 K N"],
-    line: Float[Array, "2 K N"] | None,
-    ages: Ages,
-    exponent: Array,
-    rho_max: Array,
+    params: Params, batch: Candidates, asked: Asked, searching: Bool[Array, ""] | bool
 ) -> Float[Array, "K N"]:
     """S = sum_c `vote` over candidates of the ages asked for.
 
     Candidates fill their places from the first, so the later blocks of most batches hold none and
     are skipped: by a condition outside of the maps, within which both sides would be computed.
     """
-    C, K = batch.age.shape
+    K, C = batch.age.shape
     pad = -C % BLOCK
-    age = jnp.pad(jnp.asarray(batch.age), [(0, pad), (0, 0)]).reshape(-1, BLOCK, K)
-    d = jnp.pad(jnp.asarray(batch.d), [(0, 0), (0, pad), (0, 0)]).reshape(2, -1, BLOCK, K)
-    votes = each(vote, EVENT, EVENT, BOTH, BOTH, BOTH, SAME, SAME)
+    age = jnp.pad(jnp.asarray(batch.age), [(0, 0), (0, pad)]).T.reshape(-1, BLOCK, K)
+    d = jnp.pad(jnp.asarray(batch.d), [(0, 0), (0, pad), (0, 0)])
+    d = jnp.swapaxes(d, 0, 1).reshape(-1, BLOCK, K, 2)
+    votes = jax.vmap(functools.partial(add_votes, params, searching=searching))
 
-    def add(S, dx, dy, age):
+    def add(S, d, age):
         for c in range(BLOCK):
-            S = S + votes((dx[c], dy[c]), age[c], U, line, ages, exponent, rho_max)
+            S = votes(d[c], age[c], asked, S)
         return S
 
     def body(S, block):
-        return lax.cond((block[2] > 0).any(), add, lambda S, *_: S, S, *block), None
+        return lax.cond((block[1] > 0).any(), add, lambda S, *_: S, S, *block), None
 
-    return lax.scan(body, jnp.zeros_like(U[0]), (d[0], d[1], age))[0]
+    return lax.scan(body, jnp.zeros_like(asked.U[:, 0]), (d, age))[0]
 
 
 def miss(
@@ -284,16 +344,16 @@ def _literal(
     params: Params,
     model: Model,
     batch: Candidates,
-    U: Float[Array, "2 K N"],
-    line: Float[Array, "2 K N"] | None,
-    speed: Float[Array, "K N"],
+    U: Float[Array, "K 2 N"],
+    line: Float[Array, "K 2 N"] | None,
 ) -> Float[Array, "K N"]:
     """-alpha_p times the least `miss` of an event's candidates, which is at most d_max or V_max.
 
     The last event at the same pixel is itself no candidate where the flow is not uniform: to a
     camera that does not move it would always be the best.
     """
-    d, age = jnp.asarray(batch.d), jnp.asarray(batch.age)
+    d, age = jnp.moveaxis(jnp.asarray(batch.d), -1, 0), jnp.asarray(batch.age).T
+    d = jnp.swapaxes(d, 1, 2)
     there, before, most = age > 0, jnp.full_like(age[0], jnp.inf), params.d_max
     own = there & (d == 0).all(0)
     last = jnp.where(own, age, jnp.inf).min(0)
@@ -301,8 +361,10 @@ def _literal(
     there &= ~lax.cond(params.edge > 0, edge, lambda d, age, last: age < 0, d, age, last)
     if not model.uniform:
         before, there, most = last, there & ~own, params.V_max
-    misses = each(functools.partial(miss, params, model), EVENT, EVENT, EVENT, BOTH, BOTH, BOTH)
-    over = jax.vmap(lambda d, age: misses(d, age, before, U, line, speed), (1, 0))
-    least = jnp.where(there[..., None], over(d, age), jnp.inf).min(0)
+    of_particles = jax.vmap(functools.partial(miss, params, model), (*[None] * 3, -1, -1, -1))
+    of_events = jax.vmap(of_particles, (-1, -1, 0, 0, 0, 0))
+    speed = jnp.sqrt((U**2).sum(1) + 1e-12)
+    misses = jax.vmap(lambda d, age: of_events(d, age, before, U, line, speed), (1, 0))
+    least = jnp.where(there[..., None], misses(d, age), jnp.inf).min(0)
     loss = jnp.where(batch.valid[:, None], jnp.minimum(least, most), 0)
     return -params.alpha_literal * loss

@@ -93,6 +93,13 @@ class Params(Parameters):
         1.1, "", "search anew when votes are fewer than this, in chance's votes", gradient=False
     )
     drop = Share(0.25, "", "or fewer than this share of what they were", gradient=False)
+    off = Positive(
+        0.03,
+        "",
+        "kernels: particles' weights may be off by so much of the largest, where log-likelihoods "
+        "are interpolated between motions; 0: they are not",
+        gradient=False,
+    )
     memory = Positive(6.0, "", "batches over which votes are counted for that", gradient=False)
 
     alpha_literal = Positive(2.0, "1/px", "literal: decay of the likelihood (alpha_p)")
