@@ -1,15 +1,21 @@
-.PHONY: demo test quick lint docs bench clean
+.PHONY: demo test suite quick lint docs bench clean
 .DELETE_ON_ERROR:
 
 bin := .venv/bin
 # A worker that dies is a failed test and the end: pytest-xdist would wait for it for ever.
 suite := $(bin)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --max-worker-restart 0
-install := $(bin)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e
+# Python compiles the few modules that are imported; all of them take half of the installation.
+install := $(bin)/python -m pip install --quiet --no-compile --disable-pip-version-check \
+    -c constraints.txt -e
 
 demo: .venv/demo.stamp
 	$(bin)/jaxevent demo
 
-test: lint
+# The types take one core for most of a minute: beside the tests they cost half of it.
+test: .venv/test.stamp
+	@$(MAKE) --no-print-directory -j 2 suite lint
+
+suite: .venv/test.stamp
 	$(suite)
 
 # For the edit loop: no types, and none of the tests that take long.

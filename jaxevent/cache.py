@@ -61,19 +61,22 @@ def folder_for_compiled() -> Path | None:
     return folder if os.access(folder, os.W_OK) else None
 
 
-def release_compiled(maps: int = MAPS) -> None:
+def release_compiled(maps: int = MAPS) -> bool:
     """Forget all compiled programs if the process has more than so many memory maps.
 
-    Each program keeps several maps. What is needed again is read from the cache folder.
+    Each program keeps several maps. What is needed again is read from the cache folder. Returns
+    whether they were forgotten.
     """
     jax = sys.modules.get("jax")
     try:
         many = len(Path("/proc/self/maps").read_bytes().splitlines()) > maps
     except OSError:  # other systems have no such limit
-        return
-    if jax and many:
-        jax.clear_caches()
-        gc.collect()
+        return False
+    if not (jax and many):
+        return False
+    jax.clear_caches()
+    gc.collect()
+    return True
 
 
 def _user_folder() -> Path:
