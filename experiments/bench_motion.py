@@ -6,8 +6,8 @@ Filters run over prepared candidates of simulated scenes, one event in 8, neighb
 away, by the kernel that `estimate` uses; beside them by XLA, and the same sums over candidates and
 particles as a numba loop on one core, all in CPU seconds. A third to a half of the batches are of a
 search, which asks more of an event than the loop does. The thesis publishes 100,000 events/s with
-N = 100 (GPU and CPU). Of the batch fit, seconds per window,
-and what most of them go into, J' W J v 40 times a step, beside the same as a numba loop.
+N = 100 (GPU and CPU). Of the batch fit, seconds per window, and what most of them go into, J' W J v
+some tens of times a step, beside the same as a plain loop.
 """
 
 import math
@@ -21,10 +21,12 @@ import numba
 import numpy as np
 
 from jaxevent.egomotion import voting
-from jaxevent.egomotion.batch_fit import equations, lattice, sequence
-from jaxevent.egomotion.batch_fit import tracks as tracks_of
+from jaxevent.egomotion.batch_fit import photometric, sequence
 from jaxevent.egomotion.batch_fit import windows as batch
-from jaxevent.egomotion.batch_fit.path import ROWS, Path, advanced
+from jaxevent.egomotion.batch_fit.equations import FREE, Unknowns, linearise, look
+from jaxevent.egomotion.batch_fit.loops import POWERS, subtract_mean
+from jaxevent.egomotion.batch_fit.path import Path, advanced
+from jaxevent.egomotion.batch_fit.tracks import Scene
 from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import Motion
@@ -224,48 +226,53 @@ def normal_loop(
 
 
 def normal_bench() -> tuple[dict[str, float], dict[str, float]]:
-    """One J' W J v of the batch fit, of 60,000 events where they are; J's values are drawn."""
+    """One J' W J v of the batch fit, of 60,000 events where they are, beside a drawn map."""
     recording, truth = motion_scene("texture", "varying", 200, duration=0.4)
     assert recording.camera is not None
     windows = batch.Windows(recording, batch.Params.of({}), recording.camera)
-    tracks = windows.tracks(200_000, 0.15, batch.LAST)
+    tracks, prior = windows.tracks(200_000, 0.15, batch.LAST), windows.prior(200_000, 0.15)
     T, Omega = (part[0] for part in truth.twist(np.array([0.2])))
-    depths = np.full(math.prod(tracks.nodes), np.log(np.linalg.norm(T)))
-    path = Path.constant(T / np.linalg.norm(T), Omega, depths, jnp.float32)
-    X, Y = tracks_of.placed(path, tracks)
-    at = lattice.spline(X, Y, tracks.corner, tracks.shape)
-    node = lattice.bilinear(X, Y, tracks.corner, tracks.node, tracks.nodes)
-    rng, E, n = np.random.default_rng(0), len(tracks.x), 6 * ROWS + 4
+    rng, real = np.random.default_rng(0), tracks.x.dtype
+    depths = np.full(math.prod(tracks.nodes), np.log(np.linalg.norm(T)), real)
+    path = Path.constant(T / np.linalg.norm(T), Omega, depths)
+    scene = Scene(path, rng.normal(size=tracks.shape).astype(real), 0.0)
+    problem, weight = photometric.begin(tracks, scene, prior, 1.0, plane=False)
+    made = linearise(problem, look(problem, scene, weight), settling=False)
+    slopes, weight = made.slopes, made.seen.weight
+    E, n = len(weight), FREE + len(slopes.more)
+    v = rng.normal(size=tracks.shape), rng.normal(size=n), rng.normal(size=len(depths))
+    v = v[0].astype(real), np.append(v[1], np.zeros(FREE + 4 - n)), v[2].astype(real)
 
-    def drawn(*shape: int) -> jax.Array:
-        return jnp.asarray(rng.normal(size=shape), jnp.float32)
+    def product() -> Unknowns:
+        value = made.change(v)
+        subtract_mean(value, weight, tracks.begin)
+        value *= weight
+        return made.transposed(value)
 
-    slopes, v = (drawn(n, E), drawn(E)), (drawn(*tracks.shape), drawn(n), drawn(len(depths)))
-    weight = tracks.on * at.inside
-    total = tracks_of.totals(weight, tracks)
-    jacobian = equations.Jacobian(tracks, at, node, *slopes, weight, total)
-
-    def product(jacobian: equations.Jacobian, v: tuple) -> tuple:
-        return jacobian.back(weight * jacobian.subtract_mean(jacobian.of(v)))
-
-    def step(jacobian: equations.Jacobian, v: tuple) -> tuple:
-        def one(_: Any, v: tuple) -> tuple:
-            return jax.tree.map(lambda part: part / jnp.abs(part).max(), product(jacobian, v))
-
-        return jax.lax.fori_loop(0, equations.SOLVE, one, v)
-
-    arguments = [np.asarray(part).ravel() for part in v]
-    for near, shape in ((at, tracks.shape), (node, tracks.nodes)):
-        steps = np.array(lattice.offsets(near, shape), np.int32)
-        arguments += [np.asarray(near.first), steps, np.ascontiguousarray(near.share.T)]
-    arguments += [np.ascontiguousarray(slopes[0].T)]
-    arguments += map(np.asarray, (slopes[1], weight, tracks.pixel, total))
-    for ours, its in zip(product(jacobian, v), normal_loop(*arguments), strict=True):
-        its = its.reshape(ours.shape)
-        np.testing.assert_allclose(ours, its, rtol=0, atol=1e-4 * np.abs(its).max())
-    compiled = jax.jit(step)
-    seconds = timed(lambda: compiled(jacobian, v), 10) / equations.SOLVE
-    slow = timed(lambda: normal_loop(*arguments), 100)
+    powers = slopes.tau[:, None] ** np.arange(1, POWERS + 1)
+    by_path = (slopes.base.T[:, :, None] * powers[:, None]).reshape(E, -1) @ made.chain
+    across, down = (
+        np.stack([(0.5 - t) ** 2 / 2, 0.75 - t**2, (0.5 + t) ** 2 / 2], 1)
+        for t in (slopes.u, slopes.v)
+    )
+    share = (down[:, :, None] * across[:, None]).reshape(E, 9)
+    right, low = (np.stack([1 - t, t], 1) for t in (slopes.across, slopes.down))
+    node_share = (low[:, :, None] * right[:, None]).reshape(E, 4)
+    steps = (tracks.shape[1] * np.arange(3)[:, None] + np.arange(3)).ravel()
+    node_steps = (tracks.nodes[1] * np.arange(2)[:, None] + np.arange(2)).ravel()
+    pixel = np.repeat(np.arange(len(tracks.begin) - 1), np.diff(tracks.begin))
+    total = np.maximum(np.bincount(pixel, weight), 1e-3)
+    given = v[0].ravel(), v[1][:n], v[2], share, node_share, weight, total
+    v_map, v_path, v_depth, share, node_share, own, total = (x.astype(np.float32) for x in given)
+    by_path = np.concatenate([by_path, slopes.more.T], 1).astype(np.float32)
+    arguments = (
+        v_map, v_path, v_depth, slopes.first, steps, share, slopes.node, node_steps, node_share,
+        by_path, slopes.by_depth, own, pixel, total,
+    )  # fmt: skip
+    for ours, its in zip(product(), normal_loop(*arguments), strict=True):
+        ours = ours.ravel()[: its.size]
+        np.testing.assert_allclose(ours, its.ravel(), rtol=0, atol=1e-3 * np.abs(its).max())
+    seconds, slow = timed(product, 100), timed(lambda: normal_loop(*arguments), 100)
     name = "batch general motion, one J' W J v"
     speed = {name: E / seconds / 1e6, f"{name}, as a numba loop": E / slow / 1e6}
     return speed, {f"{name} / numba loop": slow / seconds}

@@ -184,7 +184,9 @@ def within(params: Params, since: Array) -> Array:
     """
     sharp = params.rho_width == 0
     steepness = 1 / jnp.where(sharp, 1, params.rho_width)
-    soft = jax.nn.sigmoid(steepness * (jnp.log(params.rho) - jnp.log(jnp.maximum(since, 1e-7))))
+    some = params.rho > 0
+    later = jnp.log(jnp.where(some, params.rho, 1)) - jnp.log(jnp.maximum(since, 1e-7))
+    soft = jnp.where(some, jax.nn.sigmoid(steepness * later), 0.0)
     return jnp.where(sharp, jnp.where(since <= params.rho, 1.0, 0.0), soft)
 
 

@@ -3,7 +3,6 @@
 import inspect
 from types import SimpleNamespace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -20,10 +19,9 @@ def test_cells_err_independently(monkeypatch):
     x, y = rng.uniform(0, 240, (2, 400))
     one, other = rng.random((2, 400))
     on = (rng.random(400) < 0.9) * 1.0
-    costs = {"one": (jnp.asarray(one), jnp.asarray(on)), "other": (jnp.asarray(other), on + 0)}
+    costs = {"one": (one, on), "other": (other, on)}
     monkeypatch.setattr(rivals, "_costs", lambda tracks, scene, prior, sigma: costs[scene])
-    tracks: object = SimpleNamespace(x=jnp.asarray(x), y=jnp.asarray(y), corner=(0.0, 0.0),
-                                     shape=(240, 240))  # fmt: skip
+    tracks: object = SimpleNamespace(x=x, y=y, corner=(0.0, 0.0), shape=(240, 240))
     compared = inspect.unwrap(rivals.compared)  # without checks of types
     z = compared(tracks, "one", "other", None, 0.1)
     sums: dict[tuple[int, int], float] = {}
@@ -36,7 +34,7 @@ def test_cells_err_independently(monkeypatch):
 
 def test_rotation_alone_makes_about_the_same_flow():
     heading, Omega, f, rho = np.array([0.6, -0.8, 0.0]), np.array([0.1, 0.2, 0.3]), 200.0, 0.2
-    path = Path.constant(heading, Omega, np.full(4, np.log(rho)), jnp.float32)
+    path = Path.constant(heading, Omega, np.full(4, np.log(rho)))
     still = rivals.without_translation(path)
     assert np.exp(still.log_rho).max() < 1e-3
     middle = np.asarray(A(0.0, 0.0, f)) @ heading * rho + np.asarray(B(0.0, 0.0, f)) @ Omega
@@ -78,5 +76,5 @@ def test_pixels_left_out_are_others_and_no_more_events(first):
     windows = Windows(Recording("r", 64, 48, events, camera=camera), Params(), camera)
     centre, half = len(x) // 2, 1.0
     parts = windows.tracks(centre, half, 300, first), windows.tracks(centre, half, 300, 300, first)
-    held = [set(np.asarray(part.pixel)[np.asarray(part.pixel) < 64 * 48]) for part in parts]
+    held = [set(part.x) for part in parts]
     assert held[0] and held[1] and not held[0] & held[1]

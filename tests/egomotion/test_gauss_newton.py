@@ -1,47 +1,17 @@
-"""What the fits of a window share: solution, acceptance, limits and the priors' pull."""
+"""What the fits of a window share: acceptance, limits, bonds, rows and the priors' pull."""
 
-import jax
-import jax.numpy as jnp
+import dataclasses
+
 import numpy as np
 import pytest
 
-from jaxevent.egomotion.batch_fit import gauss_newton
-from jaxevent.egomotion.batch_fit.gauss_newton import Acceptance, accept, conjugate_gradients
+from jaxevent.egomotion.batch_fit import gauss_newton, rows
+from jaxevent.egomotion.batch_fit.gauss_newton import Acceptance, accept
+from jaxevent.egomotion.batch_fit.loops import POWERS
 from jaxevent.egomotion.batch_fit.path import SEGMENTS, Path, Prior
 
 K = 3
 HALF = 0.15
-
-
-def spd(n: int) -> np.ndarray:
-    root = np.random.default_rng(n).normal(size=(n, n))
-    return root @ root.T + 0.1 * np.eye(n)
-
-
-def test_conjugate_gradients_solve():
-    """A dense system, whose unknowns are a pytree, in as many steps as it has numbers."""
-    H, side = spd(12), np.random.default_rng(0).normal(size=12)
-
-    def joined(v):
-        return jnp.concatenate([v[0], v[1].ravel()])
-
-    def apart(v):
-        return v[:4], v[4:].reshape(2, 4)
-
-    found = conjugate_gradients(
-        lambda v: apart(H @ joined(v)), lambda v: v, apart(jnp.asarray(side)), 16
-    )
-    np.testing.assert_allclose(joined(found), np.linalg.solve(H, side), rtol=1e-8)
-
-
-def test_an_exact_preconditioner_needs_one_step():
-    H, side = spd(8), jnp.ones(8)
-    found = conjugate_gradients(lambda v: H @ v, lambda v: jnp.linalg.solve(H, v), side, 1)
-    np.testing.assert_allclose(found, np.linalg.solve(H, side), rtol=1e-9)
-
-
-def number(value: float) -> jax.Array:
-    return jnp.asarray(value)
 
 
 @pytest.mark.parametrize(
@@ -56,58 +26,86 @@ def number(value: float) -> jax.Array:
     ],
 )
 def test_steps_are_accepted_or_damped(before, better, gain, after):
-    now = accept(
-        Acceptance(number(before[0]), number(before[1])), jnp.asarray(better), number(gain),
-        number(1.0), jnp.asarray(True),
-    )  # fmt: skip
-    assert (float(now.momentum), float(now.damping)) == pytest.approx(after)
-    assert bool(now.goes_on) == (after[1] < 50)
+    now = accept(Acceptance(*before), better, gain, 1.0, True)
+    assert (now.momentum, now.damping) == pytest.approx(after)
+    assert now.goes_on == (after[1] < 50)
 
 
 def test_steps_are_limited():
-    assert float(gauss_newton.limit_step(jnp.array([1.0, -8.0]))) == 0.5
-    assert float(gauss_newton.limit_step(jnp.array([1.0, -3.0]))) == 1
+    assert gauss_newton.limit_step(np.array([1.0, -8.0])) == 0.5
+    assert gauss_newton.limit_step(np.array([1.0, -3.0])) == 1
 
 
 def a_path() -> Path:
     rng = np.random.default_rng(1)
-    return Path(*(jnp.asarray(rng.normal(size=shape)) for shape in ((5, 3), (5, 3), (7,))))
+    return Path(*(rng.normal(size=shape) for shape in ((5, 3), (5, 3), (7,))))
 
 
 def test_rows_are_put_back():
     path = a_path()
-    rows = gauss_newton.first_rows(path, K)
-    moved = gauss_newton.with_first_rows(path, 2 * rows, K)
-    np.testing.assert_allclose(gauss_newton.first_rows(moved, K), 2 * rows)
+    first = rows.rows_of(path, K)
+    moved = rows.with_rows(path, 2 * first)
+    np.testing.assert_allclose(rows.rows_of(moved, K), 2 * first)
     np.testing.assert_array_equal(moved.O[K:], path.O[K:])
     np.testing.assert_array_equal(moved.D[K:], path.D[K:])
     # Omega of 1 / (f h) moves an image by 1 px at the window's end, its change by 2 / (f h^2).
-    unit = gauss_newton.units_of_rows(path, number(80.0), number(HALF), K).reshape(2, K, 3)
+    unit = rows.units_of_rows(path, 80.0, HALF, K).reshape(2, K, 3)
     np.testing.assert_allclose(unit[0, :, 0], [1 / 12, 2 / 1.8, 6 / 0.27], rtol=1e-12)
     usual = np.exp(np.median(path.log_rho))
     np.testing.assert_allclose(unit[1], unit[0] / usual, rtol=1e-12)
 
 
+@pytest.mark.parametrize("k", [K, 5])
+def test_coefficients_change_with_rows_as_told(k):
+    """Against differences of the polynomials, in half windows."""
+    path = a_path()
+    unit = rows.units_of_rows(path, 80.0, HALF, k)
+    powers = HALF ** np.arange(1, POWERS + 1)
+
+    def coefficients(at: Path) -> np.ndarray:
+        both = np.stack(at.polynomials()) * powers[:, None]
+        return both.transpose(0, 2, 1).ravel()
+
+    found, h = rows.chain(path, unit, HALF, k), 1e-6
+    assert found.shape == (6 * POWERS, 6 * k)
+    for n, one in enumerate(np.eye(6 * k)):
+        step = h * one * unit
+        ends = [
+            coefficients(rows.with_rows(path, rows.rows_of(path, k) + s)) for s in (step, -step)
+        ]
+        np.testing.assert_allclose(found[:, n], (ends[0] - ends[1]) / (2 * h), atol=1e-7)
+
+
+def test_the_size_of_the_translation_is_held():
+    path = dataclasses.replace(a_path(), D=np.eye(5, 3))
+    unit = rows.units_of_rows(path, 80.0, HALF, K)
+    gauge = rows.gauge_of_rows(path, unit, 6 * K + 4)
+    expected = np.zeros(6 * K + 4)
+    expected[3 * K] = unit[3 * K]
+    np.testing.assert_allclose(gauge, expected)
+
+
 def test_priors_pull_as_written():
     rng = np.random.default_rng(2)
     now, unit = rng.normal(size=6 * K), rng.uniform(0.5, 2, 6 * K)
-    one, gyro = jnp.asarray(1.0), rng.normal(size=(SEGMENTS, 3))
-    prior = Prior(one, one, number(0.3), number(0.7), jnp.asarray(gyro), number(2.0), one, one, one)
+    gyro = rng.normal(size=(SEGMENTS, 3))
+    prior = Prior(1.0, 1.0, 0.3, 0.7, gyro, 2.0, 1.0, 1.0, 1.0)
     O = (now * unit)[: 3 * K].reshape(K, 3)  # noqa: E741
     t = ((np.arange(SEGMENTS) + 0.5) / SEGMENTS * 2 - 1) * HALF
     seen = O[0] + O[1] * t[:, None] + O[2] * t[:, None] ** 2 / 2
     changes = np.concatenate([now[3 : 3 * K], now[3 * K + 3 :]])
     expected = 0.7 * (O[0] ** 2).sum() + 0.3 * (changes**2).sum()
-    expected += 2.0 / SEGMENTS * ((seen - gyro) ** 2).sum() + 0.5
-    cost = gauss_newton.pull_of_rows(
-        jnp.asarray(now), jnp.asarray(unit), prior, number(HALF), K, 0.5
-    )
-    assert float(cost) == pytest.approx(expected / 2, rel=1e-12)
+    expected += 2.0 / SEGMENTS * ((seen - gyro) ** 2).sum()
+    H, b, constant = rows.priors_of_rows(prior, unit, HALF)
+    cost = now @ H @ now / 2 - b @ now + constant
+    assert cost == pytest.approx(expected / 2, rel=1e-12)
 
 
 def test_bonds_give_way_at_edges():
-    log_rho = jnp.array([0.0, 0.01, 5.0])
-    pairs = jnp.array([0, 1]), jnp.array([1, 2])
-    apart, bond = gauss_newton.bonds_between(log_rho, pairs, number(2.0), 0.1)
-    np.testing.assert_allclose(apart, [-0.01, -4.99])
-    np.testing.assert_allclose(bond, [2 / 1.01, 2 / (1 + 49.9**2)])
+    log_rho = np.array([[0.0, 0.01, 5.0], [0.0, 0.01, 5.0]])
+    across, down, cost = gauss_newton.bonds(log_rho, 2.0, 0.1)
+    row = [0, 2 / 1.01, 2 / (1 + 49.9**2)]
+    np.testing.assert_allclose(across, [row, row])
+    np.testing.assert_allclose(down, [[0, 0, 0], [2, 2, 2]])
+    one = 2.0 * 0.1**2 / 2 * (np.log1p(0.01) + np.log1p(49.9**2))
+    assert cost == pytest.approx(2 * one)

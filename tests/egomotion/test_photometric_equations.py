@@ -2,24 +2,20 @@
 
 import functools
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
 
 from jaxevent.egomotion.batch_fit import equations as fit
-from jaxevent.egomotion.batch_fit.gauss_newton import with_first_rows
-from jaxevent.egomotion.batch_fit.lattice import gather, laplacian, spline, weigh
+from jaxevent.egomotion.batch_fit import loops
 from jaxevent.egomotion.batch_fit.path import ROWS, SEGMENTS, Path, Prior
-from jaxevent.egomotion.batch_fit.tracks import Scene, Tracks, placed
+from jaxevent.egomotion.batch_fit.rows import with_rows
+from jaxevent.egomotion.batch_fit.tracks import Scene, Tracks, read
 
 pytestmark = pytest.mark.slow
 
 F, HALF, NODE = 20.0, 0.15, 4
 SHAPE, CORNER = (20, 24), (-12.0, -10.0)
 PIXELS, EACH = 40, 5  # that see events, and how many each
-UNKNOWNS = fit.FREE + 4  # of the path, the skew, the plane's normal
 # Differences of 1e-6 tell slopes to rounding by that, some 1e-9.
 STEP = 1e-6
 
@@ -30,11 +26,10 @@ def some_tracks() -> Tracks:
     tau = np.sort(rng.uniform(-HALF, HALF, (PIXELS, EACH)), 1).ravel()
     p = rng.choice([-1.0, 1.0], (PIXELS, EACH))
     number = np.tile(np.arange(EACH) + 1.0, PIXELS)
-    arrays = pixel % 16 - 7.5, pixel // 16 - 5.5, tau, np.cumsum(p, 1).ravel(), number, p.ravel()
-    x, y, tau, level, number, p = (jnp.asarray(part) for part in arrays)
+    begin = EACH * np.arange(PIXELS + 1)
     return Tracks(
-        x, y, tau, level, number, p, jnp.asarray(pixel, jnp.int32), jnp.asarray(F),
-        jnp.asarray(HALF), SHAPE, CORNER, 16 * 12, NODE,
+        pixel % 16 - 7.5, pixel // 16 - 5.5, tau, np.cumsum(p, 1).ravel(), number, p.ravel(), begin,
+        F, HALF, SHAPE, CORNER, NODE,
     )  # fmt: skip
 
 
@@ -44,8 +39,7 @@ def some_scene(tracks: Tracks, log_rho: np.ndarray) -> Scene:
     rows = 0.3 ** np.arange(ROWS)[:, None] / HALF ** np.arange(ROWS)[:, None]
     O, D = rng.normal(size=(2, ROWS, 3)) * rows * 0.3  # noqa: E741
     D[0] = np.array([0.5, -0.3, 0.6]) / np.linalg.norm([0.5, -0.3, 0.6])
-    path = Path(*(jnp.asarray(part) for part in (O, D, log_rho)))
-    return Scene(path, jnp.asarray(rng.normal(size=SHAPE)), jnp.asarray(0.05))
+    return Scene(Path(O, D, log_rho), rng.normal(size=SHAPE), 0.05)
 
 
 def smooth(tracks: Tracks) -> np.ndarray:
@@ -59,17 +53,8 @@ def rays_of_nodes(tracks: Tracks) -> np.ndarray:
     return np.stack([x / F, y / F, np.ones(len(x))], 1)
 
 
-@jax.jit
-def misfits_before_means(scene: Scene, tracks: Tracks) -> jax.Array:
-    at = spline(*placed(scene.path, tracks), tracks.corner, tracks.shape)
-    value = weigh(gather(scene.map, at, tracks.shape), at.share)
-    return value - tracks.level - scene.skew * tracks.number
-
-
-@jax.jit
-def look_and_linearise(problem: fit.Problem, scene: Scene) -> tuple[fit.Seen, fit.Equations]:
-    seen = fit.look(problem, scene, problem.tracks.on)
-    return seen, fit.linearise(problem, seen, jnp.asarray(False))
+def misfits_before_means(scene: Scene, tracks: Tracks) -> np.ndarray:
+    return read(scene, tracks).value - tracks.level - scene.skew * tracks.number
 
 
 @functools.cache
@@ -77,20 +62,37 @@ def linearised(normal: tuple[float, float, float] | None = None) -> tuple[fit.Se
     """Before depths that bend, or a plane."""
     tracks, plane = some_tracks(), normal is not None
     log_rho = np.log(rays_of_nodes(tracks) @ normal) if plane else smooth(tracks)
-    numbers = 1.0, 1.0, 0.3, 0.7, np.full((SEGMENTS, 3), 0.2), 2.0, 0.8, 0.05, 10.0
-    prior = Prior(*(jnp.asarray(number) for number in numbers))
-    problem = fit.Problem(tracks, prior, jnp.asarray(0.7), jnp.asarray(plane), jnp.asarray(0.5))
-    seen, equations = look_and_linearise(problem, some_scene(tracks, log_rho))
-    assert (seen.on == 1).all()
-    return seen, equations
+    gyro = np.full((SEGMENTS, 3), 0.2)
+    prior = Prior(1.0, 1.0, 0.3, 0.7, gyro, 2.0, 0.8, 0.05, 10.0)
+    problem = fit.Problem(tracks, prior, 0.7, plane, 0.5)
+    seen = fit.look(problem, some_scene(tracks, log_rho), np.ones(PIXELS * EACH))
+    assert (seen.places.inside == 1).all()
+    return seen, fit.linearise(problem, seen, settling=False)
 
 
-@jax.jit
-def moved(scene: Scene, equations: fit.Equations, v: tuple) -> Scene:
+def size_of(equations: fit.Equations) -> tuple[int, int, int]:
+    """How many numbers of the map, of the path and the like, and depths are unknown."""
+    tracks = equations.problem.tracks
+    free = fit.FREE + len(equations.slopes.more)
+    return SHAPE[0] * SHAPE[1], free, tracks.nodes[0] * tracks.nodes[1]
+
+
+def joined(parts: fit.Unknowns, n: int) -> np.ndarray:
+    """Unknowns in one, those of the path that are free."""
+    return np.concatenate([parts[0].ravel(), parts[1][:n], parts[2].ravel()])
+
+
+def apart(flat: np.ndarray, equations: fit.Equations) -> fit.Unknowns:
+    """The same, the other way; those that are not free 0."""
+    n, m, _ = size_of(equations)
+    path = np.append(flat[n : n + m], np.zeros(fit.FREE + 4 - m))
+    return flat[:n].reshape(SHAPE), path, flat[n + m :]
+
+
+def moved(scene: Scene, equations: fit.Equations, v: fit.Unknowns) -> Scene:
     """The scene after a change of the unknowns, the plane's left out."""
     image, t, q = v
-    rows = (equations.now + t)[: fit.FREE] * equations.unit
-    path = with_first_rows(scene.path, rows, ROWS)
+    path = with_rows(scene.path, (equations.now + t)[: fit.FREE] * equations.unit)
     path = Path(path.O, path.D, path.log_rho + q)
     return Scene(path, scene.map + image, scene.skew + t[fit.FREE])
 
@@ -102,24 +104,22 @@ def slopes(function, directions: np.ndarray) -> np.ndarray:
     return np.array(both) / (2 * STEP)
 
 
-def some_directions(size: int) -> np.ndarray:
-    """Some changes of the map at random; each other unknown alone, but for the plane's."""
-    n = SHAPE[0] * SHAPE[1]
+def some_directions(equations: fit.Equations) -> np.ndarray:
+    """Some changes of the map at random; each other unknown alone."""
+    n, size = size_of(equations)[0], sum(size_of(equations))
     maps = np.zeros((3, size))
     maps[:, :n] = np.random.default_rng(2).normal(size=(3, n))
-    alone = np.delete(np.eye(size)[n:], np.arange(fit.FREE + 1, UNKNOWNS), 0)
-    return np.concatenate([maps, alone])
+    return np.concatenate([maps, np.eye(size)[n:]])
 
 
 def test_misfits_change_as_linearised():
     """By every row of the path, the skew, every depth, and some changes of the map."""
     seen, equations = linearised()
-    tracks = equations.problem.tracks
-    flat, apart = ravel_pytree(equations.gradient)
-    directions = some_directions(len(flat))
-    found = jax.vmap(lambda v: equations.jacobian.of(apart(v)))(jnp.asarray(directions))
+    tracks, directions = equations.problem.tracks, some_directions(equations)
+    found = np.array([equations.change(apart(v, equations)) for v in directions])
     expected = slopes(
-        lambda v: misfits_before_means(moved(seen.scene, equations, apart(v)), tracks), directions
+        lambda v: misfits_before_means(moved(seen.scene, equations, apart(v, equations)), tracks),
+        directions,
     )
     assert (abs(expected).max(1) > 1e-3).sum() > len(expected) - 15  # some nodes see no events
     np.testing.assert_allclose(found, expected, atol=1e-7)
@@ -134,73 +134,127 @@ def test_misfits_change_with_a_plane_as_linearised(normal, near):
     rays, rho = rays_of_nodes(tracks), np.exp(scene.path.log_rho)
     assert np.ptp(rho) > 0.2 or near < 1e-6
 
-    def tilted(change: np.ndarray) -> jax.Array:
-        level = jnp.asarray(np.log(rho + np.median(rho) * rays @ change))
+    def tilted(change: np.ndarray) -> np.ndarray:
+        level = np.log(rho + np.median(rho) * rays @ change)
         path = Path(scene.path.O, scene.path.D, level)
         return misfits_before_means(scene._replace(path=path), tracks)
 
-    found, expected = equations.jacobian.by_path[fit.FREE + 1 :], slopes(tilted, np.eye(3))
+    found, expected = equations.slopes.more[1:], slopes(tilted, np.eye(3))
     np.testing.assert_allclose(found, expected, atol=near * abs(expected).max())
-    assert (equations.jacobian.by_depth == 0).all()
+    assert (equations.slopes.by_depth == 0).all()
+
+
+def test_values_of_events_are_taken_back():
+    """The transpose of what changes of the unknowns make of misfits."""
+    _, equations = linearised()
+    J = np.array([equations.change(apart(v, equations)) for v in np.eye(sum(size_of(equations)))])
+    z = np.random.default_rng(3).normal(size=PIXELS * EACH)
+    found = joined(equations.transposed(z), size_of(equations)[1])
+    np.testing.assert_allclose(found, J @ z, atol=1e-12 * abs(J @ z).max())
 
 
 def test_the_gradient_is_that_of_what_is_minimised():
     """Of misfits less their means, the weights held, and the priors."""
     seen, equations = linearised()
     problem, scene = equations.problem, seen.scene
-    prior, (a, b) = problem.prior, problem.pairs
-    flat, apart = ravel_pytree(equations.gradient)
+    prior, (rows, columns) = problem.prior, problem.tracks.nodes
 
-    @jax.jit
-    def total(scene: Scene, e: jax.Array, t: jax.Array) -> jax.Array:
-        left = equations.jacobian.subtract_mean(e)
-        differences = scene.path.log_rho[a] - scene.path.log_rho[b]
-        bonds = prior.bond * fit.BEND**2 * jnp.log1p((differences / fit.BEND) ** 2).sum()
-        maps = prior.flat * (scene.map * laplacian(scene.map)).sum() + 1e-5 * (scene.map**2).sum()
-        pull = problem.pull(equations.now + t, equations.unit)
-        return ((equations.information * left**2).sum() + bonds + maps) / 2 + pull
+    def cost(v: np.ndarray) -> float:
+        parts = apart(v, equations)
+        new = moved(scene, equations, parts)
+        left = misfits_before_means(new, problem.tracks)
+        loops.subtract_mean(left, seen.weight, problem.tracks.begin)
+        depth = new.path.log_rho.reshape(rows, columns)
+        bonds = maps = 0.0
+        for axis in (0, 1):
+            u = (np.diff(depth, axis=axis) / fit.BEND) ** 2
+            bonds += prior.bond * fit.BEND**2 * np.log1p(u).sum()
+            maps += prior.flat * (np.diff(new.map, axis=axis) ** 2).sum()
+        maps += 1e-5 * (new.map**2).sum()
+        t = equations.now + parts[1]
+        known, side, constant = problem.pull(scene.path, equations.unit)
+        pull = t @ known @ t / 2 - side @ t + constant
+        return (problem.information * (seen.weight * left**2).sum() + bonds + maps) / 2 + pull
 
-    def cost(v: np.ndarray) -> jax.Array:
-        new = moved(scene, equations, apart(v))
-        return total(new, misfits_before_means(new, problem.tracks), apart(v)[1])
-
-    directions = some_directions(len(flat))
-    found, expected = directions @ np.asarray(flat), slopes(cost, directions)
+    directions = some_directions(equations)
+    flat = joined(fit.gradient_of(equations), size_of(equations)[1])
+    found, expected = directions @ flat, slopes(cost, directions)
     np.testing.assert_allclose(found, expected, atol=1e-6 * abs(expected).max())
-    assert abs(expected[-len(scene.path.log_rho) :]).max() > 1e-3
+    assert abs(expected[-rows * columns :]).max() > 1e-3
+
+
+def times(system: loops.System, v: fit.Unknowns) -> fit.Unknowns:
+    """H v."""
+    out, out_depth = np.empty(SHAPE), np.empty(system.hold.shape)
+    t = np.ascontiguousarray(v[1][: len(system.known)])
+    depth = np.ascontiguousarray(v[2]).reshape(system.hold.shape)
+    found = loops.multiply(
+        system, np.ascontiguousarray(v[0]), t, depth, np.empty(PIXELS * EACH), out, out_depth
+    )
+    return out, found, out_depth
+
+
+@functools.cache
+def matrix(damping: float) -> np.ndarray:
+    _, equations = linearised()
+    system = fit.system_of(equations, damping)
+    size = size_of(equations)
+    eye = np.eye(sum(size))
+    return np.array([joined(times(system, apart(v, equations)), size[1]) for v in eye]).T
 
 
 def test_the_matrix_is_that_of_least_squares():
     """J' W J of misfits less their means; what is kept of it are its blocks."""
-    _, equations = linearised()
-    flat, apart = ravel_pytree(equations.gradient)
-    eye, undamped = jnp.eye(len(flat)), jnp.zeros(())
-    columns = jax.vmap(lambda v: ravel_pytree(equations.times_H(undamped, apart(v)))[0])(eye)
-    J = jax.vmap(lambda v: equations.jacobian.subtract_mean(equations.jacobian.of(apart(v))))(eye)
-    n, m = SHAPE[0] * SHAPE[1], SHAPE[0] * SHAPE[1] + UNKNOWNS
-    H = np.asarray(columns)
-    priors = H - np.asarray((J * equations.information) @ J.T)
-    held = np.asarray(equations.known + equations.held)
+    seen, equations = linearised()
+    (n, free, _), begin = size_of(equations), equations.problem.tracks.begin
+    m = n + free
+    J = np.array([equations.change(apart(v, equations)) for v in np.eye(sum(size_of(equations)))])
+    for row in J:
+        loops.subtract_mean(row, seen.weight, begin)
+    H = matrix(0.0)
+    priors = H - equations.problem.information * (J * seen.weight) @ J.T
+    held = (equations.known + equations.held)[:free, :free]
     np.testing.assert_allclose(priors[n:m, n:m], held, atol=1e-6)
     np.testing.assert_allclose(priors[m:, n:m], 0, atol=1e-9)
     np.testing.assert_allclose(H, H.T, atol=1e-9 * abs(H).max())
-    np.testing.assert_allclose(np.asarray(equations.upper), H[n:m, n:m], rtol=1e-9, atol=1e-6)
-    np.testing.assert_allclose(np.asarray(equations.mixed), H[m:, n:m], atol=1e-9)
+    upper = equations.upper[:free, :free]
+    np.testing.assert_allclose(upper, H[n:m, n:m], rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(equations.mixed[:, :free], H[m:, n:m], atol=1e-9)
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.5])
 def test_the_preconditioner_is_exact_where_the_matrix_is_of_blocks(damping):
     """A diagonal for the map, and path with depths that do not pull on each other."""
     _, equations = linearised()
-    flat, apart = ravel_pytree(equations.gradient)
-    ease = fit.precondition(equations, jnp.asarray(damping))
-    eased = jax.vmap(lambda v: ravel_pytree(ease(apart(v)))[0])(jnp.eye(len(flat)))
-    stiff = (damping + 1e-3) * np.diag(equations.stiff)
+    system, (_, free, nodes) = fit.system_of(equations, damping), size_of(equations)
+    eased = []
+    for v in np.eye(free + nodes):
+        depth = v[free:].reshape(system.hold.shape)
+        out = np.empty_like(depth)
+        t = loops._ease_rest(system, v[:free].copy(), depth.copy(), out)
+        eased.append(np.append(t, out))
+    upper, mixed = equations.upper[:free, :free], equations.mixed[:, :free]
+    stiff = (damping + 1e-3) * np.diag(equations.stiff[:free])
     lumped = (1 + damping) * np.diag(equations.lumped)
-    rest = np.block([[equations.upper + stiff, equations.mixed.T], [equations.mixed, lumped]])
-    n = SHAPE[0] * SHAPE[1]
-    map_ = (1 + damping) * np.asarray(equations.diagonal).ravel()
-    np.testing.assert_allclose(eased[:n, :n], np.diag(1 / map_), rtol=1e-12)
-    np.testing.assert_array_equal(eased[:n, n:], 0)
-    np.testing.assert_array_equal(eased[n:, :n], 0)
-    np.testing.assert_allclose(eased[n:, n:] @ rest, np.eye(len(rest)), atol=1e-7)
+    rest = np.block([[upper + stiff, mixed.T], [mixed, lumped]])
+    np.testing.assert_allclose(eased @ rest, np.eye(len(rest)), atol=1e-7)
+    map_ = (1 + damping) * equations.diagonal
+    np.testing.assert_allclose(system.ease_map, 1 / map_, rtol=1e-12)
+
+
+def test_conjugate_gradients_solve():
+    """What they leave is as small as was asked for; with more steps it is nothing."""
+    _, equations = linearised()
+    size, rng = size_of(equations), np.random.default_rng(4)
+    side = rng.normal(size=sum(size))
+    system, H = fit.system_of(equations, 0.5), matrix(0.5)
+    depth = side[size[0] + size[1] :].reshape(system.hold.shape)
+    given = side[: size[0]].reshape(SHAPE), side[size[0] : size[0] + size[1]], depth
+    exact, steps = np.linalg.solve(H, side), []
+    for enough, near in ((0.1, 0.3), (1e-3, 3e-3), (1e-9, 1e-7)):
+        *found, done = loops.conjugate_gradients(system, *given, 2000, enough)
+        off = joined(found, size[1]) - exact
+        assert np.sqrt(off @ H @ off) < near * np.sqrt(exact @ side)
+        steps.append(done)
+    assert 0 < steps[0] < steps[1] < steps[2] < 30  # 22; steepest descent needs 45
+    assert loops.conjugate_gradients(system, *given, 5, 0.0)[3] == 5

@@ -550,6 +550,29 @@ def test_gradients_are_finite_at_corners(name):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["akf", "aks"])
+def test_gradients_are_finite_at_extremes(name):
+    """Each number at 0 or its least, at a millionth and 10,000 times its default."""
+    method, recording = jaxevent.METHODS[name], random_recording(9, 50, 4, span=24_000)
+    plain = followed(params_of(method, **OPTIONS))
+    features, out = method.prepare(recording, recording.frames.t + 1, plain, extrapolate=True)
+    ones = jnp.ones((len(recording.frames.t), 12))
+    given = 0
+    for setting, number in method.Params.numbers.items():
+        most = 10.0 if number.unit == "ln I" else 1e4  # thresholds: e^10 is beyond any scene
+        for factor in (0.0, 1e-6, most) if number.gradient and np.ndim(number.default) == 0 else ():
+            value = max(factor * max(number.default, 1e-2), number.least)
+            if setting in ("share", "rho_ref"):
+                continue
+            params = plain.replace(**{setting: value})
+            gradient = SLOPE(method, params, features, out, ones, ones)
+            finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+            assert finite, (setting, value)
+            given += 1
+    assert given > 20
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["akf", "aks", "edi"])
 def test_derivative_by_the_dead_time_is_that_of_preparing_anew(name):
     method = jaxevent.METHODS[name]

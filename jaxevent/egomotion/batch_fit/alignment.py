@@ -9,37 +9,24 @@ Kanade's equations, k_s per cell and segment), the assignment of events to cells
 comes within some ten degrees from most starts; its own optimum is some degrees off.
 """
 
-from typing import Any, NamedTuple
+import dataclasses
+from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
-from jaxevent.egomotion.batch_fit.gauss_newton import (
-    DEEPEST,
-    bonds_between,
-    first_rows,
+from jaxevent.egomotion.batch_fit import images
+from jaxevent.egomotion.batch_fit.gauss_newton import DEEPEST, bonds, limit_step
+from jaxevent.egomotion.batch_fit.loops import POWERS, assign, slopes_by_coefficients
+from jaxevent.egomotion.batch_fit.path import SEGMENTS, Path, Prior, normalised, warp
+from jaxevent.egomotion.batch_fit.rows import (
+    chain,
     gauge_of_rows,
-    limit_step,
-    pull_of_rows,
+    priors_of_rows,
+    rows_of,
     units_of_rows,
-    with_first_rows,
+    with_rows,
 )
-from jaxevent.egomotion.batch_fit.path import (
-    SEGMENTS,
-    Path,
-    Prior,
-    along,
-    normalised,
-    pairs_of,
-    rotated,
-    warp,
-)
-from jaxevent.egomotion.warped import blur, splat
 
 BORDER = 3  # px at the sensor's border that are not compared
 BLOCK = 12  # px, of the score
@@ -48,19 +35,20 @@ FREE = 6 * K  # their numbers
 EDGE = 0.3  # a larger difference of log depth between cells is an edge
 
 
-class Window(eqx.Module):
-    """Events of a window, filled up with events of no weight."""
+@dataclasses.dataclass(frozen=True)
+class Window:
+    """Events of a window: places (px, undistorted, from the principal point), tau, polarity."""
 
-    x: Float[Array, " E"]  # px, undistorted, from the principal point
-    y: Float[Array, " E"]
-    tau: Float[Array, " E"]  # s from the reference time
-    p: Float[Array, " E"]  # polarity +-1, 0 where there is no event
-    f: Float[Array, ""]  # px
-    half: Float[Array, ""]  # s
-    box: Float[Array, "4"]  # px, where the sensor is: x0, x1, y0, y1
-    shape: tuple[int, int] = eqx.field(static=True)  # of the reference view
-    corner: tuple[float, float] = eqx.field(static=True)  # px, where its pixel [0, 0] lies
-    cell: int = eqx.field(static=True)
+    x: NDArray
+    y: NDArray
+    tau: NDArray  # s from the reference time
+    p: NDArray  # +-1
+    f: float  # px
+    half: float  # s
+    box: tuple[float, float, float, float]  # px, where the sensor is: x0, x1, y0, y1
+    shape: tuple[int, int]  # of the reference view
+    corner: tuple[float, float]  # px, where its pixel [0, 0] lies
+    cell: int
 
     @property
     def cells(self) -> tuple[int, int]:
@@ -76,252 +64,186 @@ class Window(eqx.Module):
         return self.corner[0] + i * self.cell + middle, self.corner[1] + j * self.cell + middle
 
 
-def assigned(path: Path, window: Window) -> Int[Array, " E"]:
-    """The cell of every event, by its warped position."""
-
-    def cell(x: Array, y: Array) -> Array:
-        rows, columns = window.cells
-        i = jnp.floor((x - window.corner[0] + 0.5) / window.cell)
-        j = jnp.floor((y - window.corner[1] + 0.5) / window.cell)
-        i, j = jnp.clip(i, 0, columns - 1), jnp.clip(j, 0, rows - 1)
-        return (j * columns + i).astype(jnp.int32)
-
-    found = cell(window.x, window.y)
-    for _ in range(2):
-        rho = jnp.exp(path.log_rho)[found]
-        found = cell(*warp(path, window.f, window.x, window.y, window.tau, rho))
-    return lax.stop_gradient(found)
-
-
-def segments(path: Path, window: Window, cell: Int[Array, " E"]) -> Float[Array, "S h w"]:
-    """The signed images of the segments' warped events."""
-    rho = jnp.exp(path.log_rho)[cell]
-    X, Y = warp(path, window.f, window.x, window.y, window.tau, rho)
-    height, width = window.shape
-    tall = height + 2  # of one image in a stack of them, apart by 2 lines
-    share = (window.tau + window.half) / (2 * window.half)
-    which = jnp.clip(jnp.floor(share * SEGMENTS), 0, SEGMENTS - 1)
-    i, j = X - window.corner[0], Y - window.corner[1]
-    inside = (i >= 0) & (i <= width - 1) & (j >= 0) & (j <= height - 1)
-    at = jnp.stack([jnp.where(inside, i, 0), jnp.where(inside, j, 0) + which * tall], 1)
-    stack = splat(at, jnp.where(inside, window.p, 0), (SEGMENTS * tall, width))
-    return stack.reshape(SEGMENTS, tall, width)[:, :height]
-
-
-def _sums(image: Array, window: Window) -> Array:
-    """Sums over cells (..., cells)."""
-    (rows, columns), n = window.cells, window.cell
-    parts = image.reshape(*image.shape[:-2], rows, n, columns, n).sum((-3, -1))
-    return parts.reshape(*image.shape[:-2], rows * columns)
-
-
-def _spread(values: Array, window: Window) -> Array:
-    """Values of cells (..., cells) at all pixels."""
-    rows, columns = window.cells
-    values = values.reshape(*values.shape[:-1], rows, columns)
-    return jnp.repeat(jnp.repeat(values, window.cell, -2), window.cell, -1)
-
-
-class Overlap(NamedTuple):
-    """What a segment and the others show of the same places."""
-
-    images: Array  # (S, h, w)
-    others: Array  # (S, h, w), the sum of the others', for as many segments as are compared
-    share: Array  # (S, cells) of a cell, that is seen
-
-
 class Displacements(NamedTuple):
     """By how much cells seem displaced in segments (S, cells), as information and its product."""
 
-    xx: Array
-    xy: Array
-    yy: Array
-    vx: Array
-    vy: Array
-    agreement: Array  # of segments: 1 where all show the same
+    xx: NDArray[np.float64]
+    xy: NDArray[np.float64]
+    yy: NDArray[np.float64]
+    vx: NDArray[np.float64]
+    vy: NDArray[np.float64]
 
 
 class Lattice(NamedTuple):
     """The cells' centres in all segments: where they lie (S, cells) px, and the times (s)."""
 
-    X: Array
-    Y: Array
-    tau: Array
-    times: Array  # (S,)
+    X: NDArray[np.float64]
+    Y: NDArray[np.float64]
+    tau: NDArray[np.float64]
 
     @classmethod
     def of(cls, window: Window) -> "Lattice":
-        cells = window.cells[0] * window.cells[1]
-        X, Y = (jnp.broadcast_to(part, (SEGMENTS, cells)) for part in window.places)
-        times = ((jnp.arange(SEGMENTS) + 0.5) / SEGMENTS * 2 - 1) * window.half
-        tau = jnp.broadcast_to(times[:, None], (SEGMENTS, cells))
-        X, Y, tau = (part.astype(window.x.dtype) for part in (X, Y, tau))
-        return cls(X, Y, tau, times)
+        times = ((np.arange(SEGMENTS) + 0.5) / SEGMENTS * 2 - 1) * window.half
+        parts = np.broadcast_arrays(*window.places, times[:, None])
+        return cls(*(np.array(part, np.float64) for part in parts))
+
+
+def warped(path: Path, window: Window) -> tuple[NDArray[np.int32], NDArray, NDArray]:
+    """The cell of every event, by its warped position, and this."""
+    number = np.empty(len(window.x), np.int32)
+    X, Y = np.empty_like(window.x), np.empty_like(window.x)
+    rho = np.exp(path.log_rho.astype(np.float64))
+    assign(
+        window.x, window.y, window.tau, *path.polynomials(), window.f, rho, window.corner,
+        window.cell, *window.cells, number, X, Y,
+    )  # fmt: skip
+    return number, X, Y
 
 
 def refine(
     window: Window, path: Path, prior: Prior, *, degree: int, blurs: int, steps: int
-) -> tuple[Path, Array]:
+) -> Path:
     """So many Gauss-Newton steps from a path; of O and D the rows up to `degree` (<= 2) move.
 
-    Images are blurred `blurs` times by [1 2 1] / 4. The second result is how well segments agreed
-    before the last step: 1 where all show the same.
+    Images are blurred `blurs` times by [1 2 1] / 4.
     """
-    return _refine(window, path, prior, int(degree), int(blurs), int(steps))
-
-
-@jax.jit
-def _refine(
-    window: Window, path: Path, prior: Prior, degree: Array, blurs: Array, steps: Array
-) -> tuple[Path, Array]:
     lattice = Lattice.of(window)
-
-    def one(_: Any, state: tuple[Path, Array]) -> tuple[Path, Array]:
-        path, _ = state
+    for _ in range(steps):
         x, y = trace_cells(path, window, lattice)
-        overlap = compare_segments(path, window, lattice, x, y, blurs)
-        found = measure_displacements(overlap, window, blurs)
-        H, g, now, unit = linearise(path, window, lattice, x, y, found, prior)
-        return step(path, H, g, now, unit, degree), found.agreement
-
-    return lax.fori_loop(0, steps, one, (path, jnp.zeros((), window.x.dtype)))
+        found = measure_displacements(path, window, lattice, x, y, blurs)
+        path = step(path, *linearise(path, window, lattice, x, y, found, prior), degree)
+    return path
 
 
-def trace_cells(path: Path, window: Window, lattice: Lattice) -> tuple[Array, Array]:
+def trace_cells(path: Path, window: Window, lattice: Lattice) -> tuple[NDArray, NDArray]:
     """Where the cells' centres were at the segments' times, x and y (S, cells) px."""
-    rho = jnp.broadcast_to(jnp.exp(path.log_rho), lattice.tau.shape)
-    x, y = lattice.X, lattice.Y
+    rho, (x, y) = np.exp(path.log_rho), lattice[:2]
     for _ in range(4):
         X, Y = warp(path, window.f, x, y, lattice.tau, rho)
         x, y = x - (X - lattice.X), y - (Y - lattice.Y)
     return x, y
 
 
-def compare_segments(
-    path: Path, window: Window, lattice: Lattice, x: Array, y: Array, blurs: Array
-) -> Overlap:
-    """The segments' images where the sensor saw the cells, and those of the others."""
-    images = segments(path, window, assigned(path, window))
-    images = lax.fori_loop(0, blurs, lambda _, image: blur(image, 1), images)
-    px = window.corner[0] + jnp.arange(window.shape[1])
-    py = window.corner[1] + jnp.arange(window.shape[0])
-    at_x = _spread(x - lattice.X, window) + px[None, None, :]
-    at_y = _spread(y - lattice.Y, window) + py[None, :, None]
-    seen = (at_x > window.box[0] + BORDER) & (at_x < window.box[1] - BORDER)
-    seen &= (at_y > window.box[2] + BORDER) & (at_y < window.box[3] - BORDER)
-    seen = seen.astype(images.dtype)
-    share = _sums(seen, window) / window.cell**2
-    images = images * seen
-    count = seen.sum(0)
-    others = (images.sum(0) - images) * seen
-    others = others * jnp.where(count > 2, SEGMENTS / jnp.maximum(count, 1), 0)
-    return Overlap(images, others, share)
-
-
-def measure_displacements(overlap: Overlap, window: Window, blurs: Array) -> Displacements:
+def measure_displacements(
+    path: Path, window: Window, lattice: Lattice, x: NDArray, y: NDArray, blurs: int
+) -> Displacements:
     """By how much cells seem displaced, by Lucas and Kanade's equations."""
-    images, others, share = overlap
-    wide = jnp.pad(others, ((0, 0), (1, 1), (1, 1)))
-    gx = (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2
-    gy = (wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2
-    both = _sums(images * others, window)
-    gain = both / jnp.maximum(_sums(others**2, window), 1e-6)
-    left = _spread(gain, window) * others - images
+    real, cells = window.x.dtype, lattice.X.shape[1]
+    _, X, Y = warped(path, window)
+    own = np.zeros((SEGMENTS, *window.shape), real)
+    images.segment_images(X, Y, window.tau, window.p, window.half, window.corner, own)
+    work = np.empty(window.shape, real)
+    for image in own:
+        images.blur(image, work, blurs)
+    low, high = (
+        np.array([window.box[k], window.box[2 + k]]) - np.array(window.corner) for k in (0, 1)
+    )
+    others, share = np.empty_like(own), np.zeros((SEGMENTS, cells))
+    both = np.zeros((SEGMENTS, cells, 3))
+    images.compare(
+        own, window.cell, low + BORDER, high - BORDER, x - lattice.X, y - lattice.Y, others, share,
+        both,
+    )  # fmt: skip
+    share /= window.cell**2
+    gain = both[..., 0] / np.maximum(both[..., 1], 1e-6)
+    sums = np.zeros((SEGMENTS, cells, 6))
+    images.measure(own, others, gain, window.cell, sums)
     # Noise (per px) of a cell; blurring correlates it.
-    noise = _sums(left**2, window).sum(0) / jnp.maximum(share.sum(0), 1) / window.cell**2
-    weight = jnp.where((gain > 0) & (share > 0), 1 / (noise + 1e-3), 0) / (1 + 1.5 * blurs)
-    xx, xy, yy = (weight * gain**2 * _sums(p, window) for p in (gx * gx, gx * gy, gy * gy))
-    vx, vy = (weight * gain * _sums(g * left, window) for g in (gx, gy))
+    noise = sums[..., 0].sum(0) / np.maximum(share.sum(0), 1) / window.cell**2
+    weight = np.where((gain > 0) & (share > 0), 1 / (noise + 1e-3), 0) / (1 + 1.5 * blurs)
+    xx, xy, yy = (weight * gain**2 * sums[..., k] for k in (1, 2, 3))
+    vx, vy = (weight * gain * sums[..., k] for k in (4, 5))
     # A cell that seems displaced by more than about a pixel is not what it is taken for.
     small = 1e-2
     det = (xx + small) * (yy + small) - xy**2
     dx, dy = ((yy + small) * vx - xy * vy) / det, ((xx + small) * vy - xy * vx) / det
     robust = 1 / (1 + (dx**2 + dy**2) / (1 + 0.5 * blurs) ** 2) ** 2
-    own = jnp.maximum((_sums(images**2, window) * share).sum(), 1e-6)
-    agreement = (gain * both * share).sum() / own
-    xx, xy, yy, vx, vy = (robust * part for part in (xx, xy, yy, vx, vy))
-    return Displacements(xx, xy, yy, vx, vy, agreement)
+    return Displacements(*(robust * part for part in (xx, xy, yy, vx, vy)))
 
 
 def linearise(
     path: Path,
     window: Window,
     lattice: Lattice,
-    x: Array,
-    y: Array,
+    x: NDArray,
+    y: NDArray,
     found: Displacements,
     prior: Prior,
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """H and g of the displacements and the priors, the path's rows, and their units.
 
     Unknowns are the path's first rows, in px at the window's end, and the cells' log depths.
     """
-    f, h, tau = window.f, window.half, lattice.tau
-    rho = jnp.broadcast_to(jnp.exp(path.log_rho), tau.shape)
-    xx, xy, yy, vx, vy, _ = found
-    now = first_rows(path, K)
-    J = jax.jacfwd(
-        lambda values: jnp.stack(warp(with_first_rows(path, values, K), f, x, y, tau, rho))
-    )(now)
-    O, C = path.coefficients()  # noqa: E741
-    rx, ry, rz = rotated(along(O, tau), x, y, f)
-    cx, cy, cz = along(C, tau)
-    r = rho * jnp.stack([f * cx - cz * rx * f / rz, f * cy - cz * ry * f / rz])
-    unit = units_of_rows(path, f, h, K)
-    J, now = J * unit, now / unit
-    MJ = jnp.stack([xx[..., None] * J[0] + xy[..., None] * J[1],
-                    xy[..., None] * J[0] + yy[..., None] * J[1]])  # fmt: skip
-    upper = jnp.einsum("isnp,isnq->pq", J, MJ)
-    mixed = jnp.einsum("isnp,isn->pn", MJ, r)
-    lower = (xx * r[0] ** 2 + 2 * xy * r[0] * r[1] + yy * r[1] ** 2).sum(0)
-    H = jnp.block([[upper, mixed], [mixed.T, jnp.diag(lower)]])
-    g = jnp.concatenate(
-        [jnp.einsum("isnp,isn->p", J, jnp.stack([vx, vy])), (r[0] * vx + r[1] * vy).sum(0)]
+    f, half, tau, n = window.f, window.half, lattice.tau, lattice.X.size
+    rho = np.broadcast_to(np.exp(path.log_rho), tau.shape)
+    unit = units_of_rows(path, f, half, K)
+    by, r = np.empty((n, 6, 2)), np.empty((n, 2))
+    slopes_by_coefficients(
+        *(np.ascontiguousarray(part, np.float64).ravel() for part in (x, y, tau, rho)),
+        *path.polynomials(), f, by, r,
+    )  # fmt: skip
+    powers = (tau.ravel() / half)[:, None] ** np.arange(1, POWERS + 1)
+    J = (by[:, :, None] * powers[:, None, :, None]).reshape(n, 6 * POWERS, 2)
+    J = J.transpose(0, 2, 1) @ chain(path, unit, half, K)
+    now = rows_of(path, K) / unit
+    W = np.stack([found.xx, found.xy, found.xy, found.yy], -1).reshape(n, 2, 2)
+    v = np.stack([found.vx, found.vy], -1).reshape(n, 2)
+    MJ = W @ J
+    cells = lattice.X.shape[1]
+    upper = J.reshape(-1, FREE).T @ MJ.reshape(-1, FREE)
+    mixed = np.einsum("ekp,ek->ep", MJ, r).reshape(SEGMENTS, cells, FREE).sum(0).T
+    lower = np.einsum("ek,ekl,el->e", r, W, r).reshape(SEGMENTS, cells).sum(0)
+    H = np.block([[upper, mixed], [mixed.T, np.diag(lower)]])
+    g = np.concatenate(
+        [np.einsum("ekp,ek->p", J, v), (r * v).sum(1).reshape(SEGMENTS, cells).sum(0)]
     )
-
-    pairs = pairs_of(*window.cells)
-    a, b = FREE + pairs[0], FREE + pairs[1]
-    apart, bond = bonds_between(path.log_rho, (pairs[0], pairs[1]), prior.smooth, EDGE)
-    H = H.at[a, a].add(bond).at[b, b].add(bond).at[a, b].add(-bond).at[b, a].add(-bond)
-    g = g.at[a].add(bond * apart).at[b].add(-bond * apart)
-    rest = jnp.zeros(len(g), H.dtype).at[FREE:].set(prior.relief)
-    H = H + jnp.diag(rest)
-    g = g.at[FREE:].add(prior.relief * (path.log_rho - path.log_rho.mean()))
-
-    def pull(rows: Array) -> Array:
-        return pull_of_rows(rows, unit, prior, h, K)
-
-    H = H.at[:FREE, :FREE].add(jax.hessian(pull)(now))
-    g = g.at[:FREE].add(jax.grad(pull)(now))
+    depth = path.log_rho.reshape(window.cells)
+    bound = bond_matrix(*bonds(depth, prior.smooth, EDGE)[:2])
+    H[FREE:, FREE:] += bound
+    g[FREE:] += bound @ path.log_rho
+    H[FREE:, FREE:] += prior.relief * np.eye(cells)
+    g[FREE:] += prior.relief * (path.log_rho - path.log_rho.mean())
+    known, side, _ = priors_of_rows(prior, unit, half)
+    H[:FREE, :FREE] += known
+    g[:FREE] += known @ now - side
     gauge = gauge_of_rows(path, unit, len(g))
-    H = H + 100 * jnp.trace(upper) / FREE * gauge[:, None] * gauge
-    return H + jnp.diag(1e-3 * jnp.diag(H) + 1e-6), g, now, unit
+    H = H + 100 * np.trace(upper) / FREE * gauge[:, None] * gauge
+    return H + np.diag(1e-3 * np.diag(H) + 1e-6), g, now, unit
 
 
-def step(path: Path, H: Array, g: Array, now: Array, unit: Array, degree: Array) -> Path:
+def bond_matrix(across: NDArray, down: NDArray) -> NDArray[np.float64]:
+    """Of the sum of squares of differences to the cells before, with these weights."""
+    number = np.arange(across.size).reshape(across.shape)
+    found = np.zeros((across.size, across.size))
+    for a, b, weight in (
+        (number[:, 1:], number[:, :-1], across[:, 1:]), (number[1:], number[:-1], down[1:]),
+    ):  # fmt: skip
+        a, b, weight = a.ravel(), b.ravel(), weight.ravel()
+        for i, j, sign in ((a, a, 1), (b, b, 1), (a, b, -1), (b, a, -1)):
+            np.add.at(found, (i, j), sign * weight)
+    return found
+
+
+def step(path: Path, H: NDArray, g: NDArray, now: NDArray, unit: NDArray, degree: int) -> Path:
     """The path after a step, whose rows above `degree` stay."""
-    still = jnp.repeat(jnp.tile(jnp.arange(K) > degree, 2), 3)
-    still = jnp.append(still, jnp.zeros(len(g) - FREE, bool))
-    H = jnp.where(still[:, None] | still, 0, H) + jnp.diag(still.astype(H.dtype))
-    change = -jnp.linalg.solve(H, jnp.where(still, 0, g))
-    change = jnp.where(jnp.isfinite(change).all(), change, 0)
-    change = change * limit_step(change[:FREE])
-    path = with_first_rows(path, (now + change[:FREE]) * unit, K)
-    deeper = jnp.clip(change[FREE:], -DEEPEST, DEEPEST)
-    return normalised(Path(path.O, path.D, path.log_rho + deeper))
+    moves = np.ones(len(g), bool)
+    moves[:FREE] = np.repeat(np.tile(np.arange(K) <= degree, 2), 3)
+    change = np.zeros(len(g))
+    change[moves] = -np.linalg.solve(H[np.ix_(moves, moves)], g[moves])
+    if not np.isfinite(change).all():
+        return path
+    change *= limit_step(change[:FREE])
+    path = with_rows(path, (now + change[:FREE]) * unit)
+    deeper = np.clip(change[FREE:], -DEEPEST, DEEPEST)
+    return normalised(Path(path.O, path.D, path.log_rho + deeper.astype(path.log_rho.dtype)))
 
 
-@jax.jit
-def score(window: Window, path: Path) -> Float[Array, ""]:
+def score(window: Window, path: Path) -> float:
     """What selects among paths: the mean over blocks of n (log S - 1.5 log n) / N."""
-    rho = jnp.exp(path.log_rho)[assigned(path, window)]
-    X, Y = warp(path, window.f, window.x, window.y, window.tau, rho)
-    both = splat(
-        jnp.stack([X, Y], 1), jnp.stack([window.p, jnp.abs(window.p)]), window.shape, window.corner
-    )
-    parts = jnp.stack([blur(both[0], 1) ** 2, both[1]])
-    height, width = (n // BLOCK * BLOCK for n in window.shape)
-    parts = parts[:, :height, :width].reshape(2, height // BLOCK, BLOCK, width // BLOCK, BLOCK)
-    S, n = parts.sum((2, 4))
-    told = jnp.log(jnp.where(n > 5, S, 1) + 1e-6) - 1.5 * jnp.log(jnp.where(n > 5, n, 1))
-    return jnp.where(n > 5, n * told, 0).sum() / jnp.maximum(jnp.abs(window.p).sum(), 1)
+    _, X, Y = warped(path, window)
+    both = np.empty((2, *window.shape), X.dtype)
+    S, n = (np.empty(tuple(size // BLOCK for size in window.shape)) for _ in range(2))
+    work = np.empty(window.shape, X.dtype)
+    images.block_sums(X, Y, window.p, window.corner, BLOCK, both, work, S, n)
+    S, n = S[n > 5], n[n > 5]
+    return float((n * (np.log(S + 1e-6) - 1.5 * np.log(n))).sum()) / max(len(X), 1)

@@ -13,43 +13,52 @@ inverse depth rho in the reference view is moved there by the exact warp
 which is linear in rho.
 """
 
+import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from numpy.typing import NDArray
+
+from jaxevent.egomotion.batch_fit import loops
 
 SEGMENTS = 8
 ROWS = 5  # of a path: T and Omega are polynomials of the fourth degree
 LEAST = 0.1  # the least inverse depth of a plane, by the usual one
 
 
-class Path(eqx.Module):
-    """The unknowns: rows O0, O1, ... (rad/s^k), and C1, D2, D3, ... in units of |T|; log depths."""
+@dataclasses.dataclass(frozen=True)
+class Path:
+    """The unknowns: rows O0, O1, ... (rad/s^k), and C1, D2, D3, ... in units of |T|; log depths.
 
-    O: Float[Array, "rows 3"]  # noqa: E741
-    D: Float[Array, "rows 3"]
-    log_rho: Float[Array, " depths"]  # 1/m in units of 1/|T|, of cells or at nodes
+    O and D are (ROWS, 3). Depths are inverse ones, 1/m in units of 1/|T|, of cells or at nodes.
+    """
+
+    O: NDArray[np.float64]  # noqa: E741
+    D: NDArray[np.float64]
+    log_rho: NDArray
 
     @classmethod
-    def constant(
-        cls, heading: NDArray, Omega: NDArray, log_rho: NDArray | Array, real: Any
-    ) -> "Path":
+    def constant(cls, heading: NDArray, Omega: NDArray, log_rho: NDArray) -> "Path":
         """Of a constant twist: unit heading, Omega (rad/s)."""
         O, D = np.zeros((ROWS, 3)), np.zeros((ROWS, 3))  # noqa: E741
         O[0], D[0] = Omega, heading
-        return cls(*(jnp.asarray(part, real) for part in (O, D, log_rho)))
+        return cls(O, D, log_rho)
 
-    def coefficients(self) -> tuple[Array, Array]:
+    def coefficients(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """O and C."""
-        C, constant = [self.D[0]], self.D[0]
-        for D in self.D[1:]:
-            constant = jnp.cross(self.O[0], constant)
-            C.append(D + constant)
-        return self.O, jnp.stack(C)
+        constant = [self.D[0]]
+        for _ in self.D[1:]:
+            constant.append(np.cross(self.O[0], constant[-1]))
+        C = np.array(constant)
+        C[1:] += self.D[1:]
+        return self.O, C
+
+    def polynomials(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """phi and C, whose rows are factors of tau, tau^2, ..."""
+        O, C = self.coefficients()  # noqa: E741
+        factorials = np.array([math.factorial(k + 1) for k in range(len(O))])[:, None]
+        return O / factorials, C / factorials
 
     def twist(self, tau: float | int | NDArray) -> tuple[NDArray, NDArray]:
         """Unit heading R' C' and Omega to second order, (times, 3) each, at times tau (s)."""
@@ -60,7 +69,7 @@ class Path(eqx.Module):
         """As `twist`, but the velocity in units of |C1|."""
         from scipy.spatial.transform import Rotation
 
-        O, C = (np.asarray(part, np.float64) for part in self.coefficients())  # noqa: E741
+        O, C = self.coefficients()  # noqa: E741
         tau = np.atleast_1d(np.asarray(tau, np.float64))
         slopes = _powers(tau, 0, len(O))
         turns = Rotation.from_rotvec(_powers(tau, 1, len(O)) @ O)
@@ -72,62 +81,40 @@ def _powers(tau: NDArray, first: int, number: int) -> NDArray[np.float64]:
     return np.stack([tau**k / math.factorial(k) for k in range(first, first + number)], 1)
 
 
-def along(coefficients: Array, tau: Array) -> list[Array]:
-    """sum_k c_k tau^k / k!, k from 1: three components."""
-    sums = [jnp.zeros_like(tau)] * 3
-    for k in range(len(coefficients), 0, -1):
-        sums = [(sums[i] + coefficients[k - 1, i]) * tau / k for i in range(3)]
-    return sums
-
-
-def rotated(phi: list[Array], x: Array, y: Array, z: Array) -> tuple[Array, Array, Array]:
-    """exp[phi]x of points, to the sixth order of |phi|, which is below 1."""
-    a, b, c = phi
-    s = a * a + b * b + c * c
-    one, two = 1 - s / 6 + s * s / 120, 0.5 - s / 24 + s * s / 720
-    cx, cy, cz = b * z - c * y, c * x - a * z, a * y - b * x
-    dx, dy, dz = b * cz - c * cy, c * cx - a * cz, a * cy - b * cx
-    return x + one * cx + two * dx, y + one * cy + two * dy, z + one * cz + two * dz
-
-
-def warp(path: Path, f: Array, x: Array, y: Array, tau: Array, rho: Array) -> tuple[Array, Array]:
+def warp(
+    path: Path, f: float, x: NDArray, y: NDArray, tau: NDArray, rho: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Where points at x, y (px) at times tau (s), of inverse depths rho, are at the reference."""
-    O, C = path.coefficients()  # noqa: E741
-    rx, ry, rz = rotated(along(O, tau), x, y, f)
-    cx, cy, cz = along(C, tau)
-    z = jnp.maximum(rz / f, 0.05)
-    rx, ry = rx / z, ry / z
-    return rx + rho * (f * cx - cz * rx), ry + rho * (f * cy - cz * ry)
-
-
-def pairs_of(rows: int, columns: int) -> Array:
-    """Neighbours on a lattice that is counted row by row, (2, pairs)."""
-    number = jnp.arange(rows * columns).reshape(rows, columns)
-    across = jnp.stack([number[:, :-1].ravel(), number[:, 1:].ravel()])
-    return jnp.concatenate([across, jnp.stack([number[:-1].ravel(), number[1:].ravel()])], 1)
+    x, y, tau, rho = (np.asarray(part, np.float64) for part in (x, y, tau, rho))
+    parts = [np.ascontiguousarray(one) for one in np.broadcast_arrays(x, y, tau, rho)]
+    X, Y = np.empty_like(parts[0]), np.empty_like(parts[0])
+    flat = [part.reshape(-1) for part in (*parts, X, Y)]
+    loops.warp(*flat[:4], *path.polynomials(), f, *flat[4:])
+    return X, Y
 
 
 class Prior(NamedTuple):
     """What is known beside the events: weights, and Omega (S, 3) rad/s at the segments' times."""
 
-    smooth: Array
-    relief: Array
-    change: Array
-    omega: Array  # 1 / (rad/s)^2
-    gyro: Array
-    gyro_weight: Array  # 1 / (rad/s)^2, 0: none
-    bond: Array  # of the photometric fit, as smooth
-    flat: Array
-    alike: Array
-    skew: Array | float = 0.0  # of the thresholds, about
-    skew_weight: Array | float = 10.0
-    moves: Array | float = 1.0  # 0: translation and depths are held
+    smooth: float
+    relief: float
+    change: float
+    omega: float  # 1 / (rad/s)^2
+    gyro: NDArray[np.float64]
+    gyro_weight: float  # 1 / (rad/s)^2, 0: none
+    bond: float  # of the photometric fit, as smooth
+    flat: float
+    alike: float
+    skew: float = 0.0  # of the thresholds, about
+    skew_weight: float = 10.0
+    moves: bool = True  # else translation and depths are held
 
 
 def normalised(path: Path) -> Path:
     """The same path with |C1| = 1, which depths make good."""
-    size = jnp.sqrt((path.D[0] ** 2).sum())
-    return Path(path.O, path.D / size, path.log_rho + jnp.log(size))
+    size = float(np.linalg.norm(path.D[0]))
+    depth = path.log_rho + path.log_rho.dtype.type(np.log(size))
+    return Path(path.O, path.D / size, depth)
 
 
 def rays_of(x: NDArray, y: NDArray, f: float) -> NDArray[np.float64]:
@@ -156,5 +143,4 @@ def advanced(path: Path, tau: float, half: float) -> Path:
     for row in C[1:]:
         constant = np.cross(O[0], constant)
         D.append(row - constant)
-    real = path.O.dtype
-    return normalised(Path(jnp.asarray(O, real), jnp.asarray(np.array(D), real), path.log_rho))
+    return normalised(Path(O.astype(np.float64), np.array(D), path.log_rho))

@@ -30,18 +30,18 @@ surface's, whose outline made the events. Adjusted from smooth depths instead, t
 the truth. Or all depths are those of a plane.
 """
 
+import math
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jax import lax
-from jaxtyping import Array, Float
+import numpy as np
+from numpy.typing import NDArray
 
 from jaxevent.egomotion.batch_fit.equations import (
     FREE,
     Equations,
     Problem,
     Seen,
+    gradient_of,
     linearise,
     look,
     solve,
@@ -51,10 +51,11 @@ from jaxevent.egomotion.batch_fit.gauss_newton import (
     Acceptance,
     accept,
     limit_step,
-    with_first_rows,
 )
+from jaxevent.egomotion.batch_fit.loops import subtract_mean
 from jaxevent.egomotion.batch_fit.path import LEAST, ROWS, Path, Prior, normalised, rays_of
-from jaxevent.egomotion.batch_fit.tracks import Scene, Tracks, subtract_mean, totals
+from jaxevent.egomotion.batch_fit.rows import with_rows
+from jaxevent.egomotion.batch_fit.tracks import Scene, Tracks
 
 CELLS = 24, 48  # px, whose errors are alike
 
@@ -62,9 +63,9 @@ CELLS = 24, 48  # px, whose errors are alike
 class Report(NamedTuple):
     """Of a fit's end: the noise (C), the robust cost per event (C^2), the share of inliers."""
 
-    noise: Array  # 1.48 times the median of the absolute misfits
-    cost: Array
-    inliers: Array
+    noise: float  # 1.48 times the median of the absolute misfits
+    cost: float
+    inliers: float
 
 
 def adjust(
@@ -84,145 +85,113 @@ def adjust(
     are a `plane`'s remain one's: rho = n . (x, y, f) / f, of which n is unknown, instead of any at
     nodes.
     """
-    # Arguments of one kind, so that one program serves all calls with as many events.
-    return _adjust(tracks, scene, prior, float(sigma), int(settle), int(steps), bool(plane))
-
-
-class _Walk(NamedTuple):
-    """Where steps of a fit have come to."""
-
-    number: Array
-    scene: Scene  # that is tried next
-    last: Scene  # that it came from
-    kept: Seen  # the best
-    acceptance: Acceptance
-
-
-@jax.jit
-def _adjust(
-    tracks: Tracks,
-    scene: Scene,
-    prior: Prior,
-    sigma: Array,
-    settle: Array,
-    steps: Array,
-    plane: Array,
-) -> tuple[Scene, Report]:
-    problem, nothing = begin(tracks, scene, prior, sigma, plane)
-
-    def go(walk: _Walk) -> _Walk:
-        n, kept = walk.number, walk.kept
-        ahead = extrapolate(walk.scene, walk.last, walk.acceptance.ahead, plane)
-        tried = look(problem, ahead, kept.weight)
-        better = (tried.energy <= kept.energy) | (n <= settle)
-        gain = jnp.where(n > settle, kept.energy - tried.energy, jnp.inf)
-        last = jax.tree.map(lambda p, q: jnp.where(better, p, q), walk.scene, kept.scene)
-        kept = jax.tree.map(lambda p, q: jnp.where(better, p, q), tried, kept)
-        acceptance = accept(walk.acceptance, better, gain, kept.energy, n >= settle)
-        goes_on = (n < steps) & acceptance.goes_on
-        scene = lax.cond(
-            goes_on,
-            lambda *now: step(problem, *now),
-            lambda *_: walk.scene,
-            kept,
-            acceptance.damping,
-            n < settle,
-        )
-        return _Walk(n + 1, scene, last, kept, acceptance)
-
-    def unfinished(walk: _Walk) -> Array:
-        return (walk.number <= steps) & walk.acceptance.goes_on
-
-    zero = jnp.zeros((), tracks.x.dtype)
-    walk = _Walk(jnp.zeros((), int), scene, scene, nothing, Acceptance(zero, zero))
-    kept = lax.while_loop(unfinished, go, walk).kept
+    problem, weight = begin(tracks, scene, prior, float(sigma), plane)
+    last, kept, now = scene, None, Acceptance(0, 0.0)
+    for n in range(steps + 1):
+        ahead = extrapolate(scene, last, now.ahead, plane)
+        tried = look(problem, ahead, weight if kept is None else kept.weight)
+        energy = math.inf if kept is None else kept.energy
+        better = n <= settle or tried.energy <= energy
+        gain = energy - tried.energy if n > settle else math.inf
+        if better or kept is None:
+            last, kept = scene, tried
+        else:
+            last = kept.scene
+        now = accept(now, better, gain, kept.energy, n >= settle)
+        if not now.goes_on:
+            break
+        if n < steps:
+            scene = step(problem, kept, now.damping, n < settle)
+    assert kept is not None
     return kept.scene, report(problem, kept)
 
 
 def begin(
-    tracks: Tracks, scene: Scene, prior: Prior, sigma: Array, plane: Array
-) -> tuple[Problem, Seen]:
-    """What steps have in common, and what is kept before the first one: nothing."""
-    real = tracks.x.dtype
-    sigma, plane = jnp.asarray(sigma, real), jnp.asarray(plane)
-    zero, none = jnp.zeros((), real), jnp.zeros_like(tracks.x)
-    problem = Problem(tracks, prior, sigma, plane, zero + jnp.inf)
-    usual = jnp.maximum(look(problem, scene, tracks.on).cost, 1e-3 * problem.limit)
-    nothing = Seen(scene, none, none, none, none, tracks.on, zero + jnp.inf, zero)
-    return problem._replace(usual=usual), nothing
+    tracks: Tracks, scene: Scene, prior: Prior, sigma: float, plane: bool
+) -> tuple[Problem, NDArray]:
+    """What steps have in common, and weights to begin with."""
+    weight = np.ones_like(tracks.x)
+    problem = Problem(tracks, prior, sigma, plane, math.inf)
+    usual = max(look(problem, scene, weight).cost, 1e-3 * problem.limit)
+    return problem._replace(usual=usual), weight
 
 
-def extrapolate(scene: Scene, last: Scene, ahead: Array, plane: Array) -> Scene:
+def extrapolate(scene: Scene, last: Scene, ahead: float, plane: bool) -> Scene:
     """The scene so many times its last step ahead (Nesterov).
 
     Only inverse depths themselves, extrapolated, are a plane's again.
     """
-    near, nearer = (jnp.exp(one.path.log_rho) for one in (last, scene))
-    tried = jax.tree.map(lambda new, old: new + ahead * (new - old), scene, last)
-    level = jnp.maximum(nearer + ahead * (nearer - near), LEAST * jnp.median(nearer))
-    level = jnp.where(plane, jnp.log(level), tried.path.log_rho)
-    return Scene(Path(tried.path.O, tried.path.D, level), *tried[1:])
+    if not ahead:
+        return scene
+    here, there = scene.path, last.path
+    O, D, image = (  # noqa: E741
+        new + ahead * (new - old)
+        for new, old in ((here.O, there.O), (here.D, there.D), (scene.map, last.map))
+    )
+    depth = here.log_rho + ahead * (here.log_rho - there.log_rho)
+    if plane:
+        near, nearer = np.exp(there.log_rho), np.exp(here.log_rho)
+        far = LEAST * np.median(nearer)
+        depth = np.log(np.maximum(nearer + ahead * (nearer - near), far))
+    skew = scene.skew + ahead * (scene.skew - last.skew)
+    real = scene.map.dtype
+    return Scene(Path(O, D, depth.astype(real)), image.astype(real), skew)
 
 
-def step(problem: Problem, kept: Seen, damping: Array, settling: Array) -> Scene:
+def step(problem: Problem, kept: Seen, damping: float, settling: bool) -> Scene:
     """The scene after a damped step of Gauss and Newton from what is kept."""
     tracks, scene = problem.tracks, kept.scene
     equations = linearise(problem, kept, settling)
-    image, t, q = solve(equations, damping, jax.tree.map(jnp.negative, equations.gradient))
-    sound = jnp.isfinite(t).all() & jnp.isfinite(q).all() & jnp.isfinite(image).all()
-    image, t, q = (jnp.where(sound, part, 0) for part in (image, t, q))
-    moved = jnp.where(settling, 0, limit_step(t[:FREE]))
-    rows = (equations.now + moved * t)[:FREE] * equations.unit
-    path = with_first_rows(scene.path, rows, ROWS)
-    nodes = path.log_rho + jnp.clip(moved * q, -DEEPEST, DEEPEST)
-    level = tilt(path, tracks, moved, t[FREE + 1 :])
-    path = normalised(Path(path.O, path.D, jnp.where(problem.plane, level, nodes)))
+    down: tuple = tuple(-part for part in gradient_of(equations))
+    image, t, q = solve(equations, damping, down)
+    if not all(np.isfinite(part).all() for part in (image, t, q)):
+        return scene
+    if settling:
+        return Scene(scene.path, scene.map + image, scene.skew)
+    moved = limit_step(t[:FREE])
+    path = with_rows(scene.path, (equations.now + moved * t)[:FREE] * equations.unit)
+    if problem.plane:
+        depth = tilt(path, tracks, moved * t[FREE + 1 :])
+    else:
+        depth = path.log_rho + np.clip(moved * q, -DEEPEST, DEEPEST)
+    path = normalised(Path(path.O, path.D, depth.astype(scene.map.dtype)))
     return Scene(path, scene.map + image, scene.skew + moved * t[FREE])
 
 
-def tilt(path: Path, tracks: Tracks, moved: Array, change: Array) -> Array:
-    """Log depths at nodes of their plane after its normal has changed.
+def tilt(path: Path, tracks: Tracks, change: NDArray) -> NDArray[np.float64]:
+    """Log depths at nodes of their plane after its normal has changed, in usual inverse depths.
 
     The plane is that of the nodes whose inverse depth was not too small for one.
     """
-    f, real = tracks.f, tracks.x.dtype
-    usual, level = jnp.exp(jnp.median(path.log_rho)), jnp.exp(path.log_rho)
-    rays = jnp.asarray(rays_of(*tracks.places, 1.0), real) / jnp.stack([f, f, jnp.ones_like(f)])
-    told = jnp.where(level > 1.5 * LEAST * usual, rays.T, 0)
-    normal = jnp.linalg.solve(told @ rays + 1e-6 * jnp.eye(3, dtype=real), told @ level)
-    level = rays @ (normal + moved * usual * change)
-    return jnp.log(jnp.maximum(level, LEAST * usual))
+    level = np.exp(path.log_rho.astype(np.float64))
+    usual = float(np.median(level))
+    rays = rays_of(*tracks.places, tracks.f)
+    told = np.where(level > 1.5 * LEAST * usual, rays.T, 0)
+    normal = np.linalg.solve(told @ rays + 1e-6 * np.eye(3), told @ level)
+    return np.log(np.maximum(rays @ (normal + usual * change), LEAST * usual))
 
 
 def report(problem: Problem, kept: Seen) -> Report:
     """What a fit tells of its end."""
-    weight, on = kept.weight, kept.on
-    tracks = problem.tracks
-    left = jnp.abs(subtract_mean(kept.e, weight, totals(weight, tracks), tracks))
-    number = jnp.maximum(on.sum(), 1)
-    middle = jnp.sort(jnp.where(on > 0, left, jnp.inf))[(number / 2).astype(jnp.int32)]
-    noise = jnp.where(jnp.isfinite(middle), 1.48 * middle, 0)
-    inliers = (on / (1 + left**2 / problem.limit) ** 2).sum() / number
+    left, on = kept.e.copy(), kept.places.inside
+    subtract_mean(left, kept.weight, problem.tracks.begin)
+    number = max(float(on.sum()), 1.0)
+    within = np.abs(left[on > 0])
+    noise = 1.48 * float(np.median(within)) if len(within) else 0.0
+    inliers = float((on / (1 + left**2 / problem.limit) ** 2).sum()) / number
     return Report(noise, kept.cost, inliers)
 
 
 def compute_covariance(
     tracks: Tracks, scene: Scene, prior: Prior, *, sigma: float | int, plane: bool = False
-) -> Float[Array, "6 6"]:
+) -> NDArray[np.float64]:
     """The covariance (6, 6) of C1 and O0 of a scene that was fitted with these settings."""
-    return _compute_covariance(tracks, scene, prior, float(sigma), bool(plane))
+    problem, weight = begin(tracks, scene, prior, float(sigma), plane)
+    seen = look(problem, scene, weight)
+    return spread(linearise(problem, seen, settling=False))
 
 
-@jax.jit
-def _compute_covariance(
-    tracks: Tracks, scene: Scene, prior: Prior, sigma: Array, plane: Array
-) -> Array:
-    problem, nothing = begin(tracks, scene, prior, sigma, plane)
-    seen = look(problem, scene, nothing.weight)
-    return spread(linearise(problem, seen, jnp.asarray(False)), seen)
-
-
-def spread(equations: Equations, seen: Seen) -> Float[Array, "6 6"]:
+def spread(equations: Equations) -> NDArray[np.float64]:
     """H^-1 (sum_c g_c g_c' + the priors') H^-1, with c cells, within which errors are alike.
 
     Of cells of 24 and of 48 px those that tell more.
@@ -231,28 +200,28 @@ def spread(equations: Equations, seen: Seen) -> Float[Array, "6 6"]:
     d(w e)/de = w (1 - 3 u) / (1 + u), u = (e / 3 sigma)^2 (Huber). Errors are
     then larger than sigma before plain shapes, where they are alike everywhere: see `inflation`.
     """
-    tracks, weight, left = equations.problem.tracks, seen.weight, equations.left
-    u = left**2 / equations.problem.limit
-    curved = (weight * (1 - 3 * u) / (1 + u)).sum() / jnp.maximum(weight.sum(), 1)
-    less = 1 / jnp.maximum(curved, 0.1) ** 2
+    problem, seen, left = equations.problem, equations.seen, equations.left
+    tracks, weight = problem.tracks, seen.weight
+    u = left**2 / problem.limit
+    curved = float((weight * (1 - 3 * u) / (1 + u)).sum()) / max(float(weight.sum()), 1.0)
+    less = 1 / max(curved, 0.1) ** 2
     rows, columns = (-(-n // CELLS[0]) for n in tracks.shape)
-    across = (tracks.x - tracks.corner[0]) // CELLS[0]
-    cell = ((tracks.y - tracks.corner[1]) // CELLS[0] * columns + across).astype(jnp.int32)
-    chosen = jnp.concatenate([jnp.arange(3 * ROWS, 3 * ROWS + 3), jnp.arange(3)])
-    zero = jax.tree.map(jnp.zeros_like, equations.gradient)
-    undamped = jnp.zeros((), left.dtype)
-
-    def column(i: Array) -> tuple[Array, Array]:
-        v = solve(equations, undamped, (zero[0], zero[1].at[i].set(1), zero[2]))
-        score = equations.information * left * equations.jacobian.of(v)
-        told = jnp.zeros(rows * columns, left.dtype).at[cell].add(score)
-        return told * equations.unit[i], v[1] * equations.unit[i]
-
-    told, own = lax.map(column, chosen)
-    size = CELLS[1] // CELLS[0]
-    wide = told.reshape(6, rows, columns)
-    wide = jnp.pad(wide, [(0, 0), (0, -rows % size), (0, -columns % size)])
+    down, across = ((tracks.y - tracks.corner[1]), (tracks.x - tracks.corner[0]))
+    cell = (down // CELLS[0] * columns + across // CELLS[0]).astype(np.int64)
+    told, own = [], []
+    for i in (*range(3 * ROWS, 3 * ROWS + 3), *range(3)):
+        side = np.zeros(FREE + 4)
+        side[i] = equations.unit[i]
+        nodes = np.zeros(math.prod(tracks.nodes))
+        v = solve(equations, 0.0, (np.zeros(tracks.shape), side, nodes), 0.0)
+        score = problem.information * weight * left * equations.change(v)
+        told.append(np.bincount(cell, score, rows * columns))
+        own.append(v[1])
+    parts, size = np.array(told), CELLS[1] // CELLS[0]
+    wide = parts.reshape(6, rows, columns)
+    wide = np.pad(wide, [(0, 0), (0, -rows % size), (0, -columns % size)])
     wide = wide.reshape(6, -(-rows // size), size, -(-columns // size), size).sum((2, 4))
-    both = [part @ part.T for part in (told, wide.reshape(6, -1))]
-    larger = jnp.where(jnp.trace(both[1]) > jnp.trace(both[0]), both[1], both[0])
-    return less * larger + own @ equations.known @ own.T
+    both = [part @ part.T for part in (parts, wide.reshape(6, -1))]
+    larger = both[1] if np.trace(both[1]) > np.trace(both[0]) else both[0]
+    prior = np.array(own)
+    return less * larger + prior @ equations.known @ prior.T

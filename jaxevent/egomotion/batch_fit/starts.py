@@ -10,24 +10,19 @@
 The two kinds fail on different scenes.
 """
 
-import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
-from jax import lax
-from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
+from jaxevent.egomotion.batch_fit import images
 from jaxevent.egomotion.batch_fit.alignment import Window
 from jaxevent.egomotion.batch_fit.path import LEAST, Path, rays_of
 from jaxevent.egomotion.geometry import A, B
-from jaxevent.egomotion.warped import blur, splat
 
 DIRECTIONS = 600  # headings of a hemisphere that are tried
 HOP, PATCH = 16, 24  # px between patches whose flow is measured, and their size
@@ -45,52 +40,38 @@ STRAINS = np.array(
 )
 
 
-@functools.partial(jax.jit, static_argnums=3)
-def _contrast(values: Array, basis: Array, window: Window, blurs: int, scale: Array) -> tuple:
-    def loss(values: Array) -> Array:
-        X, Y = _moved(jnp.tensordot(values, basis, 1), window)
-        image = blur(splat(jnp.stack([X, Y], 1), window.p, window.shape, window.corner), blurs)
-        return -jnp.sum(image**2) / scale
-
-    return jax.value_and_grad(loss)(values)
-
-
-def _moved(M: Array, window: Window) -> tuple[Array, Array]:
-    """Where exp(M tau) takes the events, to the fifth order, M in 1/s."""
-    one = jnp.ones_like(window.x)
-    term = jnp.stack([window.x / window.f, window.y / window.f, one])
-    X = term
-    for k in range(1, 6):
-        term = M @ term * window.tau / k
-        X = X + term
-    return window.f * X[0] / X[2], window.f * X[1] / X[2]
-
-
 def _sharpest(
     window: Window, basis: NDArray, values: NDArray, blurs: tuple[int, ...], steps: int
 ) -> tuple[NDArray[np.float64], float]:
     """Values of generators of the highest contrast, from some on, and minus that contrast."""
-    per_px, real, least = 1 / float(window.f * window.half), window.x.dtype, 0.0
-    shapes = jnp.asarray(basis, real)
-    for times in blurs:
-        one = jnp.ones((), real)
-        scale = -_contrast(jnp.asarray(values, real), shapes, window, times, one)[0]
+    per_px, real, least = 1 / (window.f * window.half), window.x.dtype, 0.0
+    image, work = np.empty(window.shape, real), np.empty(window.shape, real)
 
-        def value(px: NDArray, times: int = times, scale: Array = scale) -> tuple[float, NDArray]:
-            at = jnp.asarray(px * per_px, real)
-            loss, slope = _contrast(at, shapes, window, times, scale)
-            return float(loss), np.asarray(slope, np.float64) * per_px
+    def loss(values: NDArray, times: int) -> tuple[float, NDArray]:
+        M, slope = np.tensordot(values, basis, 1), np.empty(len(basis))
+        told = images.contrast_and_slope(
+            window.x, window.y, window.tau, window.p, M, basis, window.corner, window.f, times,
+            image, work, slope,
+        )  # fmt: skip
+        return told, slope
+
+    for times in blurs:
+        scale = max(-loss(values, times)[0], 1e-9)
+
+        def value(px: NDArray, times: int = times, scale: float = scale) -> tuple[float, NDArray]:
+            told, slope = loss(px * per_px, times)
+            return told / scale, slope / scale * per_px
 
         found = scipy.optimize.minimize(
             value, values / per_px, jac=True, method="L-BFGS-B", options={"maxiter": steps}
         )
-        values, least = found.x * per_px, float(found.fun) * float(scale)
+        values, least = found.x * per_px, float(found.fun) * scale
     return values, least
 
 
 def rotation(window: Window) -> NDArray[np.float64]:
     """The pure rotation (rad/s) of the highest contrast; with parallax only a beginning."""
-    far = 8 / float(window.f * window.half)
+    far = 8 / (window.f * window.half)
     first = [np.zeros(3), *(far * sign * axis for axis in np.eye(3) for sign in (1, -1))]
     found = side_by_side(lambda at: _sharpest(window, TURNS, at, (8,), 4), first)
     best = min(found, key=lambda pair: pair[1])[0]
@@ -104,11 +85,11 @@ class Plane(NamedTuple):
     normal: NDArray[np.float64]
     Omega: NDArray[np.float64]
 
-    def path(self, x: NDArray, y: NDArray, f: float, real: Any) -> Path:
+    def path(self, x: NDArray, y: NDArray, f: float, real: np.dtype) -> Path:
         """The path of this constant twist, with the plane's depths at some places (px)."""
         rho = rays_of(x, y, f) @ self.normal * np.linalg.norm(self.T)
         log_rho = np.log(np.maximum(rho, LEAST * np.median(np.abs(rho))))
-        return Path.constant(self.T / np.linalg.norm(self.T), self.Omega, log_rho, real)
+        return Path.constant(self.T / np.linalg.norm(self.T), self.Omega, log_rho.astype(real))
 
 
 def homography(window: Window, Omega: NDArray) -> NDArray[np.float64]:
@@ -139,22 +120,19 @@ def before_a_plane(M: NDArray) -> list[Plane]:
     return found
 
 
-@jax.jit
-def _flow_maps(window: Window, Omega: Array, flows: Float[Array, "n 2"]) -> tuple[Array, Array]:
+def _flow_maps(window: Window, Omega: NDArray, flows: NDArray) -> tuple[NDArray, NDArray]:
     """Contrast and number of events of all patches, (n, rows, columns), for flows (px/s)."""
-    x, y = _moved(jnp.tensordot(Omega, jnp.asarray(TURNS, Omega.dtype), 1), window)
-    height, width = (n // 8 * 8 for n in window.shape)
-
-    def patches(image: Array) -> Array:
-        image = image[:height, :width].reshape(height // 8, 8, width // 8, 8).sum((1, 3))
-        return lax.reduce_window(image, 0.0, lax.add, (3, 3), (2, 2), "VALID")
-
-    def one(U: Array) -> tuple[Array, Array]:
-        at = jnp.stack([x - U[0] * window.tau, y - U[1] * window.tau], 1)
-        both = splat(at, jnp.stack([window.p, jnp.abs(window.p)]), window.shape, window.corner)
-        return patches(blur(both[0], 1) ** 2), patches(both[1])
-
-    return lax.map(one, flows)
+    real = window.x.dtype
+    X, Y = np.empty_like(window.x), np.empty_like(window.x)
+    M = np.tensordot(Omega, TURNS.astype(float), 1)
+    images.turned(window.x, window.y, window.tau, M, window.f, X, Y)
+    rows, columns = (max((n // 8 - 3) // 2 + 1, 0) for n in window.shape)
+    S, N = np.empty((len(flows), rows, columns)), np.empty((len(flows), rows, columns))
+    both, work = np.empty((2, *window.shape), real), np.empty(window.shape, real)
+    images.flow_maps(
+        X, Y, window.tau, window.p, flows.astype(real), window.corner, both, work, S, N
+    )
+    return S, N
 
 
 class Flows(NamedTuple):
@@ -167,16 +145,12 @@ class Flows(NamedTuple):
 
 def patch_flows(window: Window, Omega: NDArray, flow_max: float) -> Flows | None:
     """Flows of patches of the derotated events; None if fewer than 6 tell one."""
-    real = window.x.dtype
-    step = 0.6 / float(window.half)
+    step = 0.6 / window.half
     count = int(np.ceil(flow_max / step))
     grid = np.arange(-count, count + 1) * step
     n = len(grid)
     flows = np.stack(np.meshgrid(grid, grid, indexing="ij"), -1).reshape(-1, 2)
-    S, N = (
-        np.asarray(part, np.float64)
-        for part in _flow_maps(window, jnp.asarray(Omega, real), jnp.asarray(flows, real))
-    )
+    S, N = _flow_maps(window, Omega, flows)
     sharp = (S / np.maximum(N, 20)).reshape(n, n, *S.shape[1:])
     N = N.reshape(sharp.shape)
     a, b = (part.ravel() for part in np.mgrid[-1:2, -1:2].astype(float))
@@ -227,8 +201,9 @@ def headings(flows: Flows, f: float, Omega: NDArray, number: int, omega_weight: 
         left = target - np.einsum("tkj,tj->tk", basis, more)
         limit = 4.0 * 4.0 ** max(0, 5 - turn_number)
         weight = 1 / variance / (1 + left**2 / variance / limit) ** 2
-        H = np.einsum("tk,tki,tkj->tij", weight, basis, basis) + damping
-        side = np.einsum("tk,tki,tk->ti", weight, basis, target) - omega_weight * Omega
+        weighted = (weight[..., None] * basis).swapaxes(1, 2)
+        H = weighted @ basis + damping
+        side = (weighted @ target[..., None])[..., 0] - omega_weight * Omega
         more = np.linalg.solve(H, side[..., None])[..., 0]
     rest = flows.U - np.einsum("kij,tj->tki", turn, more)
     information = np.linalg.inv(flows.covariance)
@@ -260,7 +235,7 @@ def start(
     usual = max(float(np.average(rho, weights=weight + 1e-12)), 1e-3)
     share = np.exp(-far / (2 * PATCH**2)) * weight / max(weight.mean(), 1e-12) + 1e-6
     depth = (share * np.clip(rho, 0.15 * usual, 6 * usual)).sum(1) / share.sum(1)
-    return Path.constant(T, Omega, np.log(depth), window.x.dtype)
+    return Path.constant(T, Omega, np.log(depth).astype(window.x.dtype))
 
 
 def side_by_side(follow: Callable[[Any], Any], rivals: list[Any]) -> list[Any]:

@@ -16,7 +16,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
@@ -158,6 +158,7 @@ class Windows:
     ):
         self.recording, self.params, self.gyro, self.seed = recording, params, gyro, seed
         self.least: dict[int, float] = {}  # C, sigma at least, by windows
+        self.real = np.dtype(jax.dtypes.canonicalize_dtype(float))
         self.xi, self.f = coordinates(recording.width, recording.height, camera)
         flat = self.xi.reshape(-1, 2)
         lower, upper = np.floor(flat.min(0)) - MARGIN, np.ceil(flat.max(0)) + MARGIN
@@ -165,7 +166,8 @@ class Windows:
         corner = lower - (cells * params.cell - (upper - lower + 1)) // 2
         self.corner = (float(corner[0]), float(corner[1]))
         self.shape = (int(cells[1]) * params.cell, int(cells[0]) * params.cell)
-        self.box = (flat[:, 0].min(), flat[:, 0].max(), flat[:, 1].min(), flat[:, 1].max())
+        ends = flat[:, 0].min(), flat[:, 0].max(), flat[:, 1].min(), flat[:, 1].max()
+        self.box = (float(ends[0]), float(ends[1]), float(ends[2]), float(ends[3]))
 
     def rows(self, centre: int, half: float) -> tuple[int, int]:
         """The events of a window."""
@@ -181,37 +183,34 @@ class Windows:
         keep = np.arange(len(events))
         if len(keep) > most:
             keep = np.sort(rng.choice(len(keep), most, replace=False))
-        real = np.dtype(jnp.result_type(float))
-        data = np.zeros((4, most), real)
-        n = len(keep)
-        data[:2, :n] = self.xi[events.y[keep], events.x[keep]].T
-        data[2, :n] = (events.t[keep] - centre) * 1e-6
-        data[3, :n] = np.where(events.p[keep], 1, -1)
-        x, y, tau, p = (jnp.asarray(part) for part in data)
+        x, y = self.xi[events.y[keep], events.x[keep]].T.astype(self.real)
+        tau = ((events.t[keep] - centre) * 1e-6).astype(self.real)
         return Window(
-            x,
-            y,
+            np.ascontiguousarray(x),
+            np.ascontiguousarray(y),
             tau,
-            p,
-            jnp.asarray(self.f, real),
-            jnp.asarray(half, real),
-            jnp.asarray(self.box, real),
+            np.where(events.p[keep], 1, -1).astype(self.real),
+            self.f,
+            half,
+            self.box,
             self.shape,
             self.corner,
             self.params.cell,
         )
 
     def prior(self, centre: int, half: float) -> Prior:
-        real = np.dtype(jnp.result_type(float))
         params = self.params
         gyro, weight = np.zeros((SEGMENTS, 3)), 0.0
         if self.gyro is not None:
             times = centre + ((np.arange(SEGMENTS) + 0.5) / SEGMENTS * 2 - 1) * half * 1e6
             at = np.clip(np.rint(times), self.gyro.start, self.gyro.stop).astype(np.int64)
             gyro, weight = self.gyro(at)[1], 1 / float(params.gyro_std) ** 2
-        values = (params.smooth, params.relief, params.change, self.omega_weight, gyro, weight)
-        values += (params.bond, params.flat, params.alike, *self.skew(centre, half), 1.0)
-        return Prior(*(jnp.asarray(value, real) for value in values))
+        smooth, relief, change, bond, flat, alike = (
+            float(getattr(params, name))
+            for name in ("smooth", "relief", "change", "bond", "flat", "alike")
+        )
+        own = smooth, relief, change, self.omega_weight, gyro, weight
+        return Prior(*own, bond, flat, alike, *self.skew(centre, half))
 
     def skew(self, centre: int, half: float) -> tuple[float, float]:
         """The skew of the thresholds by which pixels end where they began, and its weight.
@@ -256,8 +255,7 @@ class Windows:
         """Paths of constant twist to begin with, followed for a third of the window."""
         params, half = self.params, float(self.params.half_window) / 3
         window, prior = self.cut(centre, half, MIDDLE), self.prior(centre, half)
-        real = window.x.dtype
-        found = [plane.path(*window.places, self.f, real) for plane in planes]
+        found = [plane.path(*window.places, self.f, self.real) for plane in planes]
         cuts = [self.cut(centre, length, COARSE) for length in (half / 2, half)]
         for flows in side_by_side(
             lambda cut: patch_flows(cut, Omega, float(params.flow_max)), cuts
@@ -268,8 +266,8 @@ class Windows:
             found += [start(window, flows, *one) for one in best]
 
         def follow(path: Path) -> Path:
-            path, _ = refine(window, path, prior, degree=0, blurs=4, steps=6)
-            return refine(window, path, prior, degree=0, blurs=1, steps=6)[0]
+            path = refine(window, path, prior, degree=0, blurs=4, steps=6)
+            return refine(window, path, prior, degree=0, blurs=1, steps=6)
 
         ranked = side_by_side(lambda path: self.scored(window, follow(path)), found)
         return self.best(ranked)[:STARTED]
@@ -302,19 +300,13 @@ class Windows:
         begin = np.maximum.accumulate(np.where(begins, np.arange(n), 0))
         p = np.where(events.p[keep], 1, -1)
         total = np.cumsum(p)
-        real = np.dtype(jnp.result_type(float))
-        data = np.zeros((6, most), real)
-        data[:2, :n] = self.xi.reshape(-1, 2)[where].T
-        data[2, :n] = (events.t[keep] - centre) * 1e-6
-        data[3, :n] = total - (total - p)[begin]
-        data[4, :n] = np.arange(n) - begin + 1
-        data[5, :n] = p
-        which = np.full(most, pixels, np.int32)
-        which[:n] = where
         lower, upper = np.array(self.box[::2]) - MARGIN, np.array(self.box[1::2]) + MARGIN
         lower = np.floor(lower)
         across, down = (np.ceil(upper - lower).astype(int) + 1).tolist()
-        x, y, tau, level, number, p = (jnp.asarray(part) for part in data)
+        x, y = self.xi.reshape(-1, 2)[where].T
+        rows = x, y, (events.t[keep] - centre) * 1e-6, total - (total - p)[begin]
+        rows += np.arange(n) - begin + 1, p
+        x, y, tau, level, number, p = (np.ascontiguousarray(row, self.real) for row in rows)
         return Tracks(
             x,
             y,
@@ -322,12 +314,11 @@ class Windows:
             level,
             number,
             p,
-            jnp.asarray(which),
-            jnp.asarray(self.f, real),
-            jnp.asarray(half, real),
+            np.append(np.flatnonzero(begins), n),
+            self.f,
+            half,
             (down, across),
             (float(lower[0]), float(lower[1])),
-            pixels + 1,
             NODE,
         )
 
@@ -340,7 +331,7 @@ class Windows:
         def follow(paths: list[Path], window: Window, prior: Prior, degree: int, n: int) -> list:
             def one(path: Path) -> tuple[float, Path]:
                 return self.scored(
-                    window, refine(window, path, prior, degree=degree, blurs=2, steps=n)[0]
+                    window, refine(window, path, prior, degree=degree, blurs=2, steps=n)
                 )
 
             return self.best(side_by_side(one, paths))
@@ -363,10 +354,11 @@ class Windows:
         cell, (x, y) = self.params.cell, tracks.places
         middle = (cell - 1) / 2
         u, v = (x - self.corner[0] - middle) / cell, (y - self.corner[1] - middle) / cell
-        cells = np.asarray(path.log_rho, np.float64)
-        cells = cells.reshape(self.shape[0] // cell, self.shape[1] // cell)
+        cells = path.log_rho.astype(np.float64).reshape(
+            self.shape[0] // cell, self.shape[1] // cell
+        )
         log_rho = scipy.ndimage.map_coordinates(cells, [v, u], order=1, mode="nearest")
-        return Path(path.O, path.D, jnp.asarray(log_rho, path.O.dtype))
+        return Path(path.O, path.D, log_rho.astype(self.real))
 
     def before_a_plane(self, centre: int, planes: list[Plane]) -> list[Rival]:
         """Of motions before a plane those of least cost first, if a plane explains the events.
@@ -379,10 +371,9 @@ class Windows:
             half = share * float(self.params.half_window)
             tracks, prior = self.tracks(centre, half, events), self.prior(centre, half)
             if not paths:
-                real = tracks.x.dtype
-                paths = [plane.path(*tracks.places, self.f, real) for plane in planes]
+                paths = [plane.path(*tracks.places, self.f, self.real) for plane in planes]
             follow = functools.partial(_begun, tracks, prior=prior, stages=stages, plane=True)
-            found = [one for one in side_by_side(follow, paths) if float(one[1].cost) < most]
+            found = [one for one in side_by_side(follow, paths) if one[1].cost < most]
             # The first is too coarse to choose among motions that are alike.
             found = self.ranked(found) if row else found
             paths = [scene.path for scene, _ in found]
@@ -420,7 +411,7 @@ class Windows:
             found = side_by_side(follow, paths)
             paths = [scene.path for scene, _ in found]
             if number == NOISY and found:
-                noise = min(float(report.noise) for _, report in found)
+                noise = min(report.noise for _, report in found)
                 self.least[centre] = noise if noise > NOISE else 0.0
         return found
 
@@ -448,11 +439,10 @@ class Windows:
         if not left:
             return None
         scene, report = min(left, key=lambda one: self.cost(*one))
-        sigma = max(stages[-1].sigma, SHARP * float(report.noise), least)
+        sigma = max(stages[-1].sigma, SHARP * report.noise, least)
         covariance = compute_covariance(tracks, scene, prior, sigma=sigma)
         scene, report = adjust(tracks, scene, prior, sigma=sigma, settle=0, steps=1)
-        inliers = float(report.inliers)
-        covariance = inflation(inliers) * np.asarray(covariance, np.float64)
+        covariance = inflation(report.inliers) * covariance
         if least > 0 or self.parallax(scene.path, half) < PARALLAX:
             others = [one.path for one, _ in left if not near_to(one.path, scene.path)]
             path, covariance = self.with_rivals(centre, scene.path, others, covariance)
@@ -460,14 +450,14 @@ class Windows:
         return Fit(
             scene.path,
             covariance,
-            inliers,
-            float(report.cost),
-            np.asarray(scene.map),
+            report.inliers,
+            report.cost,
+            scene.map,
         )
 
     def parallax(self, path: Path, half: float) -> float:
         """How far (px) the usual point moves in a window by translation."""
-        return 2 * half * self.f * float(np.exp(np.median(np.asarray(path.log_rho))))
+        return 2 * half * self.f * float(np.exp(np.median(path.log_rho)))
 
     def with_rivals(
         self, centre: int, path: Path, others: list[Path], covariance: NDArray[np.float64]
@@ -489,8 +479,8 @@ class Windows:
         best, *rest = side_by_side(lambda one: fitted(tracks, one, prior, sigma), [path, *others])
         told = covariance.copy()
         if compared(left_out, still, best, prior, sigma) < TELLING:
-            heading = np.asarray(path.D[0], np.float64)
-            turn = np.asarray(still.path.O[0] - path.O[0], np.float64)
+            heading = path.D[0]
+            turn = still.path.O[0] - path.O[0]
             told[:3], told[:, :3] = 0, 0
             told[:3, :3] = (np.pi / 2) ** 2 / 2 * (np.eye(3) - np.outer(heading, heading))
             told[3:, 3:] += np.outer(turn, turn)
@@ -508,7 +498,7 @@ class Windows:
 
     def cost(self, scene: Scene, report: Report) -> float:
         """What selects among rivals: the cost per event, with the prior of |Omega|."""
-        value = float(report.cost) + self.turning(scene.path)
+        value = report.cost + self.turning(scene.path)
         return value if np.isfinite(value) else np.inf
 
     def turning(self, path: Path) -> float:
@@ -539,8 +529,7 @@ def _begun(
     least: float = 0.0,
 ) -> Rival:
     """Through stages, from a path alone: first the map is made."""
-    real = tracks.x.dtype
-    scene = Scene(path, jnp.zeros(tracks.shape, real), jnp.asarray(prior.skew, real))
+    scene = Scene(path, np.zeros(tracks.shape, tracks.x.dtype), prior.skew)
     scene, report = adjust(
         tracks, scene, prior, sigma=ROUNDS[0].sigma, settle=2, steps=2, plane=plane
     )
@@ -560,7 +549,7 @@ def _adjusted(
     for stage in stages:
         flat, change = stage.flatter * prior.flat, stage.stiffer * prior.change
         seen = prior._replace(flat=flat, change=change)
-        sigma = max(stage.sigma, SHARP * float(report.noise), least)
+        sigma = max(stage.sigma, SHARP * report.noise, least)
         scene, report = adjust(
             tracks, scene, seen, sigma=sigma, settle=0, steps=stage.steps, plane=plane
         )

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import part, quick
+from jaxevent.kernels import fast_part, part
 
 BLOCK = 32  # motions that are scored together; those that are no nodes are particles, as checks
 LEAST_CHECKS = 4
@@ -127,7 +127,7 @@ def _chebyshev(k, j):
     return np.cos((2 * j + 1) * np.pi / (2 * k))
 
 
-@quick
+@fast_part
 def _fill_basis(basis, row, middle, half, k, z):
     """Lagrange's polynomial of a node z at particles y: 2 / k sum_m' T_m(z) T_m(y)."""
     real = row.dtype.type
@@ -142,7 +142,7 @@ def _fill_basis(basis, row, middle, half, k, z):
         basis[i] = total * real(2) / real(k)
 
 
-@quick
+@fast_part
 def _fill_product(nodes, j, d):
     """What node j counts for each particle."""
     k = nodes.now[K]
@@ -155,7 +155,7 @@ def _fill_product(nodes, j, d):
             product[i] *= one[i]
 
 
-@quick
+@fast_part
 def _sum_products(one, other, count):
     total = one.dtype.type(0)
     for i in range(count):
@@ -163,7 +163,7 @@ def _sum_products(one, other, count):
     return total
 
 
-@quick
+@fast_part
 def _add_product(to, product, value, count):
     for i in range(count):
         to[i] += product[i] * value
