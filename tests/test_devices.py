@@ -84,11 +84,10 @@ def reconstructions(folder: Path) -> dict[str, Any]:
     objective = Objective(method)
     batch = Problem(objective, parts(recording, "held-out"))(params)[0][0]
     batch = batch if devices.alone() else batch.over(devices.local())
-    found["shared out"] = batch.features.tiles.since.sharding.num_devices
+    found["shared out"] = batch.truth.sharding.num_devices
 
     def loss(params):
-        trajectory, _ = method.run(params, batch.features)
-        return objective(params, batch), method.read(params, trajectory, batch.out).mean
+        return objective(params, batch), batch.prepared(params).mean
 
     (value, images), slope = jax.jit(jax.value_and_grad(loss, has_aux=True))(params)
     found["cf"] = images

@@ -54,6 +54,10 @@ def over_rows(kernel: Callable, rows: int, *args: Any) -> None:
         kernel(0, rows, *args)
         return
     edges = [rows * part // parts for part in range(parts + 1)]
-    jobs = [_workers().submit(kernel, *edges[k : k + 2], *args) for k in range(parts)]
+    try:
+        jobs = [_workers().submit(kernel, *edges[k : k + 2], *args) for k in range(parts)]
+    except RuntimeError:  # the interpreter ends, and JAX waits for what it has begun
+        kernel(0, rows, *args)
+        return
     for job in jobs:
         job.result()

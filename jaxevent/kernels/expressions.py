@@ -141,9 +141,9 @@ class Graph:
         if op == "sub":
             if value[1] == 0:
                 return args[0]
-            if args[0] is args[1] and args[0].level <= Level.HOST:
+            if args[0] is args[1] and args[0].level <= Level.TABLE:
                 return self.constant(0.0 if args[0].kind == "f" else 0)
-        if op == "div" and value[1] == 1:
+        if op == "div" and (value[1] == 1 or value[0] == 0):
             return args[0]
         if op in ("and", "or"):
             for k in (0, 1):

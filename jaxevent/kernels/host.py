@@ -155,6 +155,7 @@ class HostProgram:
     inputs: int = 0
     steps: list[tuple[Any, list[Any], list[int]]] = dataclasses.field(default_factory=list)
     decided: list[int] = dataclasses.field(default_factory=list)  # truth values that chose a way
+    zeros: dict[int, NDArray] = dataclasses.field(default_factory=dict)  # where values must be 0
     _known: dict[Any, list[int]] = dataclasses.field(default_factory=dict)
 
     def add_input(self, value: NDArray) -> int:
@@ -178,9 +179,10 @@ class HostProgram:
         return numbers
 
     def again(self, inputs: list[NDArray]) -> list[NDArray] | None:
-        """All values for other inputs; None where a truth value that chose a way is another."""
+        """All values for other inputs; None where one that chose a way is another."""
         values: list[NDArray] = [*inputs]
         for eqn, arguments, _ in self.steps:
             values += evaluate(eqn, [values[a] if isinstance(a, int) else a for a in arguments])
         same = all(np.array_equal(values[n], self.values[n]) for n in self.decided)
+        same = same and all(np.array_equal(values[n] == 0, z) for n, z in self.zeros.items())
         return values if same else None

@@ -11,7 +11,7 @@ from types import ModuleType
 import numba
 
 from jaxevent import cache
-from jaxevent.kernels import blocks, numeric
+from jaxevent.kernels import blocks, linear, numeric
 
 
 def module_of(text: str) -> ModuleType:
@@ -42,7 +42,7 @@ def _content(path: Path) -> bytes | None:
 @functools.cache
 def _shared() -> str:
     """What kernels are made of beside their text."""
-    sources = (Path(str(module.__file__)).read_bytes() for module in (blocks, numeric))
+    sources = (Path(str(module.__file__)).read_bytes() for module in (blocks, linear, numeric))
     return hashlib.blake2b(b"".join(sources)).hexdigest()
 
 

@@ -6,6 +6,7 @@ their way here, so that a kernel holds nothing that its parameters switch off.
 """
 
 import dataclasses
+import types
 from typing import Any
 
 import numpy as np
@@ -34,9 +35,14 @@ class Known:
 
 @dataclasses.dataclass(frozen=True)
 class OfParameters:
-    """An array known with the parameters: a value of the `HostProgram`."""
+    """An array known with the parameters: a value of the `HostProgram`.
+
+    Kernels leave out what is 0 in `sparse` ones. `change`: it is a derivative.
+    """
 
     number: int
+    sparse: bool = False
+    change: bool = False
 
 
 Value = Known | OfParameters | NDArray  # an array of nodes
@@ -47,6 +53,7 @@ class Translation:
 
     def __init__(self, graph: Graph, host: HostProgram):
         self.graph, self.host = graph, host
+        self.changes: set[Node] = set()  # numbers that are derivatives
 
     def special(self, eqn: Any, values: list[Value]) -> NDArray | None:
         """What an equation of a family's own makes; None for all others."""
@@ -77,12 +84,18 @@ class Translation:
         number = value.number if isinstance(value, OfParameters) else None
         array = value.value if isinstance(value, Known) else self.host.values[value.number]
         out = np.empty(array.shape, object)
+        sparse = isinstance(value, OfParameters) and value.sparse
+        if number is not None and sparse:
+            self.host.zeros[number] = array == 0
         for flat, place in enumerate(np.ndindex(*array.shape)):
-            if number is None:
+            if number is None or (sparse and array[place] == 0):
                 out[place] = self.graph.constant(array[place])
             else:
                 kind = KINDS[array.dtype.kind]
-                out[place] = self.graph.node("number", (number, flat), kind, Level.HOST)
+                node = self.graph.node("number", (number, flat), kind, Level.HOST)
+                if isinstance(value, OfParameters) and value.change:
+                    self.changes.add(node)
+                out[place] = node
         return out
 
     def _equation(self, eqn: Any, values: list[Value]) -> list[Value]:
@@ -104,13 +117,16 @@ class Translation:
     def _of_parameters(self, eqn: Any, values: list[Any]) -> list[Value]:
         arguments = [v.number if isinstance(v, OfParameters) else v.value for v in values]
         numbers = self.host.add(eqn, arguments)
+        known = [v for v in values if isinstance(v, OfParameters)]
+        sparse, change = any(v.sparse for v in known), any(v.change for v in known)
         out: list[Value] = []
         for number in numbers:
             if self.host.values[number].dtype == bool:
                 self.host.decided.append(number)
                 out.append(Known(self.host.values[number]))
             else:
-                out.append(OfParameters(number))
+                real = self.host.values[number].dtype.kind == "f"  # places have no derivatives
+                out.append(OfParameters(number, sparse, change and real))
         return out
 
     def _symbolic(self, eqn: Any, values: list[Value]) -> NDArray:
@@ -162,12 +178,13 @@ class Translation:
         raise Untranslatable(f"the operation {name!r}")
 
     def _power(self, base: Node, exponent: int) -> Node:
-        power = base
+        one = self.graph.constant(1.0)
+        if exponent < 0:
+            base = self.graph.apply("div", (one, base), "f")
+        power = base if exponent else one
         for _ in range(abs(exponent) - 1):
             power = self.graph.apply("mul", (power, base), "f")
-        if exponent < 0:
-            power = self.graph.apply("div", (self.graph.constant(1.0), power), "f")
-        return power if exponent else self.graph.constant(1.0)
+        return power
 
     def fold(self, op: str, array: NDArray, axes: list[int]) -> NDArray:
         """An array folded by an operation, along axes."""
@@ -249,12 +266,40 @@ class Translation:
                 return found
             return self.placed(found, kind)
         if eqn.primitive.name == "gather" and isinstance(table, OfParameters):
-            index = self.nodes(places[0])
-            one = self.host.values[table.number].ndim == 1 and index.shape[-1:] == (1,)
-            if one and eqn.params["slice_sizes"] == (1,):
-                out = np.empty(index.shape[:-1], object)
-                for place in np.ndindex(*out.shape):
-                    arguments = (table.number, index[place][0])
-                    out[place] = self.graph.apply("entry", arguments, kind)
-                return out
+            index, sizes = self.nodes(places[0]), eqn.params["slice_sizes"]
+            size = self.host.values[table.number].shape[-1]
+            if index.shape[-1:] == (1,) and sizes == (1,):
+                return self._entries(table, index[..., 0], kind)
+            numbers = eqn.params["dimension_numbers"]
+            whole = sizes[1:] == (1,) and numbers.start_index_map == (1,)
+            if index.shape[-1:] == (1,) and whole and len(numbers.offset_dims) == 1:
+                rows = [self._row(table, k, size) for k in range(sizes[0])]
+                found = [self._entries(row, index[..., 0], kind) for row in rows]
+                return np.stack(found, numbers.offset_dims[0])
         raise Untranslatable("a look-up with an index of data")
+
+    def _entries(self, table: OfParameters, index: NDArray, kind: str) -> NDArray:
+        """What stands at places of data in a table of one axis."""
+        out, array = np.empty(index.shape, object), self.host.values[table.number]
+        if table.sparse or table.change:
+            self.host.zeros[table.number] = array == 0
+            if not array.any():
+                out.fill(self.graph.constant(0.0))
+                return out
+        for place in np.ndindex(*out.shape):
+            node = self.graph.apply("entry", (table.number, index[place]), kind)
+            if table.change:
+                self.changes.add(node)
+            out[place] = node
+        return out
+
+    def _row(self, table: OfParameters, row: int, size: int) -> OfParameters:
+        """A row of a table."""
+        out = [types.SimpleNamespace(aval=self.host.values[table.number])]
+        cut = {"start_indices": (row, 0), "limit_indices": (row + 1, size), "strides": None}
+        number = table.number
+        for name, params in (("slice", cut), ("reshape", {"new_sizes": (size,)})):
+            what = types.SimpleNamespace(name=name)
+            eqn = types.SimpleNamespace(primitive=what, params=params, outvars=out)
+            (number,) = self.host.add(eqn, [number])
+        return dataclasses.replace(table, number=number)

@@ -9,6 +9,7 @@ from jaxevent.estimator import Estimate, Estimator
 from jaxevent.reconstruction.clock import Timing, time_span
 from jaxevent.reconstruction.features import Features, ReadOut
 from jaxevent.reconstruction.live import LiveVideo
+from jaxevent.reconstruction.prepared import PreparedImages, ScannedImages
 from jaxevent.reconstruction.video import ImageSequence, P, Video
 from jaxevent.reconstruction.windows import prepare
 from jaxevent.recording import Recording, Times, check_times
@@ -38,6 +39,26 @@ class ImageEstimator(Estimator[P]):
 
         Raises `InputError` if the recording lacks what the method needs.
         """
+
+    def prepare_images(
+        self,
+        recording: Recording,
+        times: Times,
+        params: P | None = None,
+        *,
+        extrapolate: bool = False,
+    ) -> PreparedImages:
+        """The images at sorted `times` as a function of parameters, for losses.
+
+            images = akf.prepare_images(recording, times)
+            loss = lambda params: ((images(params).mean - truth) ** 2).mean()
+            value, slope = jax.jit(jax.value_and_grad(loss))(akf.Params())
+
+        Prepared for those of the `params` that act through comparisons with event times, see
+        `prepare`. Raises `InputError` as `prepare` does.
+        """
+        features, out = self.prepare(recording, times, params, extrapolate=extrapolate)
+        return ScannedImages(features, out, self)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -8,7 +8,7 @@ the step over their lanes, `read` evaluates images.
 import abc
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -31,10 +31,13 @@ from jaxevent.reconstruction.features import (
     ReadOut,
     Tiles,
 )
+from jaxevent.reconstruction.fused.images import FusedImages
 from jaxevent.reconstruction.fused.video import FusedVideo
 from jaxevent.reconstruction.layout import SHAPES, SLOTS
+from jaxevent.reconstruction.prepared import PreparedImages
 from jaxevent.reconstruction.video import ImageSequence, Video
-from jaxevent.recording import Recording
+from jaxevent.reconstruction.windows import sorted_times
+from jaxevent.recording import Recording, Times
 
 
 class State(eqx.Module):
@@ -154,22 +157,49 @@ class Filter(PixelEstimator[P]):
         numba is asked for what it cannot do.
         """
         params = self.Params() if params is None else params
-        if compiler not in (None, "numba", "xla"):
-            raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
-        on_host = jnp.result_type(float) == np.float32 and jax.default_backend() == "cpu"
-        usual = on_host and len(options.get("devices", ())) < 2
-        if compiler == "xla" or (compiler is None and not usual):
+        if not _wants_kernel(compiler, options.get("devices", ())):
             return Video(self, recording, params, **options)
         mine = {name: value for name, value in options.items() if name != "devices"}
         try:
             return FusedVideo(self, recording, params, **mine)
         except Untranslatable as reason:
             if compiler == "numba":
-                raise InputError(
-                    f"numba has no kernel for the method {self.name!r} ({reason}); leave out the "
-                    "compiler"
-                ) from reason
+                raise self._without_kernel(reason) from reason
             return Video(self, recording, params, **options)
+
+    def prepare_images(
+        self,
+        recording: Recording,
+        times: Times,
+        params: P | None = None,
+        *,
+        extrapolate: bool = False,
+        compiler: str | None = None,
+    ) -> PreparedImages:
+        """As `ImageEstimator.prepare_images`.
+
+        On CPUs, in single precision, a kernel makes images and their derivatives by all parameters
+        in one pass over the events. `run` and `read` serve where a function has no translation, in
+        double precision, on other devices and on several, and for derivatives by the dead time
+        `rho_ref`. `compiler` is as in `estimate`.
+        """
+        params = self.Params() if params is None else params
+        if _wants_kernel(compiler, jax.local_devices()) and "rho_ref" not in params.followed:
+            self.check(recording)
+            times = sorted_times(times)
+            if not extrapolate:
+                self.check_span(recording, times, params)
+            try:
+                return FusedImages.of(self, recording, times, params)
+            except Untranslatable as reason:
+                if compiler == "numba":
+                    raise self._without_kernel(reason) from reason
+        return super().prepare_images(recording, times, params, extrapolate=extrapolate)
+
+    def _without_kernel(self, reason: Untranslatable) -> InputError:
+        return InputError(
+            f"numba has no kernel for the method {self.name!r} ({reason}); leave out the compiler"
+        )
 
     def step(self, params: P, state: Any, event: Event) -> Any:
         """The state of a pixel after an event: advance to it, then jump."""
@@ -244,6 +274,14 @@ class Filter(PixelEstimator[P]):
         over_images = jax.vmap(jax.vmap(one), (0 if trajectory.path is not None else None, 0, 0))
         image, P = over_images(before, since, frame)
         return Estimate(image, P, jnp.isfinite(image))
+
+
+def _wants_kernel(compiler: str | None, devices: Sequence[Any]) -> bool:
+    """Whether numba is asked for, or is what serves on these devices; raises `InputError`."""
+    if compiler not in (None, "numba", "xla"):
+        raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
+    on_host = jnp.result_type(float) == np.float32 and jax.default_backend() == "cpu"
+    return compiler == "numba" or (compiler is None and on_host and len(devices) < 2)
 
 
 def _over_tiles(step: Callable, lanes: Any, place: Place, slots: Any) -> Any:

@@ -320,6 +320,14 @@ class WindowedRecording:
         return weight, EdgeCounts(BaseCounts(at_start, left), mid, right)
 
 
+def sorted_times(times: Times) -> NDArray[np.int64]:
+    """Times of images to prepare, us; raises `InputError` if they are not sorted."""
+    times = np.atleast_1d(microseconds(times))
+    if (times[1:] < times[:-1]).any():
+        raise InputError("the times of images to prepare are not sorted; sort them")
+    return times
+
+
 def prepare(
     recording: Recording,
     times: Times,
@@ -340,9 +348,7 @@ def prepare(
         trajectory, _ = akf.run(params, features)
         image, variance, valid = akf.read(params, trajectory, out)  # (times, pixels)
     """
-    times = np.atleast_1d(microseconds(times))
-    if (times[1:] < times[:-1]).any():
-        raise InputError("the times of images to prepare are not sorted; sort them")
+    times = sorted_times(times)
     timing = Timing(*(round(float(v), 8) for v in timing))
 
     def made(growth: bool) -> tuple[Features, ReadOut]:

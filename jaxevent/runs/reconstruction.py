@@ -26,6 +26,7 @@ from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.features import Numeric, over_pixels, pixel_mesh
+from jaxevent.reconstruction.prepared import PreparedImages
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.config import NAME, NOT_NEGATIVE, POSITIVE, is_number, one_of
 from jaxevent.runs.family import Family, Goal, Shares, Sources
@@ -39,10 +40,9 @@ REGIONS = ("dark", "well", "bright")
 
 
 class Images(eqx.Module):
-    """A batch: what `run` and `read` need, the true images, and how much each value counts."""
+    """A batch: images as a function of parameters, the true ones, how much each value counts."""
 
-    features: Any
-    out: Any
+    prepared: PreparedImages
     truth: Float[Numeric, "times pixels"]
     weights: Float[Numeric, "times #pixels"]
     white: Float[Numeric, ""]  # the brightest intensity that the truth can show
@@ -55,7 +55,7 @@ class Images(eqx.Module):
             return self
         rest = (self.truth, self.weights, self.white, self.weight)
         placed = over_pixels(rest, mesh, self.truth.shape[1])
-        return Images(self.features.over(devices), self.out.over(devices), *placed)
+        return Images(self.prepared.over(devices), *placed)
 
 
 class Window(eqx.Module):
@@ -125,9 +125,9 @@ class Objective:
 
     def _counted(self, params: FrameParams, batch: Images) -> tuple[Array, int]:
         """Weighted errors (times, pixels), and how many pixels share a weight."""
-        trajectory, _ = self.method.run(params, batch.features)
-        image, variance, _ = self.method.read(params, trajectory, batch.out)
-        if self.error == "nll":
+        surprising = self.error == "nll"
+        image, variance, _ = batch.prepared(params, variance=surprising)
+        if surprising:
             errors = self._surprise(params, image, variance, batch.truth)
         else:
             errors = self._difference(image, batch) ** 2
@@ -284,7 +284,7 @@ class Problem:
             count = np.asarray(frames * part.recording.width * part.recording.height, dtype)
             return [(splits[0], Window(features, count))]
         times = frame_times(part.truth, params)[part.rows]
-        features, out = method.prepare(part.recording, times, params, extrapolate=True)
+        prepared = method.prepare_images(part.recording, times, params, extrapolate=True)
         found = []
         for s in splits:
             places = np.flatnonzero(part.split == s)
@@ -294,8 +294,7 @@ class Problem:
             white = max(1.0, float(np.nanmax(truth, initial=0)))
             spare = [(0, len(padded) - len(places)), (0, 0)]
             batch = Images(
-                features,
-                out.images(padded),
+                prepared.take(padded),
                 np.pad(np.nan_to_num(truth), spare),
                 np.pad(weights, spare),
                 np.asarray(white, dtype),

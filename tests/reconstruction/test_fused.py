@@ -26,7 +26,9 @@ import jaxevent
 from jaxevent import kernels
 from jaxevent.kernels import numeric
 from jaxevent.kernels.host import HostProgram, run
+from jaxevent.methods import METHODS
 from jaxevent.reconstruction.fused import bands
+from jaxevent.reconstruction.fused.images import FusedImages
 from jaxevent.reconstruction.fused.video import FusedVideo
 from jaxevent.reconstruction.video import Video
 
@@ -174,3 +176,52 @@ def test_numbers_of_parameters_are_found_without_compiling():
     program.decided += program.add(greater, [first, np.asarray(1.0)])
     assert program.again([np.asarray(3.0)]) is not None
     assert program.again([np.asarray(0.5)]) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["akf", "cf"])
+@pytest.mark.parametrize("values", [PARAMS, {**DEAD, **ALL}], ids=["usual", "all"])
+def test_derivatives_by_kernels_are_those_of_the_scan(name, values):
+    """Of loss and gradient in reverse, and along a direction, of means and variances."""
+    recording, method = random_recording(7, 300, 5, size=(4, 3), exposure=700), METHODS[name]
+    params = params_of(method, **values)
+    times = np.unique(np.clip(times_of(recording), recording.start, recording.stop))
+    still = {*params.without_gradient(), "ratio_min", "ratio_max"}
+    raw = {n: leaf for n, leaf in params.raw.items() if n not in still}
+    truth = np.random.default_rng(0).random((len(times), 12))
+
+    def loss(raw, images):
+        mean, variance, _ = images(params.with_raw(raw))
+        variance = jnp.where(jnp.isfinite(variance), variance, 0)
+        return ((mean - truth) ** 2).mean() + (jnp.sin(3 * mean) * variance).mean()
+
+    found = []
+    for compiler in ("numba", "xla"):
+        images = method.prepare_images(recording, times, params, compiler=compiler)
+        assert isinstance(images, FusedImages) == (compiler == "numba")
+        value, slope = jax.jit(jax.value_and_grad(loss))(raw, images)
+        along = jax.jvp(lambda r, i=images: loss(r, i), (raw,), (jax.tree.map(jnp.ones_like, raw),))
+        found.append((value, slope, along))
+    for one, other in zip(*map(jax.tree.leaves, found), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-13)
+
+
+def test_images_prepared_for_losses():
+    """Some of them, mapped over parameters, by a program that serves another recording too."""
+    first, second = small(), random_recording(3, 80, 3, size=(24, 20))
+    times, compiled = np.array([9_000, 30_000, 52_000]), []
+    method, start = jaxevent.blend, jaxevent.blend.Params()
+
+    @jax.jit
+    def means(I0, images):
+        compiled.append(I0)
+        return jax.vmap(lambda v: images(start.with_raw({"I0": v})).mean)(I0)
+
+    for recording in (first, second):
+        images = method.prepare_images(recording, times, compiler="numba").take(np.array([2, 0, 2]))
+        made = means(jnp.log(jnp.array([0.3, 1.0])), images)
+        for I0, some in zip((0.3, 1.0), made, strict=True):
+            video = method.estimate(recording, method.Params(I0=I0), compiler="numba")
+            expected = video(times[[2, 0, 2]]).mean.reshape(3, -1)
+            np.testing.assert_allclose(some, expected, rtol=1e-12)
+    assert len(compiled) == 1

@@ -33,6 +33,7 @@ from jaxevent.methods import HOMES, METHODS
 from jaxevent.parameters import Number, Parameters, Positive
 from jaxevent.reconstruction.estimator import PixelEstimator
 from jaxevent.reconstruction.filtering import Filter
+from jaxevent.reconstruction.prepared import ScannedImages
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.runs.fit import fit
 from jaxevent.runs.protocols import Reference, held_out
@@ -380,13 +381,15 @@ def test_errors_by_hand(error, clipped):
     weights = np.linspace(0.5, 2, len(truth))[None]
     weights[0, 3] = 0
     shown, true = jnp.asarray(image[None]), jnp.asarray(truth[None])
-    objective = Objective(Shown("shown", jaxevent.akf.Params), error, clipped)
+    method = Shown("shown", jaxevent.akf.Params)
+    objective = Objective(method, error, clipped)
     one = jnp.asarray(1.0)
 
     @jax.jit
     @jax.value_and_grad
     def loss(image, weights):
-        batch = Images(None, image, true, weights, jnp.asarray(white), one)
+        given = ScannedImages(None, image, method)
+        batch = Images(given, true, weights, jnp.asarray(white), one)
         return objective(jaxevent.akf.Params(), batch)
 
     expected = [by_hand(error, i, t, clipped, white) for i, t in zip(image, truth, strict=True)]

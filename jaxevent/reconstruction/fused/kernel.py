@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from jaxevent.kernels.modules import module_of
 from jaxevent.reconstruction.fused.loop import Functions
 from jaxevent.reconstruction.fused.pixel import (
+    Directions,
     FilterMethod,
     PixelProgram,
     Traced,
+    host_inputs,
     traced,
     translated,
 )
@@ -30,10 +32,11 @@ class Kernel:
     values: list[NDArray]  # of the host program
     numbers: NDArray  # what the loop takes
 
-    def start(self, variant: int, known: Any) -> list[NDArray]:
+    def start(self, variant: int, known: Any) -> dict[str, NDArray]:
         """The state at the start, of arrays of inputs that `known(name)` gives."""
-        nodes = self.program.start[variant]
-        return evaluate_arrays(nodes, known, self.values, self.program.traced.dtype)
+        start = self.program.start[variant]
+        made = evaluate_arrays([*start.values()], known, self.values, self.program.traced.dtype)
+        return dict(zip(start, made, strict=True))
 
 
 @dataclasses.dataclass
@@ -51,28 +54,28 @@ def kernel_of(
     method: FilterMethod,
     observe: Any,
     params: Any,
-    response: NDArray,
-    present: bool,
+    fixed: dict[str, NDArray],
     exposed: bool,
     dtype: np.dtype,
     stride: int,
+    directions: Directions = Directions(),  # noqa: B008
 ) -> Kernel:
-    """The kernel of a method with its parameters; raises `Untranslatable`.
+    """The kernel of a method with its parameters and `fixed` numbers; raises `Untranslatable`.
 
     Its functions are traced once for parameters of a kind, translated once for every way that
     conditions on parameters can choose, compiled once for a machine.
     """
     leaves, tree = jax.tree.flatten(params)
-    key = (method, tree, tuple(np.shape(leaf) for leaf in leaves), exposed, dtype)
+    key = (method, tree, tuple(np.shape(leaf) for leaf in leaves), exposed, dtype, directions)
     if key not in _programs:
-        _programs[key] = _Programs(traced(method, observe, params, exposed, dtype), [])
+        about = traced(method, observe, params, exposed, dtype, directions)
+        _programs[key] = _Programs(about, [])
     made = _programs[key]
-    given = [np.asarray(leaf) for leaf in leaves]
-    given += [np.asarray(response, dtype), np.asarray(float(present), dtype)]
+    given = [*host_inputs(made.traced, params, fixed).values()]
     again = ((known, known[0].host.again(given)) for known in made.known)
     found = next(((known, values) for known, values in again if values is not None), None)
     if found is None:
-        program = translated(made.traced, params, response, float(present))
+        program = translated(made.traced, params, fixed)
         found = (program, {}), program.host.values
         made.known.append(found[0])
     (program, modules), values = found
@@ -81,5 +84,5 @@ def kernel_of(
         modules[stride] = source, module_of(source.text)
     source, module = modules[stride]
     functions = Functions(module.events, module.images, module.tables, module.excess)
-    numbers = source.numbers.of(values, dtype)
+    numbers = source.values(values, dtype)
     return Kernel(functions, program, source, values, numbers)

@@ -67,11 +67,12 @@ class Memory(NamedTuple):
 
 
 class Images(NamedTuple):
-    """Images [times, pixels]."""
+    """Images [times, pixels], and derivatives of those that have any."""
 
     mean: NDArray
     variance: NDArray
     valid: NDArray[np.uint8]
+    slopes: NDArray  # [times, pixels, images, lanes]
 
 
 class Places(NamedTuple):
@@ -79,11 +80,13 @@ class Places(NamedTuple):
 
     stride: int
     exposed: bool  # whether frames have exposures
+    factors: int  # of derivatives of images, for each pixel of a row
+    room: int  # for derivatives of tables
     on: int
     off: int
     before: NDArray[np.int64]  # [2], ON and OFF
     image: NDArray[np.int64]  # [3, rows]: grey value, intensity, certainty
-    total: NDArray[np.int64]  # [rows]
+    total: NDArray[np.int64]  # [sums, rows]
     span: NDArray[np.int64]  # [2, rows]
     head: NDArray[np.int64]
     tail: NDArray[np.int64]
@@ -142,14 +145,14 @@ def _enter(band, stretch, now, given, cells, place):
                 for z in range(stride):
                     none = 0.5 if kind < 2 else 0.0
                     cells[field * stride + z] = cells[of + z] if rows > 0 else none
-        if places.total[row] >= 0:
-            total = places.total[row] * stride
-            for z in range(stride):
-                cells[total + z] = 0
+        if len(places.total) > 0:
+            for total in places.total[:, row]:
+                for z in range(total * stride, (total + 1) * stride):
+                    cells[z] = 0
             if row < rows:
                 _sum_segments(
                     events, weights, a, b, lefts[k], mids[k], rights[k], given.functions.excess,
-                    given.numbers, cells, total, stride,
+                    given.numbers, cells, places.total[:, row] * stride, stride,
                 )  # fmt: skip
     # Counts of events in eight stretches of time; places in `what` of ON, OFF, left, right.
     what = np.full((10, 4), -1)
@@ -231,15 +234,16 @@ def _count(events, weights, begin, end, left, right, cells, stride, what):
 
 @part
 def _sum_segments(
-    events, weights, begin, end, left, mid, right, excess, numbers, cells, total, stride
+    events, weights, begin, end, left, mid, right, excess, numbers, cells, totals, stride
 ):
-    """Add up what the segments of constant brightness of an exposure say, from `total` on."""
+    """Add up what the segments of constant brightness of an exposure say, from `totals` on."""
     length = right - left
     a, b = _find(events, begin, end, _edge(left)), _find(events, begin, end, _edge(right))
     middle = _find(events, begin, end, _edge(mid))
     if length <= 0 or a == b:
         return
     counts, bound = np.empty((2, stride), cells.dtype), np.empty(stride, np.float64)
+    added = np.empty(len(totals), cells.dtype)
     for half in range(2):  # backwards from the middle to the left edge, then forwards
         for z in range(stride):
             counts[0, z] = counts[1, z] = 0
@@ -249,7 +253,9 @@ def _sum_segments(
             z, now = (events[i] >> 1) & 0xFFFF, np.float64(events[i] >> 17)
             if bound[z] == bound[z]:
                 share = abs(now - bound[z]) / length
-                cells[total + z] += excess(share, 0.0, counts[0, z], counts[1, z], numbers.ctypes)
+                excess(share, 0.0, counts[0, z], counts[1, z], numbers.ctypes, added.ctypes)
+                for k in range(len(totals)):
+                    cells[totals[k] + z] += added[k]
             bound[z] = now
             one = np.float64(weights[i]) if len(weights) else 1.0
             counts[0 if events[i] & 1 else 1, z] += one if half else -one
@@ -257,7 +263,9 @@ def _sum_segments(
         for z in range(stride):
             if bound[z] == bound[z]:
                 share = abs(outer - bound[z]) / length
-                cells[total + z] += excess(share, edge, counts[0, z], counts[1, z], numbers.ctypes)
+                excess(share, edge, counts[0, z], counts[1, z], numbers.ctypes, added.ctypes)
+                for k in range(len(totals)):
+                    cells[totals[k] + z] += added[k]
 
 
 @compiled
@@ -270,6 +278,8 @@ def run(begin, end, given, memory, enter, times, until, images):
     bands, line, functions, numbers = given.bands, given.line, given.functions, given.numbers
     events, starts, place, width = bands.events, line.start, memory.place, np.int64(bands.width)
     weighted, padded, pixels = np.int64(len(bands.weights) > 0), width + 2, images.mean.shape[1]
+    size = np.int64(images.slopes.shape[2] * images.slopes.shape[3])
+    room = np.empty(max(given.places.room, given.places.factors * width), images.mean.dtype)
     for band in range(begin, end):
         cells, whole, last = memory.cells[band], memory.whole[band], memory.last[band]
         rows, i, s, row = (
@@ -288,7 +298,7 @@ def run(begin, end, given, memory, enter, times, until, images):
                     _enter(band, s, now, given, cells, place)
                 functions.tables(
                     line.variant[s], cells.ctypes, padded, (rows + 1) * padded, numbers.ctypes,
-                    line.uniform.ctypes, s * line.uniform.shape[1],
+                    line.uniform.ctypes, s * line.uniform.shape[1], room.ctypes,
                 )  # fmt: skip
                 entering = False
             stop = np.int64(until)
@@ -307,6 +317,7 @@ def run(begin, end, given, memory, enter, times, until, images):
                     cells.ctypes, whole.ctypes, last.ctypes, rows, width, padded, t,
                     (t - line.begin[s]) * line.rate[s], (t - line.mid[s]) * line.blend_rate[s],
                     numbers.ctypes, images.mean.ctypes, images.variance.ctypes, images.valid.ctypes,
+                    images.slopes.ctypes, room.ctypes, size,
                     row * pixels + bands.edges[band] * width,
                 )  # fmt: skip
                 row += 1

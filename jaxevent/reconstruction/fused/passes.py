@@ -1,0 +1,241 @@
+"""A recording's windows divided among bands, and a kernel's passes over them."""
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.kernels import over_rows
+from jaxevent.kernels.expressions import Untranslatable
+from jaxevent.reconstruction.clock import Timing
+from jaxevent.reconstruction.frames import FrameImages
+from jaxevent.reconstruction.fused.bands import BandLayout
+from jaxevent.reconstruction.fused.kernel import Kernel, kernel_of
+from jaxevent.reconstruction.fused.loop import Bands, FrameRows, Given, Images, Line, Memory, run
+from jaxevent.reconstruction.fused.pixel import Directions, traced, translated
+from jaxevent.reconstruction.fused.timeline import NEVER, make_line
+from jaxevent.reconstruction.stream import Stream, StreamState, weigh
+from jaxevent.reconstruction.windows import WindowedRecording
+from jaxevent.recording import Recording
+
+FRAME_PIXELS = 1 << 26  # of a window's frames, as they are stored
+
+
+class Window(NamedTuple):
+    """What a pass over a window rests on, whatever the kernel."""
+
+    start: int | None
+    stop: int | None
+    bands: Bands
+    line: Line
+    frames: FrameRows
+    context: StreamState  # of weighted events
+
+    @property
+    def begins(self) -> float:
+        return -math.inf if self.start is None else float(self.start)
+
+    def contains(self, time: int) -> bool:
+        return self.begins <= time and (self.stop is None or time < self.stop)
+
+
+class DividedRecording:
+    """Cuts a recording into windows whose events are divided among bands of rows.
+
+    `events` bounds a window's events; None: one window is the whole. Raises `Untranslatable` for
+    what kernels cannot do.
+    """
+
+    def __init__(
+        self, recording: Recording, timing: Timing, filtering: bool, events: int | None = None
+    ):
+        if timing.spread and not filtering:
+            raise Untranslatable("changes that are spread over time")
+        layout = BandLayout.of(recording.width, recording.height)
+        if layout is None:
+            raise Untranslatable(f"a sensor {recording.width} pixels wide")
+        whole = max(len(recording.events), 1)
+        self.recording, self.layout = recording, layout
+        self.windows = WindowedRecording(
+            recording, timing, filtering=filtering, events=whole if events is None else events
+        )
+        self.windows.frames = max(8, FRAME_PIXELS // self.windows.pixels)
+        if events is None:
+            self.windows.frames = len(self.windows.clock) + 2
+        self.images = FrameImages(recording, self.dtype)
+        none = np.zeros((3, 1), self.dtype)
+        self._tables = self.images.tables() if len(self.windows.clock) else none
+
+    @property
+    def dtype(self) -> np.dtype:
+        return self.windows.dtype
+
+    @property
+    def origin(self) -> int:
+        """The recording's start (us), from which kernels count."""
+        return self.windows.clock.origin
+
+    def kernel(
+        self,
+        method: Any,
+        params: Any,
+        clock_offset: Any,
+        directions: Directions = Directions(),  # noqa: B008
+    ) -> Kernel:
+        """The kernel of a method, for this recording's frames.
+
+        `clock_offset` is the one that the recording was divided for.
+        """
+        fixed, clock = self._fixed(clock_offset), self.windows.clock
+        return kernel_of(
+            method, method.observe, params, fixed, clock.exposed, self.dtype, self.layout.stride,
+            directions,
+        )  # fmt: skip
+
+    def check(self, method: Any, params: Any, clock_offset: Any, directions: Directions) -> None:
+        """Raise `Untranslatable` if there can be no such kernel."""
+        exposed = self.windows.clock.exposed
+        about = traced(method, method.observe, params, exposed, self.dtype, directions)
+        translated(about, params, self._fixed(clock_offset))
+
+    def _fixed(self, clock_offset: Any) -> dict[str, NDArray]:
+        return {
+            "clock_offset": np.asarray(clock_offset, self.dtype),
+            "present": np.asarray(len(self.windows.clock) > 0, self.dtype),
+            "response": np.asarray(self.images.response(), self.dtype),
+        }
+
+    def cut(self, start: int | None, state: StreamState) -> Window:
+        """The window that begins there, its events divided among the bands."""
+        windows = self.windows
+        stop, source = windows.stop_after(start), self.recording.events
+        rows = [0 if start is None else source.index(start)]
+        rows.append(len(source) if stop is None else source.index(stop))
+        used = windows.clock.used(start, stop)
+        context, finish = windows.context_of(used, *rows)
+        around = source[context:finish]
+        weight = np.empty(0, self.dtype)
+        if state.last_then is not None:
+            state = windows.move_context(state, context)
+            assert state.last_then is not None
+            stream = Stream.of(around, self.recording.width)
+            weight = weigh(stream, state.last_then.copy(), windows.dead).astype(self.dtype)
+        width = self.recording.width
+        events, weights, first = self.layout.divide(
+            around.t, around.x, around.y, around.p, weight, width, self.origin
+        )
+        bands = Bands(events, weights, first, self.layout.edges, width)
+        line = make_line(windows.clock, start, stop, self.recording.gain, self.dtype)
+        return Window(start, stop, bands, line, self._frames(used), state)
+
+    def _frames(self, used: slice) -> FrameRows:
+        clock, frames = self.windows.clock, self.recording.frames
+        left, mid, right = (e[used].astype(float) for e in (clock.left, clock.mid, clock.right))
+        images, values = np.zeros((0, 1), np.uint8), np.zeros((0, 0, 1), self.dtype)
+        if frames is not None and len(clock):
+            images = np.asarray(frames[used].images)
+            images = np.ascontiguousarray(images.reshape(len(images), -1))
+            if images.dtype.kind == "f":
+                values = self.images.values(images)
+                images = np.zeros((0, 1), np.uint8)
+        gain = self.recording.gain[used].astype(self.dtype)
+        return FrameRows(images, self._tables, values, gain, left, mid, right, used.start)
+
+
+@dataclasses.dataclass(frozen=True)
+class Held:
+    """The state of all pixels, band by band."""
+
+    cells: NDArray
+    whole: NDArray
+    last: NDArray
+
+
+class Passes:
+    """A kernel, and what its bands remember from one pass over events to the next."""
+
+    def __init__(self, kernel: Kernel, layout: BandLayout, dtype: np.dtype):
+        fields, bands = kernel.source.fields, len(layout.edges) - 1
+        self.kernel, self.layout, self.dtype = kernel, layout, dtype
+        self._memory = Memory(
+            np.zeros((bands, fields.size), dtype),
+            np.zeros((bands, max(len(fields.whole), 1) * layout.stride), np.int64),
+            np.zeros((bands, layout.stride)),
+            np.zeros((bands, 3), np.int64),
+        )
+
+    def run(
+        self,
+        window: Window,
+        until: int,
+        times: NDArray | None = None,
+        images: Images | None = None,
+        enter: tuple[int, int] = (-1, 0),
+    ) -> None:
+        """Pass over the window's events before a time (us since the recording's start)."""
+        kernel = self.kernel
+        given = Given(
+            window.bands, window.line, window.frames, kernel.source.fields.places(),
+            kernel.functions, kernel.numbers,
+        )  # fmt: skip
+        if times is None or images is None:
+            times, images = np.empty(0, np.int64), self.room(0, 0)
+        over_rows(run, len(self.layout.edges) - 1, given, self._memory, enter, times, until, images)
+
+    def room(self, times: int, pixels: int) -> Images:
+        """Where images go, and derivatives of those that have any."""
+        kinds, source = (self.dtype, self.dtype, np.dtype(np.uint8)), self.kernel.source
+        slopes = np.empty((times, pixels, len(source.outputs), source.lanes), self.dtype)
+        mean, variance, valid = (np.empty((times, pixels), kind) for kind in kinds)
+        return Images(mean, variance, valid, slopes)
+
+    def begin(self, window: Window) -> None:
+        """Enter the recording's first window: the state at the start."""
+        self._memory.last[:] = 0
+        self._start(window)
+        self.run(window, -NEVER, enter=(0, -NEVER))
+
+    def resume(self, window: Window, held: Held, now: int) -> None:
+        """Enter a later window at its beginning (us since the recording's start)."""
+        memory = self._memory
+        memory.cells[:, : held.cells.shape[1]] = held.cells
+        memory.whole[:], memory.last[:] = held.whole, held.last
+        self.run(window, -NEVER, enter=(0, now))
+
+    def state(self) -> Held:
+        """A copy of the state, without derivatives."""
+        cells, whole, last, _ = self._memory
+        held = sum(kind.kind == "f" for kind in self.kernel.program.traced.state)
+        return Held(cells[:, : held * self.layout.stride].copy(), whole.copy(), last.copy())
+
+    def _start(self, window: Window) -> None:
+        """The state at the recording's start, with its derivatives."""
+        line, source = window.line, self.kernel.source
+        fields, memory = source.fields, self._memory
+        stretch = int(np.searchsorted(line.start, 0, "right")) - 1
+        self.run(window, -NEVER, enter=(stretch, 0))
+        uniform = line.uniform[stretch]
+        position = {
+            "weight": -line.begin[stretch] * line.rate[stretch],
+            "blend": -line.mid[stretch] * line.blend_rate[stretch],
+        }
+
+        def known(name: str) -> Any:
+            if name in position:
+                return position[name]
+            if name in fields.cells:
+                return fields.of_bands(name, memory.cells, memory.whole)
+            return uniform[fields.uniform(name)]
+
+        records = fields.records(memory.cells)
+        state = self.kernel.start(int(line.variant[stretch]), known)
+        for name, values in state.items():
+            if name.startswith("state"):
+                fields.of_bands(name, memory.cells, memory.whole)[:] = values
+                continue
+            leaf, _, direction = name.removeprefix("slope").partition("_")
+            place = source.states.get(int(leaf))
+            if place is not None:
+                records[:, :, place + int(direction)] = values
