@@ -6,7 +6,7 @@ and an age dt [s], and a motion with image velocity U explains it if d = U dt. C
 the data only. They are gathered once, in batches of fixed shape; filters then run many times.
 
 Several events per pixel are kept, not only the latest: an edge fires bursts, and the last event of
-a burst is late, so a surface of latest events makes every motion too fast (by 4 to 27 %).
+a burst is late, so a surface of latest events makes every motion too fast.
 """
 
 import dataclasses

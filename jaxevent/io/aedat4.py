@@ -11,8 +11,8 @@ into radians per second. Triggers have the number of DV's type as channel: 1 and
 are the edges of a signal from outside, 3 its pulse, 4 and 5 those of the generator, 6 to 9 starts
 and ends of frames.
 
-Decoder. The package aedat (MIT, 1 MB) is taken: 48 million events/s, frames and both ends of their
-exposures. dv-processing (24 MB) decodes the same file (davis346.aedat4) to the same 78,830 events,
+Decoder. The package aedat (MIT) is taken: it is small and fast, and tells frames and both ends of
+their exposures. dv-processing decodes the same file (davis346.aedat4) to the same 78,830 events,
 59 frames with exposures and 2,363 samples; it gives a frame the start of its exposure as time and
 takes g as 9.81. aedat reports most damage, but some as a Rust panic, which is no Exception, and a
 header whose text is damaged ends the whole process; so header and packets are checked here first.

@@ -114,7 +114,7 @@ class Bag:
 
 @functools.cache
 def _types(is_ros1: bool) -> Any:
-    """What the messages of a ROS hold; made once, as it takes 25 ms."""
+    """What the messages of a ROS hold; made once, as it takes longer than a small bag."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)

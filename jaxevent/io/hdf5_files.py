@@ -83,7 +83,7 @@ def check_heaps(path: Path) -> None:
     HDF5 2.0 goes on by the size of each piece, and stays where that is 0 or overflows; for a heap
     that an attribute puts past the end of the file it takes gigabytes of memory first. The heaps
     of a file's attributes lie near its start or, if written late, its end: `_HEAPS` bytes of both
-    are searched, which takes 40 ms at most.
+    are searched.
     """
     damaged = InputError(f"{path}: a string or its heap is damaged; fetch the file again")
     with path.open("rb") as file:

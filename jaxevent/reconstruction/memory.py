@@ -27,8 +27,8 @@ def aligned(shape: tuple[int, ...], dtype: Any, empty: bool = False) -> NDArray:
 class TileMemory:
     """Memory for the fields of tiles, by name.
 
-    With `reuse` a window's tiles are written over the last one's: fresh memory costs 0.5 ms per MB
-    here, a third of the preparation. Without, it is fresh and cleared.
+    With `reuse` a window's tiles are written over the last one's: fresh memory costs
+    time. Without, it is fresh and cleared.
     """
 
     def __init__(self, reuse: bool, dtype: np.dtype):
