@@ -9,7 +9,7 @@ And what they stand on:
 
 - `models`: what moves, and how that moves the image; a model of one's own is one class;
 - `motion`: what every estimator gives, at any time;
-- `flow`: the optical flow of each event, once the motion is known;
+- `flow`: the optical flow of each event, once the motion is known; `field`: that of each pixel;
 - `candidates`: of each event its earlier neighbours, prepared once;
 - `geometry`: the flow of a rigid scene, residuals of matched events, rotations and twists;
 - `truth`: the camera's twist from poses or a gyro, and the errors of an estimate.
@@ -24,7 +24,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxevent.egomotion import candidates, flow, geometry, models, motion, truth
+    from jaxevent.egomotion import candidates, field, flow, geometry, models, motion, truth
     from jaxevent.egomotion.baselines.contrast_maximisation import contrast
     from jaxevent.egomotion.baselines.local_planes import planes
     from jaxevent.egomotion.baselines.tracked_points import frames
@@ -54,7 +54,7 @@ _HOMES = {
     "particle_filter.estimator": ("voting",),
     "truth": ("Known", "Twists", "from_gyro", "from_poses", "gyro_bias", "motion_errors"),
 }
-_MODULES = ("candidates", "flow", "geometry", "models", "motion", "truth")
+_MODULES = ("candidates", "field", "flow", "geometry", "models", "motion", "truth")
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
@@ -68,6 +68,7 @@ __all__ = [
     "candidates",
     "contrast",
     "find_model",
+    "field",
     "flow",
     "frames",
     "from_gyro",

@@ -8,6 +8,7 @@ import pytest
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import flow as module
+from jaxevent.egomotion.field import RigidFlow
 from jaxevent.egomotion.flow import Params, flow, iterate
 from jaxevent.egomotion.models import find_model
 from jaxevent.egomotion.motion import Motion
@@ -67,6 +68,36 @@ def test_flow_of_a_scene_is_the_true_one():
     flipped = flow(recording, true_motion(source, -1))
     outlier, flipped = told.residual > 1, flipped.residual > 1
     assert flipped[late].mean() > 2 * outlier[late].mean()  # 0.19 and 0.08
+
+
+def test_field_of_a_scene_is_the_true_one():
+    recording, source = textured()
+    t = 120_000
+    found = RigidFlow(recording, true_motion(source)).flow(np.array([t]))[0]
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(float)
+    T, Omega = (v[0] for v in source.twist(np.array([t])))
+    U = by_hand(x - 47.5, y - 35.5, T, Omega, 1 / source.depth(t * 1e-6))
+    error = np.linalg.norm(found - U, axis=-1)
+    assert np.median(error) < 0.12 * np.median(np.linalg.norm(U, axis=-1))
+
+
+def test_field_of_a_rotation_is_that_of_turned_rays():
+    camera = PinholeCamera(40.0, 55.0, 8.3, 6.1, (-0.2, 0.05, 0.01, -0.005, 0.0))
+    Omega, h = np.array([0.7, -0.4, 1.5]), 1e-5
+    recording = dataclasses.replace(scattered(), camera=camera)
+    moving = RigidFlow(recording, known("rotation", Omega))
+    found = moving.flow(np.array([30_000, 40_000]))
+    y, x = np.mgrid[:13, :17].astype(float)
+    ray = np.concatenate([camera.normalise(x, y), np.ones((13, 17, 1))], -1)
+    later = ray - h * np.cross(Omega, ray)
+    u, v = np.moveaxis(camera.distort(later[..., :2] / later[..., 2:]), -1, 0)
+    true = np.stack([u * 40 + 8.3 - x, v * 55 + 6.1 - y], -1) / h
+    np.testing.assert_allclose(found[1], true, rtol=0.02, atol=0.3)
+    lost = RigidFlow(recording, known("rotation", Omega, valid=np.zeros(2, bool)))
+    assert np.isnan(lost.flow(np.array([30_000]))).all()
+    bare = dataclasses.replace(recording, camera=None)
+    with pytest.raises(InputError, match="needs; give a camera"):
+        RigidFlow(bare, known("rotation", Omega)).flow(np.array([30_000]))
 
 
 def scattered(number=500, span=60_000, seed=0):

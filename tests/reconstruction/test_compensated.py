@@ -15,6 +15,7 @@ from jaxevent.methods import find
 from jaxevent.reconstruction.colour import chrominance, colour_video, luminance
 from jaxevent.reconstruction.compensated import (
     agreement,
+    estimator,
     exposures,
     fusion,
     implicit,
@@ -407,6 +408,61 @@ def test_images_are_better_than_those_of_pixels_and_frames():
     for name, method in given.items():
         values = {k: v for k, v in shared.items() if k in method.Params.settings()}
         assert ours < 0.5 * error(method, method.Params(**values)), name
+
+
+class Swirl:
+    """A known flow: it grows with time and place."""
+
+    def flow(self, times, extrapolate=False):
+        y, x = np.mgrid[:21, :30].astype(float)
+        t = np.asarray(times)[:, None, None] * 1e-6
+        return np.stack([3.0 * x - 40 * t * np.ones_like(x), 5.0 + 0 * x + 0 * t], -1)
+
+
+def test_motion_that_is_known_is_begun_with():
+    p = estimator.Start(Swirl())(500_000, 2_000, 0.2)
+    x = (np.arange(15) * 2 + 0.5)[None]
+    u = 3.0 * x - 20  # px/s, and points accelerate by -40 + 3 u
+    np.testing.assert_allclose(p[:-1, 1:-1, 0], np.repeat(0.2 * u, 10, 0)[:, 1:-1], rtol=1e-5)
+    acceleration = np.repeat((-40 + 3 * u) / 2 * 0.2**2, 10, 0)
+    np.testing.assert_allclose(p[:-1, 1:-1, 2], acceleration[:, 1:-1], rtol=0.02)
+    np.testing.assert_allclose(p[..., 1], 1.0, rtol=1e-5)
+    np.testing.assert_allclose(p[..., 3], 0.0, atol=1e-5)
+
+
+class Sliding:
+    """The motion of `Slide`, from `since` (us) on."""
+
+    def __init__(self, since=0):
+        self.since = since
+
+    def flow(self, times, extrapolate=False):
+        flow = np.broadcast_to(Slide.velocity, (len(times), 40, 48, 2)).copy()
+        flow[np.asarray(times) < self.since] = np.nan
+        return flow
+
+
+@pytest.mark.slow
+def test_images_from_known_motion():
+    recording, t = slide(), np.array([126_000, 226_000])
+    truth = np.stack([Slide().intensity(one * 1e-6) for one in t])
+
+    def made(**options):
+        return mc.estimate(recording, params(), progress=False, **options)
+
+    def error(images):
+        return ((images - truth)[:, 4:-4, 4:-4] ** 2).mean()
+
+    fixed = made(motion=Sliding(), refine=False)
+    flow = fixed.flow(t)
+    np.testing.assert_allclose(flow, np.broadcast_to(Slide.velocity, flow.shape), rtol=1e-4)
+    sought = error(video()(t).mean)
+    assert error(fixed(t).mean) < 1.05 * sought
+    assert error(made(motion=Sliding())(t).mean) < 1.2 * sought
+    # Where it is not known motion is sought from nothing.
+    late = made(motion=Sliding(200_000))(t).mean
+    np.testing.assert_array_equal(late[0], video()(t[:1]).mean[0])
+    assert (late[1] != video()(t[1:]).mean[0]).any()
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import collections
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from jaxevent.errors import InputError
 from jaxevent.estimator import Described, Estimate
@@ -98,6 +99,11 @@ class Images:
     @property
     def dtype(self) -> np.dtype:
         return self._video.dtype
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        return self._video.recording.height, self._video.recording.width
 
     def fetch(self, times: NDArray[np.int64]) -> None:
         """Read those of the sorted times that are not remembered."""
@@ -183,16 +189,61 @@ class Followed(NamedTuple):
     p: NDArray[np.float32]  # (rows, columns, 4), px at s = 1
 
 
+@runtime_checkable
+class Moving(Protocol):
+    """What tells how points move: a `RigidFlow` of egomotion, or a video with optical flow."""
+
+    def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.floating]:
+        """Optical flow (T, H, W, 2), of x and y in px/s; not finite where it is not known."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """Motion that is known beforehand; `refine` tells whether images may correct it."""
+
+    motion: Moving
+    refine: bool = True
+
+    def __call__(self, t: int, late: int, unit: float) -> NDArray[np.float32] | None:
+        """Trajectories (rows, columns, 4) of the target at a time; None where it is not known.
+
+        The acceleration is that of points: what flow differs by `late` us before and after, at the
+        places to which they go.
+        """
+        before, now, after = np.asarray(
+            self.motion.flow(np.array([t - late, t, t + late]), extrapolate=True), float
+        )
+        if not np.isfinite([before, now, after]).all():
+            return None
+        h, w = now.shape[:2]
+        y, x = np.mgrid[:h, :w].astype(float)
+        dt = late * 1e-6
+
+        def there(field: NDArray, sign: int) -> NDArray:
+            at = [y + sign * dt * now[..., 1], x + sign * dt * now[..., 0]]
+            parts = [map_coordinates(field[..., c], at, order=1, mode="nearest") for c in (0, 1)]
+            return np.stack(parts, -1)
+
+        change = (there(after, 1) - there(before, -1)) / (2 * dt)
+        p = np.concatenate([now * unit, change / 2 * unit**2], -1)
+        rows, columns = trajectories.nodes(h, w, 0)
+        padded = np.pad(p, [(0, 2 * rows - h), (0, 2 * columns - w), (0, 0)], mode="edge")
+        return padded.reshape(rows, 2, columns, 2, 4).mean((1, 3)).astype(np.float32)
+
+
 class Follower:
     """Estimates the motion of a recording's targets.
 
     Motion is sought from nothing at anchors only, which are evenly spaced in time. That of a target
     starts from the nearest anchor's. So the images of a video cost less than single ones, and none
-    depends on which others were asked for.
+    depends on which others were asked for. Where motion is known beforehand it starts from that.
     """
 
-    def __init__(self, recording: Recording, params: Params, images: Images):
-        self.params, self.images = params, images
+    def __init__(
+        self, recording: Recording, params: Params, images: Images, start: Start | None = None
+    ):
+        self.params, self.images, self.start = params, images, start
         self.schedule = schedule_of(recording, params, images)
         self.shutter = Shutter(recording, params, self.schedule.speed)
         self._anchors: collections.OrderedDict[int, tuple[Instants, NDArray[np.float32]]]
@@ -223,14 +274,26 @@ class Follower:
                 self._anchors.popitem(last=False)
         return self._anchors[at]
 
+    def _begin(self, t: int, instants: Instants) -> NDArray[np.float32]:
+        """Where the motion of a target starts, at half resolution."""
+        if self.start is not None:
+            known = self.start(t, self.schedule.step, instants.unit)
+            if known is not None:
+                h, w = self.images.size
+                return trajectories.Motion(known, 0).at(1, h, w).p
+        anchor, p = self._anchor(t)
+        apart = (t - anchor.t[anchor.own]) * 1e-6 / anchor.unit
+        return trajectories.advect(p, apart, instants.unit / anchor.unit)
+
     def __call__(self, t: int) -> Followed:
         """The target at a time (us)."""
-        anchor, known = self._anchor(t)
         instants = self.schedule(t)
+        p = self._begin(t, instants)
         s = instants.s
         L, V, clear = self.images(instants.t)
-        apart = (t - anchor.t[anchor.own]) * 1e-6 / anchor.unit
-        p = trajectories.advect(known, apart, instants.unit / anchor.unit)
+        if self.start is not None and not self.start.refine:
+            p = trajectories.Motion(p, 1).at(0, *L.shape[1:]).p
+            return Followed(instants, L, V, clear, p)
         doubted = self._doubted(V, clear)
         pyramid = trajectories.Pyramid(L, doubted, FADE)
         for _ in range(STEPS):
@@ -312,6 +375,10 @@ class CompensatedVideo(ImageSequence[Params]):
     most of the large errors, of points that the frames do not show and motion that was not found.
     The smoother's images are read as `Video` reads them, in constant memory. Images do not depend
     on which other images were asked for.
+
+    With `motion`, which has `flow(times, extrapolate)` as this video has it, trajectories start
+    from that, for instance a rigid scene's (`jaxevent.egomotion.field.RigidFlow`); without `refine`
+    they are that. Where it is not finite motion is sought from nothing.
     """
 
     def __init__(
@@ -321,9 +388,12 @@ class CompensatedVideo(ImageSequence[Params]):
         params: Params,
         *,
         window_events: int = WINDOW_EVENTS,
+        motion: Moving | None = None,
+        refine: bool = True,
         progress: bool | None = None,
     ):
         super().__init__(estimator, recording, params, progress=progress)
+        self._start = None if motion is None else Start(motion, refine)
         self._images = Images(recording, params, window_events)
         self._follower: Follower | None = None
         self._latest: tuple[int, Followed, Fused] | None = None
@@ -338,7 +408,8 @@ class CompensatedVideo(ImageSequence[Params]):
     def follow(self) -> Follower:
         """What estimates the motion of targets; made when first asked for."""
         if self._follower is None:
-            self._follower = Follower(self.recording, self.params, self._images)
+            given = (self.recording, self.params, self._images)
+            self._follower = Follower(*given, self._start)
         return self._follower
 
     def _target(self, t: int) -> tuple[Followed, Fused]:
@@ -422,7 +493,9 @@ class MotionCompensated(ImageEstimator[Params]):
             through a fixpoint (`implicit`). Else motion counts as fixed. Values are the same.
     """
 
-    options: frozenset[str] = dataclasses.field(default=frozenset({"window_events"}), kw_only=True)
+    options: frozenset[str] = dataclasses.field(
+        default=frozenset({"window_events", "motion", "refine"}), kw_only=True
+    )
     through_motion: bool = dataclasses.field(default=False, kw_only=True)
 
     def prepare(
