@@ -197,6 +197,7 @@ def compared(targets: Iterator[tuple]) -> Iterator[dict[str, Any]]:
             "label": label,
             "ingredients": np.asarray(told.ingredients),
             "signs": np.asarray(told.signs),
+            "usual": np.asarray(told.usual),
             "truth": truth.astype(np.float32),
             "I0": float(video.params.I0),
             "hdr": hdr,
@@ -325,6 +326,7 @@ def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:
             jnp.asarray(r["signs"]),
             jnp.zeros((3, 1, 1)),
             jnp.zeros((2, 1, 1)),
+            jnp.asarray(r["usual"]),
         )
         fused = decide(params, told)
         line = []

@@ -43,6 +43,7 @@ class Agreement(NamedTuple):
     activity: Float[Numeric, "h w"]  # squared changes in place between the frames next to it
     parts: Float[Numeric, "3 h w"]  # shares in M: frames before, frames after, all others
     seen: Float[Numeric, "2 h w"]  # how far the frames before and after see the point, 0..1
+    usual: Float[Numeric, "h w"]  # mean variance of the images, as in M, 0 of frames unclipped
 
 
 def taps_of(sigma: float) -> NDArray[np.float32]:
@@ -131,6 +132,7 @@ def agree_purely(params: Params, L: Float[Array, "k h w"], along: Along, place: 
         ((L[1:] - L[:-1]) ** 2 * between).sum(0),
         jnp.stack([*parts, (share * (1 - framed * (s != 0))).sum(0)]),
         jnp.stack([seen[k] * along.inside[k] for k in (place.before, place.after)]),
+        (R * (1 - along.clear) * along.V).sum(0) / total,
     )
 
 
@@ -293,6 +295,7 @@ def _gather(along, y, k, seen, variance, settings, place, out):
     L, clear, inside = along.L[k, y], along.clear[k, y], along.inside[k, y]
     total, mean, near_total, near_mean = out[0], out[1], out[2], out[3]
     frames, from_before, from_after, from_rest = out[4], out[5], out[6], out[7]
+    V, usual = along.V[k, y], out[8]
     for x in range(len(L)):
         eta = settings.information + (one - settings.information) * clear[x]
         W = eta / variance[x]
@@ -306,6 +309,7 @@ def _gather(along, y, k, seen, variance, settings, place, out):
         from_before[x] += R * before
         from_after[x] += R * after
         from_rest[x] += R * rest
+        usual[x] += R * (one - clear[x]) * V[x]
 
 
 @part
@@ -331,7 +335,7 @@ def _finish(begin, end, L, along, misfits, steep, settings, place, taps, out, ex
     """What is told of some rows; scatter is yet to be gathered."""
     count, _, w = along.L.shape
     misfit, variance = np.empty((2, count, w), np.float32)
-    seen, sums = np.empty(w, np.float32), np.empty((8, w), np.float32)
+    seen, sums = np.empty(w, np.float32), np.empty((9, w), np.float32)
     own, a, b = place.own, place.before, place.after
     for y in range(begin, end):
         sums[:] = np.float32(0)
@@ -354,6 +358,7 @@ def _finish(begin, end, L, along, misfits, steep, settings, place, taps, out, ex
         for x in range(w):
             out.near[y, x] = sums[3, x] / max(sums[2, x], np.float32(1e-9))
         out.frame_information[y] = sums[4]
+        _divide(sums[8], sums[0], out.usual[y])
         for part_of in range(3):
             _divide(sums[5 + part_of], sums[0], out.parts[part_of, y])
         for k in range(count):
@@ -386,12 +391,11 @@ def agree(params: Params, L: NDArray, along: Along, place: Place) -> Agreement:
         over_rows(_find_mean, h, *given)
         over_rows(_find_misfits, h, along, M, steep, settings, own, taps, misfits)
         seen_from = M.copy()
-    images = np.empty((7, h, w), np.float32)
-    M, total, scatter, near, near_information, frame_information, activity = images
+    images = np.empty((8, h, w), np.float32)
+    M, total, scatter, near, near_information, frame_information, activity, usual = images
     parts, seen = np.empty((3, h, w), np.float32), np.empty((2, h, w), np.float32)
-    out = Agreement(
-        M, total, scatter, near, near_information, frame_information, activity, parts, seen
-    )
+    told = (M, total, scatter, near, near_information, frame_information, activity)
+    out = Agreement(*told, parts, seen, usual)
     excess, weight = np.empty((2, h, w), np.float32)
     over_rows(_finish, h, L, along, misfits, steep, settings, place, taps, out, excess, weight)
     scatter = np.maximum(_blurred(excess, SCATTER) / _blurred(weight, SCATTER), 0)

@@ -67,6 +67,7 @@ class Comparison(Described):
     signs: Float[Array, "signs h w"]  # `SIGNS`, mostly logarithms, and 1
     parts: Float[Array, "3 h w"]  # of the mean along trajectories: frames before, after, events
     visible: Float[Array, "2 h w"]  # as in `Fused`
+    usual: Float[Array, "h w"]  # the variance of single images along trajectories
 
 
 SOURCES = ("before", "after", "events", *OTHERS)
@@ -102,7 +103,7 @@ def compare(told: Agreement, seen: Views) -> Comparison:
     as_they_are = ("seen", "seen_twice")
     X = [signs[n] if n in as_they_are else jnp.log(signs[n] + TINY) for n in SIGNS]
     X = jnp.stack([*X, jnp.ones_like(M)])
-    return Comparison(jnp.stack([M, smoothed, blend]), X, told.parts, told.seen)
+    return Comparison(jnp.stack([M, smoothed, blend]), X, told.parts, told.seen, told.usual)
 
 
 def decide(params: Params, comparison: Comparison) -> Fused:
@@ -111,6 +112,8 @@ def decide(params: Params, comparison: Comparison) -> Fused:
     choice = jnp.tensordot(params.choice.reshape(len(OTHERS), -1), X, 1)
     q = jax.nn.softmax(jnp.concatenate([jnp.zeros_like(choice[:1]), choice]), axis=0)
     P = jnp.exp(jnp.tensordot(params.doubt, X, 1))
+    # Where frames are clipped all instants rest on the same events; more of them tell no more.
+    P = jnp.maximum(P, params.common * comparison.usual)
     sources = jnp.concatenate([q[:1] * comparison.parts, q[1:]])
     return Fused((q * ingredients).sum(0), P, sources, comparison.visible)
 

@@ -79,6 +79,7 @@ class Params(smoother.Params):
         "how signs choose smoother and blend instead of the mean along trajectories",
     )
     doubt = Number(DOUBT, "1", "how signs tell the logarithm of the result's variance")
+    common = Positive(0.6, "1", "part of the variance of images from events that all of them share")
     integrate = Choice(
         (True, False), "whether images are held to what exposures and clipped pixels tell of them"
     )
