@@ -7,9 +7,11 @@ files may be made of others.
 
 import contextlib
 import contextvars
+import functools
 import math
 import re
 import struct
+import time
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -35,6 +37,7 @@ _STRING = re.compile(
     rb"\x19.[\x00\x01]\x00\x10\x00\x00\x00\x10.{11}(?:.{4})?(?:\x01\x00.{6}|\x02\x00.{2})(.{16})",
     re.DOTALL,
 )
+_HEAP = re.compile(rb"GCOL\x01\x00\x00\x00")  # `bytes.find` is slow among zeros
 
 
 @contextlib.contextmanager
@@ -83,8 +86,18 @@ def check_heaps(path: Path) -> None:
     HDF5 2.0 goes on by the size of each piece, and stays where that is 0 or overflows; for a heap
     that an attribute puts past the end of the file it takes gigabytes of memory first. The heaps
     of a file's attributes lie near its start or, if written late, its end: `_HEAPS` bytes of both
-    are searched.
+    are searched, once for a file as it is.
     """
+    about = path.stat()
+    state = about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns
+    # Of a file written just now another write might leave the same time.
+    settled = abs(time.time_ns() - about.st_mtime_ns) > 2_000_000_000
+    (search_heaps if settled else search_heaps.__wrapped__)(path, state)
+
+
+@functools.lru_cache(maxsize=16)
+def search_heaps(path: Path, state: tuple[int, ...]) -> None:
+    """`check_heaps` of a file in some state."""
     damaged = InputError(f"{path}: a string or its heap is damaged; fetch the file again")
     with path.open("rb") as file:
         pieces = [file.read(_HEAPS)]
@@ -112,8 +125,8 @@ def _heaps_end(piece: bytes) -> bool:
     """
     walks: dict[int, int] = {}  # by place, which heap came by
     ends: list[int] = []
-    at = -1
-    while (at := piece.find(b"GCOL\x01\0\0\0", at + 1)) >= 0:
+    for found in _HEAP.finditer(piece):
+        at = found.start()
         if at + 16 > len(piece):
             continue
         (size,) = struct.unpack_from("<Q", piece, at + 8)

@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-import scipy.ndimage
 from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.camera import PinholeCamera
@@ -233,6 +232,8 @@ def join_channels(images: Mapping[str, NDArray], pattern: str = "RGGB") -> NDArr
     shapes = [channel.shape for channel in channels.values()]
     if len(set(shapes)) > 1 or len(shapes[0]) != 3:
         raise InputError(f"the channels have shapes {shapes}; give all as (times, height, width)")
+    import scipy.ndimage  # slow to import
+
     count, height, width = shapes[0]
     dtype = np.result_type(np.float32, *channels.values())
     out = np.empty((count, 2 * height, 2 * width, 3), dtype)
