@@ -64,6 +64,7 @@ def run(
     force: bool,
 ) -> None:
     from jaxevent import devices
+    from jaxevent.errors import install_command
 
     parts = (coordinator, processes, process)
     if distributed and parts != (None, None, None):
@@ -79,7 +80,9 @@ def run(
     if not devices.first():
         return
     print((out / "results.md").read_text(encoding="utf-8"), end="")
-    print(f"\nwritten to {out}: {', '.join(FILES)}")
+    files = [name for name in FILES if (out / name).exists()]
+    missing = "" if "loss.png" in files else f"; loss.png needs {install_command('plot')}"
+    print(f"\nwritten to {out}: {', '.join(files)}{missing}")
     warnings = dict.fromkeys(row["warning"] for row in rows if "warning" in row)
     if warnings:
         raise InputError(f"{config}: {'; '.join(warnings)}")

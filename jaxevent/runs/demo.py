@@ -26,8 +26,9 @@ FILES = ("comparison.png", "video.mp4", "results.md", "results.json")
 def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
     """Score every method on the packaged recording; prints the table, writes all to a folder.
 
-    Raises `InputError` if the folder cannot be written, holds files of these names and `replace` is
-    False, or an extra is missing.
+    Without the extras "plot" and "video" the picture and the video are left out. Raises
+    `InputError` if the folder cannot be written, or holds files of these names and `replace` is
+    False.
     """
     check_folder(out, FILES, replace=replace)
     with resources.as_file(resources.files("jaxevent") / "data/slider_depth_crop.h5") as path:
@@ -55,12 +56,20 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
             rows.append({**row, "method": label})
         print(markdown_table(rows))
         print("Every second frame was hidden and reconstructed; seconds include compiling.")
-        print(*skipped, sep="\n")
-        _figure(recording, by_hand, out / "comparison.png")
-        slower = _video(recording, by_hand["akf"], out / "video.mp4", progress)
         write_rows(rows, write)
-    how = {"video.mp4": f" ({slower:.0f} times slower than real time)"}
-    print(f"Written to {out}: " + ", ".join(name + how.get(name, "") for name in FILES))
+        written = ["results.md", "results.json"]
+        try:
+            _figure(recording, by_hand, out / "comparison.png")
+            written.append("comparison.png")
+        except MissingExtra as error:
+            skipped.append(f"comparison.png is left out: {error}")
+        try:
+            slower = _video(recording, by_hand["akf"], out / "video.mp4", progress)
+            written.append(f"video.mp4 ({slower:.0f} times slower than real time)")
+        except MissingExtra as error:
+            skipped.append(f"video.mp4 is left out: {error}")
+        print(*skipped, sep="\n")
+    print(f"Written to {out}: {', '.join(written)}")
 
 
 def _figure(recording: Recording, params: dict[str, Any], path: Path) -> None:

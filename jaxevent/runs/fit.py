@@ -54,7 +54,7 @@ from typing import Any
 import jax
 
 from jaxevent import devices
-from jaxevent.errors import InputError, require
+from jaxevent.errors import InputError, MissingExtra
 from jaxevent.io import load, toml
 from jaxevent.progress import stage
 from jaxevent.recording import Recording
@@ -88,12 +88,12 @@ def fit(
 
     Writes the folder `out`, made if missing: params.toml (a table of physical values for each
     method), results.json ({"rows": [...], "found": [...], "gains": [...]}), results.md, loss.csv,
-    loss.png and config.toml. results.md has the table of the test images, then every number that
-    was fitted with its start and its interval (`jaxevent.confidence`), what ran to a bound or away,
-    and the gain. While it runs, `out` holds a checkpoint at most a few seconds old, by which an
-    interrupted run goes on and ends with the same parameters, to the bit. Of several processes
-    (`devices.join`) all read the recordings and return the rows, and the first reads and writes
-    `out`.
+    loss.png (with the extra "plot") and config.toml. results.md has the table of the test images,
+    then every number that was fitted with its start and its interval (`jaxevent.confidence`), what
+    ran to a bound or away, and the gain. While it runs, `out` holds a checkpoint at most a few
+    seconds old, by which an interrupted run goes on and ends with the same parameters, to the bit.
+    Of several processes (`devices.join`) all read the recordings and return the rows, and the first
+    reads and writes `out`.
 
     Args:
         config: The TOML file.
@@ -112,10 +112,8 @@ def fit(
 
     Raises:
         InputError: The file, a recording or a parameter cannot be used, `out` cannot be written,
-            holds another run's checkpoint or is written by another process, or matplotlib is
-            missing (extra "plot").
+            holds another run's checkpoint or is written by another process.
     """
-    devices.in_step(lambda: require("matplotlib", "plot"))
     out = Path(out)
     plan = devices.in_step(lambda: read_plan(Path(config), recordings))
     progress = progress if devices.first() else False
@@ -136,7 +134,10 @@ def fit(
         gained = findings.gains(plan.tasks, unseen(rows))
         write("config.toml", plan.text)
         write("loss.csv", _losses(plan.tasks, done).encode())
-        write("loss.png", _curves(plan.tasks, done))
+        try:
+            write("loss.png", _curves(plan.tasks, done))
+        except MissingExtra:
+            (out / "loss.png").unlink(missing_ok=True)  # that of a run before
         write_rows(
             rows,
             write,
