@@ -78,19 +78,19 @@ class Circling(NamedTuple):
         return p, self.omega * np.stack([0 * t, -s, c], 1) @ self.terms
 
 
-def fit_circling(recording: Recording) -> Circling:
-    """The dot's path through centroids of 0.25 ms, and the moments of events about it.
+def fit_circling(recording: Recording, hertz: float = DOT_HZ, window: float = 2.5e-4) -> Circling:
+    """The dot's path through centroids of windows (s), and the moments of events about it.
 
     Centroids and moments are those of the events within three times the larger standard deviation
     of the path, repeated until both agree, because stray events and the dot's tail have no end.
     """
     events = recording.events[:]
     t, xi = events.t * 1e-6, np.stack([events.x, events.y], 1).astype(float)
-    edges = np.arange(t[0], t[-1], 2.5e-4)
+    edges = np.arange(t[0], t[-1], window)
     rows = np.searchsorted(t, edges)
     middle = (edges[:-1] + edges[1:]) / 2
     centre = np.array([np.median(xi[a:b], 0) for a, b in zip(rows, rows[1:], strict=False)])
-    path = Circling(2 * np.pi * DOT_HZ, np.zeros((3, 2)), np.array([15.0, 10.0]), 0.0)
+    path = Circling(2 * np.pi * hertz, np.zeros((3, 2)), np.array([15.0, 10.0]), 0.0)
 
     def terms(omega: float) -> tuple[NDArray, NDArray]:
         basis = np.stack([np.ones_like(middle), np.cos(omega * middle), np.sin(omega * middle)], 1)

@@ -192,7 +192,7 @@ def test_background_is_that_without_the_targets():
     recording, _ = scene([swinging], 1.0, noise=2e4)
     stream = Stream(recording, 0, 1_000_000)
     rate = measure_background(stream).rate
-    assert rate.shape == (6, 8)
+    assert rate.shape == (24, 32)
     true = 2e4 / (SMALL[0] * SMALL[1])
     assert 0.8 * true < np.median(rate) < 1.3 * true
     assert rate.max() < 4 * true  # the target alone makes 20 times as many where it passes

@@ -2,7 +2,8 @@
 
 The rate is that of cells of the sensor, from the quieter quarter of the recording's slices: targets
 only add events, and one that comes back (swings, circles) fills many slices. One factor tells how
-active the whole sensor is in each slice.
+active the whole sensor is in each slice. Where the background is steady and bright, as lamps that
+flicker are, cells are smaller, and how its counts disperse is measured for each.
 """
 
 import dataclasses
@@ -15,9 +16,12 @@ from jaxevent.blob.finding.stream import Stream
 from jaxevent.events.filters import busiest_neighbour
 
 SLICES = 64  # of the recording's time
-CELL = 16  # px
+CELL, FINE = 16, 4  # px; fine cells where the background is bright:
+BRIGHT, STEADY = 4.0, 0.5  # times the sensor's median rate, and its own in nearly all slices
+PLENTY = 12  # events per slice and cell in which finer ones have enough
 FEWEST = 50  # events per slice in the calm cells from which the sensor's activity is told
 MOST_WINDOWS = 400  # in which the dispersion is measured
+GOLDEN = 0.5 * (5**0.5 - 1)
 FULL = 5.0  # counts in a cell whose dispersion is measured
 
 
@@ -26,14 +30,16 @@ class Background:
     """The rate of events that are of no target.
 
     Attributes:
-        rate: (rows, columns) 1/(px s), of cells of 16 px.
-        calm: (slices, rows, columns) where no target seems to be.
+        rate: (rows, columns) 1/(px s), of cells of 4 px.
+        calm: (slices, rows, columns) where no target seems to be, in cells of 16 px.
+        bright: (rows, columns) where the background itself flickers.
         activity: (slices,) factors of the rate, at least 1.
         duration: s.
     """
 
     rate: NDArray[np.float64]
     calm: NDArray[np.bool_]
+    bright: NDArray[np.bool_]
     activity: NDArray[np.float64]
     duration: float
 
@@ -44,14 +50,21 @@ class Background:
 
     def at(self, x: ArrayLike | float | int, y: ArrayLike | float | int, t: float | int) -> Any:
         """Rates, 1/(px s), at some pixels at a time (s)."""
-        rows, columns = self.rate.shape
-        row = np.clip(np.asarray(y).astype(np.int64) // CELL, 0, rows - 1)
-        column = np.clip(np.asarray(x).astype(np.int64) // CELL, 0, columns - 1)
-        return self.rate[row, column] * self.activity[self.slice(t)]
+        return look_up(self.rate, FINE, x, y) * self.activity[self.slice(t)]
+
+
+def look_up(
+    values: NDArray, cell: int, x: ArrayLike | float | int, y: ArrayLike | float | int
+) -> Any:
+    """Values (rows, columns) of cells of so many px at some pixels."""
+    rows, columns = values.shape
+    row = np.clip(np.asarray(y).astype(np.int64) // cell, 0, rows - 1)
+    column = np.clip(np.asarray(x).astype(np.int64) // cell, 0, columns - 1)
+    return values[row, column]
 
 
 def evidence(
-    n: ArrayLike | float | int, mu: ArrayLike | float | int, dispersion: float | int
+    n: ArrayLike | float | int, mu: ArrayLike | float | int, dispersion: ArrayLike | float | int
 ) -> Any:
     """Nats against n events of background, of which mu are expected; 0 if there are no more.
 
@@ -78,22 +91,21 @@ def measure_background(stream: Stream) -> Background:
     for part in stream.batches():
         pixels += np.bincount(part.y * stream.width + part.x, minlength=len(pixels))
     stream.hot = find_hot_pixels(pixels.reshape(stream.height, stream.width))
-    rows, columns = -(-stream.height // CELL), -(-stream.width // CELL)
-    cells = np.zeros(SLICES * rows * columns, np.int64)
+    fine = -(-stream.height // CELL) * CELL // FINE, -(-stream.width // CELL) * CELL // FINE
+    cells = np.zeros((SLICES, *fine), np.int32)
     for part in stream.batches():
         slices = np.minimum(part.t / stream.duration * SLICES, SLICES - 1).astype(np.int64)
-        place = (slices * rows + part.y // CELL) * columns + part.x // CELL
-        cells += np.bincount(place, minlength=len(cells))
-    return _of_counts(cells.reshape(SLICES, rows, columns).astype(float), stream.duration)
+        np.add.at(cells, (slices, part.y // FINE, part.x // FINE), 1)
+    return _of_counts(cells, stream.duration)
 
 
-def _of_counts(N: NDArray[np.float64], duration: float) -> Background:
-    """Of the counts of all cells in all slices."""
-    quarter, empty = np.quantile(N, 0.25, axis=0), (N == 0).mean(0)
-    # The mean of a Poisson number from its lower quartile, or from the share of zeros if small.
-    few = np.minimum(-np.log(np.clip(empty, 0.5 / SLICES, 1)), 5.0)
-    m = np.where(quarter >= 3, quarter + 0.674 * np.sqrt(quarter + 0.5), few)
+def _of_counts(cells: NDArray[np.int32], duration: float) -> Background:
+    """Of the counts of all fine cells in all slices."""
+    rows, columns = (n * FINE // CELL for n in cells.shape[1:])
+    N = _pooled(cells, CELL // FINE).astype(float)
+    quarter, m = _quiet(N)
     m = np.maximum(m, max(float(np.median(m)), 0.02))
+    least = np.median(m) / CELL**2
     ratio = N / m
     low = ratio <= np.quantile(ratio, 0.7, axis=(1, 2), keepdims=True)
     counted, expected = (N * low).sum((1, 2)), (m * low).sum((1, 2))
@@ -102,17 +114,47 @@ def _of_counts(N: NDArray[np.float64], duration: float) -> Background:
     if usual > 0 and counted.mean() >= FEWEST:
         activity = np.maximum(1, counted / expected / usual)
     calm = N <= np.maximum(np.median(N, 0), 1)
-    return Background(m / (CELL**2 * duration / SLICES), calm, activity, duration)
+    middle = np.median(N, 0)
+    steady = (np.quantile(N, 0.05, axis=0) >= STEADY * middle) & (middle >= PLENTY)
+    full = bright = steady & (m > BRIGHT * np.median(m))
+    density, g = m / CELL**2, CELL
+    while g > FINE:
+        g //= 2
+        full = np.kron(full & (quarter >= PLENTY), np.ones((2, 2), bool))
+        quarter, m = _quiet(_pooled(cells, g // FINE).astype(float))
+        density = np.kron(density, np.ones((2, 2)))
+        density = np.where(full, np.maximum(m / g**2, least), density)
+    return Background(density / (duration / SLICES), calm, bright, activity, duration)
 
 
-def measure_dispersion(stream: Stream, background: Background, window: float | int) -> float:
-    """Variance over mean of the background's counts in windows (s); at least 1.
+def _pooled(cells: NDArray, by: int) -> NDArray:
+    """Sums of by x by cells."""
+    slices, rows, columns = cells.shape
+    return cells.reshape(slices, rows // by, by, columns // by, by).sum((2, 4))
 
-    The median over the sensor's cells: targets in a minority of them do not change it.
+
+def _quiet(N: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+    """The lower quartile of counts over slices, and the mean of a Poisson number that has it.
+
+    Of small numbers the mean is told by the share of zeros.
+    """
+    quarter, empty = np.quantile(N, 0.25, axis=0), (N == 0).mean(0)
+    few = np.minimum(-np.log(np.clip(empty, 0.5 / SLICES, 1)), 5.0)
+    return quarter, np.where(quarter >= 3, quarter + 0.674 * np.sqrt(quarter + 0.5), few)
+
+
+def measure_dispersion(
+    stream: Stream, background: Background, window: float | int
+) -> NDArray[np.float64]:
+    """Variance over mean of the background's counts in windows (s) in cells of 16 px; at least 1.
+
+    The median over the sensor's cells: targets in a minority of them do not change it. Where the
+    background is bright it is that of the cell, so large that its fullest window is no surprise.
     """
     number = int(min(MOST_WINDOWS, stream.duration / window))
-    rows, columns = background.rate.shape
-    middles = (np.arange(number) + 0.5) / number * stream.duration
+    rows, columns = background.calm.shape[1:]
+    # At no fixed steps, for flicker has a period.
+    middles = (np.arange(number) + np.arange(number) * GOLDEN % 1) / number * stream.duration
     slices = background.slice(middles)
     calm = background.calm[slices]
     activity = background.activity[slices][:, None, None]
@@ -125,6 +167,9 @@ def measure_dispersion(stream: Stream, background: Background, window: float | i
     squares = (calm * (N - mean * activity) ** 2).sum(0)
     expected = (calm * mean * activity).sum(0)
     full = expected >= FULL
-    if full.mean() < 0.5:
-        return 1.0
-    return max(1.0, float(np.median(squares[full] / expected[full])))
+    own = np.where(full, squares / np.maximum(expected, FULL), 1.0)
+    usual = max(1.0, float(np.median(own[full]))) if full.mean() >= 0.5 else 1.0
+    # Of many windows chance alone makes the fullest one as unlikely as there are windows.
+    fullest = evidence(N * calm, mean * activity, 1).max(0) / np.log(np.maximum(calm.sum(0), 10))
+    own = np.maximum(own, fullest)
+    return np.where(background.bright & full, np.maximum(own, usual), usual)

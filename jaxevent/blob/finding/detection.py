@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.finding.background import Background, evidence
+from jaxevent.blob.finding.background import CELL, Background, evidence, look_up
 from jaxevent.blob.finding.stream import Part
 from jaxevent.kernels import compiled
 
@@ -18,7 +18,12 @@ class Scale(NamedTuple):
 
     window: float | int  # s
     cell: int  # px
-    dispersion: float  # of the background's counts in such windows
+    dispersion: NDArray[np.float64]  # of the background's counts in such windows, in 16 px cells
+
+    def dispersion_at(self, x: Any, y: Any) -> Any:
+        """That of counts in 3x3 of the scale's cells, in which flicker adds up."""
+        usual, cells = self.dispersion.min(), max(1.0, (3 * self.cell / CELL) ** 2)
+        return usual + (look_up(self.dispersion, CELL, x, y) - usual) * cells
 
 
 class Blobs(NamedTuple):
@@ -41,9 +46,10 @@ def detect(
     rows, columns = -(-size[0] // g), -(-size[1] // g)
     place, filled, around = _count(part.x, part.y, g, rows, columns)
     y, x = np.divmod(filled, columns)
-    mu = background.at(x * g + g // 2, y * g + g // 2, t) * scale.window * 9 * g * g
+    middle = x * g + g // 2, y * g + g // 2
+    mu = background.at(*middle, t) * scale.window * 9 * g * g
     tests = rows * columns * background.duration / scale.window
-    hit = evidence(around, mu, scale.dispersion) > np.log(tests / FALSE_ALARMS)
+    hit = evidence(around, mu, scale.dispersion_at(*middle)) > np.log(tests / FALSE_ALARMS)
     return _label(place, filled[hit], rows, columns)
 
 

@@ -191,7 +191,9 @@ class Links:
         if weak.any():
             spread = np.linalg.det(live.C + (seen.P[:, 0] + 0.1)[:, None, None] * np.eye(2))
             all_n, all_z, all_D = seen.moments(owner, np.ones(len(owner), bool))
-            told = evidence(all_n, self._expected(seen.p, t, spread), self.scale.dispersion)
+            told = evidence(
+                all_n, self._expected(seen.p, t, spread), self.scale.dispersion_at(*seen.p.T)
+            )
             asked = -np.log(np.where(live.confirmed, SEEN, SEEN_NEW))
             there = weak & (all_n >= 2) & (told >= asked)
             n = np.where(weak, np.where(there, all_n, 0), n)
@@ -228,7 +230,7 @@ class Links:
         live.n = np.where(heard, live.n + a * (n - live.n), live.n)
         live.hits = live.hits + heard
         mu = self._expected(live.p, t, np.linalg.det(live.C))
-        told = evidence(n, mu, self.scale.dispersion)
+        told = evidence(n, mu, self.scale.dispersion_at(*live.p.T))
         live.nats = live.nats + np.where(heard, told, 0)
         self._confirm(heard, t)
         some = live.keep(heard)

@@ -9,7 +9,7 @@ import dataclasses
 
 import numpy as np
 
-from jaxevent.blob.finding.background import CELL, Background, evidence, measure_background
+from jaxevent.blob.finding.background import FINE, Background, evidence, measure_background
 from jaxevent.blob.finding.detection import CONTACT, Scale, touching
 from jaxevent.blob.finding.found import Found, Pass
 from jaxevent.blob.finding.links import FAINT, GATE, HOLD, SEEN, Links
@@ -90,7 +90,7 @@ def find(
         found += new
         near += new
         stream = stream.without(near, 2 * GATE)
-    rate = float((background.rate * CELL**2).sum())
+    rate = float((background.rate * FINE**2).sum())
     found.sort(key=lambda path: (path.begin, path.p[0].tolist()))
     return Found(tuple(found), tuple(passes), int(stream.hot.sum()), rate, recording)
 
@@ -172,7 +172,7 @@ def _look_back(path: Path, rest: Stream, background: Background, scale: Scale) -
         n = int(near.sum())
         area = np.pi * GATE**2 * np.sqrt(np.linalg.det(S))
         mu = max(float(background.at(p[0], p[1], t)) * w * area, 1e-3)
-        if n < 2 or n < FAINT * usual or evidence(n, mu, scale.dispersion) < -np.log(SEEN):
+        if n < 2 or n < FAINT * usual or evidence(n, mu, scale.dispersion_at(*p)) < -np.log(SEEN):
             silent += 1
             continue
         z = e[near].mean(0)
