@@ -9,10 +9,9 @@ programs are kept in the user's cache folder: `jaxevent.cache` says how to chang
 """
 
 import importlib
-import sys
 from typing import TYPE_CHECKING, Any
 
-from jaxevent import cache
+from jaxevent import cache, shown
 
 if TYPE_CHECKING:
     from jaxevent import (
@@ -115,29 +114,12 @@ __all__ = [
 
 cache.keep_compiled()
 
-# What notebooks show as a table and a picture; `jaxevent.show.notebook` makes it when it is shown.
-_SHOWN = (
-    ("jaxevent.recording", "Recording"),
-    ("jaxevent.reconstruction.video", "ImageSequence"),
-    ("jaxevent.blob.tracks", "Tracks"),
-    ("jaxevent.egomotion.motion", "Motion"),
-)
-
 
 def _as_html(thing: Any) -> str:
     return importlib.import_module("jaxevent.show.notebook").as_html(thing)
 
 
-def _tell_notebook() -> None:
-    """Have IPython, where it runs, show things by `_as_html`; their modules load when used."""
-    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
-    if shell is not None:
-        formatter = shell.display_formatter.formatters["text/html"]
-        for module, name in _SHOWN:
-            formatter.for_type_by_name(module, name, _as_html)
-
-
-_tell_notebook()
+shown.as_html = _as_html  # whose module loads when something is shown
 
 
 def __getattr__(name: str) -> Any:

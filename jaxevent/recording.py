@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.camera import PinholeCamera, Response, TableResponse, UnknownResponse
 from jaxevent.errors import InputError
+from jaxevent.shown import Shown
 
 if TYPE_CHECKING:
     import pandas
@@ -268,7 +269,7 @@ class Triggers:
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Recording:
+class Recording(Shown):
     """One recording of one sensor; see the module for the conventions.
 
     `extra` keeps, by name, whatever arrays the file held beyond these fields (a contrast threshold,

@@ -31,6 +31,7 @@ from jaxevent.blob.targets import Slots, scan_steps
 from jaxevent.errors import InputError
 from jaxevent.progress import bar
 from jaxevent.recording import Times, microseconds
+from jaxevent.shown import Shown
 
 BEGINS = 32  # stretches from which tracking can be taken up again
 READS = 64  # times read per call
@@ -137,7 +138,7 @@ class _History:
             self.birth.setdefault(int(log.after[chunk, slot]), int(end[chunk]))
 
 
-class Tracks:
+class Tracks(Shown):
     """Tracks of a recording: `mean, covariance, valid = tracks(times)`.
 
     Times, arrays of shape (tracks,): `birth`, `death` (the first moment when it is no more; for a

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.estimator import Estimate
 from jaxevent.recording import Recording, Times, check_times, microseconds
+from jaxevent.shown import Shown
 
 ACROSS = 0.1  # of the spread of speeds at several depths, that of the velocity across them
 
@@ -26,7 +27,7 @@ class Calibration(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Motion:
+class Motion(Shown):
     """An estimated motion: `mean, covariance, valid = motion(times)`.
 
     The components are those of its `model`: of planar motion the image velocity (px/s), of a

@@ -21,6 +21,7 @@ from jaxevent.reconstruction.reading import Reader
 from jaxevent.reconstruction.stream import StreamState
 from jaxevent.reconstruction.windows import WINDOW_EVENTS, EventWindow, WindowedRecording
 from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.shown import Shown
 
 P = TypeVar("P", bound=FrameParams)
 
@@ -99,7 +100,7 @@ class FilteredWindow(NamedTuple):
         return (start is None or start <= time) and (stop is None or time < stop)
 
 
-class ImageSequence(abc.ABC, Generic[P]):
+class ImageSequence(Shown, abc.ABC, Generic[P]):
     """Images of a reconstruction: `image, variance, valid = sequence(times)`.
 
     A subclass reads images in `_read`. Images do not depend on which others were asked for. Raises

@@ -1,7 +1,7 @@
 """What notebooks show of a recording, a reconstruction, tracks and a motion: HTML.
 
-`import jaxevent` tells IPython of `as_html`, so that recordings need not know of pictures. Pictures
-take at most `MOST` events' work; without the extra "plot" they are left out.
+`import jaxevent` has `jaxevent.shown` use `as_html`, so that recordings need not know of pictures.
+Pictures take at most `MOST` events' work; without the extra "plot" they are left out.
 """
 
 import base64

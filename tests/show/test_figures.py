@@ -2,7 +2,6 @@
 
 import dataclasses
 import sys
-import types
 
 import numpy as np
 import pytest
@@ -122,7 +121,7 @@ def test_notebooks_show_a_table_and_a_picture(monkeypatch):
     video = Video(jaxevent.akf, small(), jaxevent.akf.Params())
     titles = {"small": small(), "akf": video, "2 tracks of small": Tracks(), "vx": motion()}
     for title, thing in titles.items():
-        shown = notebook.as_html(thing)
+        shown = thing._repr_html_()
         assert title in shown and "data:image/png;base64," in shown
     assert notebook.as_html(3) == "<pre>3</pre>"
     assert "&lt;b&gt;" in notebook.as_html(dataclasses.replace(small(), name="<b>"))
@@ -131,27 +130,3 @@ def test_notebooks_show_a_table_and_a_picture(monkeypatch):
     assert "pip install" in notebook.as_html(small()) and "img" not in notebook.as_html(small())
     with pytest.raises(MissingExtra):
         show.plot_events(small())
-
-
-def test_ipython_is_told_where_it_runs(monkeypatch):
-    told = {}
-
-    class Formatter:
-        def for_type_by_name(self, module, name, function):
-            told[module, name] = function
-
-    shell = types.SimpleNamespace(
-        display_formatter=types.SimpleNamespace(formatters={"text/html": Formatter()})
-    )
-    module = types.SimpleNamespace(get_ipython=lambda: None)
-    monkeypatch.setitem(sys.modules, "IPython", module)
-    jaxevent._tell_notebook()
-    assert not told
-    module.get_ipython = lambda: shell
-    jaxevent._tell_notebook()
-    kinds = [small(), Tracks(), motion()]
-    for thing in kinds:
-        bases = [(kind.__module__, kind.__name__) for kind in type(thing).__mro__]
-        (name,) = set(bases) & set(told)
-        assert told[name](thing) == notebook.as_html(thing)
-    assert ("jaxevent.reconstruction.video", "ImageSequence") in told

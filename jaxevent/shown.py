@@ -1,0 +1,13 @@
+"""What notebooks show."""
+
+from collections.abc import Callable
+from typing import Any
+
+as_html: Callable[[Any], str] = repr  # `jaxevent` sets that of `jaxevent.show.notebook`
+
+
+class Shown:
+    """Something that notebooks show as a table and a picture."""
+
+    def _repr_html_(self) -> str:
+        return as_html(self)
