@@ -8,6 +8,7 @@
     street   davis346_street, every 2nd, 4th, 8th; all pixels, and where something moves
     objects  simulated objects, frames at 25 and 100 Hz, halfway between frames
     blur     pans and objects, long exposures: at the frames' middles, and halfway between them
+    exposures  the same of `mc`, not fitted, with and without exposures along trajectories
     flow     the optical flow of objects, against the true one
     video    seconds of all cores per image of `mc` on slider_depth, 100 images per second, and the
              error of hidden frames: as it is, and with an anchor for every target
@@ -335,9 +336,25 @@ def panorama() -> NDArray[np.float64]:
 def blur(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> None:
     """Score images at the middles of long exposures, and halfway between frames."""
     methods = fits(fitted_to_objects(folder))
+    for cell, source, recording in tqdm(blurred(folder), disable=not sys.stderr.isatty()):
+        t, parts = at_and_between(recording)
+        store.add(cell, methods, _scorer(recording, truth_of(source, t), None, parts))
+
+
+def exposures(store: Store, folder: Path) -> None:
+    """Score `mc` on the same images, with and without exposures integrated along trajectories."""
+    mc = jaxevent.METHODS["mc"]
+    params = mc.Params.of({"c_on": 0.2, "c_off": 0.18, "I0": 0.1, "rho_ref": 5e-4})
+    both = {"mc": (mc, params), "mc, per pixel": (mc, params.replace(integrate=False))}
+    for cell, source, recording in tqdm(blurred(folder), disable=not sys.stderr.isatty()):
+        t, parts = at_and_between(recording)
+        store.add(cell, both, _scorer(recording, truth_of(source, t), None, parts))
+
+
+def blurred(folder: Path) -> Iterator[tuple[Row, Source, Recording]]:
+    """Recordings of long exposures, with what tells them apart."""
     light, seed = panorama(), SCORING[0]
-    cells = [(kind, e, v) for kind in ("pan", "objects") for e in BLURS[0] for v in BLURS[1]]
-    for kind, exposure, speed in tqdm(cells, desc="blur", disable=not sys.stderr.isatty()):
+    for kind, exposure, speed in itertools.product(("pan", "objects"), *BLURS):
         rate = min(25.0, 0.8 / exposure)
         camera = sensor(rate, exposure, max(8, round(2 * exposure * speed)))
         size, duration = (160, 120), 7 / rate + exposure
@@ -348,12 +365,15 @@ def blur(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> None:
         )
         name = f"{kind}_{1e3 * exposure:g}ms_{speed:g}px.h5"
         recording = recorded(folder / "recordings" / name, source, camera, seed)
-        assert recording.frames is not None
-        t = np.sort(np.concatenate([recording.frames.t[2:5], halfway(recording, 3)]))
-        at = np.isin(t, recording.frames.t)
-        parts = {"at_frames": np.flatnonzero(at), "between": np.flatnonzero(~at)}
-        cell = {"scene": kind, "exposure_ms": 1e3 * exposure, "speed": speed}
-        store.add(cell, methods, _scorer(recording, truth_of(source, t), None, parts))
+        yield {"scene": kind, "exposure_ms": 1e3 * exposure, "speed": speed}, source, recording
+
+
+def at_and_between(recording: Recording) -> tuple[NDArray[np.int64], dict[str, NDArray]]:
+    """The middles of three exposures and three times halfway, and which are which."""
+    assert recording.frames is not None
+    t = np.sort(np.concatenate([recording.frames.t[2:5], halfway(recording, 3)]))
+    at = np.isin(t, recording.frames.t)
+    return t, {"at_frames": np.flatnonzero(at), "between": np.flatnonzero(~at)}
 
 
 def flow_errors(
@@ -468,10 +488,8 @@ def markdown(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    tables = ("slider", "street", "objects", "blur", "flow", "video")
-    parser.add_argument(
-        "--params", type=Path, required=True, help="folder of a fit to slider_depth"
-    )
+    tables = ("slider", "street", "objects", "blur", "exposures", "flow", "video")
+    parser.add_argument("--params", type=Path, help="folder of a fit to slider_depth")
     parser.add_argument("--street-params", type=Path, help="of one to davis346_street; or the same")
     parser.add_argument("--mc-params", type=Path, help="file or folder with the parameters of mc")
     parser.add_argument("--mc-label", default="mc", help="their label; default: %(default)s")
@@ -479,6 +497,8 @@ def main() -> None:
     parser.add_argument("--tables", nargs="+", default=tables, choices=tables)
     parser.add_argument("--out", type=Path, required=True, help="folder for everything made")
     arguments = parser.parse_args()
+    if arguments.params is None and {"slider", "street", "video"} & set(arguments.tables):
+        parser.error("the tables slider, street and video need --params")
     out = arguments.out.absolute()
     out.mkdir(parents=True, exist_ok=True)
     names, compensated = arguments.methods, Compensated(arguments.mc_params, arguments.mc_label)
@@ -517,15 +537,20 @@ def _tables(
         store = Store(out / "objects.json")
         objects(store, out, fits)
         yield "objects", markdown(store.means(list(keys), names), keys, IMAGE_COLUMNS)
-    if "blur" in wanted:
-        store = Store(out / "blur.json")
-        blur(store, out, fits)
+    for name in ("blur", "exposures"):
+        if name not in wanted:
+            continue
+        store = Store(out / f"{name}.json")
+        if name == "blur":
+            blur(store, out, fits)
+        else:
+            exposures(store, out)
         parts = (("at frames", "at_frames", 100, 4), ("between", "between", 100, 4))
-        blurred = {
+        how = {
             "scene": "scene", "exposure_ms": "exposure (ms)", "speed": "px/s", "method": "method",
         }  # fmt: skip
-        rows = store.means(list(blurred), names)
-        yield "blur", markdown(rows, blurred, (*IMAGE_COLUMNS, *parts))
+        rows = store.means(list(how), names)
+        yield name, markdown(rows, how, (*IMAGE_COLUMNS, *parts))
     if "flow" in wanted:
         store = Store(out / "flow.json")
         dense_flow(store, out, fits)

@@ -14,7 +14,7 @@ from jaxevent.runs.protocols import frame_times, held_out
 from jaxevent.runs.results import check_folder, results, write_rows
 from jaxevent.runs.scores import score
 from jaxevent.show.export import evenly, shown
-from jaxevent.show.report import comparison_figure, markdown_table, video_writer
+from jaxevent.show.report import Kind, comparison_figure, markdown_table, video_writer
 
 # The thresholds of the demo's sensor, and the lag of its frames' clock, set by hand.
 BY_HAND = {"c_on": 0.083, "c_off": 0.059, "clock_offset": 0.0075}
@@ -73,29 +73,35 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
 
 
 def _figure(recording: Recording, params: dict[str, Any], path: Path) -> None:
-    """The motion-compensated image and the AKF's at one hidden frame."""
+    """What a few methods make of one hidden frame, and how `mc` is wrong and in doubt there."""
     given, hidden = held_out(recording)
     middle = hidden[len(hidden) // 2 :][:1]
-    (filtered, _, _), (image, variance, _) = (
-        method.estimate(given, values)(frame_times(middle, values))
-        for method, values in ((find("akf"), params["akf"]), (find("mc"), find("mc").Params()))
-    )
     assert given.frames is not None
     before = given.frames[int(np.searchsorted(given.frames.t, middle.t[0])) - 1 :][:1]
     truth = middle.intensity[0]
     ms = (middle.t[0] - before.t[0]) / 1000
-    comparison_figure(
-        path,
-        [
-            (f"input: last frame given, {ms:.0f} ms old", before.intensity[0], "image"),
-            ("mc, motion-compensated", image[0], "image"),
-            ("truth: the hidden frame", truth, "image"),
-            ("AKF minus truth, set by hand", np.clip(filtered[0], 0, 1) - truth, "error"),
-            ("mc minus truth", np.clip(image[0], 0, 1) - truth, "error"),
-            ("mc, standard deviation of ln(I + 0.3)", np.sqrt(variance[0]), "uncertainty"),
-        ],
-        f"{recording.name} at {middle.t[0] / 1e6:.3f} s",
-    )
+    panels: list[tuple[str, Any, Kind]] = [
+        (f"input: last frame given, {ms:.0f} ms old", before.intensity[0], "image")
+    ]
+    error = doubt = truth
+    for name, label in (
+        ("akf", "AKF, set by hand"),
+        ("aks", "smoother"),
+        ("flow", "flow between frames"),
+        ("mc", "mc, motion-compensated"),
+    ):
+        method = find(name)
+        values = params.get(name) or method.Params()
+        try:
+            image, variance, _ = method.estimate(given, values)(frame_times(middle, values))
+        except MissingExtra:
+            continue
+        panels.append((label, image[0], "image"))
+        error, doubt = np.clip(image[0], 0, 1) - truth, np.sqrt(variance[0])
+    panels.append(("truth: the hidden frame", truth, "image"))
+    panels.append(("mc minus truth", error, "error"))
+    panels.append(("mc, standard deviation of ln(I + 0.3)", doubt, "uncertainty"))
+    comparison_figure(path, panels, f"{recording.name} at {middle.t[0] / 1e6:.3f} s")
 
 
 def _video(recording: Recording, params: Any, path: Path, progress: bool | None) -> float:
