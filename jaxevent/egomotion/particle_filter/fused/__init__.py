@@ -6,5 +6,5 @@ particles, becomes expressions (`jaxevent.kernels`), and these the functions of 
 candidates as `filtering.run` does, which is differentiated and serves wherever there is no kernel.
 
 While the cloud is narrow the driver scores a few motions that span it, and interpolates between
-them (`nodes`).
+them.
 """

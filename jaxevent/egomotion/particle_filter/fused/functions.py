@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.particle_filter import filtering, likelihood
 from jaxevent.egomotion.particle_filter.filtering import Passed, State, Told
-from jaxevent.egomotion.particle_filter.fused.loop import CELLS, Functions
-from jaxevent.egomotion.particle_filter.fused.nodes import BLOCK
+from jaxevent.egomotion.particle_filter.fused.loop import BLOCK, CELLS, Functions
 from jaxevent.egomotion.particle_filter.likelihood import Event
 from jaxevent.egomotion.particle_filter.parameters import Params
 from jaxevent.kernels.expressions import Graph, Level, Node, Untranslatable, needed
@@ -43,7 +42,7 @@ from jaxevent.kernels.numeric import {imports}
 
 REAL = np.{real}
 I, F = types.int64, types.{real}
-P, NUMBERS = types.CPointer(F), types.CPointer(types.float64)
+P, WHOLE, NUMBERS = types.CPointer(F), types.CPointer(I), types.CPointer(types.float64)
 HOW = {{"error_model": "numpy", "fastmath": {{"contract"}}}}
 LOOP = {{"error_model": "numpy", "fastmath": {{"contract", "reassoc", "nsz"}}}}
 {constants}
@@ -58,8 +57,8 @@ def {name}(cells, work, numbers, count):
 
 """
 # Candidates fill their places from the first. `blocks` of `size` motions have ages in common.
-EVENT = """@callback(types.void(P, P, NUMBERS, P, P, I, I, I), **HOW)
-def {name}(cells, work, numbers, d, ages, count, first, most):
+EVENT = """@callback(types.void(P, P, NUMBERS, P, P, WHOLE, I, I, I), **HOW)
+def {name}(cells, work, numbers, d, ages, chosen, count, first, most):
     zero, begin, end = 0, 0, count
 {ask}
     if cells[{seen}] == 0:
@@ -71,15 +70,18 @@ def {name}(cells, work, numbers, d, ages, count, first, most):
         end = begin + size
 {span}
         youngest, oldest = cells[{youngest}], cells[{oldest}]
+        number = 0
         for c in range(first, first + most):
-            dt = ages[c]
-            if dt <= 0:
+            age = ages[c]
+            if age <= 0:
                 break
-            if dt < youngest or dt > oldest:
-                continue
+            chosen[number] = c
+            number += 1 if (age >= youngest) & (age <= oldest) else 0
+        for k in range(number):
+            c = chosen[k]
             cells[{dx}] = d[2 * c]
             cells[{dy}] = d[2 * c + 1]
-            cells[{dt}] = dt
+            cells[{dt}] = ages[c]
 {vote}
     begin, end = 0, count
 {answer}

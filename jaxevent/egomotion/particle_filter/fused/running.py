@@ -8,8 +8,15 @@ from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.particle_filter.filtering import Info, Noise, State
 from jaxevent.egomotion.particle_filter.fused.functions import kernel_of
-from jaxevent.egomotion.particle_filter.fused.loop import REACH, Given, Rows, Told, run
-from jaxevent.egomotion.particle_filter.fused.nodes import USED, room_for
+from jaxevent.egomotion.particle_filter.fused.loop import (
+    REACH,
+    USED,
+    Given,
+    Rows,
+    Told,
+    room_for,
+    run,
+)
 from jaxevent.egomotion.particle_filter.parameters import Params
 
 
