@@ -61,7 +61,7 @@ def test_it_is_found_by_its_path():
 @pytest.mark.slow
 def test_methods_find_the_true_motion():
     recording, params = turning(), voting.Params(**SMALL)
-    motion = voting.estimate(recording, params, model=MODEL)
+    motion = voting.estimate(recording, params, model=MODEL, compiler="numba")
     assert motion.valid[motion.t > 170_000].all()
     assert off(motion.mean[motion.t > 170_000]) < 0.05
     mean, covariance, valid = motion(np.array([200_000]))
