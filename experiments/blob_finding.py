@@ -165,6 +165,7 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--scenes", nargs="+", help="default: all of SCENES")
+    parser.add_argument("--search", action="store_true", help="only `find` and the baselines")
     parser.add_argument("--varied", action="store_true", help="all of VARIED instead")
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--first", type=int, default=0, help="the first seed")
@@ -178,10 +179,10 @@ def main() -> None:
             clock = time.process_time()
             found = find(recording, progress=False)
             seconds = time.process_time() - clock
-            smoothed, filtered = tracked(recording, found, times)
-            answers = {
-                "moment": smoothed,
-                "filter": filtered,
+            answers = {}
+            if not args.search:
+                answers["moment"], answers["filter"] = tracked(recording, found, times)
+            answers |= {
                 "find": found_paths(found, times),
                 "clusters": clusters(recording, found, times),
                 "kalman": kalman(recording, found, times),
@@ -192,7 +193,7 @@ def main() -> None:
                 print(
                     f"{name[:34]:34} {seed} {method:9}"
                     + " ".join(f"{key} {row[key]:.3g}" for key in row)
-                    + (f" | {seconds:.1f} s {found.summary()}" if method == "moment" else ""),
+                    + (f" | {seconds:.1f} s {found.summary()}" if method == "find" else ""),
                     flush=True,
                 )
     args.out.mkdir(parents=True, exist_ok=True)

@@ -122,8 +122,8 @@ def sky(recording: Recording, times: NDArray) -> tuple[Paths, NDArray | float]:
 KNOWN: dict[str, tuple[Callable, dict[str, Any]]] = {
     "spinning_dot.npz": (dot, {"preset": "fast"} | DOT_FOUND),
     "davis346_street.npz": (street, STREET),
-    "gen4.dat": (sky, SKY),
     "atis.es": (atis, {}),
+    "gen4.dat": (sky, SKY),
 }
 
 
@@ -206,7 +206,7 @@ def main() -> None:
             found = find(recording, progress=False)
             results[name] = {"without settings": {"tracks": len(found)}}
             lines.append(f"| {name} | without settings | 0 of 0 | {len(found)} | - | - | - | - |")
-        print(lines[-1], flush=True)
+        print("\n".join(lines[-len(results[name]) :]), flush=True)
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "results.json").write_text(json.dumps(results, indent=1))
     (args.out / "table.md").write_text("\n".join(lines) + "\n")
