@@ -52,7 +52,7 @@ def check_demo(out: Path, said: str) -> None:
 def test_the_fit_sees_no_frame_that_the_filter_was_given():
     """A filter reproduces the frames that it is given, whatever its thresholds are."""
     recipe = re.findall(r"```python\n(.*?)```", README, re.DOTALL)[-1]
-    assert "given = recording.with_frames" in recipe and "prepare(given, hidden.t" in recipe
+    assert "given = recording.with_frames" in recipe and "prepare_images(given, hidden.t" in recipe
 
 
 def test_every_method_is_named():

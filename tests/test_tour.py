@@ -9,7 +9,7 @@ TOUR = Path(__file__).parents[1] / "experiments" / "tour.ipynb"
 
 
 @pytest.mark.slow
-def test_the_tour_runs():
+def test_the_tour_runs(float32):
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.use("Agg")
     cells = json.loads(TOUR.read_text())["cells"]

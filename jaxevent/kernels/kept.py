@@ -9,6 +9,7 @@ but compiled again, and so is what cannot be written.
 """
 
 import contextlib
+import functools
 import hashlib
 import os
 import pickle
@@ -56,13 +57,40 @@ class _Cache(FunctionCache):
     def __init__(self, function: Callable):
         super().__init__(function)
         locator = self._impl.locator
-        self._cache_file = Files(
-            Path(locator.get_cache_path()), self._impl.filename_base, locator.get_source_stamp()
-        )
+        folder = Path(locator.get_cache_path())
+        self._cache_file = Files(folder, self._impl.filename_base, source_of(function))
 
     def save_overload(self, sig: Any, data: Any) -> None:
         with contextlib.suppress(OSError):
             super().save_overload(sig, data)
+
+
+def source_of(function: Callable) -> str:
+    """A hash of all that a function is compiled from: files, and numbers of other files."""
+    parts: dict[str, list[str]] = {}
+    waiting: list[Any] = [function]
+    while waiting:
+        one = waiting.pop()
+        path = one.__code__.co_filename
+        if path in parts:
+            continue
+        parts[path] = [_content(path)]
+        for name, value in one.__globals__.items():
+            called = getattr(value, "py_func", None)
+            if called is not None:
+                waiting.append(called)
+            elif isinstance(value, int | float | str) and not name.startswith("__"):
+                parts[path].append(f"{name} = {value!r}")
+    about = repr(sorted(parts.values()))
+    return hashlib.blake2b(about.encode(), digest_size=_HASH).hexdigest()
+
+
+@functools.cache
+def _content(path: str) -> str:
+    try:
+        return hashlib.blake2b(Path(path).read_bytes(), digest_size=_HASH).hexdigest()
+    except OSError:  # typed in
+        return path
 
 
 class Files:

@@ -27,6 +27,40 @@ def files_of(folder: Path) -> list[Path]:
     return sorted(folder.glob("__pycache__/*.nbc"))
 
 
+CALLER = """
+from parts import RATE, third
+def share(x):
+    return third(x) * RATE
+"""
+PARTS = """
+import numba
+RATE = {rate}
+@numba.njit
+def third(x):
+    return x / {by}
+"""
+
+
+@pytest.mark.parametrize("changed", [{"by": 6}, {"rate": 2}])
+def test_what_a_function_calls_or_reads_may_change(changed, tmp_path, monkeypatch):
+    (tmp_path / "caller.py").write_text(CALLER)
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def fresh(by=3, rate=1):
+        (tmp_path / "parts.py").write_text(PARTS.format(by=by, rate=rate))
+        for name in ("caller", "parts"):
+            monkeypatch.delitem(sys.modules, name, raising=False)
+        monkeypatch.setattr(sys, "dont_write_bytecode", True)
+        kept._content.cache_clear()
+        importlib.invalidate_caches()
+        return kept.compiled(importlib.import_module("caller").share)
+
+    assert fresh()(12.0) == 4
+    again = fresh()
+    assert again(12.0) == 4 and sum(again.stats.cache_hits.values()) == 1
+    assert fresh(**changed)(12.0) == 12.0 / changed.get("by", 3) * changed.get("rate", 1)
+
+
 def test_signatures_compiled_at_the_same_time_keep_apart(half, tmp_path, monkeypatch):
     # Whenever one process has written a file and is about to name it, another one compiles.
     replace, others = os.replace, [half(), half()]

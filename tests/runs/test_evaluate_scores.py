@@ -180,13 +180,20 @@ def test_what_is_known_beside_positions(cars, begin):
 
 @pytest.mark.slow
 def test_targets_are_searched_for(cars):
-    """The search takes one of the two lights: of a pair without a track no contact is told."""
     text = LIGHTS.replace("SMOOTH", "false").replace("BEGIN", "found")
     (row,) = evaluate.evaluate(configured(cars, "found", text))
-    assert (row["tracks"], row["missed"], row["false"]) == (1, 1, 0)
-    assert row["covered"] == 0.5 and row["mota"] == 0.5
-    assert row["idf1"] == pytest.approx(2 / 3)
-    assert row["rmse"] < 0.5 and row["inverse_ttc"] is None
+    assert (row["tracks"], row["missed"], row["false"]) == (2, 0, 0)
+    assert row["covered"] == 1 and row["mota"] == 1 and row["idf1"] == 1
+    assert row["rmse"] < 1 and row["inverse_ttc"] < 0.15
+
+
+@pytest.mark.slow
+def test_of_a_pair_without_tracks_no_contact_is_told(cars):
+    text = LIGHTS.replace("SMOOTH", "false").replace("BEGIN", "born")
+    text = text.replace("n_confirm = 60", "n_confirm = 1e6")
+    (row,) = evaluate.evaluate(configured(cars, "none", text))
+    assert (row["tracks"], row["missed"], row["covered"]) == (0, 2, 0)
+    assert row["inverse_ttc"] is None
 
 
 @pytest.mark.parametrize(

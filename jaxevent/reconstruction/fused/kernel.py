@@ -50,20 +50,19 @@ class _Programs:
 _programs: dict[Any, _Programs] = {}
 
 
-def kernel_of(
+def program_of(
     method: FilterMethod,
     observe: Any,
     params: Any,
     fixed: dict[str, NDArray],
     exposed: bool,
     dtype: np.dtype,
-    stride: int,
     directions: Directions = Directions(),  # noqa: B008
-) -> Kernel:
-    """The kernel of a method with its parameters and `fixed` numbers; raises `Untranslatable`.
+) -> tuple[PixelProgram, dict[int, tuple[Source, ModuleType]], list[NDArray]]:
+    """A method's program, its modules by stride, and the numbers of its parameters.
 
     Its functions are traced once for parameters of a kind, translated once for every way that
-    conditions on parameters can choose, compiled once for a machine.
+    conditions on parameters can choose. Raises `Untranslatable`.
     """
     leaves, tree = jax.tree.flatten(params)
     key = (method, tree, tuple(np.shape(leaf) for leaf in leaves), exposed, dtype, directions)
@@ -79,6 +78,26 @@ def kernel_of(
         found = (program, {}), program.host.values
         made.known.append(found[0])
     (program, modules), values = found
+    return program, modules, values
+
+
+def kernel_of(
+    method: FilterMethod,
+    observe: Any,
+    params: Any,
+    fixed: dict[str, NDArray],
+    exposed: bool,
+    dtype: np.dtype,
+    stride: int,
+    directions: Directions = Directions(),  # noqa: B008
+) -> Kernel:
+    """The kernel of a method with its parameters and `fixed` numbers; raises `Untranslatable`.
+
+    It is compiled once for a machine.
+    """
+    program, modules, values = program_of(
+        method, observe, params, fixed, exposed, dtype, directions
+    )
     if stride not in modules:
         source = write(program, stride)
         modules[stride] = source, module_of(source.text)

@@ -12,9 +12,9 @@ from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.reconstruction.fused.bands import BandLayout
-from jaxevent.reconstruction.fused.kernel import Kernel, kernel_of
+from jaxevent.reconstruction.fused.kernel import Kernel, kernel_of, program_of
 from jaxevent.reconstruction.fused.loop import Bands, FrameRows, Given, Images, Line, Memory, run
-from jaxevent.reconstruction.fused.pixel import Directions, traced, translated
+from jaxevent.reconstruction.fused.pixel import Directions
 from jaxevent.reconstruction.fused.timeline import NEVER, make_line
 from jaxevent.reconstruction.stream import Stream, StreamState, weigh
 from jaxevent.reconstruction.windows import WindowedRecording
@@ -96,9 +96,8 @@ class DividedRecording:
 
     def check(self, method: Any, params: Any, clock_offset: Any, directions: Directions) -> None:
         """Raise `Untranslatable` if there can be no such kernel."""
-        exposed = self.windows.clock.exposed
-        about = traced(method, method.observe, params, exposed, self.dtype, directions)
-        translated(about, params, self._fixed(clock_offset))
+        fixed, exposed = self._fixed(clock_offset), self.windows.clock.exposed
+        program_of(method, method.observe, params, fixed, exposed, self.dtype, directions)
 
     def _fixed(self, clock_offset: Any) -> dict[str, NDArray]:
         return {
