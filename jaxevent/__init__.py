@@ -11,7 +11,7 @@ programs are kept in the user's cache folder: `jaxevent.cache` says how to chang
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from jaxevent import cache, shown
+from jaxevent import cache, dispatch, shown
 
 if TYPE_CHECKING:
     from jaxevent import (
@@ -113,6 +113,7 @@ __all__ = [
 ]
 
 cache.keep_compiled()
+dispatch.run_in_turn()
 
 
 def _as_html(thing: Any) -> str:

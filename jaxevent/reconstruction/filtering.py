@@ -18,6 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxevent import dispatch
 from jaxevent.errors import InputError
 from jaxevent.estimator import Described, Estimate
 from jaxevent.kernels.expressions import Untranslatable
@@ -38,6 +39,8 @@ from jaxevent.reconstruction.prepared import PreparedImages
 from jaxevent.reconstruction.video import ImageSequence, Video
 from jaxevent.reconstruction.windows import sorted_times
 from jaxevent.recording import Recording, Times
+
+IN_TURN = dispatch.run_in_turn()  # whether kernels may be called from within programs
 
 
 class State(eqx.Module):
@@ -180,11 +183,13 @@ class Filter(PixelEstimator[P]):
 
         On CPUs, in single precision, a kernel makes images and their derivatives by all parameters
         in one pass over the events. `run` and `read` serve where a function has no translation, in
-        double precision, on other devices and on several, and for derivatives by the dead time
-        `rho_ref`. `compiler` is as in `estimate`.
+        double precision, on other devices and on several, for derivatives by the dead time
+        `rho_ref`, and where JAX computed before jaxevent was imported (`jaxevent.dispatch`).
+        `compiler` is as in `estimate`.
         """
         params = self.Params() if params is None else params
-        if _wants_kernel(compiler, jax.local_devices()) and "rho_ref" not in params.followed:
+        kernel = _wants_kernel(compiler, jax.local_devices()) and IN_TURN
+        if kernel and "rho_ref" not in params.followed:
             self.check(recording)
             times = sorted_times(times)
             if not extrapolate:
