@@ -9,7 +9,7 @@ from the inputs: that costs less than keeping them.
 import dataclasses
 import types
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -17,12 +17,33 @@ from numpy.typing import NDArray
 
 from jaxevent.kernels.expressions import Graph, Level, Node, Untranslatable, needed
 from jaxevent.kernels.host import HostProgram
-from jaxevent.kernels.text import Place, Writer
+from jaxevent.kernels.modules import module_of
+from jaxevent.kernels.text import Numbers, Place, Writer, import_functions
 from jaxevent.kernels.translate import FOLDS, KINDS, Known, OfParameters, Translation, Value
 
 MARK = 7919  # elements in a trace: a prime that no other axis has
 GATHERED = ("total", "largest", "place")  # operations over the axis
 SHAPES = ("shape", "new_sizes", "sizes", "limit_indices", "slice_sizes")
+
+HEAD = '''"""{about}"""
+
+import numba
+import numpy as np
+from numba import types
+
+from jaxevent.kernels.blocks import block
+from jaxevent.kernels.kept import callback
+{imports}
+
+REAL = np.{real}
+I, F = types.int64, types.{real}
+CELLS, WHOLE, NUMBERS = types.CPointer(F), types.CPointer(I), types.CPointer(types.float64)
+HOW = {{"error_model": "numpy", "fastmath": {{"contract"}}}}
+LOOP = {{"error_model": "numpy", "fastmath": {{"contract", "reassoc", "nsz"}}}}
+{constants}
+
+
+'''
 
 
 class LoopTranslation(Translation):
@@ -187,6 +208,16 @@ class Function:
         return found
 
 
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """The functions of a family: expressions, and what their numbers are."""
+
+    functions: dict[str, Function]
+    host: HostProgram
+    layout: Any  # where the numbers lie
+    dtype: np.dtype
+
+
 def leaves_of(name: str, tree: Any) -> dict[str, Any]:
     """The leaves of a tree of arrays or shapes, by the names that kernels know them by."""
     found = jax.tree_util.tree_flatten_with_path(tree)[0]
@@ -341,6 +372,17 @@ class LoopWriter(Writer):
         targets = ", ".join(self.name(n) for n in gathered)
         return [f"{' ' * indent}{targets + ' = ' if names else ''}{call}"]
 
+    def module(self, about: str, program: Program, functions: list[str]) -> tuple[str, Numbers]:
+        """The text of a module of functions, and what its numbers are."""
+        numbers, constants = self.finish(program.host.values)
+        head = HEAD.format(
+            about=about,
+            imports=import_functions(program.dtype),
+            real=program.dtype.name,
+            constants="\n".join(constants),
+        )
+        return head + "".join([*self.loops, *functions]), numbers
+
 
 @dataclasses.dataclass(frozen=True)
 class Loop:
@@ -349,3 +391,49 @@ class Loop:
     index: str
     count: str
     arguments: tuple[str, ...]  # of the function that holds it
+
+
+class Compiled(NamedTuple):
+    """A program's compiled functions, with the numbers of parameters."""
+
+    program: Any
+    functions: Any
+    numbers: NDArray[np.float64]
+
+
+class Kernels:
+    """A family's compiled programs: one for each way that conditions on parameters choose.
+
+    Args:
+        functions: A named tuple of the functions that a module has.
+        write: Writes the text of a program's module.
+        most: Nodes of a program: beyond, numba compiles longer than XLA's scan takes.
+    """
+
+    def __init__(
+        self, functions: type, write: Callable[[Any], tuple[str, Numbers]], most: int
+    ) -> None:
+        self.functions, self.write, self.most = functions, write, most
+        self._made: dict[Any, list[tuple[Any, Numbers, Any]]] = {}
+
+    def get(self, key: Any, params: Any, translate: Callable[[], Any]) -> Compiled:
+        """What is compiled for parameters; `key` names all that `translate` rests on beside them.
+
+        Raises `Untranslatable`.
+        """
+        made = self._made.setdefault(key, [])
+        given = [np.asarray(leaf) for leaf in jax.tree.leaves(params)]
+        for program, numbers, functions in made:
+            values = program.host.again(given)
+            if values is not None:
+                return Compiled(program, functions, numbers.of(values, np.dtype(float)))
+        program = translate()
+        nodes = needed([n for f in program.functions.values() for n in f.results.values()])
+        if len(nodes) > self.most:
+            raise Untranslatable(f"more than {self.most} operations")
+        text, numbers = self.write(program)
+        module = module_of(text)
+        names = self.functions._fields
+        functions = self.functions(*(getattr(module, name) for name in names))
+        made.append((program, numbers, functions))
+        return Compiled(program, functions, numbers.of(program.host.values, np.dtype(float)))

@@ -38,6 +38,12 @@ LEAST = 3  # operations that are worth a block
 Place = tuple[str, str, int]  # pointer, index and offset: pointer[index + offset]
 
 
+def import_functions(dtype: np.dtype) -> str:
+    """The line that imports `FUNCTIONS` of a kind of number."""
+    names = ", ".join(f"{name}{8 * dtype.itemsize} as {name}" for name in FUNCTIONS)
+    return f"from jaxevent.kernels.numeric import {names}"
+
+
 TABLES = re.compile(r"ENTRIES\d+")
 
 

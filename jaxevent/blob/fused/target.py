@@ -37,41 +37,19 @@ from jaxevent.blob.targets import (
     start_gate,
     update_slot,
 )
-from jaxevent.kernels.expressions import Graph, Untranslatable, needed
+from jaxevent.kernels.expressions import Graph, Untranslatable
 from jaxevent.kernels.host import HostProgram
 from jaxevent.kernels.loops import (
     MARK,
-    Function,
+    Kernels,
     Loop,
     LoopWriter,
+    Program,
     leaves_of,
     numbers_of,
     translate,
 )
-from jaxevent.kernels.modules import module_of
-from jaxevent.kernels.text import FUNCTIONS, Numbers, Place
-
-MOST_NODES = 4000  # of a program: beyond, numba compiles longer than the scan takes
-
-HEAD = '''"""The functions of one target (`jaxevent.blob.fused`)."""
-
-import numba
-import numpy as np
-from numba import types
-
-from jaxevent.kernels.blocks import block
-from jaxevent.kernels.kept import callback
-from jaxevent.kernels.numeric import {imports}
-
-REAL = np.{real}
-I, F = types.int64, types.{real}
-CELLS, WHOLE, NUMBERS = types.CPointer(F), types.CPointer(I), types.CPointer(types.float64)
-HOW = {{"error_model": "numpy", "fastmath": {{"contract"}}}}
-LOOP = {{"error_model": "numpy", "fastmath": {{"contract", "reassoc", "nsz"}}}}
-{constants}
-
-
-'''
+from jaxevent.kernels.text import Numbers, Place
 
 FUNCTION = """@callback(types.void(CELLS, WHOLE, CELLS, WHOLE, NUMBERS, I, I, I, I), **HOW)
 def {name}(cells, whole, work, marks, numbers, target, row, room, count):
@@ -110,20 +88,16 @@ class Layout:
 
 
 @dataclasses.dataclass(frozen=True)
-class Program:
-    """The functions of a filter's target: expressions, and what their numbers are."""
+class TargetProgram(Program):
+    """The functions of a filter's target."""
 
-    functions: dict[str, Function]
-    host: HostProgram
-    layout: Layout
     slot: Any  # the shapes of one target
     single: bool
-    dtype: np.dtype
 
 
 def program_of(
     filter: Filter, params: TrackerParams, own: dict[str, Any], owned: bool, dtype: np.dtype
-) -> Program:
+) -> TargetProgram:
     """The functions of one target, translated; raises `Untranslatable`.
 
     `own` are a target's own numbers, `owned` says whether events have owners.
@@ -214,7 +188,7 @@ def program_of(
         for name, (function, values, alone) in functions.items()
     }
     layout = _layout({"slot": slot, "ahead": looked, "now": now})
-    return Program(made, host, layout, slot, single, dtype)
+    return TargetProgram(made, host, layout, dtype, slot, single)
 
 
 def _aged(batch: Batch, single: bool) -> Batch:
@@ -269,7 +243,7 @@ def _of_targets(row: str, i: str) -> tuple[dict[str, str], dict[str, str]]:
     return read, {"weight.0": f"work[({row} + {WEIGHT}) * room + {i}] = {{}}"}
 
 
-def write(program: Program) -> tuple[str, Numbers]:
+def write(program: TargetProgram) -> tuple[str, Numbers]:
     """The text of a program's module."""
     read, store = _elements(program.single)
     places, stores = program.layout.places(), program.layout.stores()
@@ -302,11 +276,7 @@ def write(program: Program) -> tuple[str, Numbers]:
                 whole_width=len(program.layout.whole),
             )
         )
-    numbers, constants = writer.finish(program.host.values)
-    single = program.dtype == np.float32
-    imports = ", ".join(f"{n}{32 if single else 64} as {n}" for n in FUNCTIONS)
-    head = HEAD.format(imports=imports, real=program.dtype.name, constants="\n".join(constants))
-    return head + "".join([*writer.loops, *out]), numbers
+    return writer.module("The functions of one target (`jaxevent.blob.fused`).", program, out)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -319,8 +289,7 @@ class Kernel:
     slot: Any  # the shapes of one target
 
 
-# What has been made of a filter: programs, each for a way that conditions on parameters chose.
-_made: dict[Any, list[tuple[Program, Numbers, Functions]]] = {}
+_kernels = Kernels(Functions, write, most=4000)
 
 
 def kernel_of(
@@ -331,24 +300,10 @@ def kernel_of(
         raise Untranslatable('association = "authors"')
     leaves, tree = jax.tree.flatten(params)
     key = filter, tree, tuple(np.shape(leaf) for leaf in leaves), tuple(own), owned, dtype
-    made = _made.setdefault(key, [])
-    given = [np.asarray(leaf) for leaf in leaves]
-    for program, numbers, functions in made:
-        values = program.host.again(given)
-        if values is not None:
-            return Kernel(
-                functions, program.layout, numbers.of(values, np.dtype(float)), program.slot
-            )
-    program = program_of(filter, params, own, owned, dtype)
-    nodes = needed([n for f in program.functions.values() for n in f.results.values()])
-    if len(nodes) > MOST_NODES:
-        raise Untranslatable(f"more than {MOST_NODES} operations")
-    text, numbers = write(program)
-    module = module_of(text)
-    functions = Functions(*(getattr(module, name) for name in Functions._fields))
-    made.append((program, numbers, functions))
-    values = numbers.of(program.host.values, np.dtype(float))
-    return Kernel(functions, program.layout, values, program.slot)
+    program, functions, numbers = _kernels.get(
+        key, params, lambda: program_of(filter, params, own, owned, dtype)
+    )
+    return Kernel(functions, program.layout, numbers, program.slot)
 
 
 def shares_apart(filter: Filter) -> bool:

@@ -67,6 +67,7 @@ class DividedRecording:
         self.images = FrameImages(recording, self.dtype)
         none = np.zeros((3, 1), self.dtype)
         self._tables = self.images.tables() if len(self.windows.clock) else none
+        self._response = self.images.response()
 
     @property
     def dtype(self) -> np.dtype:
@@ -103,7 +104,7 @@ class DividedRecording:
         return {
             "clock_offset": np.asarray(clock_offset, self.dtype),
             "present": np.asarray(len(self.windows.clock) > 0, self.dtype),
-            "response": np.asarray(self.images.response(), self.dtype),
+            "response": self._response,
         }
 
     def cut(self, start: int | None, state: StreamState) -> Window:
@@ -176,7 +177,7 @@ class Passes:
         """Pass over the window's events before a time (us since the recording's start)."""
         kernel = self.kernel
         given = Given(
-            window.bands, window.line, window.frames, kernel.source.fields.places(),
+            window.bands, window.line, window.frames, kernel.source.fields.places,
             kernel.functions, kernel.numbers,
         )  # fmt: skip
         if times is None or images is None:

@@ -1,6 +1,7 @@
 """The text of a kernel: a method's expressions as functions that numba compiles."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.kernels.expressions import ELEMENTWISE, Level, Node, Untranslatable, needed, value_of
-from jaxevent.kernels.text import FUNCTIONS, Numbers, Place, Writer
+from jaxevent.kernels.text import Numbers, Place, Writer, import_functions
 from jaxevent.reconstruction.fused.loop import Places
 from jaxevent.reconstruction.fused.pixel import ROWS, PixelProgram, pieces
 
@@ -61,6 +62,7 @@ class Fields:
                 return offset + int(name.removeprefix(kind))
         return None
 
+    @functools.cached_property
     def places(self) -> Places:
         """The same for the loop."""
 
@@ -323,13 +325,10 @@ def write(program: PixelProgram, stride: int) -> Source:
     sums = _Sums(program, writer)
     parts = [_events(program, writer, sums), _images(program, writer, sums)]
     parts += [_tables(program, writer), _excess(program, writer)]
-    single = program.traced.dtype == np.float32
-    module = "jaxevent.kernels.numeric"
-    names = ", ".join(f"{n}{32 if single else 64} as {n}" for n in FUNCTIONS)
     numbers, constants = writer.finish(program.host.values)
     constants += sums.lines(numbers.size)
     head = HEAD.format(
-        imports=f"from {module} import {names}",
+        imports=import_functions(program.traced.dtype),
         real=program.traced.dtype.name,
         stride=stride,
         constants=_text(constants),

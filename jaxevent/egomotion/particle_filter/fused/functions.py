@@ -14,42 +14,22 @@ from jaxevent.egomotion.particle_filter.filtering import Passed, State, Told
 from jaxevent.egomotion.particle_filter.fused.loop import BLOCK, CELLS, Functions
 from jaxevent.egomotion.particle_filter.likelihood import Event
 from jaxevent.egomotion.particle_filter.parameters import Params
-from jaxevent.kernels.expressions import Graph, Level, Node, Untranslatable, needed
+from jaxevent.kernels.expressions import Graph, Level, Node, Untranslatable
 from jaxevent.kernels.host import HostProgram
 from jaxevent.kernels.loops import (
     MARK,
     Function,
+    Kernels,
     Loop,
     LoopWriter,
+    Program,
     leaves_of,
     numbers_of,
     translate,
 )
-from jaxevent.kernels.modules import module_of
-from jaxevent.kernels.text import FUNCTIONS, Numbers, Place
+from jaxevent.kernels.text import Numbers, Place
 
-MOST_NODES = 6000  # of a program: beyond, numba compiles longer than the scan takes
-
-HEAD = '''"""The functions of voting (`jaxevent.egomotion.particle_filter.fused`)."""
-
-import numba
-import numpy as np
-from numba import types
-
-from jaxevent.kernels.blocks import block
-from jaxevent.kernels.kept import callback
-from jaxevent.kernels.numeric import {imports}
-
-REAL = np.{real}
-I, F = types.int64, types.{real}
-P, WHOLE, NUMBERS = types.CPointer(F), types.CPointer(I), types.CPointer(types.float64)
-HOW = {{"error_model": "numpy", "fastmath": {{"contract"}}}}
-LOOP = {{"error_model": "numpy", "fastmath": {{"contract", "reassoc", "nsz"}}}}
-{constants}
-
-
-'''
-FUNCTION = """@callback(types.void(P, P, NUMBERS, I), **HOW)
+FUNCTION = """@callback(types.void(CELLS, CELLS, NUMBERS, I), **HOW)
 def {name}(cells, work, numbers, count):
     zero = 0
 {body}
@@ -57,7 +37,7 @@ def {name}(cells, work, numbers, count):
 
 """
 # Candidates fill their places from the first. `blocks` of `size` motions have ages in common.
-EVENT = """@callback(types.void(P, P, NUMBERS, P, P, WHOLE, I, I, I), **HOW)
+EVENT = """@callback(types.void(CELLS, CELLS, NUMBERS, CELLS, CELLS, WHOLE, I, I, I), **HOW)
 def {name}(cells, work, numbers, d, ages, chosen, count, first, most):
     zero, begin, end = 0, 0, count
 {ask}
@@ -118,16 +98,6 @@ class Layout:
         """The rows of an array of all particles."""
         found = {n: row for n, row in self.rows.items() if n.rpartition(".")[0] == name}
         return np.array([found[f"{name}.{k}"] for k in range(len(found))], np.int64)
-
-
-@dataclasses.dataclass(frozen=True)
-class Program:
-    """The functions of a model's voting, and what their numbers are."""
-
-    functions: dict[str, Function]
-    host: HostProgram
-    layout: Layout
-    dtype: np.dtype
 
 
 def _with_f(model: Model, f: Any) -> Model:
@@ -313,13 +283,8 @@ def write(program: Program) -> tuple[str, Numbers]:
                 **{key: at[key] for key in ("seen", "youngest", "oldest", "dt")},
             )
         )
-    numbers, constants = writer.finish(program.host.values)
-    size = 32 if program.dtype == np.float32 else 64
-    imports = ", ".join(f"{n}{size} as {n}" for n in FUNCTIONS)
-    head = HEAD.format(
-        imports=imports, real=program.dtype.name, constants="\n".join(constants)
-    )  # fmt: skip
-    return head + "".join([*writer.loops, *out]), numbers
+    about = "The functions of voting (`jaxevent.egomotion.particle_filter.fused`)."
+    return writer.module(about, program, out)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -331,28 +296,16 @@ class Kernel:
     numbers: NDArray[np.float64]
 
 
-# What has been made of a model: programs, each for a way that conditions on parameters chose.
-_made: dict[Any, list[tuple[Program, Numbers, Functions]]] = {}
+_kernels = Kernels(Functions, write, most=6000)
 
 
 def kernel_of(params: Params, model: Model, dtype: np.dtype) -> Kernel:
     """The kernel of a model with its parameters; raises `Untranslatable`."""
-    leaves, tree = jax.tree.flatten(params)
+    tree = jax.tree.structure(params)
     own, kind = jax.tree.flatten(_with_f(model, 1.0))
     if own:
         raise Untranslatable("numbers that the model holds")
-    made = _made.setdefault((kind, tree, dtype), [])
-    given = [np.asarray(leaf) for leaf in leaves]
-    for program, numbers, functions in made:
-        values = program.host.again(given)
-        if values is not None:
-            return Kernel(functions, program.layout, numbers.of(values, np.dtype(float)))
-    program = program_of(params, model, dtype)
-    nodes = needed([n for f in program.functions.values() for n in f.results.values()])
-    if len(nodes) > MOST_NODES:
-        raise Untranslatable(f"more than {MOST_NODES} operations")
-    text, numbers = write(program)
-    module = module_of(text)
-    functions = Functions(*(getattr(module, name) for name in Functions._fields))
-    made.append((program, numbers, functions))
-    return Kernel(functions, program.layout, numbers.of(program.host.values, np.dtype(float)))
+    program, functions, numbers = _kernels.get(
+        (kind, tree, dtype), params, lambda: program_of(params, model, dtype)
+    )
+    return Kernel(functions, program.layout, numbers)
