@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from jaxevent.egomotion.batch_fit import images
 from jaxevent.egomotion.batch_fit.gauss_newton import DEEPEST, bonds, limit_step
-from jaxevent.egomotion.batch_fit.loops import POWERS, assign, slopes_by_coefficients
+from jaxevent.egomotion.batch_fit.loops import POWERS, Cells, Points, assign, slopes_by_coefficients
 from jaxevent.egomotion.batch_fit.path import SEGMENTS, Path, Prior, normalised, warp
 from jaxevent.egomotion.batch_fit.rows import (
     chain,
@@ -93,10 +93,9 @@ def warped(path: Path, window: Window) -> tuple[NDArray[np.int32], NDArray, NDAr
     number = np.empty(len(window.x), np.int32)
     X, Y = np.empty_like(window.x), np.empty_like(window.x)
     rho = np.exp(path.log_rho.astype(np.float64))
-    assign(
-        window.x, window.y, window.tau, *path.polynomials(), window.f, rho, window.corner,
-        window.cell, *window.cells, number, X, Y,
-    )  # fmt: skip
+    points = Points(window.x, window.y, window.tau)
+    cells = Cells(window.corner, window.cell, *window.cells)
+    assign(points, path.motion(window.f), rho, cells, number, X, Y)
     return number, X, Y
 
 
@@ -178,10 +177,8 @@ def linearise(
     rho = np.broadcast_to(np.exp(path.log_rho), tau.shape)
     unit = units_of_rows(path, f, half, K)
     by, r = np.empty((n, 6, 2)), np.empty((n, 2))
-    slopes_by_coefficients(
-        *(np.ascontiguousarray(part, np.float64).ravel() for part in (x, y, tau, rho)),
-        *path.polynomials(), f, by, r,
-    )  # fmt: skip
+    parts = [np.ascontiguousarray(part, np.float64).ravel() for part in (x, y, tau, rho)]
+    slopes_by_coefficients(Points(*parts[:3]), parts[3], path.motion(f), by, r)
     powers = (tau.ravel() / half)[:, None] ** np.arange(1, POWERS + 1)
     J = (by[:, :, None] * powers[:, None, :, None]).reshape(n, 6 * POWERS, 2)
     J = J.transpose(0, 2, 1) @ chain(path, unit, half, K)

@@ -20,7 +20,7 @@ def _tried_depths(path: Path, tracks: Tracks, depths: NDArray) -> tuple[NDArray,
     S, N = np.empty((len(depths), *tracks.nodes)), np.empty((len(depths), *tracks.nodes))
     both, work = np.empty((2, *tracks.shape), real), np.empty(tracks.shape, real)
     images.depth_maps(
-        *(part.astype(real) for part in (rx, ry, X - rx, Y - ry)), tracks.p, depths.astype(real),
+        np.stack([rx, ry, X - rx, Y - ry]).astype(real), tracks.p, depths.astype(real),
         tracks.corner, tracks.node, SPOT, both, work, S, N,
     )  # fmt: skip
     return S, N

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from jaxevent.egomotion.batch_fit.gauss_newton import bonds
 from jaxevent.egomotion.batch_fit.loops import (
     POWERS,
+    Free,
     Slopes,
     System,
     back,
@@ -251,9 +252,9 @@ def slopes_of(problem: Problem, seen: Seen, free: bool) -> Slopes:
     )  # fmt: skip
     usual = float(np.exp(np.median(depth)))
     differentiate(
-        tracks.x, tracks.y, tracks.tau, there.inside, tracks.number, there.X, there.Y,
-        *path.polynomials(), tracks.f, tracks.half, depth, seen.scene.map.ravel(), usual, plane,
-        free, float(problem.prior.moves), tracks.grids, slopes,
+        tracks.points, tracks.number, there, path.motion(tracks.f), tracks.half, depth,
+        seen.scene.map.ravel(), Free(free, plane, float(problem.prior.moves), usual),
+        tracks.grids, slopes,
     )  # fmt: skip
     return slopes
 

@@ -246,11 +246,13 @@ def flow_maps(x, y, tau, p, flows, corner, images, work, S, N):
 
 
 @fast
-def depth_maps(rx, ry, dx, dy, p, depths, corner, node, spot, images, work, S, N):
+def depth_maps(rays, p, depths, corner, node, spot, images, work, S, N):
     """Write contrast and number of events about nodes (depths, rows, columns), by inverse depths.
 
-    A node's are those of the square of `spot` px about it.
+    `rays` are r and d (4, events): at inverse depth rho an event lies at r + rho d. A node's are
+    those of the square of `spot` px about it.
     """
+    rx, ry, dx, dy = rays
     height, width = images.shape[1:]
     rows, columns = S.shape[1:]
     before = spot // 2

@@ -30,6 +30,40 @@ class Grids(NamedTuple):
     columns: int
 
 
+class Points(NamedTuple):
+    """Events or other points: where they were seen (px, 0 at the principal point), and when."""
+
+    x: NDArray
+    y: NDArray
+    tau: NDArray  # s
+
+
+class Motion(NamedTuple):
+    """A path's polynomials: factors (POWERS, 3) of tau, tau^2, ... of phi and C."""
+
+    phi: NDArray[np.float64]
+    C: NDArray[np.float64]
+    f: float  # px
+
+
+class Cells(NamedTuple):
+    """Square cells of the reference view, row by row."""
+
+    corner: tuple[float, float]  # px, where the first pixel of the first lies
+    size: int  # px
+    rows: int
+    columns: int
+
+
+class Free(NamedTuple):
+    """What may move beside the map."""
+
+    path: bool
+    plane: bool  # depths are a plane's
+    depths: float  # 1, or 0: translation and depths are held
+    usual: float  # 1/m in units of 1/|T|, the usual inverse depth
+
+
 class Slopes(NamedTuple):
     """How misfits change, before their means are taken, event by event (E,).
 
@@ -71,8 +105,9 @@ def _turned(a, b, c, x, y, z):
 
 
 @fast_part
-def _ray(phi, C, f, x, y, tau):
+def _ray(motion, x, y, tau):
     """The ray of an event in the reference view, r + rho d: r and d."""
+    phi, C, f = motion
     a, b, c = _along(phi, tau, 0), _along(phi, tau, 1), _along(phi, tau, 2)
     rx, ry, rz = _turned(a, b, c, x, y, f)
     z = max(rz / f, 0.05)
@@ -82,29 +117,32 @@ def _ray(phi, C, f, x, y, tau):
 
 
 @fast
-def warp(x, y, tau, rho, phi, C, f, X, Y):
+def warp(points, rho, motion, X, Y):
     """Write where points of inverse depths rho are in the reference view."""
+    x, y, tau = points
     for e in range(len(x)):
-        rx, ry, dx, dy = _ray(phi, C, f, x[e], y[e], tau[e])
+        rx, ry, dx, dy = _ray(motion, x[e], y[e], tau[e])
         X[e], Y[e] = rx + rho[e] * dx, ry + rho[e] * dy
 
 
 @fast_part
-def _cell(x, y, corner, cell, rows, columns):
-    """The cell that a place is in, or the nearest one; `corner` is that of its first pixel."""
-    i = min(max(int(np.floor((x - corner[0] + 0.5) / cell)), 0), columns - 1)
-    j = min(max(int(np.floor((y - corner[1] + 0.5) / cell)), 0), rows - 1)
-    return j * columns + i
+def _cell(x, y, cells):
+    """The cell that a place is in, or the nearest one."""
+    left, top = cells.corner
+    i = min(max(int(np.floor((x - left + 0.5) / cells.size)), 0), cells.columns - 1)
+    j = min(max(int(np.floor((y - top + 0.5) / cells.size)), 0), cells.rows - 1)
+    return j * cells.columns + i
 
 
 @fast
-def assign(x, y, tau, phi, C, f, rho, corner, cell, rows, columns, number, X, Y):
+def assign(points, motion, rho, cells, number, X, Y):
     """Write the cell of every event, by where it is warped to with its cell's depth, and that."""
+    x, y, tau = points
     for e in range(len(x)):
-        rx, ry, dx, dy = _ray(phi, C, f, x[e], y[e], tau[e])
-        k = _cell(x[e], y[e], corner, cell, rows, columns)
+        rx, ry, dx, dy = _ray(motion, x[e], y[e], tau[e])
+        k = _cell(x[e], y[e], cells)
         for _ in range(2):
-            k = _cell(rx + rho[k] * dx, ry + rho[k] * dy, corner, cell, rows, columns)
+            k = _cell(rx + rho[k] * dx, ry + rho[k] * dy, cells)
         number[e], X[e], Y[e] = k, rx + rho[k] * dx, ry + rho[k] * dy
 
 
@@ -136,15 +174,16 @@ def _newton(depth, rx, ry, dx, dy, log_rho, grids):
 
 
 @fast
-def place(x, y, tau, phi, C, f, depth, high, low, grids, X, Y):
+def place(points, motion, depth, high, low, grids, X, Y):
     """Write where events are in the reference view: on the nearest surface their rays meet.
 
     On the ray of an event x = r + rho d, which the depths of the scene, rho'(x), meet where
     log rho = log rho'(r + rho d): once if they are smooth, more often beside an edge, where the
     surface of the largest rho hides the others. `high` and `low` bound depths about nodes.
     """
+    x, y, tau = points
     for e in range(len(x)):
-        rx, ry, dx, dy = _ray(phi, C, f, x[e], y[e], tau[e])
+        rx, ry, dx, dy = _ray(motion, x[e], y[e], tau[e])
         k = _corner(x[e], y[e], grids)[0]
         top, bottom = high[k] + 0.02, low[k] - 0.02
         # From near to far, the first of some depths that is not nearer than the scene's.
@@ -271,12 +310,13 @@ def weigh(e, on, first, begin, limit, usual, plane, grids, weight):
 
 
 @fast_part
-def _by_coefficients(phi, C, f, t, rx, ry, rho, hx, hy):
+def _by_coefficients(motion, t, rx, ry, rho, hx, hy):
     """Slopes by phi and C of hx X + hy Y, where (X, Y) is the end of an event's ray.
 
     Of a rotation dR x = J dphi x R x, J the left Jacobian of phi; J' w = w - one phi x w + two
     phi x (phi x w).
     """
+    phi, C, f = motion
     gone = 1 - rho * _along(C, t, 2)
     wx = gone * (-rx * ry / f * hx - (f + ry * ry / f) * hy)
     wy = gone * ((f + rx * rx / f) * hx + rx * ry / f * hy)
@@ -296,32 +336,30 @@ def _by_coefficients(phi, C, f, t, rx, ry, rho, hx, hy):
 
 
 @fast
-def slopes_by_coefficients(x, y, tau, rho, phi, C, f, by, by_depth):
+def slopes_by_coefficients(points, rho, motion, by, by_depth):
     """Write how points (n,) move, by phi and C (n, 6, 2), and by log inverse depth (n, 2)."""
+    x, y, tau = points
     for e in range(len(x)):
-        rx, ry, dx, dy = _ray(phi, C, f, x[e], y[e], tau[e])
+        rx, ry, dx, dy = _ray(motion, x[e], y[e], tau[e])
         by_depth[e, 0], by_depth[e, 1] = rho[e] * dx, rho[e] * dy
         for axis in range(2):
             h = 1.0 - axis
-            six = _by_coefficients(phi, C, f, tau[e], rx, ry, rho[e], h, 1.0 - h)
+            six = _by_coefficients(motion, tau[e], rx, ry, rho[e], h, 1.0 - h)
             for n in range(6):
                 by[e, n, axis] = six[n]
 
 
 @fast
-def differentiate(
-    x, y, tau, on, number, X, Y, phi, C, f, half, depth, image, usual, plane, free, moves,
-    grids, slopes,
-):  # fmt: skip
+def differentiate(points, number, places, motion, half, depth, image, free, grids, slopes):
     """Write the slopes of misfits, of events where they lie on the nearest surface.
 
     x = r + rho(x) d, so (1 - d grad rho') dx is what dx were with rho held, d = rho (f C - C_z r).
-    All but the map is held unless `free`; depths are if they are
-    a `plane`'s, and without `moves`.
     """
+    x, y, tau = points
+    X, Y, f = places.X, places.Y, motion.f
     for e in range(len(x)):
         t = tau[e]
-        rx, ry, dx, dy = _ray(phi, C, f, x[e], y[e], t)
+        rx, ry, dx, dy = _ray(motion, x[e], y[e], t)
         log_rho, lx, ly = _between(depth, X[e], Y[e], grids)
         rho = np.exp(log_rho)
         k, slopes.across[e], slopes.down[e] = _corner(X[e], Y[e], grids)
@@ -336,18 +374,18 @@ def differentiate(
         dx, dy = rho * dx, rho * dy
         slope = (gx * dx + gy * dy) / max(1 - lx * dx - ly * dy, FOLD)
         hx, hy = gx + slope * lx, gy + slope * ly
-        here = on[e] if free else 0.0
-        by = _by_coefficients(phi, C, f, t, rx, ry, rho, here * hx, here * hy)
+        here = places.inside[e] if free.path else 0.0
+        by = _by_coefficients(motion, t, rx, ry, rho, here * hx, here * hy)
         for n in range(6):
             slopes.base[n, e] = by[n]
         by_depth = here * (hx * dx + hy * dy)
         slopes.more[0, e] = -here * number[e]
-        if plane:
-            share = by_depth * usual / rho
+        if free.plane:
+            share = by_depth * free.usual / rho
             slopes.more[1, e] = share * X[e] / f
             slopes.more[2, e] = share * Y[e] / f
             slopes.more[3, e] = share
-        slopes.by_depth[e] = 0.0 if plane else moves * by_depth
+        slopes.by_depth[e] = 0.0 if free.plane else free.depths * by_depth
         slopes.tau[e] = t / half
 
 

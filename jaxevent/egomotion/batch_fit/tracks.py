@@ -7,7 +7,7 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from jaxevent.egomotion.batch_fit.loops import Grids, place, read_map, subtract_mean
+from jaxevent.egomotion.batch_fit.loops import Grids, Points, place, read_map, subtract_mean
 from jaxevent.egomotion.batch_fit.path import Path
 
 SIDE = 4  # nodes about an event among whose depths its own is
@@ -34,6 +34,10 @@ class Tracks:
     shape: tuple[int, int]  # of the map
     corner: tuple[float, float]  # px, where its pixel [0, 0] lies
     node: int  # px between nodes of depth
+
+    @property
+    def points(self) -> Points:
+        return Points(self.x, self.y, self.tau)
 
     @property
     def nodes(self) -> tuple[int, int]:
@@ -85,10 +89,7 @@ def placed(path: Path, tracks: Tracks) -> tuple[NDArray, NDArray]:
     of, size = depth.reshape(tracks.nodes), 2 * SIDE + 1
     high = scipy.ndimage.maximum_filter(of, size, mode="nearest").ravel()
     low = scipy.ndimage.minimum_filter(of, size, mode="nearest").ravel()
-    place(
-        tracks.x, tracks.y, tracks.tau, *path.polynomials(), tracks.f, depth, high, low,
-        tracks.grids, X, Y,
-    )  # fmt: skip
+    place(tracks.points, path.motion(tracks.f), depth, high, low, tracks.grids, X, Y)
     return X, Y
 
 
