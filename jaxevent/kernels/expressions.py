@@ -6,6 +6,7 @@ and what does not reach a result is never written. Constants are folded as they 
 
 import dataclasses
 import enum
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -34,6 +35,8 @@ ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "tanh": np.tanh,
     "sin": np.sin,
     "cos": np.cos,
+    "erf": np.vectorize(math.erf, otypes=[float]),
+    "erfc": np.vectorize(math.erfc, otypes=[float]),
     "floor": np.floor,
     "ceil": np.ceil,
     "round": np.rint,

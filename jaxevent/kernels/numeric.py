@@ -5,6 +5,7 @@ errors are below 2e-7 of the result.
 """
 
 import inspect
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -177,3 +178,23 @@ def log1p64(x):
 @part
 def logistic64(x):
     return 1 / (1 + np.exp(-x))
+
+
+@part
+def erf32(x):
+    return F(math.erf(x))
+
+
+@part
+def erfc32(x):
+    return F(math.erfc(x))
+
+
+@part
+def erf64(x):
+    return math.erf(x)
+
+
+@part
+def erfc64(x):
+    return math.erfc(x)

@@ -32,7 +32,16 @@ FORMS = {
     "round": "np.rint({0})",
     "atan2": "np.arctan2({0}, {1})",
 }
-FUNCTIONS = ("exp", "log", "log1p", "logistic", "sin", "cos")  # of `numeric`, or the header
+FUNCTIONS = (
+    "exp",
+    "log",
+    "log1p",
+    "logistic",
+    "sin",
+    "cos",
+    "erf",
+    "erfc",
+)  # of `numeric`, or the header
 LIBRARY = ("expm1", "sqrt", "tanh", "floor", "ceil", "abs")
 LEAST = 3  # operations that are worth a block
 Place = tuple[str, str, int]  # pointer, index and offset: pointer[index + offset]

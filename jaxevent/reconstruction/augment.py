@@ -168,6 +168,16 @@ def clock_lag(params: FrameParams, frames: FrameFeatures) -> Float[Array, ""]:
     return params.clock_offset - frames.clock_offset
 
 
+def segment_excess(params: FrameParams, share: Array, on: Array, off: Array) -> Array:
+    """What a segment of an exposure adds to m - 1, see `deblur_frames`."""
+    return share * jnp.expm1(brightness(params, on, off))
+
+
+def deblurred(params: FrameParams, level: Array, total: Array) -> Array:
+    """Log intensity at mid-exposure from the mean's, with the `total` of `segment_excess`."""
+    return level - jnp.log1p(total) * params.deblur
+
+
 def deblur_frames(
     params: FrameParams,
     frames: FrameFeatures,
@@ -183,10 +193,9 @@ def deblur_frames(
     if frames.segments is None or frames.head is None or frames.tail is None:
         return level, level
     s = frames.segments
-    share = s.share + clock_lag(params, frames) * s.edge
-    excess = share * jnp.expm1(brightness(params, s.on, s.off))
+    excess = segment_excess(params, s.share + clock_lag(params, frames) * s.edge, s.on, s.off)
     total = jax.ops.segment_sum(excess, s.frame_cell, level.size).reshape(level.shape)
-    level = level - jnp.log1p(total) * params.deblur
+    level = deblurred(params, level, total)
     return (
         level - brightness(params, frames.head[0], frames.head[1]),
         level + brightness(params, frames.tail[0], frames.tail[1]),

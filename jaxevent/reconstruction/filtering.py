@@ -8,7 +8,7 @@ the step over their lanes, `read` evaluates images.
 import abc
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -19,7 +19,6 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxevent import dispatch
-from jaxevent.errors import InputError
 from jaxevent.estimator import Described, Estimate
 from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.reconstruction.augment import FrameParams
@@ -33,7 +32,7 @@ from jaxevent.reconstruction.features import (
     Tiles,
 )
 from jaxevent.reconstruction.fused.images import FusedImages
-from jaxevent.reconstruction.fused.video import FusedVideo
+from jaxevent.reconstruction.fused.video import FusedVideo, wants_kernel, without_kernel
 from jaxevent.reconstruction.layout import SHAPES, SLOTS
 from jaxevent.reconstruction.prepared import PreparedImages
 from jaxevent.reconstruction.video import ImageSequence, Video
@@ -160,14 +159,14 @@ class Filter(PixelEstimator[P]):
         numba is asked for what it cannot do.
         """
         params = self.Params() if params is None else params
-        if not _wants_kernel(compiler, options.get("devices", ())):
+        if not wants_kernel(compiler, options.get("devices", ())):
             return Video(self, recording, params, **options)
         mine = {name: value for name, value in options.items() if name != "devices"}
         try:
             return FusedVideo(self, recording, params, **mine)
         except Untranslatable as reason:
             if compiler == "numba":
-                raise self._without_kernel(reason) from reason
+                raise without_kernel(self.name, reason) from reason
             return Video(self, recording, params, **options)
 
     def prepare_images(
@@ -188,7 +187,7 @@ class Filter(PixelEstimator[P]):
         `compiler` is as in `estimate`.
         """
         params = self.Params() if params is None else params
-        kernel = _wants_kernel(compiler, jax.local_devices()) and IN_TURN
+        kernel = wants_kernel(compiler, jax.local_devices()) and IN_TURN
         if kernel and "rho_ref" not in params.followed:
             self.check(recording)
             times = sorted_times(times)
@@ -198,13 +197,8 @@ class Filter(PixelEstimator[P]):
                 return FusedImages.of(self, recording, times, params)
             except Untranslatable as reason:
                 if compiler == "numba":
-                    raise self._without_kernel(reason) from reason
+                    raise without_kernel(self.name, reason) from reason
         return super().prepare_images(recording, times, params, extrapolate=extrapolate)
-
-    def _without_kernel(self, reason: Untranslatable) -> InputError:
-        return InputError(
-            f"numba has no kernel for the method {self.name!r} ({reason}); leave out the compiler"
-        )
 
     def step(self, params: P, state: Any, event: Event) -> Any:
         """The state of a pixel after an event: advance to it, then jump."""
@@ -279,14 +273,6 @@ class Filter(PixelEstimator[P]):
         over_images = jax.vmap(jax.vmap(one), (0 if trajectory.path is not None else None, 0, 0))
         image, P = over_images(before, since, frame)
         return Estimate(image, P, jnp.isfinite(image))
-
-
-def _wants_kernel(compiler: str | None, devices: Sequence[Any]) -> bool:
-    """Whether numba is asked for, or is what serves on these devices; raises `InputError`."""
-    if compiler not in (None, "numba", "xla"):
-        raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
-    on_host = jnp.result_type(float) == np.float32 and jax.default_backend() == "cpu"
-    return compiler == "numba" or (compiler is None and on_host and len(devices) < 2)
 
 
 def _over_tiles(step: Callable, lanes: Any, place: Place, slots: Any) -> Any:

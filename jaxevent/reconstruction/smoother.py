@@ -18,16 +18,21 @@ reference: all parameters can be fitted with it.
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float
+from numpy.typing import NDArray
 
 from jaxevent.estimator import Described, Estimate
+from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.parameters import Choice, Positive
 from jaxevent.reconstruction.augment import (
     CertaintyParams,
@@ -37,6 +42,8 @@ from jaxevent.reconstruction.augment import (
     clipping_bound,
     clock_lag,
     deblur_frames,
+    deblurred,
+    segment_excess,
     unclipped,
 )
 from jaxevent.reconstruction.estimator import PixelEstimator
@@ -47,6 +54,10 @@ from jaxevent.reconstruction.features import (
     Numeric,
     ReadOut,
 )
+from jaxevent.reconstruction.fused.smoothed import SmoothedVideo
+from jaxevent.reconstruction.fused.video import wants_kernel, without_kernel
+from jaxevent.reconstruction.video import ImageSequence, Video
+from jaxevent.recording import Recording
 
 
 class Params(CertaintyParams):
@@ -134,15 +145,21 @@ class Link(eqx.Module):
         )
 
 
+class Measured(eqx.Module):
+    """What frames measure."""
+
+    z: Float[Array, "*frames pixels"]  # deblurred log intensity
+    r: Float[Array, "*frames pixels"]  # its variance
+    clear: Float[Array, "*frames pixels"]  # 1: a measurement; 0: none
+    slope: Float[Array, "*frames pixels"]  # d z / d I = 1 / (I + I0)
+    side: Float[Array, "*frames pixels"]  # +1, -1: L lies above, below `bound`; 0: nothing known
+    bound: Float[Array, "*frames pixels"]
+
+
 class Rows(eqx.Module):
     """The frames of a window as measurements, and the steps from each to the next."""
 
-    z: Float[Array, "frames pixels"]  # deblurred log intensity
-    r: Float[Array, "frames pixels"]  # its variance
-    clear: Float[Array, "frames pixels"]  # 1: a measurement; 0: none
-    slope: Float[Array, "frames pixels"]  # d z / d I = 1 / (I + I0)
-    side: Float[Array, "frames pixels"]  # +1, -1: L lies above, below `bound`; 0: nothing known
-    bound: Float[Array, "frames pixels"]
+    measured: Measured
     S: Float[Array, "frames pixels"]  # sum of s c until the next frame
     q: Float[Array, "frames pixels"]  # variance that is added until then
 
@@ -166,17 +183,37 @@ class Passage(Described):
     first: Message  # (pixels,), at the first frame, of everything
     events: Float[Array, "2 frames pixels"]  # ON, OFF, from the frame to the next
     frames: FrameFeatures
+    kept: Any  # [frames, pixels], what else images need to know of frames
     link: Link  # from the last frame of this window to the last one of the window before
     last: Message  # (pixels,), of the last frame and all later ones
     log_likelihood: Float[Array, " frames"]  # of the frames, a sum over pixels
+
+
+def measure_frames(params: Params, frames: FrameFeatures, z: Array, exists: Array) -> Measured:
+    """Frames as measurements; `z` is the deblurred log intensity."""
+    noise = params.sigma_frame / certainty(params, frames) / (frames.intensity + params.I0)
+    clear = unclipped(params, frames)
+    side = clipped_side(params, frames) * params.one_sided
+    return Measured(
+        z,
+        noise**2 + params.sigma_floor**2,
+        clear * exists,
+        1 / (frames.intensity + params.I0),
+        side * exists,
+        jnp.broadcast_to(clipping_bound(params, frames), z.shape),
+    )
+
+
+def step_between(params: Params, on: Array, off: Array, seconds: Array) -> tuple[Array, Array]:
+    """The sum of s c over events, and the variance that they and time add."""
+    return brightness(params, on, off), added_variance(params, on, off, seconds)
 
 
 def make_rows(
     params: Params, frames: FrameFeatures
 ) -> tuple[Rows, Float[Array, "2 frames pixels"]]:
     """Measurements and steps; and the counts of ON and OFF events between mid-exposures."""
-    level = jnp.log(frames.intensity + params.I0)
-    z, counts = level, frames.span
+    z, counts = jnp.log(frames.intensity + params.I0), frames.span
     if frames.head is not None and frames.tail is not None:
         left, _ = deblur_frames(params, frames)
         z = left + brightness(params, frames.head[0], frames.head[1])
@@ -187,21 +224,9 @@ def make_rows(
     counts = jnp.where(follows, counts, 0)
     moves = share_events(params, frames, counts)
     gap = jnp.where(follows, 1 / jnp.where(follows, rate[:, None], 1), 0)
-    q = added_variance(params, moves[0], moves[1], gap)
-    noise = params.sigma_frame / certainty(params, frames) / (frames.intensity + params.I0)
-    clear = unclipped(params, frames)
-    side = clipped_side(params, frames) * params.one_sided
-    measured = Rows(
-        z,
-        noise**2 + params.sigma_floor**2,
-        clear * exists,
-        1 / (frames.intensity + params.I0),
-        side * exists,
-        jnp.broadcast_to(clipping_bound(params, frames), z.shape),
-        brightness(params, moves[0], moves[1]),
-        jnp.broadcast_to(q, z.shape),
-    )
-    return measured, counts
+    S, q = step_between(params, moves[0], moves[1], gap)
+    measured = measure_frames(params, frames, z, exists)
+    return Rows(measured, S, jnp.broadcast_to(q, z.shape)), counts
 
 
 def share_events(params: Params, frames: FrameFeatures, counts: Array) -> Array:
@@ -224,8 +249,15 @@ def share_events(params: Params, frames: FrameFeatures, counts: Array) -> Array:
         return three(three(values, values.ndim - 1), values.ndim - 2) - values
 
     given = around(jnp.ones(image.shape[-2:], image.dtype)) / 8
-    mixed = image + params.share * (around(image) / 8 - given * image)
-    return mixed.reshape(counts.shape)
+    return shared(params, image, around(image), given).reshape(counts.shape)
+
+
+def shared(params: Params, own: Array, around: Array, given: Array) -> Array:
+    """Events of a pixel of which the part `given` of the neighbours get their share.
+
+    `around` are those of its neighbours.
+    """
+    return own + params.share * (around / 8 - given * own)
 
 
 def added_variance(params: Params, on: Array, off: Array, seconds: Array) -> Array:
@@ -258,7 +290,7 @@ def one_sided_message(state: Gaussian, row: Sided, floor: Array) -> tuple[Messag
     return Message(weight * (m / P - state.m / state.P), weight * J), weight * log_Phi
 
 
-def measure(params: Params, state: Gaussian, row: Rows) -> tuple[Gaussian, Message, Array]:
+def measure(params: Params, state: Gaussian, row: Measured) -> tuple[Gaussian, Message, Array]:
     """The state after a frame, what the frame says, and the log likelihood of that."""
     # A half clear pixel counts half: its variance is doubled.
     J = row.clear / row.r
@@ -274,6 +306,43 @@ def measure(params: Params, state: Gaussian, row: Rows) -> tuple[Gaussian, Messa
     return Gaussian(m, P), said, row.clear * log_gauss + log_side
 
 
+def initial(params: Params) -> Gaussian:
+    """The state before the first frame."""
+    mean = jnp.log(params.start + params.I0)
+    return Gaussian(mean, jnp.broadcast_to(params.P_start, mean.shape))
+
+
+def information(state: Gaussian) -> Message:
+    """A state as a message."""
+    return Message(state.m / state.P, 1 / state.P)
+
+
+def one_pixel(gain: Array, fixed: dict[str, Any], **image: Array) -> FrameFeatures:
+    """One frame of one pixel: grey value, intensity and certainty."""
+    none = jnp.zeros((2, 1, 1), gain.dtype)
+    return FrameFeatures(
+        **image,
+        **fixed,
+        gain=gain[0],
+        span=none,
+        before=none[:, 0],
+        head=None,
+        tail=None,
+        segments=None,
+        weight_rate=none[:, 0, 0],
+        blend_rate=none[0, 0],
+        present=jnp.ones(()),
+        rows=jnp.zeros(3, int),
+        width=1,
+    )
+
+
+def join(m: Array, precision: Array, later: Message) -> Gaussian:
+    """What is known from before, with its precision 1 / P, and from later."""
+    P = 1 / (precision + later.J)
+    return Gaussian(m + P * (later.h - later.J * m), P)
+
+
 def filter_forward(params: Params, rows: Rows, state: Gaussian) -> tuple[Any, ...]:
     """Kalman filter over frames, arrays [frames, pixels].
 
@@ -281,7 +350,7 @@ def filter_forward(params: Params, rows: Rows, state: Gaussian) -> tuple[Any, ..
     """
 
     def step(at: Gaussian, row: Rows) -> tuple[Gaussian, Any]:
-        after, said, log_likelihood = measure(params, at, row)
+        after, said, log_likelihood = measure(params, at, row.measured)
         return Gaussian(after.m + row.S, after.P + row.q), (at, after, said, log_likelihood)
 
     return lax.scan(step, state, rows)[1]
@@ -300,8 +369,8 @@ def filter_backward(
         here = later.earlier(S, q) + own
         return jax.tree.map(lambda a, b: jnp.where(i == number - 1, a, b), last, here), later
 
-    zero = jnp.zeros_like(rows.z[0])
-    steps = (jnp.arange(len(rows.z)), said, rows.S, rows.q)
+    zero = jnp.zeros_like(rows.S[0])
+    steps = (jnp.arange(len(rows.S)), said, rows.S, rows.q)
     return lax.scan(step, Message(zero, zero), steps, reverse=True)
 
 
@@ -314,8 +383,8 @@ def compose_links(rows: Rows, said: Message, anchor: Any, number: Any) -> Link:
         inside = (i >= anchor) & (i < number - 1)
         return jax.tree.map(lambda a, b: jnp.where(inside, a, b), longer, link), None
 
-    zero, one = jnp.zeros_like(rows.z[0]), jnp.ones_like(rows.z[0])
-    steps = (jnp.arange(len(rows.z)), said, rows.S, rows.q)
+    zero, one = jnp.zeros_like(rows.S[0]), jnp.ones_like(rows.S[0])
+    steps = (jnp.arange(len(rows.S)), said, rows.S, rows.q)
     return lax.scan(step, Link(one, zero, zero, zero, zero), steps)[0]
 
 
@@ -358,6 +427,9 @@ class Smoother(PixelEstimator[Params]):
     """The estimator of this module."""
 
     has_likelihood: ClassVar[bool] = True
+    options: frozenset[str] = dataclasses.field(
+        default=frozenset({"window_events", "devices", "compiler"}), kw_only=True
+    )
 
     @property
     def filters(self) -> bool:
@@ -367,10 +439,21 @@ class Smoother(PixelEstimator[Params]):
     def looks_ahead(self) -> bool:
         return True
 
+    def keep(self, params: Params, frames: FrameFeatures, measured: Measured, events: Any) -> Any:
+        """What images need to know of frames beside the messages: arrays [frames, pixels].
+
+        `events` [frames, pixels] lie within exposures; None where no exposure is known.
+        """
+        return ()
+
+    def tell(self, params: Params, state: Gaussian, kept: Any, here: Array) -> Estimate:
+        """Images of smoothed states; `here`: at the middle of the exposure of the frame before."""
+        image = jnp.exp(state.m) - params.I0
+        return Estimate(image, state.P, jnp.isfinite(image))
+
     def start(self, params: Params, features: Features) -> Gaussian:
         pixels = features.last.shape
-        mean = jnp.log(params.start + params.I0)
-        return Gaussian(jnp.broadcast_to(mean, pixels), jnp.broadcast_to(params.P_start, pixels))
+        return jax.tree.map(lambda v: jnp.broadcast_to(v, pixels), initial(params))
 
     def run(
         self,
@@ -388,8 +471,12 @@ class Smoother(PixelEstimator[Params]):
         last = jax.tree.map(lambda v: v[number - 1], said) if future is None else future
         first, later = filter_backward(rows, said, last, number)
         link = compose_links(rows, said, anchor, number)
-        first = first + Message(state.m / state.P, 1 / state.P)
-        passage = Passage(past, later, first, counts, frames, link, last, likelihood.sum(1))
+        first = first + information(state)
+        events = None
+        if frames.head is not None and frames.tail is not None:
+            events = (jnp.asarray(frames.head) + frames.tail).sum(0)
+        kept = self.keep(params, frames, rows.measured, events)
+        passage = Passage(past, later, first, counts, frames, kept, link, last, likelihood.sum(1))
         return passage, jax.tree.map(lambda v: v.at[onward].get(mode="clip"), ahead)
 
     def read(self, params: Params, trajectory: Passage, out: ReadOut) -> Estimate:
@@ -399,18 +486,116 @@ class Smoother(PixelEstimator[Params]):
 
         later = jax.tree.map(lambda v: v[f], trajectory.future)
         later = jax.tree.map(lambda a, b: jnp.where(behind, a, b), trajectory.first, later)
-        S, q = (
-            brightness(params, until[0], until[1]),
-            added_variance(params, until[0], until[1], seconds),
-        )
-        later = later.earlier(S, q)
+        later = later.earlier(*step_between(params, until[0], until[1], seconds))
+        S, q = step_between(params, since[0], since[1], elapsed)
         # Before the first frame there is no past: its variance is without bound.
-        m = jnp.where(behind, 0, trajectory.past.m[f] + brightness(params, since[0], since[1]))
-        P = trajectory.past.P[f] + added_variance(params, since[0], since[1], elapsed)
-        P = 1 / (jnp.where(behind, 0, 1 / jnp.where(behind, 1, P)) + later.J)
-        m = m + P * (later.h - later.J * m)
-        image = jnp.exp(m) - params.I0
-        return Estimate(image, P, jnp.isfinite(image))
+        m = jnp.where(behind, 0, trajectory.past.m[f] + S)
+        precision = jnp.where(behind, 0, 1 / jnp.where(behind, 1, trajectory.past.P[f] + q))
+        # Times are whole microseconds, the middle of an exposure may lie up to one before.
+        here = ~behind & (jnp.asarray(points.elapsed)[:, None] < 1e-6)
+        kept = jax.tree.map(lambda v: v[f], trajectory.kept)
+        return self.tell(params, join(m, precision, later), kept, here)
+
+    def held_by_pixel(self, number: Array) -> dict[str, Any]:
+        """The trees of numbers that `of_pixel` speaks of, all as the one given."""
+        state, said = Gaussian(number, number), Message(number, number)
+        return {"state": state, "said": said, "link": Link(*[number] * 5)}
+
+    def through(self, link: NDArray, later: NDArray) -> NDArray:
+        """Numbers of the message before several frames, from those of their link and the later."""
+        message = Link(*link).before(Message(*later))
+        return np.stack([message.h, message.J])
+
+    def of_pixel(self, exposed: bool) -> dict[str, Callable[..., dict[str, Any]]]:
+        """What `run` and `read` do at one pixel, for kernels (`fused.smoothing`).
+
+        Functions of parameters, what is known with them, and numbers that kernels keep by name.
+        """
+
+        def counted(params, on, off, around_on, around_off, given):
+            return shared(params, on, around_on, given), shared(params, off, around_off, given)
+
+        def frame(known, clipped, exists, gain, total, inside, state, **image):
+            params, fixed = known
+            frames = one_pixel(gain, fixed, **image)
+            z = jnp.log(frames.intensity + params.I0)
+            z = deblurred(params, z, total) if exposed else z
+            measured = measure_frames(params, frames, z, exists)
+            kept = self.keep(params, frames, measured, inside if exposed else None)
+            side = measured.side
+            if not clipped:
+                measured = dataclasses.replace(measured, side=jnp.zeros_like(side))
+            past, said, _ = measure(params, state, measured)
+            return {"past": past, "said": said, "kept": kept, "side": side}
+
+        def move(known, past, seconds, **counts):
+            on, off = counted(known[0], **counts)
+            S, q = step_between(known[0], on, off, seconds)
+            return {"moved_on": on, "moved_off": off, "state": Gaussian(past.m + S, past.P + q)}
+
+        def link(known, link, said, moved_on, moved_off, seconds):
+            S, q = step_between(known[0], moved_on, moved_off, seconds)
+            return {"link": link.then(Link(jnp.ones_like(S), S, q, said.h, said.J))}
+
+        def back(known, later, said, moved_on, moved_off, seconds):
+            here = later.earlier(*step_between(known[0], moved_on, moved_off, seconds)) + said
+            return {"said": later, "later": here}
+
+        def show(known, past, said, moved_on, moved_off, kept, elapsed, seconds, here, **counts):
+            on, off = counted(known[0], **counts)
+            left = step_between(known[0], moved_on - on, moved_off - off, seconds)
+            S, q = step_between(known[0], on, off, elapsed)
+            state = join(past.m + S, 1 / (past.P + q), said.earlier(*left))
+            return {"image": self.tell(known[0], state, kept, here)}
+
+        def before(known, later, kept, seconds, **counts):
+            left = step_between(known[0], *counted(known[0], **counts), seconds)
+            first = later + information(initial(known[0]))
+            zero = jnp.zeros_like(later.h)
+            state = join(zero, zero, first.earlier(*left))
+            return {"image": self.tell(known[0], state, kept, zero > 0)}
+
+        def start(known):
+            return {"state": initial(known[0])}
+
+        def excess(known, share, on, off):
+            return {"excess": segment_excess(known[0], share, on, off)}
+
+        return {
+            "start": start,
+            "frame": functools.partial(frame, clipped=False),
+            "clipped": functools.partial(frame, clipped=True),
+            "move": move,
+            "link": link,
+            "back": back,
+            "show": show,
+            "before": before,
+            "excess": excess,
+        }
+
+    def estimate(
+        self,
+        recording: Recording,
+        params: Params | None = None,
+        *,
+        compiler: str | None = None,
+        **options: Any,
+    ) -> ImageSequence[Params]:
+        """As `Filter.estimate`: by a kernel on CPUs, in single precision.
+
+        `run` and `read` serve in double precision, on other devices, on several, and where changes
+        are spread over time. Raises `InputError`.
+        """
+        params = self.Params() if params is None else params
+        if not wants_kernel(compiler, options.get("devices", ())):
+            return Video(self, recording, params, **options)
+        mine = {name: value for name, value in options.items() if name != "devices"}
+        try:
+            return SmoothedVideo(self, recording, params, **mine)
+        except Untranslatable as reason:
+            if compiler == "numba":
+                raise without_kernel(self.name, reason) from reason
+            return Video(self, recording, params, **options)
 
     def log_likelihood(self, params: Params, features: Features) -> Float[Array, ""]:
         """Of all frames of a prepared recording, given its events: a sum over frames and pixels."""

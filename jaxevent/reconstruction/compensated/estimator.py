@@ -49,7 +49,7 @@ from jaxevent.reconstruction.compensated.warping import places, sample, warp, wa
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.features import Features, Numeric, ReadOut
 from jaxevent.reconstruction.frames import FrameImages
-from jaxevent.reconstruction.video import ImageSequence, Video
+from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.reconstruction.windows import WINDOW_EVENTS, prepare
 from jaxevent.recording import Recording, Times, microseconds
 
@@ -91,8 +91,8 @@ class Images:
     """The smoother's images at any instants of a recording, the latest ones remembered."""
 
     def __init__(self, recording: Recording, params: Params, window_events: int):
-        self._video = Video(
-            evidence, recording, params, window_events=window_events, progress=False
+        self._video = evidence.estimate(
+            recording, params, window_events=window_events, progress=False
         )
         self._kept: collections.OrderedDict[int, Estimate] = collections.OrderedDict()
 

@@ -8,25 +8,16 @@ from jaxtyping import Array, Float
 
 from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.compensated.parameters import Params
-from jaxevent.reconstruction.features import Features, ReadOut
-from jaxevent.reconstruction.smoother import Passage, Rows, Smoother, make_rows
+from jaxevent.reconstruction.features import FrameFeatures
+from jaxevent.reconstruction.smoother import Gaussian, Measured, Smoother
 
 
-class Passing(NamedTuple):
-    """A smoothed window, and its frames as measurements."""
+class Shown(NamedTuple):
+    """What frames show at the middle of their exposures."""
 
-    passage: Passage
-    rows: Rows
-    z: Float[Array, "frames pixels"]  # log intensity at the middle of exposures
-    V: Float[Array, "frames pixels"]  # its variance
-
-    @property
-    def link(self) -> Any:
-        return self.passage.link
-
-    @property
-    def last(self) -> Any:
-        return self.passage.last
+    z: Float[Array, "*frames pixels"]  # log intensity
+    V: Float[Array, "*frames pixels"]  # its variance
+    clear: Float[Array, "*frames pixels"]
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -38,31 +29,20 @@ class Evidence(Smoother):
     variance (sigma_pixel / (I + I0))^2 + 1e-4, deblurred as far as events tell of the exposure.
     """
 
-    def run(
-        self, params: Params, features: Features, state: Any = None, future: Any = None
-    ) -> tuple[Any, Any]:
-        passage, state = super().run(params, features, state, future)
-        frames = features.at(params.rho_ref).frames
-        rows, _ = make_rows(params, frames)
-        z, V = rows.z, (params.sigma_pixel * rows.slope) ** 2 + 1e-4
-        if frames.head is not None and frames.tail is not None:
+    def keep(self, params: Params, frames: FrameFeatures, measured: Measured, events: Any) -> Shown:
+        z, V = measured.z, (params.sigma_pixel * measured.slope) ** 2 + 1e-4
+        if events is not None:
             blurred = jnp.log(frames.intensity + params.I0)
-            change = rows.z - blurred
+            change = z - blurred
             # What events tell of an exposure is no better than a threshold and their noise: where
             # the correction is not larger than that, a blurred frame is nearer to the truth.
-            events = (frames.head + frames.tail).sum(0)
             error = params.c_on * params.c_off * (0.25 + params.sigma_event**2 * events / 3)
             trust = change**2 / (change**2 + error)
             z, V = blurred + trust * change, V + trust * error
-        return Passing(passage, rows, z, V), state
+        return Shown(z, V, measured.clear)
 
-    def read(self, params: Params, trajectory: Passing, out: ReadOut) -> Estimate:
-        passage, rows = trajectory.passage, trajectory.rows
-        image, V, _ = super().read(params, passage, out)
-        L = jnp.log(jnp.maximum(image, 0) + params.I0)
-        frame, elapsed = jnp.asarray(out.points.frame), jnp.asarray(out.points.elapsed)
-        # Times are whole microseconds, the middle of an exposure may lie up to one before.
-        here = ((elapsed >= 0) & (elapsed < 1e-6))[:, None] & (rows.clear[frame] > 0.5)
-        L = jnp.where(here, trajectory.z[frame], L)
-        own = trajectory.V[frame]
-        return Estimate(L, jnp.where(here, jnp.minimum(V, own), V), here)
+    def tell(self, params: Params, state: Gaussian, kept: Shown, here: Array) -> Estimate:
+        L = jnp.log(jnp.maximum(jnp.exp(state.m) - params.I0, 0) + params.I0)
+        shown = here & (kept.clear > 0.5)
+        V = jnp.where(shown, jnp.minimum(state.P, kept.V), state.P)
+        return Estimate(jnp.where(shown, kept.z, L), V, shown)

@@ -136,7 +136,7 @@ def _enter(band, stretch, now, given, cells, place):
         for kind in range(3):
             field = places.image[kind, row]
             if field >= 0 and row < rows:
-                _load_image(
+                load_image(
                     frames.images, frames.tables, frames.values, frames.gain[k], kind, k,
                     bands.width, bands.edges[band], bands.edges[band + 1], cells, field * stride,
                 )  # fmt: skip
@@ -150,7 +150,7 @@ def _enter(band, stretch, now, given, cells, place):
                 for z in range(total * stride, (total + 1) * stride):
                     cells[z] = 0
             if row < rows:
-                _sum_segments(
+                sum_segments(
                     events, weights, a, b, lefts[k], mids[k], rights[k], given.functions.excess,
                     given.numbers, cells, places.total[:, row] * stride, stride,
                 )  # fmt: skip
@@ -159,7 +159,7 @@ def _enter(band, stretch, now, given, cells, place):
     for row in range(3):
         k = base + row - number
         if row >= fresh and row < rows:
-            left, mid, right = _edge(lefts[k]), _edge(mids[k]), _edge(rights[k])
+            left, mid, right = edge_of(lefts[k]), edge_of(mids[k]), edge_of(rights[k])
         else:
             left = mid = right = np.int64(0)
         if row >= fresh:
@@ -168,21 +168,23 @@ def _enter(band, stretch, now, given, cells, place):
         if counted <= row < 2:
             left = right = np.int64(0)
             if row + 1 < rows:  # another frame follows
-                left, right = _edge(lefts[k]), _edge(rights[k + 1])
+                left, right = edge_of(lefts[k]), edge_of(rights[k + 1])
             _note(what, 6 + row, places.span[0, row], places.span[1, row], left, right)
     # The piece counts from its exposure's left edge, before the first from the window's start.
-    left = _edge(lefts[frame - number]) if frame >= 0 else now
+    left = edge_of(lefts[frame - number]) if frame >= 0 else now
     _note(what, 8, np.int64(places.on), np.int64(places.off), left, now)
     if frame < 0 and count > 0:
-        _note(what, 9, places.before[0], places.before[1], np.int64(line.opening), _edge(rights[0]))
+        _note(
+            what, 9, places.before[0], places.before[1], np.int64(line.opening), edge_of(rights[0])
+        )
     for k in range(10):
         if what[k, 0] >= 0:
-            _count(events, weights, a, b, what[k, 2], what[k, 3], cells, stride, what[k])
+            count_events(events, weights, a, b, what[k, 2], what[k, 3], cells, stride, what[k])
     place[band, 2] = frame
 
 
 @part
-def _edge(time):
+def edge_of(time):
     """Events earlier than this whole number of us are before the time."""
     return np.int64(np.ceil(time))
 
@@ -193,7 +195,7 @@ def _note(what, row, on, off, left, right):
 
 
 @part
-def _load_image(images, tables, values, gain, kind, k, width, top, bottom, cells, at):
+def load_image(images, tables, values, gain, kind, k, width, top, bottom, cells, at):
     """A frame's grey values, intensities or certainties, into a field of `cells`."""
     by = gain if kind == 1 else gain / gain  # 1 of the same type
     for line in range(top, bottom):
@@ -207,7 +209,7 @@ def _load_image(images, tables, values, gain, kind, k, width, top, bottom, cells
 
 
 @part
-def _find(events, begin, end, time):
+def find(events, begin, end, time):
     """The first of a band's events, from begin to end, that is not before a time."""
     while begin < end:
         middle = (begin + end) >> 1
@@ -219,13 +221,13 @@ def _find(events, begin, end, time):
 
 
 @part
-def _count(events, weights, begin, end, left, right, cells, stride, what):
+def count_events(events, weights, begin, end, left, right, cells, stride, what):
     """Count the events of every pixel with left <= t < right into the fields what[:2]."""
     on, off, weighted = what[0] * stride, what[1] * stride, len(weights) > 0
     for z in range(stride):
         cells[on + z] = 0
         cells[off + z] = 0
-    i = _find(events, begin, end, left)
+    i = find(events, begin, end, left)
     while i < end and events[i] >> 17 < right:
         z = ((events[i] >> 1) & 0xFFFF) + (on if events[i] & 1 else off)
         cells[z] += weights[i] if weighted else 1
@@ -233,13 +235,13 @@ def _count(events, weights, begin, end, left, right, cells, stride, what):
 
 
 @part
-def _sum_segments(
+def sum_segments(
     events, weights, begin, end, left, mid, right, excess, numbers, cells, totals, stride
 ):
     """Add up what the segments of constant brightness of an exposure say, from `totals` on."""
     length = right - left
-    a, b = _find(events, begin, end, _edge(left)), _find(events, begin, end, _edge(right))
-    middle = _find(events, begin, end, _edge(mid))
+    a, b = find(events, begin, end, edge_of(left)), find(events, begin, end, edge_of(right))
+    middle = find(events, begin, end, edge_of(mid))
     if length <= 0 or a == b:
         return
     counts, bound = np.empty((2, stride), cells.dtype), np.empty(stride, np.float64)
@@ -290,7 +292,7 @@ def run(begin, end, given, memory, enter, times, until, images):
         )
         entering, now = enter[0] >= 0, np.int64(enter[1])
         if entering:
-            i, s = _find(events, bands.first[band], bands.first[band + 1], now), np.int64(enter[0])
+            i, s = find(events, bands.first[band], bands.first[band + 1], now), np.int64(enter[0])
             place[band, 2] = -9  # no frame is known
         while True:
             if entering:

@@ -89,7 +89,7 @@ class DividedRecording:
 
         `clock_offset` is the one that the recording was divided for.
         """
-        fixed, clock = self._fixed(clock_offset), self.windows.clock
+        fixed, clock = self.fixed(clock_offset), self.windows.clock
         return kernel_of(
             method, method.observe, params, fixed, clock.exposed, self.dtype, self.layout.stride,
             directions,
@@ -97,10 +97,11 @@ class DividedRecording:
 
     def check(self, method: Any, params: Any, clock_offset: Any, directions: Directions) -> None:
         """Raise `Untranslatable` if there can be no such kernel."""
-        fixed, exposed = self._fixed(clock_offset), self.windows.clock.exposed
+        fixed, exposed = self.fixed(clock_offset), self.windows.clock.exposed
         program_of(method, method.observe, params, fixed, exposed, self.dtype, directions)
 
-    def _fixed(self, clock_offset: Any) -> dict[str, NDArray]:
+    def fixed(self, clock_offset: Any) -> dict[str, NDArray]:
+        """What is known with the parameters."""
         return {
             "clock_offset": np.asarray(clock_offset, self.dtype),
             "present": np.asarray(len(self.windows.clock) > 0, self.dtype),
@@ -114,8 +115,13 @@ class DividedRecording:
         rows = [0 if start is None else source.index(start)]
         rows.append(len(source) if stop is None else source.index(stop))
         used = windows.clock.used(start, stop)
-        context, finish = windows.context_of(used, *rows)
-        around = source[context:finish]
+        bands, state = self.divide(state, *windows.context_of(used, *rows))
+        line = make_line(windows.clock, start, stop, self.recording.gain, self.dtype)
+        return Window(start, stop, bands, line, self.frames(used), state)
+
+    def divide(self, state: StreamState, context: int, finish: int) -> tuple[Bands, StreamState]:
+        """A range of rows of the events, divided among the bands; the state moved to its begin."""
+        windows, around = self.windows, self.recording.events[context:finish]
         weight = np.empty(0, self.dtype)
         if state.last_then is not None:
             state = windows.move_context(state, context)
@@ -126,11 +132,9 @@ class DividedRecording:
         events, weights, first = self.layout.divide(
             around.t, around.x, around.y, around.p, weight, width, self.origin
         )
-        bands = Bands(events, weights, first, self.layout.edges, width)
-        line = make_line(windows.clock, start, stop, self.recording.gain, self.dtype)
-        return Window(start, stop, bands, line, self._frames(used), state)
+        return Bands(events, weights, first, self.layout.edges, width), state
 
-    def _frames(self, used: slice) -> FrameRows:
+    def frames(self, used: slice) -> FrameRows:
         clock, frames = self.windows.clock, self.recording.frames
         left, mid, right = (e[used].astype(float) for e in (clock.left, clock.mid, clock.right))
         images, values = np.zeros((0, 1), np.uint8), np.zeros((0, 0, 1), self.dtype)

@@ -1,13 +1,17 @@
 """Video by kernels: events, recursion and images in one pass over bands of pixels."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
+from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.fused.passes import DividedRecording, Held, Passes, Window
 from jaxevent.reconstruction.fused.timeline import NEVER
@@ -110,3 +114,18 @@ class FusedVideo(ImageSequence[P]):
             self._passes.resume(window, begin.held, begin.start - self._divided.origin)
         self._open, self._done = window, -NEVER
         return window
+
+
+def wants_kernel(compiler: str | None, devices: Sequence[Any]) -> bool:
+    """Whether numba is asked for, or is what serves on these devices; raises `InputError`."""
+    if compiler not in (None, "numba", "xla"):
+        raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
+    on_host = jnp.result_type(float) == np.float32 and jax.default_backend() == "cpu"
+    return compiler == "numba" or (compiler is None and on_host and len(devices) < 2)
+
+
+def without_kernel(name: str, reason: Untranslatable) -> InputError:
+    """What to raise where numba is asked for and there is no kernel of a method."""
+    return InputError(
+        f"numba has no kernel for the method {name!r} ({reason}); leave out the compiler"
+    )

@@ -1,0 +1,238 @@
+"""The loops that kernels of smoothers share: over a band's frames, forwards and backwards, and
+over images.
+
+All numbers of a pixel lie at the same place of arrays of `stride` numbers, as in `loop`: first
+those of the frame that a pass has come to, then those that are kept of each frame. What differs
+from method to method are the functions of `FrameFunctions`, which `smoothing` writes, and the
+places of fields; so this module is compiled once.
+"""
+
+import warnings
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.kernels import compiled, part
+from jaxevent.reconstruction.fused.loop import (
+    Bands,
+    FrameRows,
+    count_events,
+    edge_of,
+    find,
+    load_image,
+    sum_segments,
+)
+
+# Functions that are passed as arguments are called through their address.
+warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
+
+
+class FrameFunctions(NamedTuple):
+    """What is a method's own (`smoothing`)."""
+
+    start: Any
+    frame: Any
+    clipped: Any
+    move: Any
+    link: Any
+    back: Any
+    show: Any
+    before: Any
+    excess: Any
+
+
+class FramePlaces(NamedTuple):
+    """Where fields lie, in strides."""
+
+    stride: int
+    work: int  # fields of the frame that a pass has come to
+    kept: int  # fields that are kept of each frame
+    image: NDArray[np.int64]  # grey value, intensity, certainty
+    total: NDArray[np.int64]  # [1], sums over exposures
+    inside: int  # events within exposures; -1: not needed
+    side: int
+    counts: NDArray[np.int64]  # ON, OFF, and those of the neighbours
+    exposed: bool  # whether exposures are known
+    sided: bool  # whether clipped frames tell anything
+
+
+class FrameLine(NamedTuple):
+    """A stretch of frames in time (us since the recording's start)."""
+
+    mid: NDArray[np.int64]  # events before it are before the frame
+    following: NDArray[np.int64]  # the same of the frame after
+    seconds: NDArray[np.float64]  # until then
+    exists: NDArray[np.float64]  # 1, or 0 for frames that measure nothing
+
+
+class GivenFrames(NamedTuple):
+    """What passes over a stretch of frames rest on."""
+
+    bands: Bands
+    line: FrameLine
+    frames: FrameRows
+    places: FramePlaces
+    functions: FrameFunctions
+    numbers: NDArray
+
+
+class Instants(NamedTuple):
+    """Times of images (us since the recording's start) and where they lie among the frames."""
+
+    time: NDArray[np.int64]
+    frame: NDArray[np.int64]  # the one before, -1 before the first
+    elapsed: NDArray[np.float64]  # s since then
+    seconds: NDArray[np.float64]  # until the next; 0 after the last
+    here: NDArray[np.float64]  # 1 in the middle of the frame's exposure
+
+
+@part
+def _sum_around(cells, of, to, above, width, rows, stride):
+    """Sums over the eight neighbours of a band's own pixels, from one field into another."""
+    padded, c, out = width + 2, of * stride, to * stride
+    for z in range(padded, (rows + 1) * padded):
+        above[z] = cells[c + z - padded] + cells[c + z] + cells[c + z + padded]
+    for z in range(padded + 1, (rows + 1) * padded - 1):
+        cells[out + z] = above[z - 1] + above[z] + above[z + 1] - cells[c + z]
+
+
+@part
+def _look(band, k, given, cells):
+    """A frame's image, and what events say of its exposure."""
+    bands, frames, places = given.bands, given.frames, given.places
+    stride, top, bottom = places.stride, bands.edges[band], bands.edges[band + 1]
+    a, b = bands.first[band], bands.first[band + 1]
+    for kind in range(3):
+        load_image(
+            frames.images, frames.tables, frames.values, frames.gain[k], kind, k,
+            bands.width, top, bottom, cells, places.image[kind] * stride,
+        )  # fmt: skip
+    if not places.exposed:
+        return
+    left, right = frames.left[k], frames.right[k]
+    total = places.total[0] * stride
+    for z in range(stride):
+        cells[total + z] = 0
+    sum_segments(
+        bands.events, bands.weights, a, b, left, frames.mid[k], right, given.functions.excess,
+        given.numbers, cells, places.total * stride, stride,
+    )  # fmt: skip
+    if places.inside >= 0:
+        what = np.full(2, places.inside)
+        count_events(
+            bands.events, bands.weights, a, b, edge_of(left), edge_of(right), cells, stride, what
+        )
+
+
+@part
+def _measure_clipped(k, row, given, cells, begin, end):
+    """Measure again where a frame is clipped: most pixels are not, and that is dear."""
+    places, line, gain = given.places, given.line, np.float64(given.frames.gain[k])
+    side = places.side * places.stride
+    z = begin
+    while z < end:
+        while z < end and cells[side + z] == 0:
+            z += 1
+        first = z
+        while z < end and cells[side + z] != 0:
+            z += 1
+        if z > first:
+            given.functions.clipped(
+                cells.ctypes, given.numbers.ctypes, row, first, z, gain, line.exists[k], 0.0
+            )
+
+
+@compiled
+def filter_frames(begin, end, given, memory, starts, linked):
+    """Pass forwards over a stretch of frames; its state is the one before the first frame.
+
+    Afterwards it is that before the frame after the last. `starts`: the recording does here.
+    """
+    bands, line, places, functions = given.bands, given.line, given.places, given.functions
+    numbers, stride, counts = given.numbers, places.stride, places.counts
+    width, padded = np.int64(bands.width), np.int64(bands.width + 2)
+    above = np.zeros(stride, numbers.dtype)
+    for band in range(begin, end):
+        cells, rows = memory[band], bands.edges[band + 1] - bands.edges[band]
+        a, b = bands.first[band], bands.first[band + 1]
+        first, last = padded, (rows + 1) * padded
+        if starts:
+            functions.start(cells.ctypes, numbers.ctypes, 0, first, last, 0.0, 0.0, 0.0)
+        for k in range(len(line.mid)):
+            row = np.int64((places.work + k * places.kept) * stride)
+            _look(band, k, given, cells)
+            gain, seconds = np.float64(given.frames.gain[k]), line.seconds[k]
+            functions.frame(
+                cells.ctypes, numbers.ctypes, row, first, last, gain, line.exists[k], 0.0
+            )
+            if places.sided:
+                _measure_clipped(k, row, given, cells, first, last)
+            count_events(
+                bands.events, bands.weights, a, b, line.mid[k], line.following[k], cells, stride,
+                counts,
+            )  # fmt: skip
+            _sum_around(cells, counts[0], counts[2], above, width, rows, stride)
+            _sum_around(cells, counts[1], counts[3], above, width, rows, stride)
+            functions.move(cells.ctypes, numbers.ctypes, row, first, last, seconds, 0.0, 0.0)
+            if linked:
+                functions.link(cells.ctypes, numbers.ctypes, row, first, last, seconds, 0.0, 0.0)
+
+
+@compiled
+def smooth_frames(begin, end, given, memory):
+    """Pass backwards; before it is known what frames after the stretch say at the next one."""
+    bands, line, places = given.bands, given.line, given.places
+    padded = np.int64(bands.width + 2)
+    for band in range(begin, end):
+        cells, rows = memory[band], bands.edges[band + 1] - bands.edges[band]
+        for j in range(len(line.mid)):
+            k = len(line.mid) - 1 - j
+            row = np.int64((places.work + k * places.kept) * places.stride)
+            given.functions.back(
+                cells.ctypes, given.numbers.ctypes, row, padded, (rows + 1) * padded,
+                line.seconds[k], 0.0, 0.0,
+            )  # fmt: skip
+
+
+@compiled
+def read_images(begin, end, given, memory, instants, images):
+    """Images at sorted instants of a smoothed stretch."""
+    bands, line, places, functions = given.bands, given.line, given.places, given.functions
+    events, weights, weighted = bands.events, bands.weights, len(bands.weights) > 0
+    numbers, stride, counts = given.numbers, places.stride, places.counts
+    width, pixels = np.int64(bands.width), images.mean.shape[1]
+    padded, above = width + 2, np.zeros(places.stride, numbers.dtype)
+    for band in range(begin, end):
+        cells, rows = memory[band], bands.edges[band + 1] - bands.edges[band]
+        a, b, known, i = bands.first[band], bands.first[band + 1], -1, 0
+        on, off = counts[0] * stride, counts[1] * stride
+        for image in range(len(instants.time)):
+            f, now = instants.frame[image], instants.time[image]
+            row = np.int64((places.work + max(f, 0) * places.kept) * stride)
+            at = np.int64(image * pixels + bands.edges[band] * width)
+            if f < 0:
+                count_events(events, weights, a, b, now + 1, line.mid[0], cells, stride, counts)
+            elif f != known:
+                i, known = find(events, a, b, line.mid[f]), f
+                for z in range(stride):
+                    cells[on + z] = cells[off + z] = 0
+            while f >= 0 and i < b and events[i] >> 17 <= now:
+                z = ((events[i] >> 1) & 0xFFFF) + (on if events[i] & 1 else off)
+                cells[z] += weights[i] if weighted else 1
+                i += 1
+            _sum_around(cells, counts[0], counts[2], above, width, rows, stride)
+            _sum_around(cells, counts[1], counts[3], above, width, rows, stride)
+            if f < 0:
+                functions.before(
+                    cells.ctypes, numbers.ctypes, row, rows, width, padded,
+                    instants.seconds[image], 0.0, 0.0, images.mean.ctypes, images.variance.ctypes,
+                    images.valid.ctypes, at,
+                )  # fmt: skip
+            else:
+                functions.show(
+                    cells.ctypes, numbers.ctypes, row, rows, width, padded,
+                    instants.elapsed[image], instants.seconds[image], instants.here[image],
+                    images.mean.ctypes, images.variance.ctypes, images.valid.ctypes, at,
+                )  # fmt: skip
