@@ -541,7 +541,7 @@ class MotionCompensated(ImageEstimator[Params]):
     def read(self, params: Params, trajectory: Any, out: Targets) -> Estimate:
         """The images prepared in `out`; the motion is what `prepare` found."""
         L, V, clear = evidence.read(params, trajectory, out.instants)
-        frames = jax.tree.map(jnp.asarray, trajectory.passage.frames)
+        frames = jax.tree.map(jnp.asarray, trajectory.frames)
         width = frames.width
         L, V, clear = (v.reshape(len(v), -1, width) for v in (L, V, clear.astype(L.dtype)))
 
