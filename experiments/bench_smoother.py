@@ -110,13 +110,14 @@ def program(t, x, y, p, image, certainty, mid, times, numbers):
 def program_images(recording: Recording, times: np.ndarray) -> np.ndarray:
     frames, v = recording.frames, jaxevent.aks.Params().values()
     assert frames is not None
+    grey = np.asarray(frames.images)
     table = np.arange(256) / 255
     certain = np.maximum(np.asarray(recording.response.certainty(table)), v["w_min"])
-    image = np.asarray(recording.response.intensity(table))[frames.images]
+    image = np.asarray(recording.response.intensity(table))[grey]
     names = ("c_on", "c_off", "I0", "sigma_event", "sigma_bg", "sigma_frame", "sigma_floor")
     numbers = [v[name] for name in names] + [np.log(v["start"] + v["I0"]), v["P_start"], v["share"]]
-    e = recording.events
-    return program(e.t, e.x, e.y, e.p, image, certain[frames.images], frames.t, times,
+    e = recording.events[:]
+    return program(e.t, e.x, e.y, e.p, image, certain[grey], frames.t, times,
                    tuple(float(n) for n in numbers))  # fmt: skip
 
 
@@ -126,7 +127,7 @@ def images_by(recording: Recording, times: np.ndarray, compiler: str) -> np.ndar
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--exposed", action="store_true")
     arguments = parser.parse_args()
@@ -144,9 +145,9 @@ def main() -> int:
         "compiled by XLA": lambda: images_by(recording, times, "xla"),
         "kernel, one image": lambda: images_by(recording, times[:1], "numba"),
     }
-    images = {name: way() for name, way in ways.items()}
+    made = {name: way() for name, way in ways.items()}
     if not arguments.exposed:
-        worst = abs(images["kernel"] - images["numba program"]).max()
+        worst = abs(made["kernel"] - made["numba program"]).max()
         assert worst < 1e-4, worst
     seconds = dict.fromkeys(ways, np.inf)
     for _ in range(arguments.repeat):
