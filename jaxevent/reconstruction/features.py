@@ -219,6 +219,16 @@ class Features(Described):
         """The features for a dead time near the one that they were made for."""
         return _grown(self, rho_ref)
 
+    def weighted(self, factors: Float[Numeric, "2 pixels"]) -> "Features":
+        """The same with every pixel's ON and OFF events times its factor; without tiles."""
+        if self.tiles is not None:
+            raise ValueError("the events of tiles cannot be weighted")
+        segments = self.frames.segments
+        cell = None if segments is None else segments.frame_cell % self.last.shape[0]
+        by_frame = factors[:, None]
+        exposed = [] if cell is None else [by_frame, by_frame, factors[0][cell], factors[1][cell]]
+        return _weighted(self, [by_frame, factors, *exposed])
+
     def over(self, devices: Sequence[Any]) -> "Features":
         """The features on several devices: lanes of tiles and pixels of images shared out."""
         mesh = pixel_mesh(devices)
@@ -267,6 +277,10 @@ class ReadOut(Described):
         """The read-out for a dead time near the one that it was made for."""
         return _grown(self, rho_ref)
 
+    def weighted(self, factors: Float[Numeric, "2 pixels"]) -> "ReadOut":
+        """The same with every pixel's ON and OFF events times its factor."""
+        return _weighted(self, list(factors))
+
     def over(self, devices: Sequence[Any]) -> "ReadOut":
         """The read-out on several devices, pixels shared out."""
         mesh = pixel_mesh(devices)
@@ -297,3 +311,14 @@ def _grown(counting: Counting, rho_ref: Array) -> Counting:
     change = rho_ref - growth.rho_ref
     moved = [n + change * g for n, g in zip(counting.counts(), growth.counts, strict=True)]
     return eqx.tree_at(lambda c: c.counts(), counting, moved)
+
+
+def _weighted(counting: Counting, factors: list[Any]) -> Counting:
+    def times(counts: list[Any]) -> list[Any]:
+        return [n * factor for n, factor in zip(counts, factors, strict=True)]
+
+    growth = counting.growth
+    weighted = eqx.tree_at(lambda c: c.counts(), counting, times(counting.counts()))
+    if growth is None:
+        return weighted
+    return dataclasses.replace(weighted, growth=Growth(times(growth.counts), growth.rho_ref))

@@ -219,7 +219,8 @@ class Video(ImageSequence[P]):
     are asked for; windows before them are filtered first. One window is kept, and the state at
     every window's start, so memory does not grow with the recording's length. Images do not depend
     on which other images were asked for, nor on the windows. Given several `devices`, of this
-    process, they share out the pixels.
+    process, they share out the pixels. `factors` (2, pixels) are those of ON and OFF thresholds of
+    single pixels, for estimators that do not filter.
     """
 
     estimator: PixelMethod
@@ -233,9 +234,10 @@ class Video(ImageSequence[P]):
         window_events: int = WINDOW_EVENTS,
         progress: bool | None = None,
         devices: Sequence[Any] = (),
+        factors: NDArray[np.floating] | None = None,
     ):
         super().__init__(estimator, recording, params, progress=progress)
-        self._devices = devices
+        self._devices, self._factors = devices, factors
         self._mesh = pixel_mesh(devices)
         self._windows = WindowedRecording(
             recording,
@@ -274,7 +276,8 @@ class Video(ImageSequence[P]):
             done = end
 
     def _place(self, part: Any) -> Any:
-        """Put features or a read-out on the devices."""
+        """Weight features or a read-out, and put them on the devices."""
+        part = part if self._factors is None else part.weighted(self._factors)
         return part if self._mesh is None else part.over(self._devices)
 
     def _share_out(self, state: Any) -> Any:

@@ -573,6 +573,19 @@ def test_prepared_images_are_those_of_the_video():
 
 
 @pytest.mark.slow
+def test_images_are_of_learned_thresholds(monkeypatch):
+    """The video and prepared images take what is learned; tests/reconstruction/test_thresholds."""
+    times, at = prepared()[0], params()
+    factors = np.random.default_rng(2).uniform(1, 4, (2, 40 * 48)).astype(np.float32)
+    monkeypatch.setattr(estimator, "learn", lambda *_: factors)
+    images = mc.estimate(slide(), at, progress=False)(times).mean
+    assert np.abs(images - video()(times).mean).max() > 0.01
+    features, out = mc.prepare(slide(), times, at)
+    estimate = jax.jit(lambda p: mc.read(p, mc.run(p, features)[0], out))(at)
+    np.testing.assert_allclose(estimate.mean.reshape(2, 40, 48), images, atol=2e-3)
+
+
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences():
     _, value = prepared()
 

@@ -45,11 +45,12 @@ from jaxevent.reconstruction.compensated.fusion import (
 from jaxevent.reconstruction.compensated.implicit import Numbers, Seen, depending
 from jaxevent.reconstruction.compensated.instants import ROOM, Instants, Schedule, speed_of
 from jaxevent.reconstruction.compensated.parameters import Params
+from jaxevent.reconstruction.compensated.thresholds import learn
 from jaxevent.reconstruction.compensated.warping import places, sample, warp, warp_purely
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.features import Features, Numeric, ReadOut
 from jaxevent.reconstruction.frames import FrameImages
-from jaxevent.reconstruction.video import ImageSequence
+from jaxevent.reconstruction.video import ImageSequence, Video
 from jaxevent.reconstruction.windows import WINDOW_EVENTS, prepare
 from jaxevent.recording import Recording, Times, microseconds
 
@@ -88,12 +89,24 @@ class Targets(Described):
 
 
 class Images:
-    """The smoother's images at any instants of a recording, the latest ones remembered."""
+    """The smoother's images at any instants of a recording, the latest ones remembered.
 
-    def __init__(self, recording: Recording, params: Params, window_events: int):
-        self._video = evidence.estimate(
-            recording, params, window_events=window_events, progress=False
-        )
+    `factors` (2, pixels) are those of single pixels' thresholds; None: all are alike.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        params: Params,
+        window_events: int,
+        factors: NDArray[np.floating] | None = None,
+    ):
+        self.factors, given = factors, (recording, params)
+        options: dict[str, Any] = {"window_events": window_events, "progress": False}
+        if factors is None:
+            self._video = evidence.estimate(*given, **options)
+        else:  # kernels know of no factors
+            self._video = Video(evidence, *given, factors=factors, **options)
         self._kept: collections.OrderedDict[int, Estimate] = collections.OrderedDict()
 
     @property
@@ -358,6 +371,22 @@ def fuse_images(params: Params, target: Followed) -> Fused:
     return _decide(params, *look(params, target))
 
 
+def follower_of(
+    recording: Recording, params: Params, window_events: int, start: Start | None = None
+) -> Follower:
+    """The follower of a recording, with the thresholds of single pixels where they are learned."""
+    follow = Follower(recording, params, Images(recording, params, window_events), start)
+
+    def fused(t: int) -> tuple[NDArray, NDArray]:
+        found = fuse_images(params, follow(t))
+        return np.asarray(found.L), np.asarray(found.P)
+
+    factors = learn(recording, params, follow.schedule.span, fused)
+    if factors is None:
+        return follow
+    return Follower(recording, params, Images(recording, params, window_events, factors), start)
+
+
 @jax.jit
 def _carry(images: Array, s: Array, p: Array) -> Array:
     """Images (n, h, w, channels) at s (n,) along trajectories."""
@@ -394,7 +423,7 @@ class CompensatedVideo(ImageSequence[Params]):
     ):
         super().__init__(estimator, recording, params, progress=progress)
         self._start = None if motion is None else Start(motion, refine)
-        self._images = Images(recording, params, window_events)
+        self._window_events = window_events
         self._follower: Follower | None = None
         self._latest: tuple[int, Followed, Fused] | None = None
         self._frames = FrameImages(recording, np.dtype(np.float32))
@@ -402,14 +431,14 @@ class CompensatedVideo(ImageSequence[Params]):
 
     @property
     def dtype(self) -> np.dtype:
-        return self._images.dtype
+        return np.dtype(jnp.result_type(float))
 
     @property
     def follow(self) -> Follower:
         """What estimates the motion of targets; made when first asked for."""
         if self._follower is None:
-            given = (self.recording, self.params, self._images)
-            self._follower = Follower(*given, self._start)
+            given = (self.recording, self.params, self._window_events)
+            self._follower = follower_of(*given, self._start)
         return self._follower
 
     def _target(self, t: int) -> tuple[Followed, Fused]:
@@ -452,7 +481,7 @@ class CompensatedVideo(ImageSequence[Params]):
         target, fused = self._target(to)
         s = ((at - to) * 1e-6 / target.instants.unit).astype(np.float32)
         order = np.argsort(at, kind="stable")
-        L, V, clear = (part[np.argsort(order)] for part in self._images(at[order]))
+        L, V, clear = (part[np.argsort(order)] for part in self.follow.images(at[order]))
         along = warp(L, V, clear, s, target.p)
         seen = _carry(np.asarray(images, np.float32), s, target.p)
         return np.asarray(seen), np.asarray(_shown(self.params, fused.L, along))
@@ -514,12 +543,14 @@ class MotionCompensated(ImageEstimator[Params]):
             self.check_span(recording, wanted, params)
         if not len(wanted):
             raise InputError(f"{recording.name}: no times to prepare images for; give some")
-        images = Images(recording, params, WINDOW_EVENTS)
-        follow = Follower(recording, params, images)
+        follow = follower_of(recording, params, WINDOW_EVENTS)
         chosen = [follow.schedule(t) for t in wanted.tolist()]
         room = room_for(max(len(one) for one in chosen))
         every = np.unique(np.concatenate([one.t for one in chosen]))
         features, instants = prepare(recording, every, Timing.of(params), filtering=False)
+        factors = follow.images.factors
+        if factors is not None:
+            features, instants = features.weighted(factors), instants.weighted(factors)
         shape = (len(chosen), *trajectories.nodes(recording.height, recording.width, 0), 4)
         rows, p = np.zeros((len(chosen), room), np.int32), np.zeros(shape, np.float32)
         places, taken = [], []

@@ -83,6 +83,9 @@ class Params(smoother.Params):
     integrate = Choice(
         (True, False), "whether images are held to what exposures and clipped pixels tell of them"
     )
+    learn = Choice(
+        (True, False), "whether thresholds of single pixels are learned where events allow"
+    )
     smear = Positive(1.2, "1", "part of what an exposure smears, squared, that is in doubt")
     vague = Positive(
         0.2, "ln I", "standard deviation from which an image is not valid", gradient=False

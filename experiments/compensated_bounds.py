@@ -1,0 +1,138 @@
+"""What bounds `mc`: objects with parts of it replaced by the truth, and pixels that are not alike.
+
+    python experiments/compensated_bounds.py --out bounds
+
+Tables:
+
+    objects     simulated objects, 25 Hz, halfway between frames, of the seeds that
+                experiments/motion_compensated.py scores: the motion found, the true one, and the
+                true visibility beside it; all errors, and those within 2 px of where surfaces meet
+    thresholds  fast pans of HDR scenes by sensors whose pixels' thresholds differ more and more:
+                MSE of ln(I + I0) of bright pixels and of all, with and without learning these
+
+Recordings are simulated into the folder. Sensors' common thresholds are given, nothing is fitted.
+"""
+
+import argparse
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from motion_compensated import SCORING, halfway, objects_at
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, map_coordinates
+
+import jaxevent
+from jaxevent.reconstruction.compensated import fusion
+from jaxevent.reconstruction.compensated.agreement import agree
+from jaxevent.reconstruction.compensated.estimator import Followed, place_of
+from jaxevent.reconstruction.compensated.warping import Along, warp
+from jaxevent.simulate import TESTING, Objects, Pan, Sensor, scene, simulate
+
+RATE, IMAGES, EDGE = 25.0, 6, 2.0  # Hz; images per recording; px
+MISMATCH, SEEDS = (0.03, 0.1, 0.15), (2, 3)
+mc = jaxevent.METHODS["mc"]
+
+
+def truly_along(target: Followed, source: Objects, t: int) -> tuple[Along, NDArray[np.bool_]]:
+    """A target's images along the true trajectories, and where the points are hidden."""
+    instants, L, V, clear, _ = target
+    count, h, w = L.shape
+    y, x = np.mgrid[:h, :w].astype(float)
+    warped, hidden = np.zeros((4, count, h, w), np.float32), np.zeros((count, h, w), bool)
+    for k, at in enumerate(instants.t):
+        moved, hidden[k] = source.displacement(t * 1e-6, float(at) * 1e-6)
+        Y, X = y + moved[..., 1], x + moved[..., 0]
+        for n, (image, order) in enumerate(((L[k], 3), (V[k], 1), (clear[k] * 1.0, 1))):
+            warped[n, k] = map_coordinates(image, [Y, X], order=order, mode="nearest")
+        warped[3, k] = (-0.5 <= X) & (w - 0.5 >= X) & (-0.5 <= Y) & (h - 0.5 >= Y)
+    return Along(*warped), hidden
+
+
+def objects(folder: Path) -> Iterator[str]:
+    """The table, line by line."""
+    params = mc.Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4)
+    found: dict[str, list] = {}
+    for seed in SCORING:
+        source, recording = objects_at(folder, RATE, seed)
+        video = mc.estimate(recording, params, progress=False)
+        for t in halfway(recording, IMAGES).tolist():
+            truth, seen = source.intensity(t * 1e-6).clip(0, 1), source.visible(t * 1e-6)
+            meet = np.zeros(seen.shape, bool)
+            meet[:, 1:] |= seen[:, 1:] != seen[:, :-1]
+            meet[1:] |= seen[1:] != seen[:-1]
+            near = np.asarray(distance_transform_edt(~meet)) < EDGE
+            target = video.follow(t)
+            instants, L, V, clear, p = target
+            place = place_of(instants, clear, len(instants))
+            true, hidden = truly_along(target, source, t)
+            cases = {
+                "motion found": warp(L, V, np.asarray(clear, np.float32), instants.s, p),
+                "true motion": true,
+                "true motion and visibility": true._replace(inside=true.inside * ~hidden),
+            }
+            for name, along in cases.items():
+                told = fusion.compare(
+                    agree(params, L, along, place), fusion.views(L, V, along, place)
+                )
+                image = np.exp(np.asarray(fusion.decide(params, told).L)) - float(params.I0)
+                error = (image.clip(0, 1) - truth) ** 2
+                found.setdefault(name, []).append(
+                    (error.mean(), (error * near).sum() / error.sum())
+                )
+    yield "| objects | MSE x 1e-2 | of it near edges |"
+    yield "|---|---:|---:|"
+    for name, rows in found.items():
+        error, share = np.mean(rows, 0)
+        yield f"| {name} | {100 * error:.4f} | {100 * share:.0f} % |"
+
+
+def thresholds(folder: Path) -> Iterator[str]:
+    """The table, line by line: geometric means over recordings."""
+    yield "| mismatch | alike: bright, all | learned: bright, all | learned in |"
+    yield "|---|---:|---:|---:|"
+    for mismatch in MISMATCH:
+        errors: dict[bool, list] = {False: [], True: []}
+        counts = []
+        for name in TESTING:
+            for seed in SEEDS:
+                sensor = dataclasses.replace(Sensor(), mismatch=mismatch)
+                source = Pan(scene(name), speed="fast", duration=0.5, seed=seed)
+                recording = simulate(source, sensor, seed, name)
+                times, truths = recording.extra["hdr_t"], recording.extra["hdr"]
+                rows = np.unique(np.linspace(2, len(times) - 3, 4).round().astype(int))
+                for learn in errors:
+                    params = mc.Params(
+                        preset="hdr", c_on=0.2, c_off=0.18, rho_ref=5e-4, learn=learn
+                    )
+                    video = mc.estimate(recording, params, progress=False)
+                    image, truth, I0 = video(times[rows]).mean, truths[rows], float(params.I0)
+                    square = (np.log(np.maximum(image, 0) + I0) - np.log(truth + I0)) ** 2
+                    bright = square[truth > 1].mean() if (truth > 1).any() else np.nan
+                    errors[learn].append((bright, square.mean()))
+                    if learn:
+                        counts.append(video.follow.images.factors is not None)
+        cells = [np.exp(np.nanmean(np.log(errors[learn]), 0)) for learn in (False, True)]
+        text = " | ".join(", ".join(f"{v:.4f}" for v in cell) for cell in cells)
+        yield f"| {mismatch:g} | {text} | {sum(counts)} of {len(counts)} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    tables = {"objects": objects, "thresholds": thresholds}
+    parser.add_argument("--tables", nargs="+", default=list(tables), choices=tables)
+    parser.add_argument("--out", type=Path, required=True, help="folder for everything made")
+    arguments = parser.parse_args()
+    out = arguments.out.absolute()
+    out.mkdir(parents=True, exist_ok=True)
+    for name in arguments.tables:
+        lines = []
+        for line in tables[name](out):
+            lines.append(line)
+            print(line, flush=True)
+        (out / f"{name}.md").write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()
