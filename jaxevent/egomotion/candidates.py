@@ -273,7 +273,7 @@ def _gather(stream, rules, latest, limits, gate, out, state, clock, scratch):
             if fill == size or (fill > 0 and now - first > longest):
                 batch, fill = batch + 1, 0
             if batch == batches or now > until:
-                state[:] = batch, fill, first, until
+                state[0], state[1], state[2], state[3] = batch, fill, first, until
                 return i, True
             if fill == 0:
                 if batch == 0:
@@ -327,5 +327,5 @@ def _gather(stream, rules, latest, limits, gate, out, state, clock, scratch):
         at = (head[sign, line, column] + 1) % kept
         head[sign, line, column] = at
         ring[sign, line, column, at] = now
-    state[:] = batch, fill, first, until
+    state[0], state[1], state[2], state[3] = batch, fill, first, until
     return len(t_in), False

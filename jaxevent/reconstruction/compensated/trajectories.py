@@ -411,7 +411,8 @@ def _solve(N, b, p, across, down, smooth, ridge, iterations, d):
         for i in range(rows):
             for c in range(4):
                 if turn == 0:
-                    q[c, i + 1, 1:-1] = z[i, c]
+                    for j in range(columns):  # a slice would take longer to compile
+                        q[c, i + 1, j + 1] = z[i, c, j]
                 else:
                     _scale_and_add(share, z[i, c], q[c, i + 1, 1:-1])
         sums[:] = np.float32(0)

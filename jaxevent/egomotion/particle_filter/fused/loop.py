@@ -273,8 +273,15 @@ def _resample(rows, uniform, cells, work, count):
         work[rows.log_weights, :count] = even
     else:
         for k in range(len(rows.moved)):
-            work[rows.particles[k], :count] = work[rows.moved[k], :count]
-        work[rows.log_weights, :count] = work[rows.weighed, :count]
+            _copy(work[rows.moved[k]], work[rows.particles[k]], count)
+        _copy(work[rows.weighed], work[rows.log_weights], count)
+
+
+@part
+def _copy(one, other, count):
+    """Copy so many numbers; of slices numba takes over a second to compile it."""
+    for i in range(count):
+        other[i] = one[i]
 
 
 @part
