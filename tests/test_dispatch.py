@@ -11,6 +11,7 @@ FIRST = "import jaxevent; jaxevent.akf"
 LOOK = "; from jaxevent.reconstruction import filtering; print(filtering.IN_TURN)"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("program", "said"),
     [(BEFORE, "True"), (FIRST, "True"), (AFTER, "False")],

@@ -31,6 +31,7 @@ class Parts:
         return ((batch - params.raw["c_on"]) / SPREAD) ** 2 / 2, jnp.ones_like(batch)
 
 
+@pytest.mark.slow
 def test_a_prior_and_a_likelihood_make_the_posterior():
     """Of Gaussians, in logarithms: the mean weighted by precision, and the precisions added."""
     y = jnp.asarray(np.random.default_rng(3).normal(np.log(0.1), SPREAD, N))

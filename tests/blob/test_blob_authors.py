@@ -57,6 +57,7 @@ def followed(recording, seeds, **values):
 CASES = [("blob_mini", True), ("lights_mini", True), ("ties_mini", True), ("ties_mini", False)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "offset"), CASES)
 def test_the_authors_program(golden, name, offset):
     recording, seeds, tables = golden_of(golden, name)
@@ -95,6 +96,7 @@ def stream(t, xi, p):
     return Recording("ties", 64, 48, made)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("waiting", [1, 20, WAITING + 5])
 def test_events_of_one_time_are_replayed(waiting):
     """They act as if they had come one after the other until the next event, in its place."""

@@ -266,6 +266,7 @@ SETTINGS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("m", "name", "values", "oracle"), SETTINGS)
 def test_filters_equal_a_dense_joint_version(m, name, values, oracle):
     params = params_of(name, **values)

@@ -72,6 +72,7 @@ def test_what_the_user_sets_wins_over_what_is_found(crossed):
         blob.moment.estimate(crossed[0], found=found, seeds=[(10.0, 10.0, 3.0)])
 
 
+@pytest.mark.slow
 def test_noise_and_hot_pixels_are_no_targets():
     hot = [Target(Line((x, 40.0), size=(0.01, 0.01)), 2e3) for x in (20.0, 90.0)]
     recording, _ = scene(hot, noise=2e4, seed=3)
@@ -82,6 +83,7 @@ def test_noise_and_hot_pixels_are_no_targets():
     assert len(tracks) == 0 and tracks([0.1]).mean.shape == (1, 0, 8)
 
 
+@pytest.mark.slow
 def test_a_ring_and_a_pair_of_edges_are_one_target_each():
     ring = [Target(Line((44, 48), (100.0, 0.0), size=(25, 25)), 2e4, "ring")]
     edges = [

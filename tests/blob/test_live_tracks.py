@@ -143,6 +143,7 @@ def test_the_kernel_says_the_same(float32):
     np.testing.assert_allclose(one.mean, other.mean, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_after_the_last_event_states_are_predicted():
     recording, params = scene(), blob.constant_velocity.Params(**FEW)
     seeds = [(60.0, 80.0, 8.0)]

@@ -94,7 +94,8 @@ def all_at_once(recording, M, size, start, times):
     return x, np.stack([P[4 * k : 4 * k + 4, 4 * k : 4 * k + 4] for k in found])
 
 
-@pytest.mark.parametrize("M", [1, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("M", [1, 4])
 def test_equals_least_squares_of_all_states(walk, M):
     """Before, in and after a pause, and after the last event."""
     tracker, start, size = blob.constant_velocity, (58.0, 62.0), 4.0

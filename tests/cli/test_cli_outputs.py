@@ -267,6 +267,7 @@ def test_what_cannot_be_printed(folder):
         assert len(jaxevent.load(folder / f"{closed}.h5").events) == len(small().events)
 
 
+@pytest.mark.slow
 def test_a_terminal_without_other_letters(folder):
     (folder / "source.h5").rename(folder / "\u00b5.h5")
     ascii = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}

@@ -403,6 +403,7 @@ def test_contrast_is_the_same_at_another_time(straight):
     assert np.array_equal(one.mean, two.mean) and np.array_equal(one.t + 3_600_000_000, two.t)
 
 
+@pytest.mark.slow
 def test_windows_of_a_number_of_events(straight):
     recording, truth = straight
     params = contrast.Params.of({**SMALL.values(), "window": "events"})
@@ -413,7 +414,7 @@ def test_windows_of_a_number_of_events(straight):
 
 
 @pytest.mark.slow
-def test_silence_and_noise_are_lost_and_the_motion_found_again(straight):
+def test_silence_and_noise_are_lost_and_the_motion_found_again(straight, optimised):
     recording, truth = straight
     e, rng = recording.events, np.random.default_rng(0)
     n = 3000

@@ -49,7 +49,7 @@ def by_hand(x, y, T, Omega, inverse_depth):
     return F * (P_later[..., :2] / P_later[..., 2:] - P[..., :2] / P[..., 2:]) / h
 
 
-def test_flow_of_a_scene_is_the_true_one():
+def test_flow_of_a_scene_is_the_true_one(optimised):
     recording, source = textured()
     told = flow(recording, true_motion(source))
     events = recording.events
@@ -70,7 +70,7 @@ def test_flow_of_a_scene_is_the_true_one():
     assert flipped[late].mean() > 2 * outlier[late].mean()  # 0.19 and 0.08
 
 
-def test_field_of_a_scene_is_the_true_one():
+def test_field_of_a_scene_is_the_true_one(optimised):
     recording, source = textured()
     t = 120_000
     found = RigidFlow(recording, true_motion(source)).flow(np.array([t]))[0]
@@ -208,7 +208,7 @@ def test_where_the_motion_is_lost_there_is_no_flow():
     assert not nothing.valid.any() and nothing.outliers() == 0
 
 
-def test_noise_is_an_outlier():
+def test_noise_is_an_outlier(optimised):
     recording, source = textured()
     rng = np.random.default_rng(0)
     noise = scattered(2000, 100_000, 1).events

@@ -38,6 +38,7 @@ def moving(flow, seconds: float, number: int = 700, every: float = 0.7, camera=C
     return Recording("moving", WIDTH, HEIGHT, events, camera=camera)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("speed", "seconds"), [(12.0, 2.0), (90.0, 0.6), (900.0, 0.1)])
 def test_a_speed_is_told(speed, seconds):
     recording = moving(lambda x: np.tile([0.8 * speed, -0.6 * speed], (len(x), 1)), seconds)

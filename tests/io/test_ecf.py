@@ -85,6 +85,7 @@ def decoded(data):
     return ecf.decode(np.frombuffer(data, np.uint8))
 
 
+@pytest.mark.slow
 def test_chunks_written_out_by_hand():
     one = bytes.fromhex("06000000 0400000000000000 01 00022000 00000000 00000000")
     assert decoded(one).tolist() == [(1, 2, 0, 4)]

@@ -178,6 +178,7 @@ def still(L, V=0.01):
     return warping.Along(L, np.full_like(L, V), ones, ones)
 
 
+@pytest.mark.slow
 def test_agreement_is_that_of_the_pure_function():
     L, V, clear, s, p = warped_case()
     along, at = warping.warp(L, V, clear, s, p), place(3, 1, 0, 2)
@@ -301,6 +302,7 @@ def held(params, L, P, case, samples):
     return np.asarray(quick.L), np.asarray(quick.P)
 
 
+@pytest.mark.slow
 def test_an_exposure_is_the_mean_along_trajectories():
     L, taken, shots, p = exposed()
     I0 = float(Params().I0)
@@ -322,6 +324,7 @@ def test_an_exposure_is_the_mean_along_trajectories():
     np.testing.assert_allclose((back * dL).sum(), (q * slope).sum(), rtol=0.1)
 
 
+@pytest.mark.slow
 def test_images_are_held_to_blurred_frames():
     case = exposed()
     truth = case[0]
@@ -341,6 +344,7 @@ def test_images_are_held_to_blurred_frames():
     np.testing.assert_allclose(unchanged, blurred, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_clipped_pixels_tell_their_side():
     truth, taken, shots, p = exposed()
     white = shots._replace(grey=np.ones_like(shots.grey))
@@ -618,6 +622,7 @@ def balanced():
     return jax.tree.map(jnp.asarray, values)
 
 
+@pytest.mark.slow
 def test_equations_are_those_of_the_steps():
     p, (L, V, s, _), numbers = jax.tree.map(np.asarray, balanced())
     near = np.exp(-2 * s**2).astype(np.float32)
@@ -701,6 +706,7 @@ def test_tiny_sensors_and_single_frames(size):
         assert not valid[np.sqrt(P) >= mc.Params().vague].any() and (P > 0).all()
 
 
+@pytest.mark.slow
 def test_blurring_is_scipys():
     image = np.random.default_rng(5).normal(size=(20, 25)).astype(np.float32)
     expected = gaussian_filter(image, 1.5, mode="nearest", truncate=3.34)

@@ -126,6 +126,7 @@ def test_kernel_without_frames(recording):
         check("akf", recording, PARAMS, window_events=7)
 
 
+@pytest.mark.slow
 def test_kernel_of_a_users_own_filter():
     """A state of three numbers, one of them whole; nothing is written twice."""
     recording, params = small(), own_filter.Params(gain=0.3, alpha=20.0)
@@ -246,12 +247,16 @@ def test_derivatives_by_kernels_are_those_of_the_scan(name, values):
         images = method.prepare_images(recording, times, params, compiler=compiler)
         assert isinstance(images, FusedImages) == (compiler == "numba")
         value, slope = jax.jit(jax.value_and_grad(loss))(raw, images)
-        along = jax.jvp(lambda r, i=images: loss(r, i), (raw,), (jax.tree.map(jnp.ones_like, raw),))
+        ones = jax.tree.map(jnp.ones_like, raw)
+        along = jax.jit(lambda r, t, i: jax.jvp(lambda v: loss(v, i), (r,), (t,)))(
+            raw, ones, images
+        )
         found.append((value, slope, along))
     for one, other in zip(*map(jax.tree.leaves, found), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_images_prepared_for_losses():
     """Some of them, mapped over parameters, by a program that serves another recording too."""
     first, second = small(), random_recording(3, 80, 3, size=(24, 20))

@@ -678,6 +678,7 @@ def test_presets():
         jaxevent.akf.Params(certainty=2)
 
 
+@pytest.mark.slow
 def test_a_video_becomes_an_xarray_dataset():
     xarray = pytest.importorskip("xarray", reason="needs the extra xarray")
     recording = small()

@@ -56,6 +56,7 @@ def untimed(rows: list[dict]) -> list[dict]:
     return [{key: value for key, value in row.items() if key != "seconds"} for row in rows]
 
 
+@pytest.mark.slow
 def test_a_grid_is_every_combination(tmp_path):
     jaxevent.save(small(), tmp_path / "small.h5")
     text = """

@@ -227,7 +227,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.slow
-def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
+def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys, optimised):
     monkeypatch.setattr(jaxevent.runs.fit, "PERIOD", 0.0)
     config, out = write(folder, CONFIG), folder / "out"
     fit(config, folder / "whole")

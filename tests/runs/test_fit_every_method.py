@@ -110,6 +110,7 @@ def test_a_method_on_the_host_is_searched_and_not_fitted(folder, name):
     assert list(task(folder, name, f"search = {{ {number} = [0.1, 0.2, 3] }}").search) == [number]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["planes", "frames"])
 def test_a_search_ends_at_the_least_loss_of_what_the_method_tells(folder, name):
     if name == "frames":
@@ -143,6 +144,7 @@ def batch_times(batch, recording) -> np.ndarray:
     return np.rint(recording.start + 1e6 * batch.time).astype(np.int64)
 
 
+@pytest.mark.slow
 def test_flow_says_why_it_is_not_fitted(folder):
     with pytest.raises(InputError, match="cannot be fitted; fit another, or compare"):
         task(folder, "flow", "search = { clock_offset = [-0.01, 0.01, 3] }")

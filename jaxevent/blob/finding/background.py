@@ -10,7 +10,7 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.events.filters import busiest_neighbour
@@ -43,19 +43,17 @@ class Background:
     activity: NDArray[np.float64]
     duration: float
 
-    def slice(self, t: ArrayLike | float | int) -> Any:
+    def slice(self, t: NDArray | float | int) -> Any:
         """Which slices hold times (s)."""
         part = np.asarray(t) / self.duration * SLICES
         return np.clip(part, 0, SLICES - 1).astype(np.int64)
 
-    def at(self, x: ArrayLike | float | int, y: ArrayLike | float | int, t: float | int) -> Any:
+    def at(self, x: NDArray | float | int, y: NDArray | float | int, t: float | int) -> Any:
         """Rates, 1/(px s), at some pixels at a time (s)."""
         return look_up(self.rate, FINE, x, y) * self.activity[self.slice(t)]
 
 
-def look_up(
-    values: NDArray, cell: int, x: ArrayLike | float | int, y: ArrayLike | float | int
-) -> Any:
+def look_up(values: NDArray, cell: int, x: NDArray | float | int, y: NDArray | float | int) -> Any:
     """Values (rows, columns) of cells of so many px at some pixels."""
     rows, columns = values.shape
     row = np.clip(np.asarray(y).astype(np.int64) // cell, 0, rows - 1)
@@ -64,7 +62,7 @@ def look_up(
 
 
 def evidence(
-    n: ArrayLike | float | int, mu: ArrayLike | float | int, dispersion: ArrayLike | float | int
+    n: NDArray | float | int, mu: NDArray | float | int, dispersion: NDArray | float | int
 ) -> Any:
     """Nats against n events of background, of which mu are expected; 0 if there are no more.
 
