@@ -8,7 +8,7 @@ from the inputs: that costs less than keeping them.
 
 import dataclasses
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -237,11 +237,14 @@ def translate(
     graph: Graph,
     host: HostProgram,
     single: bool = False,
+    seeds: int = 0,
+    zeros: Collection[str] = (),
 ) -> Function:
     """`function(params, **given)`, which returns a dict; raises `Untranslatable`.
 
     `given` are trees of shapes by name. Arrays with an axis of `MARK` are elements. `host` has the
-    leaves of the parameters as its inputs.
+    leaves of the parameters as its inputs; the last `seeds` are derivatives, mostly 0.
+    `zeros` are names of single numbers that are always 0.
     """
     try:
         call = lambda p, v: function(p, **v)  # noqa: E731
@@ -249,10 +252,11 @@ def translate(
     except Exception as error:  # whatever a function raises
         about = f"its functions fail in a trace: {error}"
         raise Untranslatable(about.partition("\n")[0]) from error
-    values: list[Value] = [OfParameters(k) for k in range(len(jax.tree.leaves(params)))]
+    known = len(jax.tree.leaves(params))
+    values: list[Value] = [OfParameters(k, k >= known - seeds) for k in range(known)]
     for name in sorted(given):
         for leaf_name, leaf in leaves_of(name, given[name]).items():
-            values.append(_inputs(graph, leaf_name, leaf, single))
+            values.append(_inputs(graph, leaf_name, leaf, single, zeros))
     translation = LoopTranslation(graph, host, single)
     made = iter(translation.run(closed, values))
     results: dict[str, Node] = {}
@@ -263,14 +267,17 @@ def translate(
     return Function(results)
 
 
-def _inputs(graph: Graph, name: str, leaf: Any, single: bool) -> Value:
+def _inputs(graph: Graph, name: str, leaf: Any, single: bool, zeros: Collection[str]) -> Value:
     shape = tuple(1 if size == MARK else size for size in leaf.shape)
     elements = MARK in leaf.shape and not single
     level = Level.ELEMENT if elements else Level.POINT
     out = np.empty(shape, object)
     names = iter(numbers_of(name, leaf))
     for place in np.ndindex(*shape):
-        out[place] = graph.input(next(names), KINDS[leaf.dtype.kind], level)
+        number = next(names)
+        none = number in zeros
+        kind = KINDS[leaf.dtype.kind]
+        out[place] = graph.constant(0.0) if none else graph.input(number, kind, level)
     return out
 
 

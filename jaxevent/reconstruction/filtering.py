@@ -18,7 +18,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxevent import dispatch
 from jaxevent.estimator import Described, Estimate
 from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.reconstruction.augment import FrameParams
@@ -31,15 +30,12 @@ from jaxevent.reconstruction.features import (
     ReadOut,
     Tiles,
 )
-from jaxevent.reconstruction.fused.images import FusedImages
+from jaxevent.reconstruction.fused.images import DividedEvents, prepared_by_kernel
 from jaxevent.reconstruction.fused.video import FusedVideo, wants_kernel, without_kernel
 from jaxevent.reconstruction.layout import SHAPES, SLOTS
 from jaxevent.reconstruction.prepared import PreparedImages
 from jaxevent.reconstruction.video import ImageSequence, Video
-from jaxevent.reconstruction.windows import sorted_times
 from jaxevent.recording import Recording, Times
-
-IN_TURN = dispatch.run_in_turn()  # whether kernels may be called from within programs
 
 
 class State(eqx.Module):
@@ -187,17 +183,11 @@ class Filter(PixelEstimator[P]):
         `compiler` is as in `estimate`.
         """
         params = self.Params() if params is None else params
-        kernel = wants_kernel(compiler, jax.local_devices()) and IN_TURN
-        if kernel and "rho_ref" not in params.followed:
-            self.check(recording)
-            times = sorted_times(times)
-            if not extrapolate:
-                self.check_span(recording, times, params)
-            try:
-                return FusedImages.of(self, recording, times, params)
-            except Untranslatable as reason:
-                if compiler == "numba":
-                    raise without_kernel(self.name, reason) from reason
+        fused = prepared_by_kernel(
+            DividedEvents, self, recording, times, params, extrapolate, compiler
+        )
+        if fused is not None:
+            return fused
         return super().prepare_images(recording, times, params, extrapolate=extrapolate)
 
     def step(self, params: P, state: Any, event: Event) -> Any:

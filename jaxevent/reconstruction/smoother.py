@@ -54,10 +54,13 @@ from jaxevent.reconstruction.features import (
     Numeric,
     ReadOut,
 )
+from jaxevent.reconstruction.fused.images import prepared_by_kernel
 from jaxevent.reconstruction.fused.smoothed import SmoothedVideo
+from jaxevent.reconstruction.fused.smoothed_images import DividedFrames
 from jaxevent.reconstruction.fused.video import wants_kernel, without_kernel
+from jaxevent.reconstruction.prepared import PreparedImages
 from jaxevent.reconstruction.video import ImageSequence, Video
-from jaxevent.recording import Recording
+from jaxevent.recording import Recording, Times
 
 
 class Params(CertaintyParams):
@@ -512,6 +515,9 @@ class Smoother(PixelEstimator[Params]):
         Functions of parameters, what is known with them, and numbers that kernels keep by name.
         """
 
+        def lag(known):
+            return known[0].clock_offset - known[1]["clock_offset"]
+
         def counted(params, on, off, around_on, around_off, given):
             return shared(params, on, around_on, given), shared(params, off, around_off, given)
 
@@ -543,13 +549,14 @@ class Smoother(PixelEstimator[Params]):
 
         def show(known, past, said, moved_on, moved_off, kept, elapsed, seconds, here, **counts):
             on, off = counted(known[0], **counts)
-            left = step_between(known[0], moved_on - on, moved_off - off, seconds)
-            S, q = step_between(known[0], on, off, elapsed)
+            rest = jnp.where(seconds > 0, seconds + lag(known), 0)
+            left = step_between(known[0], moved_on - on, moved_off - off, rest)
+            S, q = step_between(known[0], on, off, elapsed - lag(known))
             state = join(past.m + S, 1 / (past.P + q), said.earlier(*left))
             return {"image": self.tell(known[0], state, kept, here)}
 
         def before(known, later, kept, seconds, **counts):
-            left = step_between(known[0], *counted(known[0], **counts), seconds)
+            left = step_between(known[0], *counted(known[0], **counts), seconds + lag(known))
             first = later + information(initial(known[0]))
             zero = jnp.zeros_like(later.h)
             state = join(zero, zero, first.earlier(*left))
@@ -558,8 +565,8 @@ class Smoother(PixelEstimator[Params]):
         def start(known):
             return {"state": initial(known[0])}
 
-        def excess(known, share, on, off):
-            return {"excess": segment_excess(known[0], share, on, off)}
+        def excess(known, share, edge, on, off):
+            return {"total": segment_excess(known[0], share + lag(known) * edge, on, off)}
 
         return {
             "start": start,
@@ -596,6 +603,24 @@ class Smoother(PixelEstimator[Params]):
             if compiler == "numba":
                 raise without_kernel(self.name, reason) from reason
             return Video(self, recording, params, **options)
+
+    def prepare_images(
+        self,
+        recording: Recording,
+        times: Times,
+        params: Params | None = None,
+        *,
+        extrapolate: bool = False,
+        compiler: str | None = None,
+    ) -> PreparedImages:
+        """As `Filter.prepare_images`."""
+        params = self.Params() if params is None else params
+        fused = prepared_by_kernel(
+            DividedFrames, self, recording, times, params, extrapolate, compiler
+        )
+        if fused is not None:
+            return fused
+        return super().prepare_images(recording, times, params, extrapolate=extrapolate)
 
     def log_likelihood(self, params: Params, features: Features) -> Float[Array, ""]:
         """Of all frames of a prepared recording, given its events: a sum over frames and pixels."""

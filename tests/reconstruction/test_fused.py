@@ -226,12 +226,12 @@ def test_numbers_of_parameters_are_found_without_compiling():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["akf", "cf"])
+@pytest.mark.parametrize("name", ["akf", "cf", "aks"])
 @pytest.mark.parametrize("values", [PARAMS, {**DEAD, **ALL}], ids=["usual", "all"])
 def test_derivatives_by_kernels_are_those_of_the_scan(name, values):
     """Of loss and gradient in reverse, and along a direction, of means and variances."""
     recording, method = random_recording(7, 300, 5, size=(4, 3), exposure=700), METHODS[name]
-    params = params_of(method, **values)
+    params = params_of(method, **{**values, "spread": 0.0})
     times = np.unique(np.clip(times_of(recording), recording.start, recording.stop))
     still = {*params.without_gradient(), "ratio_min", "ratio_max"}
     raw = {n: leaf for n, leaf in params.raw.items() if n not in still}

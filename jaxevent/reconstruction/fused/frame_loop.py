@@ -50,7 +50,7 @@ class FramePlaces(NamedTuple):
     work: int  # fields of the frame that a pass has come to
     kept: int  # fields that are kept of each frame
     image: NDArray[np.int64]  # grey value, intensity, certainty
-    total: NDArray[np.int64]  # [1], sums over exposures
+    total: NDArray[np.int64]  # sums over exposures, and their derivatives
     inside: int  # events within exposures; -1: not needed
     side: int
     counts: NDArray[np.int64]  # ON, OFF, and those of the neighbours
@@ -76,6 +76,7 @@ class GivenFrames(NamedTuple):
     places: FramePlaces
     functions: FrameFunctions
     numbers: NDArray
+    slot: NDArray[np.int64]  # of each band in the memory
 
 
 class Instants(NamedTuple):
@@ -112,9 +113,9 @@ def _look(band, k, given, cells):
     if not places.exposed:
         return
     left, right = frames.left[k], frames.right[k]
-    total = places.total[0] * stride
-    for z in range(stride):
-        cells[total + z] = 0
+    for total in places.total:
+        for z in range(total * stride, (total + 1) * stride):
+            cells[z] = 0
     sum_segments(
         bands.events, bands.weights, a, b, left, frames.mid[k], right, given.functions.excess,
         given.numbers, cells, places.total * stride, stride,
@@ -155,7 +156,7 @@ def filter_frames(begin, end, given, memory, starts, linked):
     width, padded = np.int64(bands.width), np.int64(bands.width + 2)
     above = np.zeros(stride, numbers.dtype)
     for band in range(begin, end):
-        cells, rows = memory[band], bands.edges[band + 1] - bands.edges[band]
+        cells, rows = memory[given.slot[band]], bands.edges[band + 1] - bands.edges[band]
         a, b = bands.first[band], bands.first[band + 1]
         first, last = padded, (rows + 1) * padded
         if starts:
@@ -186,7 +187,7 @@ def smooth_frames(begin, end, given, memory):
     bands, line, places = given.bands, given.line, given.places
     padded = np.int64(bands.width + 2)
     for band in range(begin, end):
-        cells, rows = memory[band], bands.edges[band + 1] - bands.edges[band]
+        cells, rows = memory[given.slot[band]], bands.edges[band + 1] - bands.edges[band]
         for j in range(len(line.mid)):
             k = len(line.mid) - 1 - j
             row = np.int64((places.work + k * places.kept) * places.stride)
@@ -203,9 +204,10 @@ def read_images(begin, end, given, memory, instants, images):
     events, weights, weighted = bands.events, bands.weights, len(bands.weights) > 0
     numbers, stride, counts = given.numbers, places.stride, places.counts
     width, pixels = np.int64(bands.width), images.mean.shape[1]
+    size = np.int64(images.slopes.shape[2] * images.slopes.shape[3])
     padded, above = width + 2, np.zeros(places.stride, numbers.dtype)
     for band in range(begin, end):
-        cells, rows = memory[band], bands.edges[band + 1] - bands.edges[band]
+        cells, rows = memory[given.slot[band]], bands.edges[band + 1] - bands.edges[band]
         a, b, known, i = bands.first[band], bands.first[band + 1], -1, 0
         on, off = counts[0] * stride, counts[1] * stride
         for image in range(len(instants.time)):
@@ -228,11 +230,12 @@ def read_images(begin, end, given, memory, instants, images):
                 functions.before(
                     cells.ctypes, numbers.ctypes, row, rows, width, padded,
                     instants.seconds[image], 0.0, 0.0, images.mean.ctypes, images.variance.ctypes,
-                    images.valid.ctypes, at,
+                    images.valid.ctypes, images.slopes.ctypes, size, at,
                 )  # fmt: skip
             else:
                 functions.show(
                     cells.ctypes, numbers.ctypes, row, rows, width, padded,
                     instants.elapsed[image], instants.seconds[image], instants.here[image],
-                    images.mean.ctypes, images.variance.ctypes, images.valid.ctypes, at,
+                    images.mean.ctypes, images.variance.ctypes, images.valid.ctypes,
+                    images.slopes.ctypes, size, at,
                 )  # fmt: skip

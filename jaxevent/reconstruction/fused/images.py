@@ -5,6 +5,7 @@ parameters that are asked for. JAX sees a function with a rule for its derivativ
 which is linear in the parameters' changes; so gradients in reverse cost the same one pass.
 """
 
+import abc
 import functools
 import itertools
 import threading
@@ -19,34 +20,47 @@ import numpy as np
 from jaxtyping import Int
 from numpy.typing import NDArray
 
+from jaxevent import dispatch
 from jaxevent.estimator import Estimate
+from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.features import Numeric
+from jaxevent.reconstruction.fused.loop import Images
 from jaxevent.reconstruction.fused.passes import DividedRecording, Passes
 from jaxevent.reconstruction.fused.pixel import Directions
-from jaxevent.recording import Recording
+from jaxevent.reconstruction.fused.video import wants_kernel, without_kernel
+from jaxevent.reconstruction.windows import sorted_times
+from jaxevent.recording import Recording, Times
+
+IN_TURN = dispatch.run_in_turn()  # whether kernels may be called from within programs
 
 _held: "weakref.WeakValueDictionary[int, Divided]" = weakref.WeakValueDictionary()
 _numbers = itertools.count()
 
 
-class Divided:
+class Divided(abc.ABC):
     """A recording divided among bands, with the kernels that have passed over it.
 
     What is of one method, precision and size is equal: programs that JAX compiles for one serve
-    all. Which one is meant is told by its number, when they run.
+    all. Which one is meant is told by its number, when they run. Raises `Untranslatable` unless
+    there are kernels for the images and their derivatives.
     """
 
     def __init__(self, method: Any, recording: Recording, times: NDArray[np.int64], params: Any):
-        self._recording = DividedRecording(recording, Timing.of(params), method.filters)
-        self.method, self.dtype = method, self._recording.dtype
+        self.recording = DividedRecording(recording, Timing.of(params), method.filters)
+        self.method, self.dtype = method, self.recording.dtype
         self.pixels = recording.width * recording.height
-        self._clock_offset = np.asarray(params.clock_offset)
-        self._window = self._recording.cut(None, self._recording.windows.initial())
-        self._times = times - self._recording.origin
+        self.clock_offset = np.asarray(params.clock_offset)
+        self._times = times - self.recording.origin
         self._lock = threading.Lock()
-        self._passes: dict[Directions, Passes] = {}
-        self.check(params)
+        dead = params.without_gradient()
+        numbers = [
+            (leaf, k)
+            for leaf, (path, value) in enumerate(jax.tree_util.tree_flatten_with_path(params)[0])
+            if getattr(path[-1], "key", None) not in dead
+            for k in range(np.size(value))
+        ]
+        self.check(params, Directions(tuple(numbers), ("mean", "variance")))
         self.number = next(_numbers)
         _held[self.number] = self
 
@@ -59,39 +73,21 @@ class Divided:
     def _kind(self) -> tuple:
         return self.method, self.pixels, self.dtype.name
 
-    def check(self, params: Any) -> None:
-        """Raise `Untranslatable` unless there are kernels for the images and their derivatives."""
-        self._recording.kernel(self.method, params, self._clock_offset)
-        dead = params.without_gradient()
-        numbers = [
-            (leaf, k)
-            for leaf, (path, value) in enumerate(jax.tree_util.tree_flatten_with_path(params)[0])
-            if getattr(path[-1], "key", None) not in dead
-            for k in range(np.size(value))
-        ]
-        self._recording.check(
-            self.method,
-            params,
-            self._clock_offset,
-            Directions(tuple(numbers), ("mean", "variance")),
-        )
+    @abc.abstractmethod
+    def check(self, params: Any, directions: Directions) -> None:
+        """Raise `Untranslatable` unless there are kernels for images and these derivatives."""
+
+    @abc.abstractmethod
+    def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> Images:
+        """Images at sorted times (us since the recording's start), and their derivatives."""
 
     def images(
         self, rows: NDArray, params: Any, directions: Directions
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Images at some of the times, and their derivatives (times, pixels, images, lanes)."""
         wanted, places = np.unique(rows, return_inverse=True)
-        times = self._times[wanted]
         with self._lock:
-            kernel = self._recording.kernel(self.method, params, self._clock_offset, directions)
-            passes = self._passes.get(directions)
-            if passes is None or passes.kernel.source is not kernel.source:
-                passes = Passes(kernel, self._recording.layout, self.dtype)
-                self._passes[directions] = passes
-            passes.kernel = kernel
-            passes.begin(self._window)
-            images = passes.room(len(times), self.pixels)
-            passes.run(self._window, int(times[-1]) + 1 if len(times) else 0, times, images)
+            images = self.make(self._times[wanted], params, directions)
         made = images.mean, images.variance, images.valid.view(bool), images.slopes
         if len(wanted) == len(rows) and (places == np.arange(len(rows))).all():
             return made
@@ -99,19 +95,41 @@ class Divided:
         return mean, variance, valid, slopes
 
 
+class DividedEvents(Divided):
+    """Of a filter, which passes over the events."""
+
+    def __init__(self, method: Any, recording: Recording, times: NDArray[np.int64], params: Any):
+        super().__init__(method, recording, times, params)
+        self._window = self.recording.cut(None, self.recording.windows.initial())
+        self._passes: dict[Directions, Passes] = {}
+
+    def check(self, params: Any, directions: Directions) -> None:
+        self.recording.kernel(self.method, params, self.clock_offset)
+        self.recording.check(self.method, params, self.clock_offset, directions)
+
+    def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> Images:
+        kernel = self.recording.kernel(self.method, params, self.clock_offset, directions)
+        passes = self._passes.get(directions)
+        if passes is None or passes.kernel.source is not kernel.source:
+            passes = Passes(kernel, self.recording.layout, self.dtype)
+            self._passes[directions] = passes
+        passes.kernel = kernel
+        passes.begin(self._window)
+        images = passes.room(len(times), self.pixels)
+        passes.run(self._window, int(times[-1]) + 1 if len(times) else 0, times, images)
+        return images
+
+
 class FusedImages(eqx.Module):
-    """`PreparedImages` by kernels. Raises `Untranslatable` where there are none."""
+    """`PreparedImages` by kernels."""
 
     number: Int[Numeric, ""]  # of what is held
     rows: Int[Numeric, " times"]
     held: Divided = eqx.field(static=True)
 
     @classmethod
-    def of(
-        cls, method: Any, recording: Recording, times: NDArray[np.int64], params: Any
-    ) -> "FusedImages":
-        held = Divided(method, recording, times, params)
-        return cls(np.asarray(held.number, np.int32), np.arange(len(times)), held)
+    def of(cls, held: Divided, times: int) -> "FusedImages":
+        return cls(np.asarray(held.number, np.int32), np.arange(times), held)
 
     def __call__(self, params: Any, *, variance: bool = True) -> Estimate:
         outputs = ("mean", "variance") if variance else ("mean",)
@@ -124,6 +142,35 @@ class FusedImages(eqx.Module):
     def over(self, devices: Sequence[Any]) -> "FusedImages":
         """Images of kernels are made on the host."""
         return self
+
+
+def prepared_by_kernel(
+    kind: type[Divided],
+    method: Any,
+    recording: Recording,
+    times: Times,
+    params: Any,
+    extrapolate: bool,
+    compiler: str | None,
+) -> FusedImages | None:
+    """A method's images at sorted times by kernels; None where these do not serve.
+
+    See `Filter.prepare_images`. Raises `InputError` where numba is asked for what it cannot do.
+    """
+    if not (wants_kernel(compiler, jax.local_devices()) and IN_TURN):
+        return None
+    if "rho_ref" in params.followed:
+        return None
+    method.check(recording)
+    times = sorted_times(times)
+    if not extrapolate:
+        method.check_span(recording, times, params)
+    try:
+        return FusedImages.of(kind(method, recording, times, params), len(times))
+    except Untranslatable as reason:
+        if compiler == "numba":
+            raise without_kernel(method.name, reason) from reason
+        return None
 
 
 def _evaluate(

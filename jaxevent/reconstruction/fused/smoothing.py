@@ -15,12 +15,13 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels.expressions import Graph, Node, Untranslatable, needed
+from jaxevent.kernels.expressions import Graph, Node, Untranslatable, needed, value_of
 from jaxevent.kernels.host import HostProgram
 from jaxevent.kernels.loops import Function, leaves_of, translate
 from jaxevent.kernels.modules import module_of
 from jaxevent.kernels.text import FUNCTIONS, Numbers, Place, Writer
 from jaxevent.reconstruction.fused.frame_loop import FrameFunctions
+from jaxevent.reconstruction.fused.pixel import Directions
 from jaxevent.reconstruction.video import ImageMethod
 
 COUNTS = ("on", "off", "around_on", "around_off", "given")
@@ -28,6 +29,12 @@ STATE, LATER = ("state.m", "state.P"), ("later.h", "later.J")
 LINK = tuple(f"link.{name}" for name in "AbChJ")
 WORK = ("grey", "intensity", "certainty", "total", "inside", "side", *COUNTS, *STATE, *LATER, *LINK)
 ROW = ("moved_on", "moved_off", "past.m", "past.P", "said.h", "said.J")
+
+# What has derivatives by parameters.
+MOVING = ("total", "state", "later", "moved_on", "moved_off", "past", "said", "kept")
+
+# Of these, what does not rest on its own value before.
+NEVER_CARRIED = tuple(f"slopes['{name}']" for name in ("total", "moved_on", "moved_off", "kept"))
 
 # Numbers that are equal for all pixels, by function.
 UNIFORM = {
@@ -80,8 +87,12 @@ def {name}(cells, numbers, row, begin, end, a, b, c):
 
 IMAGES = """
 
-@callback(types.void(CELLS, CELLS, I, I, I, I, D, D, D, CELLS, CELLS, MARKS, I), **HOW)
-def {name}(cells, numbers, row, rows, width, padded, a, b, c, mean, variance, valid, at):
+@callback(
+    types.void(CELLS, CELLS, I, I, I, I, D, D, D, CELLS, CELLS, MARKS, CELLS, I, I), **HOW
+)
+def {name}(
+    cells, numbers, row, rows, width, padded, a, b, c, mean, variance, valid, slopes, size, at,
+):
     u0, u1, u2 = REAL(a), REAL(b), REAL(c)
     for line in range(rows):
         for column in range(width):
@@ -91,15 +102,15 @@ def {name}(cells, numbers, row, rows, width, padded, a, b, c, mean, variance, va
             mean[at + line * width + column] = {mean}
             variance[at + line * width + column] = {variance}
             valid[at + line * width + column] = np.uint8({valid})
+{slopes}
 """
 
 EXCESS = """
 
 @callback(types.void(D, D, F, F, CELLS, CELLS), **HOW)
 def excess(share64, edge64, on, off, numbers, out):
-    share = REAL(share64)
+    share, edge = REAL(share64), REAL(edge64)
 {lines}
-    out[0] = {excess}
 """
 
 
@@ -109,8 +120,14 @@ class FrameProgram:
 
     functions: dict[str, Function]
     host: HostProgram
+    work: tuple[str, ...]  # names of the numbers of the frame that a pass has come to
     row: tuple[str, ...]  # names of the numbers that are kept of every frame
     dtype: np.dtype
+    directions: Directions
+
+    def slopes(self, name: str) -> list[str]:
+        """The names of a number's derivatives."""
+        return [slope_of(name, d) for d in range(len(self.directions.numbers))]
 
     def uses(self, name: str) -> bool:
         """Whether the functions read a number."""
@@ -144,10 +161,63 @@ class FrameWriter(Writer):
         return super().input(node) if text is None else text
 
 
+def slope_of(name: str, direction: int) -> str:
+    """The name of a number's derivative."""
+    tree, dot, leaf = name.partition(".")
+    tree, bracket, rest = tree.partition("[")
+    return f"slopes['{tree}']{bracket}{rest}{dot}{leaf}:{direction}"
+
+
+def with_slopes(function: Callable[..., dict[str, Any]]) -> Callable[..., dict[str, Any]]:
+    """The same with the derivatives of its results along directions in the parameters.
+
+    `known` ends with directions in the parameters, `slopes` are derivatives of inputs along them,
+    both with an axis of directions in front.
+    """
+
+    def both(known: Any, slopes: dict[str, Any], **given: Any) -> dict[str, Any]:
+        params, fixed, seeds = known
+
+        def of(params: Any, moving: dict[str, Any]) -> tuple[Any, Any]:
+            made = function((params, fixed), **{**given, **moving})
+            told = {key: tree for key, tree in made.items() if key in MOVING}
+            if "image" in made:
+                told |= {"mean": made["image"].mean, "variance": made["image"].covariance}
+            return told, made
+
+        def along(seeds: Any, slopes: Any) -> Any:
+            moving = {name: given[name] for name in slopes}
+            return jax.jvp(of, (params, moving), (seeds, slopes), has_aux=True)[1:]
+
+        changes, made = jax.vmap(along, out_axes=(0, None))(seeds, slopes)
+        return made | {"slopes": changes}
+
+    return both
+
+
+def _seeds(params: Any, directions: Directions) -> Any:
+    """The directions in the parameters."""
+    leaves, tree = jax.tree.flatten(params)
+    count = len(directions.numbers)
+    seeds = [np.zeros((count, *np.shape(leaf)), np.asarray(leaf).dtype) for leaf in leaves]
+    for d, (leaf, number) in enumerate(directions.numbers):
+        seeds[leaf].reshape(count, -1)[d, number] = 1
+    return jax.tree.unflatten(tree, seeds)
+
+
+def _known(params: Any, fixed: dict[str, Any], directions: Directions) -> Any:
+    return (params, fixed, _seeds(params, directions)) if directions.numbers else (params, fixed)
+
+
 def _translated(
-    method: SmoothingMethod, params: Any, fixed: dict[str, Any], exposed: bool, dtype: np.dtype
+    method: SmoothingMethod,
+    params: Any,
+    fixed: dict[str, Any],
+    exposed: bool,
+    dtype: np.dtype,
+    directions: Directions,
 ) -> FrameProgram:
-    graph, host, known = Graph(), HostProgram(), (params, fixed)
+    graph, host, known = Graph(), HostProgram(), _known(params, fixed, directions)
     for leaf in jax.tree.leaves(known):
         host.add_input(np.asarray(leaf))
     shape = jax.ShapeDtypeStruct((1, 1), dtype)
@@ -162,51 +232,71 @@ def _translated(
     held = jax.eval_shape(method.held_by_pixel, shape)
     state, said = held["state"], held["said"]
     try:
-        frame = functools.partial(functions["frame"], known)
+        frame = functools.partial(functions["frame"], known[:2])
         kept = jax.eval_shape(lambda v: frame(**v), given | {"state": state})["kept"]
     except Exception as error:  # whatever a method's functions raise
         about = f"its functions fail for one pixel: {error}"
         raise Untranslatable(about.partition("\n")[0]) from error
+    # In an order in which it is known which derivatives are always 0 (`dead`).
     wanted = {
+        "excess": tree(("share", "edge", "on", "off")),
+        "move": {"past": state, **counts, **seconds},
         "start": {},
         "frame": {**given, "state": state},
         "clipped": {**given, "state": state},
-        "move": {"past": state, **counts, **seconds},
         "link": {"link": held["link"], "said": said, **moved, **seconds},
         "back": {"later": said, "said": said, **moved, **seconds},
         "show": {"past": state, "said": said, **moved, "kept": kept, **counts, **seconds,
                  "elapsed": shape, "here": jax.ShapeDtypeStruct((1, 1), bool)},
         "before": {"later": said, "kept": kept, **counts, **seconds},
-        "excess": tree(("share", "on", "off")),
     }  # fmt: skip
+    count, dead = len(directions.numbers), set[str]()
+    seeds = len(jax.tree.leaves(known[2:]))
     for name, values in wanted.items():
-        of[name] = translate(functions[name], known, values, graph, host, single=True)
+        function = functions[name]
+        if count:
+            moving = {key: tree for key, tree in values.items() if key in MOVING}
+            slopes = jax.tree.map(lambda v: jax.ShapeDtypeStruct((count, 1, 1), v.dtype), moving)
+            function, values = with_slopes(function), {**values, "slopes": slopes}
+        of[name] = translate(
+            function, known, values, graph, host, single=True, seeds=seeds, zeros=dead
+        )
+        if name in ("excess", "move", "clipped"):
+            dead |= {
+                key
+                for key, node in of[name].results.items()
+                if value_of(node) == 0 and key.startswith(NEVER_CARRIED)
+            }
     row = (*ROW, *(leaf for leaf in leaves_of("kept", kept)))
-    return FrameProgram(of, host, row, dtype)
+    program = FrameProgram(of, host, WORK, row, dtype, directions)
+    work = [s for n in WORK if n.partition(".")[0] in MOVING for s in program.slopes(n)]
+    row_slopes = [s for n in row for s in program.slopes(n) if _number(s) not in dead]
+    return dataclasses.replace(program, work=(*WORK, *work), row=(*row, *row_slopes))
 
 
 def _write(program: FrameProgram, stride: int) -> tuple[str, Numbers]:
     """The text of a program's module, for bands of `stride` pixels."""
-    places: dict[str, Place] = {f"{n}.0": ("cells", "z", i * stride) for i, n in enumerate(WORK)}
-    places |= {f"{n}.0": ("cells", "k", i * stride) for i, n in enumerate(program.row)}
+    places: dict[str, Place] = {
+        _number(n): ("cells", index, i * stride)
+        for index, names in (("z", program.work), ("k", program.row))
+        for i, n in enumerate(names)
+    }
     writer, parts = FrameWriter(places), list[str]()
     for name, function in program.functions.items():
         uniform = {f"{n}.0": f"u{i}" for i, n in enumerate(UNIFORM.get(name, ()))}
         if "here.0" in uniform:
             uniform["here.0"] += " != 0"
-        of_segment = {"share.0": "share", "on.0": "on", "off.0": "off"}
+        of_segment = {f"{n}.0": n for n in ("share", "edge", "on", "off")}
         writer.texts = of_segment if name == "excess" else uniform
         results = function.results
         stored = {key: node for key, node in results.items() if key in places}
         if name in ("show", "before"):
-            images = dict(zip(("mean", "variance", "valid"), results.values(), strict=True))
-            lines = writer.lines([*images.values()], 12)
-            texts = {key: writer.name(node) for key, node in images.items()}
-            parts.append(IMAGES.format(name=name, lines="\n".join(lines), **texts))
+            parts.append(_images(name, program, writer))
         elif name == "excess":
-            lines = writer.lines([*results.values()], 4)
-            excess = writer.name(results["excess.0"])
-            parts.append(EXCESS.format(lines="\n".join(lines), excess=excess))
+            totals = [results[_number(n)] for n in ("total", *program.slopes("total"))]
+            lines = writer.lines(totals, 4)
+            lines += [f"    out[{k}] = {writer.name(node)}" for k, node in enumerate(totals)]
+            parts.append(EXCESS.format(lines="\n".join(lines)))
         else:
             lines = writer.lines([*stored.values()], 8)
             for key, node in stored.items():
@@ -224,6 +314,33 @@ def _write(program: FrameProgram, stride: int) -> tuple[str, Numbers]:
     return head + "".join(parts), numbers
 
 
+def _number(name: str) -> str:
+    """The name of a single number as `loops.translate` gives it."""
+    leaf, _, direction = name.partition(":")
+    return f"{leaf}.{direction or 0}"
+
+
+def _images(name: str, program: FrameProgram, writer: FrameWriter) -> str:
+    """A function of images, and of their derivatives."""
+    results, directions = program.functions[name].results, program.directions
+    images = {n: results[f"image.{n}.0"] for n in ("mean", "covariance", "valid")}
+    outputs = directions.of if directions.numbers else ()
+    slopes = {
+        (k, d): results[_number(slope)]
+        for k, output in enumerate(outputs)
+        for d, slope in enumerate(program.slopes(output))
+    }
+    lines = writer.lines([*images.values(), *slopes.values()], 12)
+    stores = [
+        f"            slopes[(at + line * width + column) * size + {k * directions.lanes + d}] = "
+        f"{writer.name(node)}"
+        for (k, d), node in slopes.items()
+    ]
+    texts = {key: writer.name(node) for key, node in images.items()}
+    texts["variance"] = texts.pop("covariance")
+    return IMAGES.format(name=name, lines="\n".join(lines), slopes="\n".join(stores), **texts)
+
+
 # What has been made of methods: programs, each for a way that conditions on parameters chose, with
 # their modules by stride.
 _made: dict[Any, list[tuple[FrameProgram, dict[int, tuple[Numbers, ModuleType]]]]] = {}
@@ -236,15 +353,17 @@ def smoother_kernel(
     exposed: bool,
     dtype: np.dtype,
     stride: int,
+    directions: Directions = Directions(),  # noqa: B008
 ) -> FrameKernel:
     """The kernel of a smoother with its parameters and `fixed` numbers; raises `Untranslatable`."""
-    leaves, tree = jax.tree.flatten((params, fixed))
-    key = method, tree, tuple(np.shape(leaf) for leaf in leaves), exposed, dtype
+    leaves, tree = jax.tree.flatten(_known(params, fixed, directions))
+    shapes = tuple(np.shape(leaf) for leaf in leaves)
+    key = method, tree, shapes, exposed, dtype, directions
     made, given = _made.setdefault(key, []), [np.asarray(leaf) for leaf in leaves]
     again = ((known, known[0].host.again(given)) for known in made)
     found = next(((known, values) for known, values in again if values is not None), None)
     if found is None:
-        program = _translated(method, params, fixed, exposed, dtype)
+        program = _translated(method, params, fixed, exposed, dtype, directions)
         found = (program, {}), program.host.values
         made.append(found[0])
     (program, modules), values = found
