@@ -8,7 +8,7 @@ import pytest
 AFTER = "import jax.numpy; jax.numpy.ones(3); import jaxevent; jaxevent.akf"
 BEFORE = "import jax, jaxevent; jax.numpy.ones(3); jaxevent.akf"
 FIRST = "import jaxevent; jaxevent.akf"
-LOOK = "; from jaxevent.reconstruction import filtering; print(filtering.IN_TURN)"
+LOOK = "; from jaxevent.reconstruction.fused import images; print(images.IN_TURN)"
 
 
 @pytest.mark.slow
