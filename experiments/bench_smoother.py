@@ -5,14 +5,17 @@
 A stream of 5 M events at 346x260 (bench.py), 200 images in 2 s. The program passes forwards and
 backwards over whole images, in double precision on one core, with the arithmetic of the smoother's
 defaults: exposures not known (--exposed: the kernel and the scan deblur those of 10 ms, the program
-does not), nothing clipped. CPU seconds of one process, minima of repeats in turn.
+does not), nothing clipped. Then the loss at 8 images of the prepared recording, and it with its
+gradient by 8 parameters. CPU seconds of one process, minima of repeats in turn.
 """
 
 import argparse
 import dataclasses
+import functools
 import time
 from typing import Any
 
+import jax
 import numba
 import numpy as np
 from bench import machine, stream
@@ -126,6 +129,38 @@ def images_by(recording: Recording, times: np.ndarray, compiler: str) -> np.ndar
     return np.concatenate([np.asarray(part.mean) for _, part in made.batches(times)])
 
 
+def losses(recording: Recording) -> dict[str, Any]:
+    """The mean squared error at 8 images, and it with its gradient by 8 parameters."""
+    names = (
+        "c_on",
+        "c_off",
+        "I0",
+        "sigma_event",
+        "sigma_bg",
+        "sigma_frame",
+        "sigma_floor",
+        "share",
+    )
+    start, frames = jaxevent.aks.Params(), recording.frames
+    assert frames is not None
+    rows, tasks = slice(1, 49, 6), {}
+    truth = jax.numpy.asarray(frames.intensity[rows].reshape(8, -1))
+
+    def loss(raw, images, truth):
+        image, _, _ = images(start.with_raw(raw), variance=False)
+        return ((image - truth) ** 2).mean()
+
+    raw = {name: start.raw[name] for name in names}
+    functions = {"loss": jax.jit(loss), "loss and gradient": jax.jit(jax.value_and_grad(loss))}
+    for compiler, by in (("numba", "kernel"), ("xla", "XLA")):
+        times = frames.t[rows] + 20_000
+        images = jaxevent.aks.prepare_images(recording, times, start, compiler=compiler)
+        for name, function in functions.items():
+            given = functools.partial(function, raw, images, truth)
+            tasks[f"{name}, {by}"] = lambda given=given: jax.block_until_ready(given())
+    return tasks
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--repeat", type=int, default=5)
@@ -146,6 +181,10 @@ def main() -> int:
         "kernel, one image": lambda: images_by(recording, times[:1], "numba"),
     }
     made = {name: way() for name, way in ways.items()}
+    slopes = losses(recording)
+    for task in slopes.values():
+        task()
+    ways |= slopes
     if not arguments.exposed:
         worst = abs(made["kernel"] - made["numba program"]).max()
         assert worst < 1e-4, worst
@@ -158,7 +197,7 @@ def main() -> int:
     print(f"{machine()}; {len(times)} images; M events per CPU second")
     for name, cpu in seconds.items():
         ratio = seconds["numba program"] / cpu
-        print(f"{name:20} {len(recording.events) / cpu / 1e6:7.2f} {ratio:6.2f} x the program")
+        print(f"{name:25} {len(recording.events) / cpu / 1e6:7.2f} {ratio:6.2f} x the program")
     return 0
 
 

@@ -80,10 +80,11 @@ PIXELS = """
 @callback(types.void(CELLS, CELLS, I, I, I, D, D, D), **HOW)
 def {name}(cells, numbers, row, begin, end, a, b, c):
     u0, u1, u2 = REAL(a), REAL(b), REAL(c)
-    for z in range(begin, end):
-        k = row + z
-{lines}
+{loops}
 """
+PIXELS_LOOP = """    for z in range(begin, end):
+        k = row + z
+{lines}"""
 
 IMAGES = """
 
@@ -95,15 +96,13 @@ def {name}(
 ):
     u0, u1, u2 = REAL(a), REAL(b), REAL(c)
     for line in range(rows):
-        for column in range(width):
+        first = at + line * width
+{loops}
+"""
+IMAGES_LOOP = """        for column in range(width):
             z = (line + 1) * padded + 1 + column
             k = row + z
-{lines}
-            mean[at + line * width + column] = {mean}
-            variance[at + line * width + column] = {variance}
-            valid[at + line * width + column] = np.uint8({valid})
-{slopes}
-"""
+{lines}"""
 
 EXCESS = """
 
@@ -298,11 +297,9 @@ def _write(program: FrameProgram, stride: int) -> tuple[str, Numbers]:
             lines += [f"    out[{k}] = {writer.name(node)}" for k, node in enumerate(totals)]
             parts.append(EXCESS.format(lines="\n".join(lines)))
         else:
-            lines = writer.lines([*stored.values()], 8)
-            for key, node in stored.items():
-                array, index, offset = places[key]
-                lines.append(f"        {array}[{index} + {offset}] = {writer.name(node)}")
-            parts.append(PIXELS.format(name=name, lines="\n".join(lines)))
+            texts = {key: "{}[{} + {}]".format(*places[key]) for key in stored}
+            loops = _loops(stored, texts, writer, PIXELS_LOOP, 8)
+            parts.append(PIXELS.format(name=name, loops=loops))
     numbers, constants = writer.finish(program.host.values)
     single = program.dtype == np.float32
     head = HEAD.format(
@@ -330,15 +327,38 @@ def _images(name: str, program: FrameProgram, writer: FrameWriter) -> str:
         for k, output in enumerate(outputs)
         for d, slope in enumerate(program.slopes(output))
     }
-    lines = writer.lines([*images.values(), *slopes.values()], 12)
-    stores = [
-        f"            slopes[(at + line * width + column) * size + {k * directions.lanes + d}] = "
-        f"{writer.name(node)}"
-        for (k, d), node in slopes.items()
-    ]
-    texts = {key: writer.name(node) for key, node in images.items()}
-    texts["variance"] = texts.pop("covariance")
-    return IMAGES.format(name=name, lines="\n".join(lines), slopes="\n".join(stores), **texts)
+    texts = dict(zip(images, ("mean", "variance", "valid"), strict=True))
+    texts = {key: f"{array}[first + column]" for key, array in texts.items()}
+    wanted: dict[str, Node] = {**images}
+    for (k, d), node in slopes.items():
+        key = f"slopes {k}.{d}"
+        wanted[key] = node
+        texts[key] = f"slopes[(first + column) * size + {k * directions.lanes + d}]"
+    return IMAGES.format(name=name, loops=_loops(wanted, texts, writer, IMAGES_LOOP, 12))
+
+
+def _loops(
+    wanted: dict[str, Node], texts: dict[str, str], writer: FrameWriter, loop: str, indent: int
+) -> str:
+    """Loops over pixels that store results: derivatives, one direction each, then the rest.
+
+    LLVM computes several pixels at once only where loops read and write few fields: that is worth
+    computing factors again. Derivatives rest on numbers that the last loop may write.
+    """
+    groups: dict[int, list[str]] = {}
+    for key in wanted:
+        slope = key.startswith("slopes")
+        group = int(key.rpartition(".")[2]) if slope else len(wanted)
+        groups.setdefault(group, []).append(key)
+    out = []
+    for _, keys in sorted(groups.items()):
+        lines = writer.lines([wanted[key] for key in keys], indent)
+        for key in keys:
+            value = writer.name(wanted[key])
+            value = f"np.uint8({value})" if wanted[key].kind == "b" else value
+            lines.append(f"{' ' * indent}{texts[key]} = {value}")
+        out.append(loop.format(lines="\n".join(lines)))
+    return "\n".join(out)
 
 
 # What has been made of methods: programs, each for a way that conditions on parameters chose, with
