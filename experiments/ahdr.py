@@ -8,8 +8,8 @@ configs/fit_ahdr.toml, gives the smoother's numbers to mc, and scores all on the
 the true HDR images. Errors are geometric means over test recordings; after +- is the standard
 deviation over the seeds of such a mean, in per cent. Done parts are kept in the folder and not
 repeated. With --methods only those are fitted and scored. The tables are those of all recordings,
-of slow and of fast ones. Where ColorVideoVDP is installed (pip install '.[hdr]'), they have its
-quality Q too, of every sixth image.
+of slow and of fast ones, and the calibration of each scene. Where ColorVideoVDP is installed (pip
+install '.[hdr]'), they have its quality Q too, of every sixth image.
 """
 
 import argparse
@@ -148,19 +148,35 @@ def table(rows: list[dict]) -> str:
     lines += ["", "| method | z2 bright, dark, well | Q |", "|---|---|---:|"]
     for label in labels:
         mine = [row for row in rows if row["method"] == label]
-        z2 = "-"
-        if mine[0].get("z2") is not None:
-            parts = {
-                part: np.average(
-                    [r["regions"][part]["z2"] for r in mine],
-                    weights=[r["regions"][part]["share"] for r in mine],
-                )
-                for part in ("bright", "dark", "well")
-            }
-            z2 = ", ".join(f"{value:.2g}" for value in parts.values())
         seen = [row["Q"] for row in mine]
         Q = "-" if None in seen else f"{np.mean(seen):.2f}"
-        lines.append(f"| {label} | {z2} | {Q} |")
+        lines.append(f"| {label} | {calibration(mine)} | {Q} |")
+    return "\n".join(lines) + "\n"
+
+
+def calibration(rows: list[dict]) -> str:
+    """z2 of bright, dark and well-exposed pixels."""
+    if rows[0].get("z2") is None:
+        return "-"
+    parts = [[row["regions"][part] for row in rows] for part in ("bright", "dark", "well")]
+    means = [
+        np.average([r["z2"] for r in part], weights=[r["share"] for r in part]) for part in parts
+    ]
+    return ", ".join(f"{value:.2g}" for value in means)
+
+
+def scenes_apart(rows: list[dict]) -> str:
+    """The table of z2, scene by scene."""
+    labels = dict.fromkeys(row["method"] for row in rows)
+    lines = [
+        "| z2 bright, dark, well | " + " | ".join(TESTING) + " |",
+        "|---|" + "---|" * len(TESTING),
+    ]
+    for label in labels:
+        mine = [row for row in rows if row["method"] == label and row.get("z2") is not None]
+        own = {n: [r for r in mine if r["recording"].startswith(f"{n}_")] for n in TESTING}
+        if mine:
+            lines.append(f"| {label} | " + " | ".join(map(calibration, own.values())) + " |")
     return "\n".join(lines) + "\n"
 
 
@@ -191,6 +207,7 @@ def main() -> None:
     for speed in SECONDS:
         own = [row for row in rows if f"_{speed}_" in row["recording"]]
         text += f"\n{speed}\n\n{table(own)}"
+    text += f"\n{scenes_apart(rows)}"
     (out / "table.md").write_text(text)
     print(text)
 
