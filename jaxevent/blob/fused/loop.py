@@ -109,8 +109,8 @@ def run(functions, numbers, settings, chunks, memory, told, work, marks):
     for chunk in range(len(chunks.t)):
         _begin_chunk(functions, given, settings, chunks, memory, chunk)
         if len(told.cells):
-            told.cells[chunk] = cells
-            told.whole[chunk] = whole
+            _copy(cells, told.cells[chunk])
+            _copy(whole, told.whole[chunk])
         for k in range(len(cells)):
             functions.limit(*given, k, 0, 0, 1)
         _run_steps(functions, given, settings, chunks, memory, chunk, work, marks)
@@ -120,6 +120,14 @@ def run(functions, numbers, settings, chunks, memory, told, work, marks):
             told.ended[chunk, k] = told.death[chunk, k] = 0
         if chunks.cycle[chunk]:
             _end_cycle(functions, given, settings, chunks, memory, chunk, told)
+
+
+@part
+def _copy(table, out):
+    """Copy numbers one by one: numba takes over a second to compile the copy of an array."""
+    for k in range(table.shape[0]):
+        for field in range(table.shape[1]):
+            out[k, field] = table[k, field]
 
 
 @part
