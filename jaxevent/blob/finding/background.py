@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
+from jaxevent.blob.finding.scene import SceneMotion
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.events.filters import busiest_neighbour
 
@@ -35,6 +37,8 @@ class Background:
         bright: (rows, columns) where the background itself flickers.
         activity: (slices,) factors of the rate, at least 1.
         duration: s.
+        scene: How the scene moves, if it does; rate, calm and bright are of places in the scene.
+        corner: x and y (px) of the scene's place where they begin.
     """
 
     rate: NDArray[np.float64]
@@ -42,15 +46,40 @@ class Background:
     bright: NDArray[np.bool_]
     activity: NDArray[np.float64]
     duration: float
+    scene: SceneMotion | None = None
+    corner: tuple[int, int] = (0, 0)
 
     def slice(self, t: NDArray | float | int) -> Any:
         """Which slices hold times (s)."""
         part = np.asarray(t) / self.duration * SLICES
         return np.clip(part, 0, SLICES - 1).astype(np.int64)
 
-    def at(self, x: NDArray | float | int, y: NDArray | float | int, t: float | int) -> Any:
-        """Rates, 1/(px s), at some pixels at a time (s)."""
-        return look_up(self.rate, FINE, x, y) * self.activity[self.slice(t)]
+    def at(
+        self, x: NDArray | float | int, y: NDArray | float | int, t: Any, over: int = FINE
+    ) -> Any:
+        """Rates, 1/(px s), at some pixels at a time (s); in a scene means of `over` x `over` px."""
+        rate = self.rate
+        if self.scene is not None:
+            rate = np.maximum(ndimage.uniform_filter(rate, max(1, round(over / FINE))), rate.min())
+        return look_up(rate, FINE, *self.place(x, y, t)) * self.activity[self.slice(t)]
+
+    @property
+    def mean(self) -> float:
+        """1/(px s), over all places that are seen when no target is there."""
+        part = np.kron(self.calm.any(0), np.ones((CELL // FINE, CELL // FINE)))
+        return float((self.rate * part).sum() / part.sum())
+
+    @property
+    def sharp(self) -> float:
+        """The longest window, s, in which the scene moves no farther than a cell."""
+        return np.inf if self.scene is None else FINE / max(self.scene.speed, 1e-9)
+
+    def place(self, x: Any, y: Any, t: Any) -> tuple[Any, Any]:
+        """Where pixels are at times (s), px from `corner`."""
+        if self.scene is None:
+            return x, y
+        x, y = self.scene.in_scene(x, y, t)
+        return x - self.corner[0], y - self.corner[1]
 
 
 def look_up(values: NDArray, cell: int, x: NDArray | float | int, y: NDArray | float | int) -> Any:
@@ -100,7 +129,7 @@ def measure_background(stream: Stream) -> Background:
 def _of_counts(cells: NDArray[np.int32], duration: float) -> Background:
     """Of the counts of all fine cells in all slices."""
     rows, columns = (n * FINE // CELL for n in cells.shape[1:])
-    N = _pooled(cells, CELL // FINE).astype(float)
+    N = pooled(cells, CELL // FINE).astype(float)
     quarter, m = _quiet(N)
     m = np.maximum(m, max(float(np.median(m)), 0.02))
     least = np.median(m) / CELL**2
@@ -119,13 +148,13 @@ def _of_counts(cells: NDArray[np.int32], duration: float) -> Background:
     while g > FINE:
         g //= 2
         full = np.kron(full & (quarter >= PLENTY), np.ones((2, 2), bool))
-        quarter, m = _quiet(_pooled(cells, g // FINE).astype(float))
+        quarter, m = _quiet(pooled(cells, g // FINE).astype(float))
         density = np.kron(density, np.ones((2, 2)))
         density = np.where(full, np.maximum(m / g**2, least), density)
     return Background(density / (duration / SLICES), calm, bright, activity, duration)
 
 
-def _pooled(cells: NDArray, by: int) -> NDArray:
+def pooled(cells: NDArray, by: int) -> NDArray:
     """Sums of by x by cells."""
     slices, rows, columns = cells.shape
     return cells.reshape(slices, rows // by, by, columns // by, by).sum((2, 4))
@@ -159,7 +188,9 @@ def measure_dispersion(
     N = np.zeros((number, rows, columns))
     for k, middle in enumerate(middles):
         part = stream.window(middle - window / 2, middle + window / 2)
-        place = part.y // CELL * columns + part.x // CELL
+        x, y = background.place(part.x, part.y, part.t)
+        row = np.clip(np.asarray(y // CELL, np.int64), 0, rows - 1)
+        place = row * columns + np.clip(np.asarray(x // CELL, np.int64), 0, columns - 1)
         N[k] = np.bincount(place, minlength=rows * columns).reshape(rows, columns)
     mean = (N * calm).sum(0) / np.maximum((activity * calm).sum(0), 1)
     squares = (calm * (N - mean * activity) ** 2).sum(0)

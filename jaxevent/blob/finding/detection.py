@@ -47,9 +47,11 @@ def detect(
     place, filled, around = _count(part.x, part.y, g, rows, columns)
     y, x = np.divmod(filled, columns)
     middle = x * g + g // 2, y * g + g // 2
-    mu = background.at(*middle, t) * scale.window * 9 * g * g
+    mu = background.at(*middle, t, 3 * g) * scale.window * 9 * g * g
     tests = rows * columns * background.duration / scale.window
-    hit = evidence(around, mu, scale.dispersion_at(*middle)) > np.log(tests / FALSE_ALARMS)
+    hit = evidence(around, mu, scale.dispersion_at(*background.place(*middle, t))) > np.log(
+        tests / FALSE_ALARMS
+    )
     return _label(place, filled[hit], rows, columns)
 
 

@@ -36,6 +36,7 @@ class Found:
         hot_pixels: How many were left out.
         background: Events of no target, per s, of the whole sensor.
         recording: Whose events these are.
+        camera_moves: Whether the background was taken for a scene that moves past the camera.
     """
 
     paths: tuple[Path, ...]
@@ -43,6 +44,7 @@ class Found:
     hot_pixels: int
     background: float
     recording: Recording
+    camera_moves: bool = False
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -56,6 +58,8 @@ class Found:
         text = f"{count}, background of {self.background:,.0f} events/s"
         if self.hot_pixels:
             text += f", {self.hot_pixels} hot pixel{'s' * (self.hot_pixels != 1)} left out"
+        if self.camera_moves:
+            text += ", the camera moves"
         if not len(self):
             return text
         size, speed, rate = (self._typical(values) for values in self._numbers())

@@ -191,9 +191,7 @@ class Links:
         if weak.any():
             spread = np.linalg.det(live.C + (seen.P[:, 0] + 0.1)[:, None, None] * np.eye(2))
             all_n, all_z, all_D = seen.moments(owner, np.ones(len(owner), bool))
-            told = evidence(
-                all_n, self._expected(seen.p, t, spread), self.scale.dispersion_at(*seen.p.T)
-            )
+            told = evidence(all_n, self._expected(seen.p, t, spread), self._dispersion(seen.p, t))
             asked = -np.log(np.where(live.confirmed, SEEN, SEEN_NEW))
             there = weak & (all_n >= 2) & (told >= asked)
             n = np.where(weak, np.where(there, all_n, 0), n)
@@ -230,7 +228,7 @@ class Links:
         live.n = np.where(heard, live.n + a * (n - live.n), live.n)
         live.hits = live.hits + heard
         mu = self._expected(live.p, t, np.linalg.det(live.C))
-        told = evidence(n, mu, self.scale.dispersion_at(*live.p.T))
+        told = evidence(n, mu, self._dispersion(live.p, t))
         live.nats = live.nats + np.where(heard, told, 0)
         self._confirm(heard, t)
         some = live.keep(heard)
@@ -239,9 +237,12 @@ class Links:
 
     def _expected(self, p: NDArray, t: float | int, determinant: NDArray) -> NDArray[np.float64]:
         """Events of the background in gates."""
-        rate = self.background.at(p[:, 0], p[:, 1], t)
+        rate = self.background.at(p[:, 0], p[:, 1], t, 3 * self.scale.cell)
         area = np.pi * GATE**2 * np.sqrt(np.maximum(determinant, 0))
         return np.maximum(rate * area * self.scale.window, 1e-3)
+
+    def _dispersion(self, p: NDArray, t: float | int) -> NDArray[np.float64]:
+        return self.scale.dispersion_at(*self.background.place(p[:, 0], p[:, 1], t))
 
     def _confirm(self, heard: NDArray, t: float | int) -> None:
         live = self.live

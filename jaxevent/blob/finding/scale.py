@@ -58,7 +58,8 @@ class _Stretch(NamedTuple):
 
 def choose_scale(stream: Stream, background: Background) -> Choice | None:
     """The scale that predicts best; None if the recording is too short or nothing is found."""
-    windows = WINDOWS[LEAST_WINDOWS * WINDOWS * 1e-6 <= stream.duration] * 1e-6
+    longest = min(stream.duration / LEAST_WINDOWS, background.sharp)
+    windows = WINDOWS[WINDOWS * 1e-6 <= longest] * 1e-6
     if not len(windows):
         return None
     raw, scores = np.zeros((2, len(windows), len(CELLS)))
@@ -83,11 +84,11 @@ def choose_scale(stream: Stream, background: Background) -> Choice | None:
     good = scores >= best - PLATEAU * best
     most = raw.max(0)
     sharp = raw >= most - (1 - SHARP) * abs(most)
-    longest = [float(windows[np.flatnonzero(column).max()]) for column in sharp.T]
+    longest_of = [float(windows[np.flatnonzero(column).max()]) for column in sharp.T]
     for j in range(len(CELLS))[::-1]:
         for i in np.flatnonzero(good[:, j]):
             scale = Scale(float(windows[i]), CELLS[j], dispersions[i])
-            split = _merged(stream, background, scale, begins[:, i], longest[:j])
+            split = _merged(stream, background, scale, begins[:, i], longest_of[:j])
             good[i, j] = split <= MERGED
         if good[:, j].any():
             column = np.where(good[:, j], scores[:, j], -np.inf)

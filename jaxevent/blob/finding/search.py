@@ -9,12 +9,14 @@ import dataclasses
 
 import numpy as np
 
-from jaxevent.blob.finding.background import FINE, Background, evidence, measure_background
+from jaxevent.blob.finding.background import Background, evidence, measure_background
 from jaxevent.blob.finding.detection import CONTACT, Scale, touching
 from jaxevent.blob.finding.found import Found, Pass
 from jaxevent.blob.finding.links import FAINT, GATE, HOLD, SEEN, Links
+from jaxevent.blob.finding.moving import find_moving_background
 from jaxevent.blob.finding.paths import Path
-from jaxevent.blob.finding.scale import choose_scale
+from jaxevent.blob.finding.scale import Choice, choose_scale
+from jaxevent.blob.finding.scene import SceneMotion
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.blob.seeds import span_of
 from jaxevent.progress import stage
@@ -22,6 +24,7 @@ from jaxevent.recording import Recording
 
 PASSES = 4
 WORTH = 0.05  # nats per event from which a pass is worth it
+WORTH_MOVING = 0.1  # and before a scene that moves, whose map is less exact
 FEWEST = 100  # events of a recording that is looked at
 ONE_PIXEL = 0.5  # px: what is smaller is a pixel, no blob
 FILL = 0.5  # share of its windows in which a target was seen
@@ -31,6 +34,7 @@ REST = 2.0  # times the life of the shorter of both
 TOGETHER = 0.9  # share of the longer life that two parts of one object have in common
 RIGID, MOVED, FAR = 0.25, 2.0, 4.0  # of the sum of their sizes: change of distance, and the
 # paths on which parts keep theirs, or slide along each other
+OWN_WAY = 2.0  # sizes: deviation, along any axis, of a path in a moving scene from its mean
 EDGE = 2.0  # sizes from the sensor's edge, where others come and go
 SAME = 0.5  # share of a target's life near one of an earlier pass that makes it a part of that
 
@@ -58,13 +62,33 @@ def find(
         return Found((), (), 0, 0.0, recording)
     with stage("find: background", progress):
         background = measure_background(stream)
+    with stage("find: scale", progress):
+        choice = choose_scale(stream, background)
+    if choice is not None:
+        with stage("find: the scene's motion", progress):
+            moving = find_moving_background(stream, background, choice)
+        if moving is not None:
+            background, choice = moving, choose_scale(stream, moving)
+    found, passes = _search(stream, background, choice, progress)
+    rate = background.mean * stream.width * stream.height
+    moves = background.scene is not None
+    found.sort(key=lambda path: (path.begin, path.p[0].tolist()))
+    return Found(tuple(found), tuple(passes), int(stream.hot.sum()), rate, recording, moves)
+
+
+def _search(
+    stream: Stream, background: Background, choice: Choice | None, progress: bool | None
+) -> tuple[list[Path], list[Pass]]:
+    """Paths and passes against a background; the choice is that of the first pass."""
     found: list[Path] = []
     near: list[Path] = []
     passes: list[Pass] = []
+    worth = WORTH if background.scene is None else WORTH_MOVING
     for number in range(PASSES):
-        with stage(f"find, pass {number + 1}: scale", progress):
-            choice = choose_scale(stream, background)
-        if choice is None or choice.score < WORTH:
+        if number:
+            with stage(f"find, pass {number + 1}: scale", progress):
+                choice = choose_scale(stream, background)
+        if choice is None or choice.score < worth:
             break
         confirmed = Links(stream, background, choice.scale).follow(
             f"find, pass {number + 1}", progress
@@ -73,6 +97,10 @@ def find(
             passes.append(Pass(choice, 0))
             break
         confirmed = _join_rigid(confirmed)
+        if background.scene is not None:
+            scene = background.scene
+            near += [path for path in confirmed if not _own_way(path, scene, stream)]
+            confirmed = [path for path in confirmed if _own_way(path, scene, stream)]
         near += confirmed
         with stage(f"find, pass {number + 1}: beginnings", progress):
             rest = stream.without(near, GATE)
@@ -90,9 +118,7 @@ def find(
         found += new
         near += new
         stream = stream.without(near, 2 * GATE)
-    rate = float((background.rate * FINE**2).sum())
-    found.sort(key=lambda path: (path.begin, path.p[0].tolist()))
-    return Found(tuple(found), tuple(passes), int(stream.hot.sum()), rate, recording)
+    return found, passes
 
 
 def _lasting(path: Path) -> bool:
@@ -115,6 +141,14 @@ def _join_rigid(paths: list[Path]) -> list[Path]:
         else:
             paths[k], k = _both(paths[k], paths.pop(part)), 0
     return paths
+
+
+def _own_way(path: Path, scene: SceneMotion, stream: Stream) -> bool:
+    """Whether a path goes farther in the scene than its size."""
+    x, y = scene.in_scene(path.p[:, 0], path.p[:, 1], (path.t - stream.start) * 1e-6)
+    way = np.cov(np.stack([x, y])) if len(x) > 1 else np.zeros((2, 2))
+    ratio = np.linalg.solve(np.median(path.C, 0), way)
+    return bool(np.linalg.eigvals(ratio).real.max() > OWN_WAY**2)
 
 
 def _rigid(one: Path, other: Path) -> bool:
@@ -171,8 +205,9 @@ def _look_back(path: Path, rest: Stream, background: Background, scale: Scale) -
         near = np.einsum("ni,ij,nj->n", e, np.linalg.inv(S), e) < GATE**2
         n = int(near.sum())
         area = np.pi * GATE**2 * np.sqrt(np.linalg.det(S))
-        mu = max(float(background.at(p[0], p[1], t)) * w * area, 1e-3)
-        if n < 2 or n < FAINT * usual or evidence(n, mu, scale.dispersion_at(*p)) < -np.log(SEEN):
+        mu = max(float(background.at(p[0], p[1], t, 3 * scale.cell)) * w * area, 1e-3)
+        F = scale.dispersion_at(*background.place(p[0], p[1], t))
+        if n < 2 or n < FAINT * usual or evidence(n, mu, F) < -np.log(SEEN):
             silent += 1
             continue
         z = e[near].mean(0)

@@ -1,0 +1,137 @@
+"""The background that a moving camera sees: a map of the scene that goes with it.
+
+It is taken only where a scene is seen all over the sensor, dense with edges, and where its map,
+moved along, tells events better than one at rest. Targets that go together, as stars do, are no
+scene.
+"""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from jaxevent.blob.finding.background import CELL, FINE, FULL, SLICES, Background, pooled
+from jaxevent.blob.finding.detection import detect
+from jaxevent.blob.finding.scale import STRETCHES, Choice
+from jaxevent.blob.finding.scene import SceneMotion, measure_scene_motion
+from jaxevent.blob.finding.stream import Stream
+
+CALM = 0.75  # share of the slices in which a place is seen whose counts are taken
+LEAST = 0.05  # of the mean rate: that of places without events
+TILES, FILLED, FEW = 4, 9, 3  # tiles along each side; of all, those with so many events in blobs
+BRIGHT = 1.5  # times the mean rate: what is bright is an edge if it is
+LONG, LARGE = 2.5, 0.1  # so many times as long as wide, or of this share of the map's shorter side
+SCENE = 0.3  # share of the bright that is edges
+TOLD = 0.1  # of the stretches may be told worse by a map that moves than by one at rest
+MOVED = 2.0  # px
+
+
+def find_moving_background(
+    stream: Stream, background: Background, choice: Choice
+) -> Background | None:
+    """The background as a map that moves; None where the camera does not seem to move.
+
+    `background` is that at rest, and `choice` the scale of its blobs.
+    """
+    if _filled(stream, background, choice) < FILLED:
+        return None
+    scene = measure_scene_motion(stream, choice.scale.window)
+    if scene.travel < MOVED:
+        return None
+    moving = measure_moving_background(stream, scene)
+    seen = np.kron(moving.calm.any(0), np.ones((CELL // FINE, CELL // FINE))) > 0
+    if _of_edges(np.where(seen, moving.rate, 0), moving.mean) < SCENE:
+        return None
+    rest = dataclasses.replace(scene, maps=np.broadcast_to(np.eye(2, 3), scene.maps.shape))
+    still, gains, w = measure_moving_background(stream, rest), [], choice.scale.window
+    for t in np.maximum(stream.times(STRETCHES), w):
+        part = stream.window(t - w, t)
+        one, other = (b.at(part.x, part.y, part.t) for b in (moving, still))
+        gains.append(float(np.log(one / other).mean()) if len(part) else 0.0)
+    return moving if np.quantile(gains, TOLD) >= 0 else None
+
+
+def _filled(stream: Stream, background: Background, choice: Choice) -> float:
+    """In how many tiles of the sensor blobs are seen, in the median window."""
+    w, size = choice.scale.window, (stream.height, stream.width)
+    told = []
+    for t in np.maximum(stream.times(STRETCHES), w):
+        part = stream.window(t - w, t)
+        labels, _ = detect(part, background, choice.scale, size, t)
+        y, x = part.y[labels > 0], part.x[labels > 0]
+        place = y * TILES // size[0] * TILES + x * TILES // size[1]
+        told.append((np.bincount(place, minlength=TILES**2) >= FEW).sum())
+    return float(np.median(told))
+
+
+def _of_edges(rate: NDArray[np.float64], mean: float) -> float:
+    """Share of what is bright that is long or large: edges, and not what may be targets."""
+    excess = np.where(rate > BRIGHT * mean, rate - mean, 0)
+    labels = np.zeros(rate.shape, np.int32)
+    ndimage.label(excess > 0, np.ones((3, 3)), labels)
+    number = int(labels.max())
+    y, x = np.nonzero(excess)
+    part, n = labels[y, x] - 1, excess[y, x]
+
+    def total(values: NDArray) -> NDArray:
+        return np.bincount(part, n * values, number) / mass
+
+    mass = np.bincount(part, n, number)
+    mx, my = total(x), total(y)
+    xx, yy, xy = total(x * x) - mx**2, total(y * y) - my**2, total(x * y) - mx * my
+    half, cross = (xx + yy) / 2 + 1 / 12, np.hypot((xx - yy) / 2, xy)
+    long = np.sqrt(half + cross) > LONG * np.sqrt(half - cross)
+    large = np.sqrt(half + cross) > LARGE * min(rate.shape)
+    return float(mass[long | large].sum() / max(mass.sum(), 1e-300))
+
+
+def measure_moving_background(stream: Stream, scene: SceneMotion) -> Background:
+    """Rates of places of the scene while they are seen, from the calmer three quarters of slices.
+
+    What goes its own way is nowhere in the scene for long.
+    """
+    size = np.array([stream.width, stream.height])
+    middles = (np.arange(SLICES) + 0.5) / SLICES * stream.duration
+    x, y = (np.array([[0, 1, 0, 1], [0, 0, 1, 1]]) * (size[:, None] - 1))[..., None]
+    places = np.stack(scene.in_scene(x, y, middles))
+    low = np.floor(places.min((1, 2)))
+    columns, rows = ((places.max((1, 2)) - low) // CELL + 1).astype(int)
+    corner = int(low[0]), int(low[1])
+
+    y, x = np.mgrid[:rows, :columns] * CELL + CELL / 2
+    x, y = scene.on_sensor(x[..., None] + low[0], y[..., None] + low[1], middles)
+    seen = np.moveaxis((x >= 0) & (x < size[0]) & (y >= 0) & (y < size[1]), 2, 0)
+    by = CELL // FINE
+    cells = np.zeros((SLICES, rows * by, columns * by), np.int32)
+    for part in stream.batches():
+        slices = np.minimum(part.t / stream.duration * SLICES, SLICES - 1).astype(np.int64)
+        x, y = scene.in_scene(part.x, part.y, part.t)
+        column = np.clip((x - low[0]) // FINE, 0, columns * by - 1).astype(np.int64)
+        row = np.clip((y - low[1]) // FINE, 0, rows * by - 1).astype(np.int64)
+        np.add.at(cells, (slices, row, column), 1)
+
+    N = np.where(seen, pooled(cells, by), np.inf)
+    rank = np.ceil(CALM * seen.sum(0)).astype(int) - 1
+    most = np.take_along_axis(np.sort(N, 0), np.maximum(rank, 0)[None], 0)[0]
+    calm = seen & (N <= most)
+    activity = _activity(N, calm, seen)
+    there = np.kron(calm, np.ones((1, by, by))) > 0
+    expected = (there * activity[:, None, None]).sum(0)
+    rate = (cells * there).sum(0) / np.maximum(expected, 1) / FINE**2
+    known = expected > 0
+    usual = max(float(rate[known].mean()), 0.02 / CELL**2)
+    rate = np.where(known, np.maximum(rate, LEAST * usual), usual) * SLICES / stream.duration
+    bright = np.ones((rows, columns), bool)
+    return Background(rate, calm, bright, activity, stream.duration, scene, corner)
+
+
+def _activity(N: NDArray, calm: NDArray, seen: NDArray) -> NDArray[np.float64]:
+    """Of each slice: the median ratio of counts to the places' calm ones, over the slices' own."""
+    mean = np.where(calm, N, 0).sum(0) / np.maximum(calm.sum(0), 1)
+    full = mean >= FULL
+    told = np.array([
+        np.median(n[s & full] / mean[s & full]) if (s & full).any() else 1.0
+        for n, s in zip(N, seen, strict=True)
+    ])  # fmt: skip
+    return np.clip(told / max(float(np.median(told)), 1e-9), 0.1, 10)

@@ -1,0 +1,163 @@
+"""How the whole scene moves past a moving camera.
+
+An image of events is aligned to what was seen before by a shift and a turn, from coarse to fine
+(Lucas and Kanade), with little weight where they differ. Chained, these motions tell where places
+of the scene are on the sensor.
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from jaxevent.blob.finding.stream import Part, Stream
+
+REFERENCE = np.array([[60.0, 60], [180, 60], [60, 180], [180, 180]])  # px
+STEPS = 128  # motions of a recording, at most
+WIDE = 240  # bins of a pixel and more, so that no more of them lie side by side
+ODD = 1.5  # of the usual difference: pixels that differ so much have half the weight
+NEWEST = 0.07  # share of the newest window in what was seen
+BLURS = (4, 2, 1)  # bins
+ROUNDS, SMALL = 8, 0.02  # of Gauss and Newton, at most; bins at which they end
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneMotion:
+    """Where points of the scene are: at t (n,) s in `maps` (n, 2, 3), px from px at the start."""
+
+    t: NDArray[np.float64]
+    maps: NDArray[np.float64]
+
+    @property
+    def travel(self) -> float:
+        """px, how far `REFERENCE` is from where it was at the start, at most."""
+        return float(np.hypot(*(self._reference() - REFERENCE[:, None]).T).max())
+
+    @property
+    def speed(self) -> float:
+        """px/s, the median over time of that of `REFERENCE`."""
+        moved = np.diff(self._reference(), axis=1)
+        return float(np.median(np.hypot(*moved.T).mean(1) / np.diff(self.t)))
+
+    def _reference(self) -> NDArray[np.float64]:
+        """(4, n, 2)."""
+        moved = np.einsum("nij,kj->kni", self.maps[:, :, :2], REFERENCE)
+        return moved + self.maps[:, :, 2]
+
+    def at(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Maps at some times, on straight lines between those known."""
+        k = np.clip(np.searchsorted(self.t, t) - 1, 0, len(self.t) - 2)
+        part = np.asarray((t - self.t[k]) / (self.t[k + 1] - self.t[k]))
+        return self.maps[k] + part[..., None, None] * (self.maps[k + 1] - self.maps[k])
+
+    def in_scene(self, x: Any, y: Any, t: Any) -> tuple[Any, Any]:
+        """Where in the scene pixels of the sensor are at times (s)."""
+        (a, b, e), (c, d, f) = np.moveaxis(self.at(np.asarray(t, float)), (-2, -1), (0, 1))
+        x, y, over = x - e, y - f, a * d - b * c
+        return (d * x - b * y) / over, (a * y - c * x) / over
+
+    def on_sensor(self, x: Any, y: Any, t: Any) -> tuple[Any, Any]:
+        """Where on the sensor places of the scene are at times (s)."""
+        (a, b, e), (c, d, f) = np.moveaxis(self.at(np.asarray(t, float)), (-2, -1), (0, 1))
+        return a * x + b * y + e, c * x + d * y + f
+
+
+def measure_scene_motion(stream: Stream, window: float | int) -> SceneMotion:
+    """The shift and turn of all that is seen in a stream, from windows (s) aligned to those before.
+
+    What was seen before is a mean of earlier windows, each carried on as the scene went.
+    """
+    steps = int(min(STEPS, stream.duration / window))
+    begins = np.linspace(0, stream.duration - window, steps)
+    bins = -(-max(stream.width, stream.height) // WIDE)
+    maps, motion, seen = [np.eye(2, 3)], None, None
+    for number, begin in enumerate(begins):
+        image = _image(stream.window(begin, begin + window), stream, bins)
+        if seen is None:
+            seen = image
+            continue
+        motion = _align(seen, image, _shift(seen, image) if motion is None else motion)
+        step = _px(motion, image.shape, bins)
+        maps.append(np.concatenate([step[:, :2] @ maps[-1][:, :2],
+            step[:, :2] @ maps[-1][:, 2:] + step[:, 2:]], 1))  # fmt: skip
+        new = max(NEWEST, 1 / (number + 1))
+        before = _carry(seen, motion)
+        seen = np.where(np.isfinite(before), (1 - new) * before + new * image, image)
+    return SceneMotion(begins + window / 2, np.array(maps))
+
+
+def _carry(image: NDArray, motion: NDArray) -> NDArray[np.float64]:
+    """An image after a motion; NaN where it was not seen before."""
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    moved = motion @ _fields(image.shape)
+    at = [y - moved[..., 1], x - moved[..., 0]]
+    return ndimage.map_coordinates(image, at, order=1, cval=np.nan)
+
+
+def _image(part: Part, stream: Stream, bins: int) -> NDArray[np.float64]:
+    """Roots of counts: their noise is everywhere the same."""
+    rows, columns = -(-stream.height // bins), -(-stream.width // bins)
+    place = part.y // bins * columns + part.x // bins
+    return np.sqrt(np.bincount(place, minlength=rows * columns).reshape(rows, columns))
+
+
+def _fields(shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """(rows, columns, 3, 2): a turn about the middle, and shifts right and down.
+
+    A unit of turn moves what is a quarter of the sides' sum away by one.
+    """
+    y, x = np.mgrid[: shape[0], : shape[1]].astype(float)
+    quarter = sum(shape) / 4
+    x, y = (x - (shape[1] - 1) / 2) / quarter, (y - (shape[0] - 1) / 2) / quarter
+    one, none = np.ones(shape), np.zeros(shape)
+    fields = [(-y, x), (one, none), (none, one)]
+    return np.stack([np.stack(field, 2) for field in fields], 2)
+
+
+def _px(motion: NDArray, shape: tuple[int, ...], bins: int) -> NDArray[np.float64]:
+    """A motion of bins as one of px: p + displacement = A p + b, (2, 3)."""
+    turn = motion[0] / (sum(shape) / 4)
+    A = np.array([[0, -turn], [turn, 0]])
+    middle = (np.array(shape[::-1]) - 1) / 2
+    b = bins * (motion[1:] - A @ middle) - A @ np.full(2, (bins - 1) / 2)
+    return np.concatenate([A, b[:, None]], 1) + np.eye(2, 3)
+
+
+def _shift(one: NDArray, other: NDArray) -> NDArray[np.float64]:
+    """The shift at which two images are most alike."""
+    a, b = (np.fft.rfft2(ndimage.gaussian_filter(i, 3) - i.mean()) for i in (one, other))
+    alike = np.fft.irfft2(b * a.conj(), one.shape)
+    at = np.unravel_index(alike.argmax(), alike.shape)
+    y, x = (int(k) if k < n / 2 else int(k) - n for k, n in zip(at, one.shape, strict=True))
+    return np.array([0.0, x, y])
+
+
+def _align(one: NDArray, other: NDArray, motion: NDArray) -> NDArray[np.float64]:
+    """The motion (3,), in bins of `_fields`, that takes one image to the other."""
+    fields = _fields(one.shape)
+    y, x = np.mgrid[: one.shape[0], : one.shape[1]]
+    for blur in BLURS:
+        a, b = (ndimage.gaussian_filter(image, blur, mode="constant") for image in (one, other))
+        for _ in range(ROUNDS):
+            half_x, half_y = np.moveaxis(motion @ fields, 2, 0) / 2
+            before, after = (
+                ndimage.map_coordinates(i, [y + s * half_y, x + s * half_x], order=1, cval=np.nan)
+                for i, s in ((a, -1), (b, 1))
+            )
+            known = np.isfinite(before) & np.isfinite(after)
+            e = np.where(known, after - before, 0)
+            gy, gx = np.gradient(np.where(known, (after + before) / 2, 0))
+            usual = np.sqrt((e**2).sum() / max(known.sum(), 1)) + 1e-12
+            weight = (known / (1 + (e / (ODD * usual)) ** 2)).ravel()
+            slopes = (gx[..., None] * fields[..., 0] + gy[..., None] * fields[..., 1]).reshape(
+                -1, 3
+            )
+            H = slopes.T @ (slopes * weight[:, None])
+            H += np.eye(3) * (1e-4 * np.trace(H) / 3 + 1e-12)
+            step = np.linalg.solve(H, slopes.T @ (weight * e.ravel()))
+            motion = motion - step
+            if abs(step).max() < SMALL:
+                break
+    return motion

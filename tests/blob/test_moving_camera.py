@@ -1,0 +1,108 @@
+"""Targets before a scene that moves past the camera, and the scene's motion against the truth."""
+
+import numpy as np
+import pytest
+
+from jaxevent import blob
+from jaxevent.blob.finding.moving import measure_moving_background
+from jaxevent.blob.finding.scene import SceneMotion, measure_scene_motion
+from jaxevent.blob.finding.stream import Stream
+from jaxevent.recording import Events, Recording
+from jaxevent.simulate.blobs import Circle, Line, Target, simulate_blobs
+
+FRAME, DURATION = (128, 96), 0.8
+SIZE = np.array(FRAME)
+SHIFT, TURN = np.array([60.0, -25.0]), 0.3  # px/s, rad/s about the sensor's middle
+
+
+def maps(t):
+    """(times, 2, 3), of px at the start."""
+    c, s = np.cos(TURN * t), np.sin(TURN * t)
+    R = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    middle = (SIZE - 1) / 2
+    b = middle + SHIFT * t[:, None] - np.einsum("nij,j->ni", R, middle)
+    return np.concatenate([R, b[..., None]], 2)
+
+
+def seen_by_a_moving_camera(recording, seed=0, rate=1e6):
+    """A recording with the events of 150 edges that go as `maps` tells."""
+    rng = np.random.default_rng(seed)
+    n = rng.poisson(rate * DURATION)
+    a = rng.uniform(-SIZE, 2 * SIZE, (150, 2))
+    angle = rng.uniform(0, np.pi, 150)
+    d = np.stack([np.cos(angle), np.sin(angle)], 1) * rng.uniform(10, 40, (150, 1))
+    k, t = rng.integers(0, 150, n), rng.uniform(0, DURATION, n)
+    there = a[k] + rng.random((n, 1)) * d[k]
+    M = maps(t)
+    xi = np.rint(np.einsum("nij,nj->ni", M[:, :, :2], there) + M[:, :, 2])
+    inside = ((xi >= 0) & (xi < SIZE)).all(1)
+    own = recording.events[:]
+    x, y = xi[inside].astype(np.uint16).T
+    us = np.concatenate([own.t, (t[inside] * 1e6).astype(np.int64)])
+    order = np.argsort(us, kind="stable")
+    x, y = np.concatenate([own.x, x])[order], np.concatenate([own.y, y])[order]
+    p = np.concatenate([own.p, rng.random(len(us) - len(own)) < 0.5])[order]
+    return Recording("moving", *FRAME, Events(us[order], x, y, p))
+
+
+def before_noise(targets, seed=0, noise=2e3):
+    far = Target(Line((-500.0, -500.0), size=(1.0, 1.0)), 1.0)  # never seen
+    return simulate_blobs([*targets, far], FRAME, DURATION, noise, seed)
+
+
+def test_the_scene_goes_as_it_was_made_to():
+    recording = seen_by_a_moving_camera(before_noise([])[0])
+    scene = measure_scene_motion(Stream(recording, 0, 800_000), 0.01)
+    corners = np.array([[0, 0], [127, 0], [0, 95], [127, 95]], float)
+    # Its places are px of the first window, whose middle is 5 ms after the start.
+    first = maps(scene.t[:1])[0]
+    start = (corners - first[:, 2]) @ np.linalg.inv(first[:, :2]).T
+    true = maps(scene.t)
+    moved = np.einsum("nij,kj->nki", true[:, :, :2], start) + true[:, None, :, 2]
+    for k, corner in enumerate(corners):
+        x, y = scene.on_sensor(corner[0], corner[1], scene.t)
+        assert np.hypot(*(np.stack([x, y], 1) - moved[:, k]).T).max() < 2.5
+        np.testing.assert_allclose(
+            np.stack(scene.in_scene(x, y, scene.t), 1),
+            np.broadcast_to(corner, moved[:, k].shape),
+            atol=1e-9,
+        )
+    assert scene.travel == pytest.approx(np.hypot(*SHIFT) * DURATION, rel=0.3)
+
+
+def test_a_moving_map_holds_the_rates_of_places():
+    """Of a scene of even rate: that rate, whatever part of the time a place is seen."""
+    recording, _ = before_noise([], 1, 4e5)
+    t = np.linspace(0, DURATION, 9)
+    M = np.tile(np.eye(2, 3), (9, 1, 1))
+    M[:, 0, 2] = 100 * t
+    background = measure_moving_background(Stream(recording, 0, 800_000), SceneMotion(t, M))
+    true = 4e5 / SIZE.prod()
+    assert background.mean == pytest.approx(true, rel=0.15)
+    x = np.arange(2, 126)
+    for time in np.linspace(0, 0.79, 5):
+        assert background.at(x, 48, time, 12).mean() == pytest.approx(true, rel=0.1)
+
+
+@pytest.mark.slow
+def test_only_what_goes_its_own_way_is_a_target():
+    own = Circle((64, 48), 28, 8.0, size=(4.0, 3.0))
+    recording, truth = before_noise([Target(own, 3e4)])
+    found = blob.find(seen_by_a_moving_camera(recording), progress=False)
+    assert found.camera_moves and "the camera moves" in found.summary()
+    (path,) = found.paths
+    assert path.end - path.begin > 0.9 * DURATION * 1e6
+    assert np.median(np.hypot(*(path.p - truth(path.t)[:, 0, :2]).T)) < 2
+
+
+@pytest.mark.slow
+def test_targets_that_go_together_are_no_scene():
+    rng = np.random.default_rng(2)
+    places = np.stack(np.meshgrid(np.arange(-30, 128, 24), np.arange(8, 110, 24)), -1)
+    targets = [
+        Target(Line(tuple(p + rng.uniform(-5, 5, 2)), (30.0, -4.0), size=(1.5, 1.2)), 1500.0)
+        for p in places.reshape(-1, 2)
+    ]
+    recording, _ = before_noise(targets)
+    found = blob.find(recording, progress=False)
+    assert not found.camera_moves and len(found) > 15
