@@ -21,6 +21,7 @@ CALM = 0.75  # share of the slices in which a place is seen whose counts are tak
 LEAST = 0.05  # of the mean rate: that of places without events
 TILES, FILLED, FEW = 4, 9, 3  # tiles along each side; of all, those with so many events in blobs
 BRIGHT = 1.5  # times the mean rate: what is bright is an edge if it is
+STRIP, SIDES = 16, 3  # of the sensor's width or height a side takes, and how many are reached
 LONG, LARGE = 2.5, 0.1  # so many times as long as wide, or of this share of the map's shorter side
 SCENE = 0.3  # share of the bright that is edges
 TOLD = 0.1  # of the stretches may be told worse by a map that moves than by one at rest
@@ -53,16 +54,22 @@ def find_moving_background(
 
 
 def _filled(stream: Stream, background: Background, choice: Choice) -> float:
-    """In how many tiles of the sensor blobs are seen, in the median window."""
+    """In how many tiles of the sensor blobs are seen, in the median window.
+
+    None, if they do not reach three of its sides: an object may be large, but it is seen whole.
+    """
     w, size = choice.scale.window, (stream.height, stream.width)
-    told = []
+    tiles, sides = [], []
     for t in np.maximum(stream.times(STRETCHES), w):
         part = stream.window(t - w, t)
         labels, _ = detect(part, background, choice.scale, size, t)
         y, x = part.y[labels > 0], part.x[labels > 0]
         place = y * TILES // size[0] * TILES + x * TILES // size[1]
-        told.append((np.bincount(place, minlength=TILES**2) >= FEW).sum())
-    return float(np.median(told))
+        tiles.append((np.bincount(place, minlength=TILES**2) >= FEW).sum())
+        strips = [STRIP * v < n for v, n in ((x, size[1]), (y, size[0]))]
+        strips += [STRIP * (n - 1 - v) < n for v, n in ((x, size[1]), (y, size[0]))]
+        sides.append(sum(strip.sum() >= FEW for strip in strips))
+    return float(np.median(tiles)) if np.median(sides) >= SIDES else 0.0
 
 
 def _of_edges(rate: NDArray[np.float64], mean: float) -> float:
