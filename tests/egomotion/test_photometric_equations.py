@@ -125,6 +125,16 @@ def test_misfits_change_as_linearised():
     np.testing.assert_allclose(found, expected, atol=1e-7)
 
 
+@pytest.mark.parametrize("skew, known", [(5.0, 0.2), (-5.0, 0.0), (0.1, 0.1)])
+def test_the_skew_stays_near_that_of_counts(skew, known):
+    """Within two deviations, here 0.1, of what counts tell, also while a fit extrapolates."""
+    seen, equations = linearised()
+    prior = equations.problem.prior._replace(skew=0.1, skew_weight=1 / 0.05**2)
+    problem = equations.problem._replace(prior=prior)
+    scene = seen.scene._replace(skew=skew)
+    assert fit.look(problem, scene, seen.weight).scene.skew == pytest.approx(known)
+
+
 # Log depths of tilts of a plane that faces the camera are linear between nodes; others' nearly, and
 # there the factors of the plane's normal are not all the same.
 @pytest.mark.parametrize("normal, near", [((0.0, 0.0, 0.6), 1e-7), ((0.2, -0.1, 0.6), 0.02)])

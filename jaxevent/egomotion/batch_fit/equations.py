@@ -40,6 +40,9 @@ FREE = 6 * ROWS  # numbers of a path's rows; after them come the skew and the pl
 # With 0.2 left a fit takes more steps and ends at costs some per cent higher.
 SOLVE, LEFT = 40, 0.05
 TINY = 1e-5  # weight of the map's squares
+# Standard deviations of its prior that the skew may be off. On slider_depth it goes else from 0.2,
+# by counts, to 0.99, where ON events tell nothing, and a mirrored motion costs less than the true.
+SKEWED = 2.0
 
 Unknowns = tuple[NDArray, NDArray, NDArray]
 
@@ -103,7 +106,9 @@ def laplacian(image: NDArray) -> NDArray:
 def look(problem: Problem, scene: Scene, weight: NDArray) -> Seen:
     """The scene with |C1| = 1, what it costs, and the weights of events, from those before."""
     tracks, prior, sigma, plane, usual = problem
-    scene = Scene(normalised(scene.path), *scene[1:])
+    most = SKEWED / math.sqrt(float(prior.skew_weight))
+    skew = min(max(float(scene.skew), prior.skew - most), prior.skew + most)
+    scene = Scene(normalised(scene.path), scene.map, skew)
     places = read(scene, tracks)
     e = places.value - tracks.level - tracks.x.dtype.type(scene.skew) * tracks.number
     weight = weight.copy()

@@ -8,6 +8,8 @@ than under the other, and D_c its sum over cells of 48 px, which err independent
 Single events would claim more: those of a cell see the same edges.
 """
 
+import dataclasses
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +23,29 @@ CELL = 48  # px, within which errors are alike
 FAR = -9.0  # log inverse depth that makes no parallax
 SIGMA = 0.1  # C, at least
 STEPS = 16
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """Pixels of a window that rivals are fitted to, and others on which they are compared."""
+
+    tracks: Tracks
+    left_out: Tracks
+    prior: Prior
+    sigma: float  # C, the same for all
+
+    def fit(self, path: Path, *, moves: bool = True) -> Scene:
+        """A scene fitted from a path; unless it `moves` by rotation alone."""
+        return fitted(self.tracks, path, self.prior, self.sigma, moves=moves)
+
+    def z(self, one: Scene, other: Scene) -> float:
+        """Of `other` over `one`, above 0 where events left out cost less under `other`."""
+        return compared(self.left_out, one, other, self.prior, self.sigma)
+
+    def best(self, scenes: list[Scene]) -> int:
+        """Which scene is the furthest before all others, or the least behind one."""
+        least = [min((self.z(b, a) for b in scenes if b is not a), default=0.0) for a in scenes]
+        return int(np.argmax(least))
 
 
 def without_translation(path: Path) -> Path:

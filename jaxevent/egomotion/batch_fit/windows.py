@@ -26,7 +26,7 @@ from jaxevent.egomotion.batch_fit.alignment import Window, refine, score
 from jaxevent.egomotion.batch_fit.depths import depths
 from jaxevent.egomotion.batch_fit.path import SEGMENTS, Path, Prior
 from jaxevent.egomotion.batch_fit.photometric import Report, adjust, compute_covariance
-from jaxevent.egomotion.batch_fit.rivals import SIGMA, compared, fitted, without_translation
+from jaxevent.egomotion.batch_fit.rivals import SIGMA, Trial, without_translation
 from jaxevent.egomotion.batch_fit.starts import (
     Plane,
     before_a_plane,
@@ -90,6 +90,10 @@ SKEW = 0.03  # standard deviation of the thresholds' skew by counts, at least
 NOISY, NOISE = 1, 0.1  # the stage, C
 HARDLY = -3.0  # added to log inverse depths where translation is not told
 TELLING = 3.0  # z, from which there is a translation
+REFUTED = 2.0  # z, from which another motion is not possible
+# Rivals whose cost is so many times the least in the end are compared on pixels left out: events
+# fitted tell the motion from its mirror image by 3 % of the cost, or the other way round.
+ALIKE = 1.5
 PARALLAX = 6.0  # px in a window; where there is less, rotation alone is tried too
 SHARP = 0.4  # sigma by the noise that is seen, at least: events beside edges are outliers
 
@@ -438,14 +442,22 @@ class Windows:
         )
         if not left:
             return None
-        scene, report = min(left, key=lambda one: self.cost(*one))
+        ranked = self.ranked(left)
+        few = least > 0 or self.parallax(ranked[0][0].path, half) < PARALLAX
+        limit = np.inf if few else ALIKE * self.cost(*ranked[0])
+        close = [one for one in ranked if self.cost(*one) <= limit]
+        trial = self.trial(centre) if few or len(close) > 1 else None
+        fits = side_by_side(lambda one: trial.fit(one[0].path), close) if trial else []
+        chosen = trial.best(fits) if trial else 0
+        scene, report = close[chosen]
         sigma = max(stages[-1].sigma, SHARP * report.noise, least)
         covariance = compute_covariance(tracks, scene, prior, sigma=sigma)
         scene, report = adjust(tracks, scene, prior, sigma=sigma, settle=0, steps=1)
         covariance = inflation(report.inliers) * covariance
-        if least > 0 or self.parallax(scene.path, half) < PARALLAX:
-            others = [one.path for one, _ in left if not near_to(one.path, scene.path)]
-            path, covariance = self.with_rivals(centre, scene.path, others, covariance)
+        if trial:
+            others = [(one.path, fit) for (one, _), fit in zip(close, fits, strict=True)]
+            best = others.pop(chosen)[1]
+            path, covariance = _with_rivals(trial, scene.path, best, others, covariance, few)
             scene = scene._replace(path=path)
         return Fit(
             scene.path,
@@ -459,38 +471,17 @@ class Windows:
         """How far (px) the usual point moves in a window by translation."""
         return 2 * half * self.f * float(np.exp(np.median(path.log_rho)))
 
-    def with_rivals(
-        self, centre: int, path: Path, others: list[Path], covariance: NDArray[np.float64]
-    ) -> tuple[Path, NDArray[np.float64]]:
-        """Path and covariance with what rivals leave open, compared on pixels left out (`rivals`).
-
-        Where rotation alone explains these about as well nothing tells the heading. The path is
-        then the rotation's, with hardly a translation, and Omega may be either's. Else other
-        motions count by their likelihood, exp(-z^2 / 2).
-        """
+    def trial(self, centre: int) -> Trial:
+        """Pixels of a window for the comparison of rivals."""
         half = float(self.params.half_window)
         first, last = self.rows(centre, half)
         limit = min(TRIED, int(0.6 * (last - first)))
-        tracks = self.tracks(centre, half, TRIED, limit)
-        left_out = self.tracks(centre, half, TRIED, TRIED, limit)
-        prior, least = self.prior(centre, half), self.least.get(centre, 0.0)
-        sigma = max(SIGMA, least)
-        still = fitted(tracks, without_translation(path), prior, sigma, moves=False)
-        best, *rest = side_by_side(lambda one: fitted(tracks, one, prior, sigma), [path, *others])
-        told = covariance.copy()
-        if compared(left_out, still, best, prior, sigma) < TELLING:
-            heading = path.D[0]
-            turn = still.path.O[0] - path.O[0]
-            told[:3], told[:, :3] = 0, 0
-            told[:3, :3] = (np.pi / 2) ** 2 / 2 * (np.eye(3) - np.outer(heading, heading))
-            told[3:, 3:] += np.outer(turn, turn)
-            far = Path(still.path.O, path.D, path.log_rho + HARDLY)
-            return far, told
-        for other, scene in zip(others, rest, strict=True):
-            z = max(compared(left_out, scene, best, prior, sigma), 0.0)
-            apart = np.concatenate([other.D[0] - path.D[0], other.O[0] - path.O[0]])
-            told += np.exp(-(z**2) / 2) * np.outer(apart, apart)
-        return path, told
+        return Trial(
+            self.tracks(centre, half, TRIED, limit),
+            self.tracks(centre, half, TRIED, TRIED, limit),
+            self.prior(centre, half),
+            max(SIGMA, self.least.get(centre, 0.0)),
+        )
 
     def ranked(self, rivals: list[Rival]) -> list[Rival]:
         """That of least cost first, without those that came to a better one."""
@@ -504,6 +495,38 @@ class Windows:
     def turning(self, path: Path) -> float:
         """The prior of |Omega|, per event."""
         return 0.5 * self.omega_weight * float((path.O[0] ** 2).sum()) / LAST
+
+
+def _with_rivals(
+    trial: Trial,
+    path: Path,
+    best: Scene,
+    others: list[tuple[Path, Scene]],
+    covariance: NDArray[np.float64],
+    few: bool,
+) -> tuple[Path, NDArray[np.float64]]:
+    """Path and covariance with what rivals leave open, compared on pixels left out (`rivals`).
+
+    Where there is `few` parallax, rotation alone is a rival. Where it explains these pixels about
+    as well nothing tells the heading. The path is then the rotation's, with hardly a translation,
+    and Omega may be either's. Else other motions that are not refuted count by their likelihood,
+    exp(-z^2 / 2).
+    """
+    told = covariance.copy()
+    if few:
+        still = trial.fit(without_translation(path), moves=False)
+        if trial.z(still, best) < TELLING:
+            heading, turn = path.D[0], still.path.O[0] - path.O[0]
+            told[:3], told[:, :3] = 0, 0
+            told[:3, :3] = (np.pi / 2) ** 2 / 2 * (np.eye(3) - np.outer(heading, heading))
+            told[3:, 3:] += np.outer(turn, turn)
+            return Path(still.path.O, path.D, path.log_rho + HARDLY), told
+    for other, scene in others:
+        z = max(trial.z(scene, best), 0.0)
+        apart = np.concatenate([other.D[0] - path.D[0], other.O[0] - path.O[0]])
+        if z < REFUTED:
+            told += np.exp(-(z**2) / 2) * np.outer(apart, apart)
+    return path, told
 
 
 def near_to(path: Path, other: Path) -> bool:
