@@ -32,15 +32,15 @@ def test_cells_err_independently(monkeypatch):
     assert z == pytest.approx(D.sum() / np.sqrt((D**2).sum()), rel=1e-4)
 
 
-def test_the_best_rival_is_before_all_others(monkeypatch):
-    """Whatever fitted events cost: on pixels left out the third is before both others."""
-    before = {("a", "b"): 3.0, ("c", "a"): 2.4, ("c", "b"): 2.9}  # z of the first over the second
+def test_the_first_rival_gives_way_if_it_is_refuted(monkeypatch):
+    """By what is furthest before it on pixels left out."""
+    before = {("b", "a"): 2.1, ("c", "a"): 2.4, ("b", "c"): 1.9}  # z of the first over the second
     z = before | {(two, one): -value for (one, two), value in before.items()}
     monkeypatch.setattr(rivals.Trial, "z", lambda self, one, other: z[other, one])
     best = inspect.unwrap(rivals.Trial.best)
     trial = object.__new__(rivals.Trial)
     assert best(trial, ["a", "b", "c"]) == 2
-    assert best(trial, ["b", "a"]) == 1
+    assert best(trial, ["c", "b"]) == best(trial, ["b", "a", "c"]) == 0
     assert best(trial, ["a"]) == 0
 
 

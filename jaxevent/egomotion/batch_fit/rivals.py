@@ -23,6 +23,7 @@ CELL = 48  # px, within which errors are alike
 FAR = -9.0  # log inverse depth that makes no parallax
 SIGMA = 0.1  # C, at least
 STEPS = 16
+REFUTED = 2.0  # z of another motion, from which one is not possible
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,9 +44,10 @@ class Trial:
         return compared(self.left_out, one, other, self.prior, self.sigma)
 
     def best(self, scenes: list[Scene]) -> int:
-        """Which scene is the furthest before all others, or the least behind one."""
-        least = [min((self.z(b, a) for b in scenes if b is not a), default=0.0) for a in scenes]
-        return int(np.argmax(least))
+        """Which scene to take: the first, or what is furthest before it, if it is refuted."""
+        z = [0.0, *(self.z(scenes[0], other) for other in scenes[1:])]
+        best = int(np.argmax(z))
+        return best if z[best] > REFUTED else 0
 
 
 def without_translation(path: Path) -> Path:

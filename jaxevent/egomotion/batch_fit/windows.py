@@ -90,9 +90,9 @@ SKEW = 0.03  # standard deviation of the thresholds' skew by counts, at least
 NOISY, NOISE = 1, 0.1  # the stage, C
 HARDLY = -3.0  # added to log inverse depths where translation is not told
 TELLING = 3.0  # z, from which there is a translation
-REFUTED = 2.0  # z, from which another motion is not possible
-# Rivals whose cost is so many times the least in the end are compared on pixels left out: events
-# fitted tell the motion from its mirror image by 3 % of the cost, or the other way round.
+# Rivals whose cost is so many times the least in the end are compared on pixels left out: fitted
+# events tell the motion from its mirror image by 3 % of the cost, or the other way round. Only what
+# these pixels refute gives way: outlines before nothing else tell more where they are fitted.
 ALIKE = 1.5
 PARALLAX = 6.0  # px in a window; where there is less, rotation alone is tried too
 SHARP = 0.4  # sigma by the noise that is seen, at least: events beside edges are outliers
@@ -454,10 +454,10 @@ class Windows:
         covariance = compute_covariance(tracks, scene, prior, sigma=sigma)
         scene, report = adjust(tracks, scene, prior, sigma=sigma, settle=0, steps=1)
         covariance = inflation(report.inliers) * covariance
-        if trial:
+        if trial and few:
             others = [(one.path, fit) for (one, _), fit in zip(close, fits, strict=True)]
             best = others.pop(chosen)[1]
-            path, covariance = _with_rivals(trial, scene.path, best, others, covariance, few)
+            path, covariance = _with_rivals(trial, scene.path, best, others, covariance)
             scene = scene._replace(path=path)
         return Fit(
             scene.path,
@@ -503,29 +503,25 @@ def _with_rivals(
     best: Scene,
     others: list[tuple[Path, Scene]],
     covariance: NDArray[np.float64],
-    few: bool,
 ) -> tuple[Path, NDArray[np.float64]]:
     """Path and covariance with what rivals leave open, compared on pixels left out (`rivals`).
 
-    Where there is `few` parallax, rotation alone is a rival. Where it explains these pixels about
-    as well nothing tells the heading. The path is then the rotation's, with hardly a translation,
-    and Omega may be either's. Else other motions that are not refuted count by their likelihood,
-    exp(-z^2 / 2).
+    Where rotation alone explains these about as well nothing tells the heading. The path is then
+    the rotation's, with hardly a translation, and Omega may be either's. Else other motions count
+    by their likelihood, exp(-z^2 / 2).
     """
     told = covariance.copy()
-    if few:
-        still = trial.fit(without_translation(path), moves=False)
-        if trial.z(still, best) < TELLING:
-            heading, turn = path.D[0], still.path.O[0] - path.O[0]
-            told[:3], told[:, :3] = 0, 0
-            told[:3, :3] = (np.pi / 2) ** 2 / 2 * (np.eye(3) - np.outer(heading, heading))
-            told[3:, 3:] += np.outer(turn, turn)
-            return Path(still.path.O, path.D, path.log_rho + HARDLY), told
+    still = trial.fit(without_translation(path), moves=False)
+    if trial.z(still, best) < TELLING:
+        heading, turn = path.D[0], still.path.O[0] - path.O[0]
+        told[:3], told[:, :3] = 0, 0
+        told[:3, :3] = (np.pi / 2) ** 2 / 2 * (np.eye(3) - np.outer(heading, heading))
+        told[3:, 3:] += np.outer(turn, turn)
+        return Path(still.path.O, path.D, path.log_rho + HARDLY), told
     for other, scene in others:
         z = max(trial.z(scene, best), 0.0)
         apart = np.concatenate([other.D[0] - path.D[0], other.O[0] - path.O[0]])
-        if z < REFUTED:
-            told += np.exp(-(z**2) / 2) * np.outer(apart, apart)
+        told += np.exp(-(z**2) / 2) * np.outer(apart, apart)
     return path, told
 
 
