@@ -4,6 +4,7 @@ A few hundred operations on single numbers: XLA would compile longer than they t
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -186,3 +187,32 @@ class HostProgram:
         same = all(np.array_equal(values[n], self.values[n]) for n in self.decided)
         same = same and all(np.array_equal(values[n] == 0, z) for n, z in self.zeros.items())
         return values if same else None
+
+
+class Programs:
+    """Programs of the same functions, each for a way that conditions on parameters chose.
+
+    A program has its `HostProgram` as `host`. With it is kept what was made of it.
+    """
+
+    def __init__(self) -> None:
+        self._made: list[tuple[Any, Any]] = []
+
+    def get(
+        self,
+        inputs: list[NDArray],
+        translate: Callable[[], Any],
+        make: Callable[[Any], Any] = lambda program: {},
+    ) -> tuple[Any, Any, list[NDArray]]:
+        """The program for some inputs, what `make` made of it, and the values of its host program.
+
+        It is translated if there is none yet.
+        """
+        for program, made in self._made:
+            values = program.host.again(inputs)
+            if values is not None:
+                return program, made, values
+        program = translate()
+        made = make(program)
+        self._made.append((program, made))
+        return program, made, program.host.values

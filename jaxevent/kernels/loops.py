@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.kernels.expressions import Graph, Level, Node, Untranslatable, needed
-from jaxevent.kernels.host import HostProgram
+from jaxevent.kernels.host import HostProgram, Programs
 from jaxevent.kernels.modules import module_of
 from jaxevent.kernels.text import Numbers, Place, Writer, import_functions
 from jaxevent.kernels.translate import FOLDS, KINDS, Known, OfParameters, Translation, Value
@@ -421,26 +421,23 @@ class Kernels:
         self, functions: type, write: Callable[[Any], tuple[str, Numbers]], most: int
     ) -> None:
         self.functions, self.write, self.most = functions, write, most
-        self._made: dict[Any, list[tuple[Any, Numbers, Any]]] = {}
+        self._made: dict[Any, Programs] = {}
 
     def get(self, key: Any, params: Any, translate: Callable[[], Any]) -> Compiled:
         """What is compiled for parameters; `key` names all that `translate` rests on beside them.
 
         Raises `Untranslatable`.
         """
-        made = self._made.setdefault(key, [])
         given = [np.asarray(leaf) for leaf in jax.tree.leaves(params)]
-        for program, numbers, functions in made:
-            values = program.host.again(given)
-            if values is not None:
-                return Compiled(program, functions, numbers.of(values, np.dtype(float)))
-        program = translate()
+        programs = self._made.setdefault(key, Programs())
+        program, (numbers, functions), values = programs.get(given, translate, self._compile)
+        return Compiled(program, functions, numbers.of(values, np.dtype(float)))
+
+    def _compile(self, program: Any) -> tuple[Numbers, Any]:
         nodes = needed([n for f in program.functions.values() for n in f.results.values()])
         if len(nodes) > self.most:
             raise Untranslatable(f"more than {self.most} operations")
         text, numbers = self.write(program)
         module = module_of(text)
         names = self.functions._fields
-        functions = self.functions(*(getattr(module, name) for name in names))
-        made.append((program, numbers, functions))
-        return Compiled(program, functions, numbers.of(program.host.values, np.dtype(float)))
+        return numbers, self.functions(*(getattr(module, name) for name in names))

@@ -19,7 +19,6 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxevent.estimator import Described, Estimate
-from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import P, PixelEstimator
 from jaxevent.reconstruction.features import (
@@ -31,7 +30,7 @@ from jaxevent.reconstruction.features import (
     Tiles,
 )
 from jaxevent.reconstruction.fused.images import DividedEvents, prepared_by_kernel
-from jaxevent.reconstruction.fused.video import FusedVideo, wants_kernel, without_kernel
+from jaxevent.reconstruction.fused.video import FusedVideo, video_by_kernel
 from jaxevent.reconstruction.layout import SHAPES, SLOTS
 from jaxevent.reconstruction.prepared import PreparedImages
 from jaxevent.reconstruction.video import ImageSequence, Video
@@ -155,15 +154,8 @@ class Filter(PixelEstimator[P]):
         numba is asked for what it cannot do.
         """
         params = self.Params() if params is None else params
-        if not wants_kernel(compiler, options.get("devices", ())):
-            return Video(self, recording, params, **options)
-        mine = {name: value for name, value in options.items() if name != "devices"}
-        try:
-            return FusedVideo(self, recording, params, **mine)
-        except Untranslatable as reason:
-            if compiler == "numba":
-                raise without_kernel(self.name, reason) from reason
-            return Video(self, recording, params, **options)
+        fused = video_by_kernel(FusedVideo, self, recording, params, compiler, options)
+        return Video(self, recording, params, **options) if fused is None else fused
 
     def prepare_images(
         self,

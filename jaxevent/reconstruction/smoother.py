@@ -32,7 +32,6 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.estimator import Described, Estimate
-from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.parameters import Choice, Positive
 from jaxevent.reconstruction.augment import (
     CertaintyParams,
@@ -57,7 +56,7 @@ from jaxevent.reconstruction.features import (
 from jaxevent.reconstruction.fused.images import prepared_by_kernel
 from jaxevent.reconstruction.fused.smoothed import SmoothedVideo
 from jaxevent.reconstruction.fused.smoothed_images import DividedFrames
-from jaxevent.reconstruction.fused.video import wants_kernel, without_kernel
+from jaxevent.reconstruction.fused.video import video_by_kernel
 from jaxevent.reconstruction.prepared import PreparedImages
 from jaxevent.reconstruction.video import ImageSequence, Video
 from jaxevent.recording import Recording, Times
@@ -594,15 +593,8 @@ class Smoother(PixelEstimator[Params]):
         are spread over time. Raises `InputError`.
         """
         params = self.Params() if params is None else params
-        if not wants_kernel(compiler, options.get("devices", ())):
-            return Video(self, recording, params, **options)
-        mine = {name: value for name, value in options.items() if name != "devices"}
-        try:
-            return SmoothedVideo(self, recording, params, **mine)
-        except Untranslatable as reason:
-            if compiler == "numba":
-                raise without_kernel(self.name, reason) from reason
-            return Video(self, recording, params, **options)
+        fused = video_by_kernel(SmoothedVideo, self, recording, params, compiler, options)
+        return Video(self, recording, params, **options) if fused is None else fused
 
     def prepare_images(
         self,

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.kernels.host import Programs
 from jaxevent.kernels.modules import module_of
 from jaxevent.reconstruction.fused.loop import Functions
 from jaxevent.reconstruction.fused.pixel import (
@@ -39,15 +40,8 @@ class Kernel:
         return dict(zip(start, made, strict=True))
 
 
-@dataclasses.dataclass
-class _Programs:
-    """What has been made of a method whose functions were traced once."""
-
-    traced: Traced
-    known: list[tuple[PixelProgram, dict[int, tuple[Source, ModuleType]]]]
-
-
-_programs: dict[Any, _Programs] = {}
+# Of methods whose functions were traced once.
+_programs: dict[Any, tuple[Traced, Programs]] = {}
 
 
 def program_of(
@@ -68,17 +62,10 @@ def program_of(
     key = (method, tree, tuple(np.shape(leaf) for leaf in leaves), exposed, dtype, directions)
     if key not in _programs:
         about = traced(method, observe, params, exposed, dtype, directions)
-        _programs[key] = _Programs(about, [])
-    made = _programs[key]
-    given = [*host_inputs(made.traced, params, fixed).values()]
-    again = ((known, known[0].host.again(given)) for known in made.known)
-    found = next(((known, values) for known, values in again if values is not None), None)
-    if found is None:
-        program = translated(made.traced, params, fixed)
-        found = (program, {}), program.host.values
-        made.known.append(found[0])
-    (program, modules), values = found
-    return program, modules, values
+        _programs[key] = about, Programs()
+    about, programs = _programs[key]
+    given = [*host_inputs(about, params, fixed).values()]
+    return programs.get(given, lambda: translated(about, params, fixed))
 
 
 def kernel_of(

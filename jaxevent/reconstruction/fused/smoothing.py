@@ -8,7 +8,6 @@ kept of every frame (`ROW`, and what images need beside them).
 import dataclasses
 import functools
 from collections.abc import Callable
-from types import ModuleType
 from typing import Any, Protocol, runtime_checkable
 
 import jax
@@ -16,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.kernels.expressions import Graph, Node, Untranslatable, needed, value_of
-from jaxevent.kernels.host import HostProgram
+from jaxevent.kernels.host import HostProgram, Programs
 from jaxevent.kernels.loops import Function, leaves_of, translate
 from jaxevent.kernels.modules import module_of
-from jaxevent.kernels.text import FUNCTIONS, Numbers, Place, Writer
+from jaxevent.kernels.text import Numbers, Place, Writer, import_functions
 from jaxevent.reconstruction.fused.frame_loop import FrameFunctions
 from jaxevent.reconstruction.fused.pixel import Directions
 from jaxevent.reconstruction.video import ImageMethod
@@ -66,7 +65,7 @@ from numba import types
 
 from jaxevent.kernels.blocks import block
 from jaxevent.kernels.kept import callback
-from jaxevent.kernels.numeric import {imports}
+{imports}
 
 REAL, STRIDE = np.{real}, {stride}
 I, D, F = types.int64, types.float64, types.{real}
@@ -301,9 +300,8 @@ def _write(program: FrameProgram, stride: int) -> tuple[str, Numbers]:
             loops = _loops(stored, texts, writer, PIXELS_LOOP, 8)
             parts.append(PIXELS.format(name=name, loops=loops))
     numbers, constants = writer.finish(program.host.values)
-    single = program.dtype == np.float32
     head = HEAD.format(
-        imports=", ".join(f"{n}{32 if single else 64} as {n}" for n in FUNCTIONS),
+        imports=import_functions(program.dtype),
         real=program.dtype.name,
         stride=stride,
         constants="\n".join(constants),
@@ -361,9 +359,7 @@ def _loops(
     return "\n".join(out)
 
 
-# What has been made of methods: programs, each for a way that conditions on parameters chose, with
-# their modules by stride.
-_made: dict[Any, list[tuple[FrameProgram, dict[int, tuple[Numbers, ModuleType]]]]] = {}
+_programs: dict[Any, Programs] = {}  # with their modules by stride
 
 
 def smoother_kernel(
@@ -379,14 +375,10 @@ def smoother_kernel(
     leaves, tree = jax.tree.flatten(_known(params, fixed, directions))
     shapes = tuple(np.shape(leaf) for leaf in leaves)
     key = method, tree, shapes, exposed, dtype, directions
-    made, given = _made.setdefault(key, []), [np.asarray(leaf) for leaf in leaves]
-    again = ((known, known[0].host.again(given)) for known in made)
-    found = next(((known, values) for known, values in again if values is not None), None)
-    if found is None:
-        program = _translated(method, params, fixed, exposed, dtype, directions)
-        found = (program, {}), program.host.values
-        made.append(found[0])
-    (program, modules), values = found
+    program, modules, values = _programs.setdefault(key, Programs()).get(
+        [np.asarray(leaf) for leaf in leaves],
+        lambda: _translated(method, params, fixed, exposed, dtype, directions),
+    )
     if stride not in modules:
         text, numbers = _write(program, stride)
         modules[stride] = numbers, module_of(text)

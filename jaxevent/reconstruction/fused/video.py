@@ -1,7 +1,7 @@
 """Video by kernels: events, recursion and images in one pass over bands of pixels."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -122,6 +122,29 @@ def wants_kernel(compiler: str | None, devices: Sequence[Any]) -> bool:
         raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
     on_host = jnp.result_type(float) == np.float32 and jax.default_backend() == "cpu"
     return compiler == "numba" or (compiler is None and on_host and len(devices) < 2)
+
+
+def video_by_kernel(
+    kind: Callable[..., ImageSequence[P]],
+    method: Any,
+    recording: Recording,
+    params: P,
+    compiler: str | None,
+    options: dict[str, Any],
+) -> ImageSequence[P] | None:
+    """A method's images by a kernel; None where it does not serve.
+
+    Raises `InputError` where numba is asked for what it cannot do.
+    """
+    if not wants_kernel(compiler, options.get("devices", ())):
+        return None
+    mine = {name: value for name, value in options.items() if name != "devices"}
+    try:
+        return kind(method, recording, params, **mine)
+    except Untranslatable as reason:
+        if compiler == "numba":
+            raise without_kernel(method.name, reason) from reason
+        return None
 
 
 def without_kernel(name: str, reason: Untranslatable) -> InputError:
