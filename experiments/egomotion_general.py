@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from jaxevent.egomotion import truth
+from jaxevent.egomotion import scores
 from jaxevent.egomotion.batch_fit import sequence
 from jaxevent.egomotion.batch_fit import windows as batch
 from jaxevent.simulate import motion_scene
@@ -45,8 +45,8 @@ def window(scene: str, motion: str, seed: int, params: batch.Params) -> dict[str
     return {
         "scene": f"{scene} {motion}",
         "seed": seed,
-        "heading": float(truth.axis_error(heading, T)[0]),
-        "Omega": 100 * float(truth.relative_error(turn, Omega)[0]),
+        "heading": float(scores.axis_error(heading, T)[0]),
+        "Omega": 100 * float(scores.relative_error(turn, Omega)[0]),
         "heading sigma": float(np.degrees(spread[0])),
         "Omega sigma": 100 * float(spread[1] / np.linalg.norm(Omega)),
         "agreement": fit.agreement,
@@ -62,8 +62,8 @@ def whole(scene: str, seed: int, params: batch.Params, seconds: float) -> dict[s
     spent = time.perf_counter() - clock
     kept = found.valid
     T, Omega = source.twist(found.t[kept])
-    heading = truth.axis_error(found.mean[kept, :3], T)
-    turn = 100 * truth.relative_error(found.mean[kept, 3:], Omega)
+    heading = scores.axis_error(found.mean[kept, :3], T)
+    turn = 100 * scores.relative_error(found.mean[kept, 3:], Omega)
     return {
         "scene": f"{scene} varying",
         "seed": seed,

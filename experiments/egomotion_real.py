@@ -37,7 +37,7 @@ Rows = list[dict[str, Any]]
 
 
 def angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return egomotion.truth.axis_error(np.atleast_2d(a), np.atleast_2d(b))
+    return egomotion.scores.axis_error(np.atleast_2d(a), np.atleast_2d(b))
 
 
 def disk(data: Path) -> Rows:

@@ -11,7 +11,7 @@ pure translation to the right), and two cuts of 13 and 99 ms of rotation, withou
 
 Parameters are those that suit the recording by themselves, those of `literal` are the thesis'
 (`Params.presets`). Every estimate counts for the time that what it saw shows (`centred`). Errors
-are those of `truth.motion_errors` from 0.2 s to 0.1 s before the end, where all methods tell
+are those of `scores.motion_errors` from 0.2 s to 0.1 s before the end, where all methods tell
 something, means over seeds: `failed` counts sequences without any estimate there, which are not in
 the means.
 `CPU` is CPU seconds per second of recording, programs being compiled. What table.csv holds already

@@ -29,7 +29,7 @@ from jaxevent.egomotion import voting
 from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.particle_filter.parameters import Params
 from jaxevent.egomotion.particle_filter.smoothing import smoothed
-from jaxevent.egomotion.truth import axis_error, relative_error, relative_magnitude_error
+from jaxevent.egomotion.scores import axis_error, relative_error, relative_magnitude_error
 from jaxevent.io.output import complete
 from jaxevent.recording import Recording
 from jaxevent.simulate import motion_scene

@@ -130,8 +130,8 @@ def run(
 ) -> None:
     from jaxevent.egomotion import find_model
     from jaxevent.egomotion.choice import choose
-    from jaxevent.egomotion.truth import gyro_bias
-    from jaxevent.egomotion.truth import imu_rotation as rotation_of
+    from jaxevent.egomotion.twists import gyro_bias
+    from jaxevent.egomotion.twists import imu_rotation as rotation_of
     from jaxevent.io import load
     from jaxevent.runs.egomotion import find_estimator
     from jaxevent.show.motion import Output
@@ -254,7 +254,7 @@ def _gyro(
     import numpy as np
 
     from jaxevent.egomotion import from_gyro
-    from jaxevent.egomotion.truth import constant_between
+    from jaxevent.egomotion.twists import constant_between
 
     zero = np.zeros(3) if bias is None else bias
     measured = from_gyro(recording.imu, zero, turned)

@@ -12,7 +12,8 @@ And what they stand on:
 - `flow`: the optical flow of each event, once the motion is known; `field`: that of each pixel;
 - `candidates`: of each event its earlier neighbours, prepared once;
 - `geometry`: the flow of a rigid scene, residuals of matched events, rotations and twists;
-- `truth`: the camera's twist from poses or a gyro, and the errors of an estimate.
+- `twists`: the camera's twist from poses or a gyro; `truth`: what is true of a recording's motion;
+  `scores`: the errors of an estimate.
 
 All speak of the camera's own twist (T, Omega) in its axes, x to the right, y down, z forward.
 
@@ -24,7 +25,17 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxevent.egomotion import candidates, field, flow, geometry, models, motion, truth
+    from jaxevent.egomotion import (
+        candidates,
+        field,
+        flow,
+        geometry,
+        models,
+        motion,
+        scores,
+        truth,
+        twists,
+    )
     from jaxevent.egomotion.baselines.contrast_maximisation import contrast
     from jaxevent.egomotion.baselines.local_planes import planes
     from jaxevent.egomotion.baselines.tracked_points import frames
@@ -33,14 +44,9 @@ if TYPE_CHECKING:
     from jaxevent.egomotion.models import MODELS, Model, find_model
     from jaxevent.egomotion.motion import Motion
     from jaxevent.egomotion.particle_filter.estimator import voting
-    from jaxevent.egomotion.truth import (
-        Known,
-        Twists,
-        from_gyro,
-        from_poses,
-        gyro_bias,
-        motion_errors,
-    )
+    from jaxevent.egomotion.scores import motion_errors
+    from jaxevent.egomotion.truth import Known
+    from jaxevent.egomotion.twists import Twists, from_gyro, from_poses, gyro_bias
 
 # Loaded when first used: compiled preparation and SciPy are slow to import.
 _HOMES = {
@@ -52,9 +58,13 @@ _HOMES = {
     "models": ("MODELS", "Model", "find_model"),
     "motion": ("Motion",),
     "particle_filter.estimator": ("voting",),
-    "truth": ("Known", "Twists", "from_gyro", "from_poses", "gyro_bias", "motion_errors"),
+    "scores": ("motion_errors",),
+    "truth": ("Known",),
+    "twists": ("Twists", "from_gyro", "from_poses", "gyro_bias"),
 }
-_MODULES = ("candidates", "field", "flow", "geometry", "models", "motion", "truth")
+_MODULES = (
+    "candidates", "field", "flow", "geometry", "models", "motion", "scores", "truth", "twists",
+)  # fmt: skip
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
@@ -79,7 +89,9 @@ __all__ = [
     "motion",
     "motion_errors",
     "planes",
+    "scores",
     "truth",
+    "twists",
     "voting",
 ]
 

@@ -1,4 +1,4 @@
-"""A motion compared with a known one: the figures of `truth.motion_errors` over some times."""
+"""A motion compared with a known one: the figures of `scores.motion_errors` over some times."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import Motion
-from jaxevent.egomotion.truth import Known, axis_error, motion_errors, relative_error
+from jaxevent.egomotion.scores import axis_error, motion_errors, relative_error
+from jaxevent.egomotion.truth import Known
 from jaxevent.metrics import MEANINGS
 
 FIGURES = {  # of `motion_errors`: their units

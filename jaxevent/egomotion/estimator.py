@@ -68,7 +68,7 @@ class MotionEstimator(Estimator[P]):
     `models.MODELS`, "package.module:Class" or the class; the `camera`, by default the recording's;
     and the `seed`: the same one gives the same motion. Some take `smooth`: whether later events
     tell of a time too; `cloud`: how many particles of an estimate to keep; and `gyro`, what a gyro
-    measured (`truth.from_gyro`).
+    measured (`twists.from_gyro`).
 
     Attributes:
         linear: Whether it needs a flow that is linear in the motion.

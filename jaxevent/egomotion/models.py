@@ -40,7 +40,7 @@ from jaxevent.estimator import imported
 from jaxevent.parameters import nearest
 
 if TYPE_CHECKING:
-    from jaxevent.egomotion.truth import Twists
+    from jaxevent.egomotion.twists import Twists
 
 Numeric = Array | np.ndarray
 Params = Any  # of the method that asks
@@ -51,7 +51,7 @@ SLOWEST = 0.3  # baseline / tau_max, the slowest of the first planar hypotheses
 class Part:
     """Components that belong together: a vector, or a direction, which is a unit vector.
 
-    `figure` is what `truth.motion_errors` calls such vectors.
+    `figure` is what `scores.motion_errors` calls such vectors.
     """
 
     name: str

@@ -14,7 +14,7 @@ Settings beside `protocol = "motion"`:
     gyro = false                        # tell the gyro to methods that take it
     seed = 0
 
-A row has the errors of `truth.motion_errors` at 200 times per second, without those at which the
+A row has the errors of `scores.motion_errors` at 200 times per second, without those at which the
 motion was lost: `lost`, their share of all after it was first found, `startup` (s) later.
 `per_time` lists t (us) and `error`, the relative error in %, and of a direction, as the `heading`
 of general motion, its error in degrees; None where lost.
@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 from jaxevent.egomotion.comparison import by_part, compare
 from jaxevent.egomotion.estimator import RATE, MotionEstimator
 from jaxevent.egomotion.models import Model, find_model
-from jaxevent.egomotion.truth import Known, from_gyro, imu_rotation, known
+from jaxevent.egomotion.truth import Known, known
+from jaxevent.egomotion.twists import from_gyro, imu_rotation
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording

@@ -17,7 +17,8 @@ from jaxevent.egomotion import flow as event_flow
 from jaxevent.egomotion.comparison import Comparison, compare
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.egomotion.motion import Motion
-from jaxevent.egomotion.truth import Known, constant_between, from_poses, known, nearest_axes
+from jaxevent.egomotion.truth import Known, known
+from jaxevent.egomotion.twists import constant_between, from_poses, nearest_axes
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.estimator import Estimate
 from jaxevent.io.description import CLOCK

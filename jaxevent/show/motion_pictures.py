@@ -18,7 +18,8 @@ from jaxevent.egomotion.candidates import coordinates
 from jaxevent.egomotion.flow import Flow
 from jaxevent.egomotion.models import Model, Numeric
 from jaxevent.egomotion.motion import Motion
-from jaxevent.egomotion.truth import Known, axis_error, endpoint_error
+from jaxevent.egomotion.scores import axis_error, endpoint_error
+from jaxevent.egomotion.truth import Known
 from jaxevent.egomotion.warped import blur, contrast, splat
 from jaxevent.estimator import Estimate
 from jaxevent.io.output import complete

@@ -17,7 +17,7 @@ from jaxevent.egomotion.batch_fit.depths import depths as look_for_depths
 from jaxevent.egomotion.batch_fit.path import ROWS, Path, advanced, normalised, warp
 from jaxevent.egomotion.batch_fit.photometric import Report, compute_covariance
 from jaxevent.egomotion.batch_fit.tracks import Scene, misfits, placed
-from jaxevent.egomotion.truth import Twists
+from jaxevent.egomotion.twists import Twists
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion import contrast, find_model, truth, voting
+from jaxevent.egomotion import contrast, find_model, truth, twists, voting
 from jaxevent.egomotion.choice import choose, layers, standard
 from jaxevent.egomotion.geometry import A, B
 from jaxevent.egomotion.motion import Calibration, Motion
@@ -142,24 +142,24 @@ def test_a_gyro_in_other_axes_and_with_a_bias():
     t = np.linspace(0, 1, 50)
     Omega = np.stack([0.3 * np.sin(7 * t), 0.2 * np.cos(5 * t), 0.5 + 0.2 * np.sin(9 * t)], 1)
     bias = np.array([0.05, -0.06, 0.02])
-    np.testing.assert_allclose(truth.constant_between(Omega, Omega + bias), bias)
-    for name, R in truth.AXES.items():
+    np.testing.assert_allclose(twists.constant_between(Omega, Omega + bias), bias)
+    for name, R in twists.AXES.items():
         assert np.linalg.det(R) == pytest.approx(1)
         measured = (Omega + bias) @ R  # R takes the gyro's axes to the camera's
-        found = truth.nearest_axes(Omega, measured)
+        found = twists.nearest_axes(Omega, measured)
         assert found == (None if name == "camera" else name)
         imu = Imu(np.rint(1e6 * t).astype(np.int64), measured, np.zeros_like(measured))
-        np.testing.assert_allclose(truth.from_gyro(imu, rotation=R).Omega, Omega + bias)
+        np.testing.assert_allclose(twists.from_gyro(imu, rotation=R).Omega, Omega + bias)
     # Axes without a name are told as `imu_rotation` reads them.
     R = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
-    found = truth.nearest_axes(Omega, (Omega + bias) @ R)
+    found = twists.nearest_axes(Omega, (Omega + bias) @ R)
     assert found is not None
-    np.testing.assert_array_equal(truth.imu_rotation(found), R)
-    np.testing.assert_array_equal(truth.imu_rotation("y-up"), np.diag([1.0, -1, -1]))
-    np.testing.assert_array_equal(truth.imu_rotation("0,1,0,0,0,1,1,0,0")[0], [0, 1, 0])
+    np.testing.assert_array_equal(twists.imu_rotation(found), R)
+    np.testing.assert_array_equal(twists.imu_rotation("y-up"), np.diag([1.0, -1, -1]))
+    np.testing.assert_array_equal(twists.imu_rotation("0,1,0,0,0,1,1,0,0")[0], [0, 1, 0])
     for wrong in ("y_up", "1,2", "1,0,0,0,1,0,0,0,-1"):
         with pytest.raises(InputError, match="imu-rotation"):
-            truth.imu_rotation(wrong)
+            twists.imu_rotation(wrong)
 
 
 def test_poses_and_a_depth_tell_an_image_velocity():

@@ -12,7 +12,8 @@ from PIL import Image
 
 import jaxevent
 from jaxevent import blob, egomotion
-from jaxevent.egomotion.truth import endpoint_error, read_motion
+from jaxevent.egomotion.scores import endpoint_error
+from jaxevent.egomotion.truth import read_motion
 from jaxevent.errors import InputError
 from jaxevent.runs import evaluate
 from jaxevent.runs.blob_positions import read_positions

@@ -24,7 +24,7 @@ def solve(params: Params, given: Given) -> Motion:
 
     The motion at a time is the mean of what the windows around it tell, of those nearer the more
     (a raised cosine). Estimates are a fifth of a `step` apart. The seed chooses events where a
-    window has more than `events`. The option `gyro` (`truth.from_gyro`) settles Omega.
+    window has more than `events`. The option `gyro` (`twists.from_gyro`) settles Omega.
     """
     recording, camera, gyro = given.recording, given.camera, given.more.get("gyro")
     assert camera is not None

@@ -39,7 +39,7 @@ from jaxevent.egomotion.batch_fit.starts import (
 )
 from jaxevent.egomotion.batch_fit.tracks import Scene, Tracks
 from jaxevent.egomotion.candidates import coordinates
-from jaxevent.egomotion.truth import Twists
+from jaxevent.egomotion.twists import Twists
 from jaxevent.parameters import Count, Number, Parameters, Positive
 from jaxevent.recording import Recording
 
