@@ -43,7 +43,6 @@ from jaxevent.blob import (
 )
 from jaxevent.blob.losses import Positions
 from jaxevent.blob.prepare import Features, packing_key
-from jaxevent.devices import shared_out
 from jaxevent.errors import InputError
 from jaxevent.io.output import finite, values_of
 from jaxevent.parameters import Parameters, nearest
@@ -52,9 +51,10 @@ from jaxevent.runs import blob_positions
 from jaxevent.runs.blob_positions import Known, Targets, seed_at, span_of_events
 from jaxevent.runs.blob_scores import TrackProtocol
 from jaxevent.runs.config import NAME
-from jaxevent.runs.family import Family, Goal, Shares, Sources
+from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources, share_out
 from jaxevent.show.report import aligned, legend
 from jaxevent.splits import SPLITS, windows
+from jaxevent.tuning import Batches
 
 LOSSES = ("likelihood", "positions")
 EVENTS = ("all", "associated")
@@ -117,26 +117,15 @@ class TrackGoal(Goal):
 
     def problem(
         self, sources: Sources, split: Shares, window: float | int | None
-    ) -> Callable[[TrackerParams], tuple[list[Batch], list[Batch]]]:
+    ) -> Callable[[TrackerParams], Batches]:
         found = [part for part in self._parts(sources, split, window) if part.split < 2]
         if self.loss.name == "positions":
             found = [p for p in found if p.known is not None and np.isfinite(p.known.xi).any()]
-        prepared: tuple[Any, Any] = (None, None)
 
-        def batches(params: TrackerParams) -> tuple[list[Batch], list[Batch]]:
-            nonlocal prepared
-            fixed = packing_key(params)
-            if prepared[0] != fixed:
-                prepared = (None, None)  # so that two are never held at once
-                packed = jax.device_put(self._packed(found, params, self.loss.name))
-                pairs = list(zip(found, packed, strict=True))
-                by_split = tuple(
-                    shared_out([b for part, b in pairs if part.split == s]) for s in (0, 1)
-                )
-                prepared = fixed, by_split
-            return prepared[1]
+        def make(params: TrackerParams) -> Batches:
+            return share_out(found, jax.device_put(self._packed(found, params, self.loss.name)))
 
-        return batches
+        return LastBatches(packing_key, make)
 
     def score(
         self,

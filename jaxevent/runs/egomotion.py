@@ -42,7 +42,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxevent.devices import shared_out
 from jaxevent.egomotion.comparison import by_part
 from jaxevent.egomotion.estimator import RATE, Batch, MotionEstimator, Stretch
 from jaxevent.egomotion.models import Model, find_model
@@ -54,10 +53,11 @@ from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
 from jaxevent.runs import egomotion_scores as scores
 from jaxevent.runs.config import NATURAL
-from jaxevent.runs.family import Family, Shares, Sources
+from jaxevent.runs.family import Family, LastBatches, Shares, Sources, share_out
 from jaxevent.runs.family import Goal as FamilyGoal
 from jaxevent.show.report import aligned, legend
 from jaxevent.splits import SPLITS, windows
+from jaxevent.tuning import Batches
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,25 +111,18 @@ class Goal(FamilyGoal):
 
     def problem(
         self, sources: Sources, split: Shares, window: float | int | None
-    ) -> Callable[[Any], tuple[list[Batch], list[Batch]]]:
+    ) -> Callable[[Any], Batches]:
         found = [one for one in self._stretches(sources, split, window) if one.split < 2]
-        prepared: tuple[Any, Any] = (None, None)
 
-        def batches(params: Any) -> tuple[list[Batch], list[Batch]]:
-            nonlocal prepared
+        def acting(params: Any) -> dict[str, float]:
             acts = params.without_gradient() if self.method.differentiable else params.numbers
-            fixed = {name: float(getattr(params, name)) for name in acts}
-            if prepared[0] != fixed:
-                prepared = (None, None)  # so that two are never held at once
-                made = self.method.follow(found, params, self.kind, self.runs, self.settle)
-                pairs = list(zip(found, made, strict=True))
-                by_split = tuple(
-                    shared_out([b for one, b in pairs if one.split == s]) for s in (0, 1)
-                )
-                prepared = fixed, by_split
-            return prepared[1]
+            return {name: float(getattr(params, name)) for name in acts}
 
-        return batches
+        def make(params: Any) -> Batches:
+            made = self.method.follow(found, params, self.kind, self.runs, self.settle)
+            return share_out(found, made)
+
+        return LastBatches(acting, make)
 
     def score(
         self,

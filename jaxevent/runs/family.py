@@ -9,6 +9,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
+from jaxevent.devices import shared_out
 from jaxevent.estimator import Estimator
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
@@ -87,6 +88,31 @@ class Protocol(abc.ABC):
         settings of the protocol and the method's own. A `sample` in the row is the picture that the
         report shows.
         """
+
+
+class LastBatches:
+    """Batches as a function of parameters, made again only where `key(params)` is another.
+
+    `make(params)` gives those to fit to and those to validate on.
+    """
+
+    def __init__(self, key: Callable[[Any], Any], make: Callable[[Any], Batches]):
+        self._key, self._make = key, make
+        self._last: tuple[Any, Batches] | None = None
+
+    def __call__(self, params: Any) -> Batches:
+        fixed = self._key(params)
+        if self._last is None or self._last[0] != fixed:
+            self._last = None  # so that two are never held at once
+            self._last = fixed, self._make(params)
+        return self._last[1]
+
+
+def share_out(parts: Sequence[Any], batches: Sequence[Any]) -> Batches:
+    """The batches of parts by their `split`, those of other processes left to them."""
+    pairs = list(zip(parts, batches, strict=True))
+    fit, validation = (shared_out([b for part, b in pairs if part.split == s]) for s in (0, 1))
+    return fit, validation
 
 
 class Goal(abc.ABC):

@@ -29,11 +29,12 @@ from jaxevent.reconstruction.features import Numeric, over_pixels, pixel_mesh
 from jaxevent.reconstruction.prepared import PreparedImages
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.config import NAME, NOT_NEGATIVE, POSITIVE, is_number, one_of
-from jaxevent.runs.family import Family, Goal, Shares, Sources
+from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources
 from jaxevent.runs.protocols import A_GAP, GAP, PROTOCOLS, Reference, divide, frame_times, is_gap
 from jaxevent.runs.scores import HeldOut, ImageProtocol, score, subset
 from jaxevent.show.report import markdown_table
 from jaxevent.splits import SPLITS, interleave
+from jaxevent.tuning import Batches
 
 ERRORS = ("linear", "log", "nll")
 REGIONS = ("dark", "well", "bright")
@@ -228,7 +229,7 @@ class Problem:
     `devices.ELSEWHERE`.
 
     They are prepared when first asked for and again for params that differ in what preparation
-    fixes (`pixels.Timing`). `weights` are those of dark, well exposed and bright pixels of HDR
+    fixes (`clock.Timing`). `weights` are those of dark, well exposed and bright pixels of HDR
     references, told apart by their `clip`; omitted, 1.
     """
 
@@ -249,22 +250,21 @@ class Problem:
         self._rooms = [
             max([int((part.split == s).sum()) for part, _ in self._jobs], default=0) for s in (0, 1)
         ]
-        self._prepared: tuple[tuple[float, ...], tuple[list[Any], list[Any]]] | None = None
+        self._last = LastBatches(Timing.of, self._prepare)
 
-    def __call__(self, params: FrameParams) -> tuple[list[Any], list[Any]]:
+    def __call__(self, params: FrameParams) -> Batches:
         """Batches to fit to, and batches to validate on."""
-        fixed = Timing.of(params)
-        if self._prepared is None or self._prepared[0] != fixed:
-            self._prepared = None  # so that two are never held at once
-            batches: tuple[list[Any], list[Any]] = ([], [])
-            for number, (part, splits) in enumerate(self._jobs):
-                used = self._used(part, splits)
-                mine = number % jax.process_count() == jax.process_index()
-                made = self._batches(part, used, params) if mine and used else []
-                for s, batch in made if mine else [(s, ELSEWHERE) for s in used]:
-                    batches[s].append(batch)
-            self._prepared = fixed, batches
-        return self._prepared[1]
+        return self._last(params)
+
+    def _prepare(self, params: FrameParams) -> Batches:
+        batches: tuple[list[Any], list[Any]] = ([], [])
+        for number, (part, splits) in enumerate(self._jobs):
+            used = self._used(part, splits)
+            mine = number % jax.process_count() == jax.process_index()
+            made = self._batches(part, used, params) if mine and used else []
+            for s, batch in made if mine else [(s, ELSEWHERE) for s in used]:
+                batches[s].append(batch)
+        return batches
 
     def _used(self, part: Part, splits: Sequence[int]) -> Sequence[int]:
         """Those of the splits that the part has a batch of."""
