@@ -15,14 +15,17 @@ ACROSS = 0.1  # of the spread of speeds at several depths, that of the velocity 
 
 
 class Calibration(NamedTuple):
-    """What errors are made of beside the covariance C of a fit: factor C + share^2 |m|^2 + change.
+    """What errors are made of beside the covariance C of a fit of a motion m:
 
-    The last is change^2 (d d' + b b'), d the change of the motion within what an estimate sees and
-    b by how much it bends there. Chosen on simulated scenes: `experiments/egomotion_sigmas.py`.
+    factor C + share^2 |m|^2 + speed^2 m m' + change^2 (d d' + b b'),
+
+    d the change of the motion within what an estimate sees and b by how much it bends there.
+    Chosen on simulated scenes: `experiments/egomotion_sigmas.py`.
     """
 
     factor: float = 1.0
     share: float = 0.0
+    speed: float = 0.0  # likewise, of motions that are told too slow or too fast
     change: float = 0.0
 
 
@@ -107,6 +110,7 @@ class Motion(Shown):
             covariance = covariance + by.change**2 * d[:, :, None] * d[:, None, :]
         eye = np.eye(mean.shape[1])
         covariance = covariance + by.share**2 * (mean**2).sum(1)[:, None, None] * eye
+        covariance = covariance + by.speed**2 * mean[:, :, None] * mean[:, None, :]
         return dataclasses.replace(self, covariance=covariance)
 
     def with_layers(self, recording: Recording) -> tuple["Motion", str]:

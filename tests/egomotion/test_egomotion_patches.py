@@ -120,7 +120,7 @@ def test_standard():
     assert standard(np.zeros(3)) == 0
 
 
-def test_errors_are_made_of_three():
+def test_what_errors_are_made_of():
     t = np.array([0, 100_000, 200_000])
     mean = np.array([[1.0, 0], [2, 0], [3, 0]])
     motion = Motion.of("planar", t, mean, np.tile(np.eye(2), (3, 1, 1)))
@@ -134,6 +134,9 @@ def test_errors_are_made_of_three():
     later = told(np.array([200_000, 250_000, 300_000]), extrapolate=True)
     grown = later.covariance - told.covariance[2]
     np.testing.assert_allclose(grown, [[[v, 0], [0, 0]] for v in (0, 0.25, 1)], atol=1e-12)
+    fast = Motion.of("planar", t, mean + [0, 1], np.tile(np.eye(2), (3, 1, 1)))
+    told = fast.calibrated(Calibration(speed=0.5))
+    np.testing.assert_allclose(told.covariance[1] - np.eye(2), [[1.0, 0.5], [0.5, 0.25]])
     lost = Motion.of("planar", t, mean, np.full((3, 2, 2), np.nan))
     assert not lost(t).valid.any()  # without a sigma
 
