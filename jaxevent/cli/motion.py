@@ -37,7 +37,8 @@ def add(commands: Any) -> None:
         "--method",
         metavar="NAME",
         help="voting, batch, contrast, planes or frames, or one of your own, "
-        "package.module:object; default: voting, for general motion batch",
+        "package.module:object; default: voting, and contrast where voting finds nothing, for "
+        "general motion batch",
     )
     one.add_argument(
         "--params",
@@ -169,19 +170,15 @@ def run(
     _check(estimator, kind, imu, smooth)
     _need_camera(recording, kind)
     true = output.known(whole, kind, bias, turned, depth)
-    values, given = _parameters(estimator, kind, params)
-    values, line = estimator.suit(recording, values, given=given)
-    if line:
-        print(line)
     clock = time.perf_counter()
     settings: dict[str, Any] = {"model": kind, "seed": seed, "progress": show_progress()}
-    if "cloud" in estimator.options:
-        settings["cloud"] = CLOUD
     if smooth:
         settings["smooth"] = True
-    if imu:
-        settings["gyro"] = _gyro(estimator, recording, values, settings, bias, turned)
-    told = estimator.estimate(recording, values, **settings)
+    told, values = _told(estimator, recording, params, settings, (imu, bias, turned))
+    if not told.valid.any() and not (method or params or smooth) and kind.otherwise:
+        print(f"{estimator.name} found no motion, so {kind.otherwise} is tried")
+        estimator = find_estimator(kind.otherwise)
+        told, values = _told(estimator, recording, params, settings, (imu, bias, turned))
     told, warning = told.with_layers(recording)
     if warning:
         print(warning)
@@ -245,6 +242,24 @@ def _parameters(estimator: Any, kind: Any, path: Path | None) -> tuple[Any, set[
     values = estimator.Params.load(path, estimator.name)
     table = read_toml(path)
     return values, {*table, *table.get(estimator.name, {})}
+
+
+def _told(
+    estimator: Any, recording: Any, params: Path | None, settings: dict[str, Any], gyro: Any
+) -> tuple[Any, Any]:
+    """The motion by a method, with parameters that suit the recording, and these.
+
+    `gyro` tells whether the IMU helps, its bias and its axes.
+    """
+    values, given = _parameters(estimator, settings["model"], params)
+    values, line = estimator.suit(recording, values, given=given)
+    if line:
+        print(line)
+    more = {"cloud": CLOUD} if "cloud" in estimator.options else {}
+    helps, bias, turned = gyro
+    if helps:
+        more["gyro"] = _gyro(estimator, recording, values, settings, bias, turned)
+    return estimator.estimate(recording, values, **settings, **more), values
 
 
 def _gyro(

@@ -82,6 +82,7 @@ class Model(eqx.Module):
         fits_depth: Whether poses tell its truth up to the depth of the scene, see `at_one_depth`.
         unknown: The spread of a motion that nothing tells, in its unit.
         method: The method that suits it best.
+        otherwise: The method to try where that finds nothing, if there is one.
         preset: Of the parameters of voting, that it starts with.
     """
 
@@ -99,6 +100,7 @@ class Model(eqx.Module):
     fits_depth: ClassVar[bool] = False
     unknown: ClassVar[float] = 10.0
     method: ClassVar[str] = "voting"
+    otherwise: ClassVar[str | None] = "contrast"
     preset: ClassVar[str | None] = None
 
     @property
@@ -364,7 +366,7 @@ class General(Model):
     needs_camera = True
     half_line = True
     known_from = ("poses",)
-    method = "batch"
+    method, otherwise = "batch", None
     preset = "general"
 
     def basis(self, xi):

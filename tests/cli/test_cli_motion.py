@@ -77,6 +77,18 @@ def test_columns_are_exact():
     }
 
 
+def test_another_method_is_tried_where_the_usual_one_finds_nothing(folder, capsys, monkeypatch):
+    monkeypatch.setattr(Voting, "estimate", lambda self, *_, model, **__: Motion.nothing(model))
+    monkeypatch.setattr(Planar, "otherwise", "planes")
+    words = ["motion", str(folder / "planar.h5"), "--model", "planar", "--out", str(folder / "out")]
+    assert cli.main(words) == 0
+    printed = capsys.readouterr().out
+    assert "voting found no motion, so planes is tried" in printed
+    assert "planar motion by planes" in printed and "never found" not in printed
+    assert cli.main([*words[:-1], str(folder / "other"), "--method", "voting"]) == 0
+    assert "never found" in capsys.readouterr().out  # a method that was asked for stays
+
+
 def test_a_folder_of_everything(folder, capsys):
     path, table_path = folder / "planar.h5", folder / "planar.csv"
     words = ("--model", "planar", "--truth", table_path, "--flow", "--seed", 3, "--stop", 0.2)
