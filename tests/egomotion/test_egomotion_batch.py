@@ -427,6 +427,25 @@ def a_fit(path, cost):
     return batch.Fit(path, np.eye(6), 1.0, cost, np.zeros((1, 1)))
 
 
+def test_windows_that_disagree_are_less_sure():
+    """By the mean square of differences halfway to the windows before and after."""
+    turns = [np.array([0.0, 0, w]) for w in (0.0, 0.2, 0.1)]
+    paths = [Path.constant(np.array([0.0, 0, 1]), turn, np.zeros(1)) for turn in turns]
+    paths[1].O[1, 2] = -2.0  # rad/s^2
+    fits = [a_fit(path, 1.0) for path in paths]
+    centres = np.array([0, 100_000, 200_000])
+    told = sequence._disagreements(centres, [*fits], 150_000)
+    before, after = 0.2 + 2.0 * 0.05 - 0.0, 0.1 - (0.2 - 2.0 * 0.05)
+    expected = np.array([before**2, (before**2 + after**2) / 2, after**2])
+    np.testing.assert_allclose([off[5, 5] for off in told], expected, atol=1e-12)
+    assert all(np.abs(off[:5, :5]).max() < 1e-12 for off in told)
+    for lost in ([fits[0], None, fits[2]], [fits[0]]):
+        apart = sequence._disagreements(centres[: len(lost)], lost, 150_000)
+        assert not np.any(apart)
+    far = sequence._disagreements(10 * centres, [*fits], 150_000)
+    assert not np.any(far)  # they share no events
+
+
 def windows_that(monkeypatch, fit, follow):
     """Windows whose fits are given, by centre and path; what was asked for, in order."""
     asked = []

@@ -120,14 +120,16 @@ def _blended(
 ) -> Motion:
     """The motion of overlapping windows; lost where none tells it.
 
-    Of a window the middle two thirds count, those beyond `reach` where no other tells more.
+    Of a window the middle two thirds count, those beyond `reach` where no other tells more. How far
+    a window disagrees with its neighbours is in its covariance.
     """
     end = 2 * half // 3
     t = np.arange(max(centres[0] - end, first), min(centres[-1] + end, last) + 1, max(step // 5, 1))
     heading, Omega = np.zeros((len(t), 3)), np.zeros((len(t), 3))
     covariance, total, contrast = np.zeros((len(t), 6, 6)), np.zeros(len(t)), np.zeros(len(t))
     reach = min(end, step)
-    for centre, fit in zip(centres, fits, strict=True):
+    apart = _disagreements(centres, fits, half)
+    for centre, fit, off in zip(centres, fits, apart, strict=True):
         near = np.abs(t - centre) <= end
         if fit is None or not near.any():
             continue
@@ -136,7 +138,7 @@ def _blended(
         T, turn = fit.path.twist((t[near] - centre) * 1e-6)
         heading[near] += weight[:, None] * T
         Omega[near] += weight[:, None] * turn
-        covariance[near] += weight[:, None, None] * fit.covariance
+        covariance[near] += weight[:, None, None] * (fit.covariance + off)
         contrast[near] += weight * fit.agreement
         total[near] += weight
     lost = total < 1e-6
@@ -145,6 +147,29 @@ def _blended(
     heading = np.where(size > 0, heading / np.where(size > 0, size, 1), np.array([0.0, 0, 1]))
     mean = np.concatenate([heading, Omega / safe[:, None]], 1)
     return Motion.of(General, t, mean, covariance / safe[:, None, None], ~lost, contrast / safe)
+
+
+def _disagreements(
+    centres: NDArray, fits: list[Fit | None], half: int
+) -> list[NDArray[np.float64]]:
+    """Mean squares (6, 6) of how far windows differ from those before and after that they overlap.
+
+    Halfway between them. What one window shows beside its own errors is whether another, of other
+    events in part, finds the same: a minimum that is not the truth's comes and goes.
+    """
+    found: list[list[NDArray[np.float64]]] = [[] for _ in fits]
+    for k, (one, other) in enumerate(zip(fits[:-1], fits[1:], strict=True)):
+        way = int(centres[k + 1] - centres[k])
+        if one is None or other is None or way >= 2 * half:
+            continue
+        before, after = (
+            np.concatenate(fit.path.twist(0.5e-6 * side), 1)[0]
+            for fit, side in ((one, way), (other, -way))
+        )
+        square = np.outer(after - before, after - before)
+        found[k].append(square)
+        found[k + 1].append(square)
+    return [np.mean(squares, 0) if squares else np.zeros((6, 6)) for squares in found]
 
 
 def lengths(params: Params, speed: Speed) -> dict[str, float]:
