@@ -212,27 +212,36 @@ def standard(D: NDArray[np.float64]) -> float:
     return float(D.sum()) / size if size > 0 else 0.0
 
 
-def layers(recording: Recording, camera: PinholeCamera | None = None) -> Layers | None:
-    """Whether the image moves as one; None where nothing is seen to move.
+def layers(
+    recording: Recording,
+    model: type[Model] = Planar,
+    camera: PinholeCamera | None = None,
+) -> Layers | None:
+    """Whether the image moves as one, as planar motion or a rotation does; None where nothing is
+    seen to move, and of other models.
 
-    Every patch may go its own share of the usual way.
+    Every patch may go its own share of the way that the model makes there.
     """
-    speed = usual_speed(recording, camera)
+    camera = camera or recording.camera
+    speed = usual_speed(recording, camera) if model in (Planar, Rotation) else None
     seen = [] if speed is None else looks(recording, speed, camera)
+    _, f = coordinates(recording.width, recording.height, camera)
     differ, factors, speeds = [], [], []
     for one in seen:
         d = planar(one)
-        size = float(np.hypot(*d))
-        if size < 1:
+        if float(np.hypot(*d)) < 1:
             continue
-        own = np.concatenate([FACTORS, [1.0]])[:, None, None] * np.tile(d, (len(one.xi), 1))
+        ways = np.tile(d, (len(one.xi), 1))
+        if model is Rotation:
+            ways = np.asarray(rotation_basis(one.xi, f)) @ rotation(one, f, d)
+        own = np.append(FACTORS, 1.0)[:, None, None] * ways
         train = sharpness(one, 0, own)
         pick, at = train.argmax(0), np.arange(len(one.xi))
         differ.append(sharpness(one, 1, own[pick, at]) - sharpness(one, 1, own[-1]))
         telling = train.max(0) - train[-1] + train.max(0) - np.median(train, 0) > np.log(1.3)
         factor = np.append(FACTORS, 1.0)[pick][telling]
         factors.append(factor)
-        speeds.append(factor * size / one.length)
+        speeds.append(factor * np.hypot(*ways[telling].T) / one.length)
     if not factors or not len(np.concatenate(factors)):
         return None
     factor, speed_of = np.concatenate(factors), np.concatenate(speeds)

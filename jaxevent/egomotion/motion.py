@@ -117,19 +117,22 @@ class Motion(Shown):
         """The same, with the spread of the image's parts in its covariance, and a line of warning.
 
         One velocity of the whole image is no better than by how much its parts differ, as those at
-        several depths do; see `choice.layers`. Of other models it is the same.
+        several depths do; and where they differ from a rotation translation may have made all of
+        it. See `choice.layers`. Of other models it is the same.
         """
         from jaxevent.egomotion.choice import layers
 
-        found = layers(recording) if self.model.uniform else None
+        found = layers(recording, self.model)
         if found is None or not found.several:
             return self, ""
         mean = np.nan_to_num(self.mean)
         size2 = (mean**2).sum(1)[:, None, None]
-        along = found.spread**2 * mean[:, :, None] * mean[:, None, :]
-        across = (found.spread * ACROSS) ** 2 * size2 * np.eye(mean.shape[1])
+        spread = found.spread if self.model.uniform else 1.0
+        along = spread**2 * mean[:, :, None] * mean[:, None, :]
+        across = (spread * ACROSS) ** 2 * size2 * np.eye(mean.shape[1])
+        how = "as one" if self.model.uniform else "as a rotation makes it"
         line = (
-            f"the image does not move as one: parts of it at {found.slow:.0f} to {found.fast:.0f} "
+            f"the image does not move {how}: parts of it at {found.slow:.0f} to {found.fast:.0f} "
             "px/s, as at several depths; sigmas count that, and --model general may explain it"
         )
         return dataclasses.replace(self, covariance=self.covariance + along + across), line

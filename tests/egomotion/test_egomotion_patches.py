@@ -103,6 +103,11 @@ def test_models_are_told_apart():
     along = several.spread**2 * (1 + 0.1**2) * (one @ one)
     unit = one / np.linalg.norm(one)
     assert unit @ wider.covariance[0] @ unit == pytest.approx(1 + along) and "depths" in line
+    turn = Motion.of("rotation", t, np.tile([0.0, 2, 0], (2, 1)), np.tile(np.eye(3), (2, 1, 1)))
+    same, line = turn.with_layers(turning)
+    assert same is turn and not line
+    wider, line = turn.with_layers(sliding)  # translation may have made all of it
+    assert wider.covariance[0, 1, 1] == pytest.approx(1 + 4 * 1.01) and "rotation" in line
 
 
 def test_a_heading_that_nothing_tells_is_said():
