@@ -11,9 +11,9 @@ from scipy import stats
 from jaxevent import blob
 from jaxevent.blob.finding.agility import GRID, _log_likelihood, fit_agility
 from jaxevent.blob.finding.background import evidence, find_hot_pixels, measure_background
+from jaxevent.blob.finding.parts import join_parts
 from jaxevent.blob.finding.paths import ANYBODY, NOBODY, candidates, join
 from jaxevent.blob.finding.paths import Path as TargetPath
-from jaxevent.blob.finding.search import _join_rigid
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.errors import InputError
 from jaxevent.io import load
@@ -111,17 +111,40 @@ def test_paths_in_contact_all_their_lives_are_one():
     t = np.arange(0, 50_000, 1000)
     x = 20 + 1e-3 * t
     one, other = _path(t, x, 30.0, 3.0, 30), _path(t, x, 39.0, 3.0, 10)
-    far, late = _path(t, x, 45.0, 3.0, 10), _path(t[25:], x[25:], 39.0, 3.0, 10)
+    far, crossing = _path(t, x, 45.0, 3.0, 10), _path(t, x[::-1], 39.0, 3.0, 10)
     resting = [_path(t, 20.0, y, 3.0, 10) for y in (30.0, 39.0)]
-    for pair in ([one, far], [one, late], resting):
-        assert len(_join_rigid(pair)) == 2
-    (both,) = _join_rigid([other, one])
+    for pair in ([one, far], [one, crossing], resting):
+        assert len(join_parts(pair)) == 2
+    (both,) = join_parts([other, one])
     np.testing.assert_allclose(both.p, np.stack([x, np.full(len(t), 32.25)], 1))
     weight = np.array([0.75, 0.25])
     spread = np.cov([30.0, 39.0], aweights=weight, ddof=0)  # and that of each part
     np.testing.assert_allclose(
         both.C, np.broadcast_to(np.diag([9.0, 9 + float(spread)]), both.C.shape)
     )
+
+
+def test_pieces_of_an_edge_are_one_while_each_is_seen():
+    t = np.arange(0, 50_000, 1000)
+    x = 20 + 1e-3 * t
+    ends = slice(0, 50), slice(10, 50), slice(12, 40)
+    pieces = [
+        dataclasses.replace(
+            _path(t[k], x[k], y, 1.0, 10), C=np.tile(np.diag([0.25, 16.0]), (len(t[k]), 1, 1))
+        )
+        for k, y in zip(ends, (0.0, 18.0, 36.0), strict=True)  # 2.25 sizes apart
+    ]
+    (edge,) = join_parts(pieces)
+    seen = np.stack([(t >= t[k][0]) & (t <= t[k][-1]) for k in ends])
+    y = (seen * [[0.0], [18.0], [36.0]]).sum(0) / seen.sum(0)
+    np.testing.assert_array_equal(edge.t, t)
+    np.testing.assert_allclose(edge.p, np.stack([x, y], 1))
+    np.testing.assert_allclose(edge.n, 10 * seen.sum(0))
+    spread = (seen * ([[0.0], [18.0], [36.0]] - y) ** 2).sum(0) / seen.sum(0)
+    np.testing.assert_allclose(edge.C[:, 1, 1], 16 + spread)
+    round_ones = [dataclasses.replace(one, C=16 * np.tile(np.eye(2), (len(one.t), 1, 1)))
+        for one in pieces]  # fmt: skip
+    assert len(join_parts(round_ones)) == 3  # as far apart, but no edges
 
 
 @pytest.mark.parametrize("count", [0, 1, 99])

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from jaxevent import blob
-from jaxevent.blob.finding.moving import measure_moving_background
+from jaxevent.blob.finding.moving import goes_own_way, measure_moving_background
+from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.scene import SceneMotion, measure_scene_motion
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.recording import Events, Recording
@@ -82,6 +83,20 @@ def test_a_moving_map_holds_the_rates_of_places():
     x = np.arange(2, 126)
     for time in np.linspace(0, 0.79, 5):
         assert background.at(x, 48, time, 12).mean() == pytest.approx(true, rel=0.1)
+
+
+def test_what_another_depth_does_is_no_own_way():
+    """The scene goes right at 100 px/s: others go faster, slower, across and against it."""
+    t = np.linspace(0, 1, 51)
+    M = np.tile(np.eye(2, 3), (51, 1, 1))
+    M[:, 0, 2] = 100 * t
+    scene = SceneMotion(t, M)
+    C = np.tile(9.0 * np.eye(2), (51, 1, 1))
+    for v, own in (((100, 0), 0), ((250, 0), 0), ((20, 0), 0), ((100, 60), 1), ((-60, 0), 1)):
+        p = np.array([60.0, 50]) + t[:, None] * v
+        us = 5_000_000 + np.rint(t * 1e6).astype(np.int64)
+        path = Path(us, p, np.zeros_like(p), C, np.full(51, 30.0), 20_000, 1.0)
+        assert goes_own_way(path, scene, 5_000_000) == bool(own)
 
 
 @pytest.mark.slow

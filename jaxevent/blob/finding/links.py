@@ -21,6 +21,7 @@ from jaxevent.blob.finding.detection import (
     measure_blobs,
     touching,
 )
+from jaxevent.blob.finding.parts import unite
 from jaxevent.blob.finding.paths import STILL, Path
 from jaxevent.blob.finding.stream import Part, Stream
 from jaxevent.progress import bar
@@ -31,6 +32,9 @@ HOLD, HOLD_NEW = (
     24,
     2,
 )  # windows that silent targets are held: confirmed ones (and twice those seen), others
+HOLD_MOVING = (
+    4  # before a scene that moves, where what is silent is hidden and does not stand still
+)
 SEEN, SEEN_NEW = 1e-3, 1e-5  # false alarms of a look where a target is known to be
 FAINT = 0.02  # of its own rate: a target with fewer events is silent
 GAIN = 0.2  # of size and rate
@@ -82,8 +86,8 @@ class Live:
         return self.q * np.clip(self.nis, 0.05, 50)
 
     def predict(self, t: float | int) -> tuple[NDArray, NDArray]:
-        """Positions (n, 2) and P (n, 3) at t."""
-        dt, (a, b, c), q = t - self.t, self.P.T, self.agility
+        """Positions (n, 2) and P (n, 3) at t; what stands still is not driven any more."""
+        dt, (a, b, c), q = t - self.t, self.P.T, np.where(self.miss < STILL, self.agility, 0)
         P = [a + 2 * b * dt + c * dt**2 + q * dt**3 / 3, b + c * dt + q * dt**2 / 2, c + q * dt]
         return self.p + self.v * dt[:, None], np.stack(P, 1)
 
@@ -137,7 +141,7 @@ class Links:
         self.contacts: dict[tuple[int, int], tuple[float, NDArray, float]] = {}
         self.pairs: dict[int, tuple[float, int]] = {}
         self.confirmed: set[int] = set()
-        self.parts: set[int] = set()
+        self.parts: dict[int, int] = {}  # and whose
         tests = stream.width * stream.height * stream.duration / scale.window
         self.enough = np.log(tests / FALSE_ALARMS)
 
@@ -159,13 +163,17 @@ class Links:
         t = np.concatenate([np.full(len(row.id), row.t) for row in self.rows])
         us = self.stream.start + np.rint(t * 1e6).astype(np.int64)
         joined = [np.concatenate([getattr(row, name) for row in self.rows]) for name in "pvCnmR"]
-        paths = []
-        for one in sorted(self.confirmed - self.parts):
+        paths = {}
+        for one in sorted(self.confirmed | set(self.parts)):
             at = np.flatnonzero(ids == one)
             p, v, C, n, m, R = (values[at] for values in joined)
             agility = fit_agility(t[at], m, R, np.median(_larger(C)) / w**3)
-            paths.append(Path(us[at], p, v, C, n, round(1e6 * w), agility))
-        return paths
+            paths[one] = Path(us[at], p, v, C, n, round(1e6 * w), agility)
+        for part, whole in self.parts.items():  # in order of time: a whole may become a part
+            if whole in paths:
+                both = unite(paths[whole], paths[part])
+                paths[whole] = dataclasses.replace(both, agility=paths[whole].agility)
+        return [paths[one] for one in sorted(self.confirmed - set(self.parts))]
 
     def _step(self, begin: float | int) -> None:
         w = self.scale.window
@@ -201,6 +209,9 @@ class Links:
         heard = (n >= 2) & (n >= FAINT * live.top)
         live.miss = np.where(heard, 0, live.miss + 1)
         still = live.miss == STILL
+        # If it does go on, then no faster than before, or by its size in the time that it is held.
+        fast = (live.v**2).sum(1) + _larger(live.C) / (HOLD * self.scale.window) ** 2
+        live.P[still, 2] = np.minimum(live.P[:, 2], fast)[still]
         live.v[still], live.P[still, 1] = 0, 0
 
         square = _larger(D)
@@ -321,19 +332,20 @@ class Links:
         live.n[big] += live.n[small]
         live.hits[big] = max(live.hits[big], live.hits[small])
         live.part[small] = True
+        self.parts[int(live.id[small])] = int(live.id[big])
 
     def _over(self) -> NDArray[np.bool_]:
         """Which targets end."""
         live, (rows, columns) = self.live, self.size
         x, y = live.p.T
         outside = (x <= -1) | (x >= columns) | (y <= -1) | (y >= rows)
-        hold = np.where(live.confirmed, np.minimum(HOLD, 2 * live.hits), HOLD_NEW)
+        longest = HOLD if self.background.scene is None else HOLD_MOVING
+        hold = np.where(live.confirmed, np.minimum(longest, 2 * live.hits), HOLD_NEW)
         return live.part | outside | (live.miss > hold)
 
     def _end(self, which: NDArray) -> None:
         over = self.live.keep(which)
         self.confirmed |= set(over.id[over.confirmed].tolist())
-        self.parts |= set(over.id[over.part].tolist())
         self.live = self.live.keep(~which)
 
     def _begin_targets(

@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from jaxevent.blob.finding.background import CELL, FINE, FULL, SLICES, Background, pooled
 from jaxevent.blob.finding.detection import detect
+from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.scale import STRETCHES, Choice
 from jaxevent.blob.finding.scene import SceneMotion, measure_scene_motion
 from jaxevent.blob.finding.stream import Stream
@@ -26,6 +27,8 @@ LONG, LARGE = 2.5, 0.1  # so many times as long as wide, or of this share of the
 SCENE = 0.3  # share of the bright that is edges
 TOLD = 0.1  # of the stretches may be told worse by a map that moves than by one at rest
 MOVED = 2.0  # px
+OWN_WAY = 2.0  # sizes: deviation, along any axis, of a target's own way from its mean
+STEP = 0.01  # s before and after, between which the scene's motion at a target is told
 
 
 def find_moving_background(
@@ -91,6 +94,29 @@ def _of_edges(rate: NDArray[np.float64], mean: float) -> float:
     long = np.sqrt(half + cross) > LONG * np.sqrt(half - cross)
     large = np.sqrt(half + cross) > LARGE * min(rate.shape)
     return float(mass[long | large].sum() / max(mass.sum(), 1e-300))
+
+
+def goes_own_way(path: Path, scene: SceneMotion, start: int) -> bool:
+    """Whether a target goes farther than its size, and a cell, on a way that no depth goes.
+
+    What is nearer or farther than most of the scene goes the scene's way, faster or slower. So the
+    path across the scene's motion counts, and along it only what goes against it. `start`: us.
+    """
+    t = (path.t - start) * 1e-6
+    if len(t) < 2:
+        return False
+    now = np.clip(t[:, None] + [-STEP, STEP], scene.t[0], scene.t[-1])
+    x, y = scene.in_scene(path.p[:, 0], path.p[:, 1], t)
+    x, y = scene.on_sensor(x[:, None], y[:, None], now)
+    flow = np.stack([x[:, 1] - x[:, 0], y[:, 1] - y[:, 0]], 1)
+    flow /= np.maximum(now[:, 1] - now[:, 0], 1e-9)[:, None]
+    along = flow / np.maximum(np.hypot(*flow.T), 1e-9)[:, None]
+    moved = np.diff(path.p, axis=0)
+    with_scene = (moved * along[1:]).sum(1)
+    own = moved - np.maximum(with_scene, 0)[:, None] * along[1:]
+    way = np.cov(np.concatenate([[[0, 0]], np.cumsum(own, 0)]).T)
+    ratio = np.linalg.solve(np.median(path.C, 0) + FINE**2 * np.eye(2), way)
+    return bool(np.linalg.eigvals(ratio).real.max() > OWN_WAY**2)
 
 
 def measure_moving_background(stream: Stream, scene: SceneMotion) -> Background:

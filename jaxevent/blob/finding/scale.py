@@ -53,7 +53,7 @@ class _Stretch(NamedTuple):
     number: int  # of events
     expected: float  # events of the blobs
     large: float  # events in blobs of three and more,
-    touching: float  # and in those of them that touch another one
+    split: float  # and in those of them that touch another one
 
 
 def choose_scale(stream: Stream, background: Background) -> Choice | None:
@@ -169,13 +169,13 @@ def _predict(
     density[:, 0] = _intensity(x, y, last.n, p, S)
     density[:, 1:] = _smooth(x, y, *places, size, WIDTHS, BINS)
     large = last.n >= 3
-    size_of = np.sqrt(np.linalg.eigvalsh(last.C[large])[:, 1])
-    apart = np.hypot(*(last.p[large, None] - last.p[large]).transpose(2, 0, 1))
-    near = apart < CONTACT * (size_of[:, None] + size_of)
+    # By ellipses: pieces along an outline touch each other, both of its sides do not.
+    p, C = last.p[large], last.C[large]
+    near = np.asarray(touching(p[:, None], C[:, None], p, C) < CONTACT)
     np.fill_diagonal(near, False)
     b = background.at(x, y, t) * w
-    touching = last.n[large][near.any(1)].sum()
-    return _Stretch(density, b, share, len(third), last.n.sum(), last.n[large].sum(), touching)
+    split = last.n[large][near.any(1)].sum()
+    return _Stretch(density, b, share, len(third), last.n.sum(), last.n[large].sum(), split)
 
 
 def _score(told: list[_Stretch]) -> tuple[float, float]:
@@ -183,9 +183,8 @@ def _score(told: list[_Stretch]) -> tuple[float, float]:
     density = np.concatenate([one.density for one in told])
     b = np.concatenate([one.background for one in told])
     weight = np.concatenate([np.full(len(one.background), one.share) for one in told])
-    number, expected, large, touching = (
-        sum(getattr(one, name) for one in told)
-        for name in ("number", "expected", "large", "touching")
+    number, expected, large, split = (
+        sum(getattr(one, name) for one in told) for name in ("number", "expected", "large", "split")
     )
 
     if not len(b):
@@ -195,7 +194,7 @@ def _score(told: list[_Stretch]) -> tuple[float, float]:
         share = share * ((weight / (density @ share + b)) @ density) + 1e-12
         share /= share.sum()
     nats = float((weight * np.log(density @ share / b + 1)).sum() - expected) / number
-    return nats, nats - SPLIT * abs(nats) * touching / max(large, 1e-9)
+    return nats, nats - SPLIT * abs(nats) * split / max(large, 1e-9)
 
 
 def _extrapolate(before: Blobs, last: Blobs) -> tuple[NDArray, NDArray]:

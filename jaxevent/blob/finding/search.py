@@ -8,15 +8,16 @@ remains, so that slow and fast targets are found in one recording.
 import dataclasses
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaxevent.blob.finding.background import Background, evidence, measure_background
 from jaxevent.blob.finding.detection import CONTACT, Scale, touching
 from jaxevent.blob.finding.found import Found, Pass
 from jaxevent.blob.finding.links import FAINT, GATE, HOLD, SEEN, Links
-from jaxevent.blob.finding.moving import find_moving_background
+from jaxevent.blob.finding.moving import find_moving_background, goes_own_way
+from jaxevent.blob.finding.parts import join_parts
 from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.scale import Choice, choose_scale
-from jaxevent.blob.finding.scene import SceneMotion
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.blob.seeds import span_of
 from jaxevent.progress import stage
@@ -30,11 +31,8 @@ ONE_PIXEL = 0.5  # px: what is smaller is a pixel, no blob
 FILL = 0.5  # share of its windows in which a target was seen
 JOINS = 1.5  # ellipses' distances, as `touching`, of a target's end and its new beginning
 PAUSE = 4 * HOLD  # windows between them at most; or, at rest,
+LAST = 8  # windows that tell how fast it went
 REST = 2.0  # times the life of the shorter of both
-TOGETHER = 0.9  # share of the longer life that two parts of one object have in common
-RIGID, MOVED, FAR = 0.25, 2.0, 4.0  # of the sum of their sizes: change of distance, and the
-# paths on which parts keep theirs, or slide along each other
-OWN_WAY = 2.0  # sizes: deviation, along any axis, of a path in a moving scene from its mean
 EDGE = 2.0  # sizes from the sensor's edge, where others come and go
 SAME = 0.5  # share of a target's life near one of an earlier pass that makes it a part of that
 
@@ -96,24 +94,15 @@ def _search(
         if not confirmed:
             passes.append(Pass(choice, 0))
             break
-        confirmed = _join_rigid(confirmed)
-        if background.scene is not None:
-            scene = background.scene
-            near += [path for path in confirmed if not _own_way(path, scene, stream)]
-            confirmed = [path for path in confirmed if _own_way(path, scene, stream)]
-        near += confirmed
         with stage(f"find, pass {number + 1}: beginnings", progress):
-            rest = stream.without(near, GATE)
-            new = [
-                _look_back(path, rest, background, choice.scale)
-                for path in confirmed
-                if _lasting(path)
-            ]
-        new = [
-            path
-            for path in _stitch(new, (stream.width, stream.height))
-            if not _left_over(path, found)
-        ]
+            rest = stream.without([*near, *confirmed], GATE)
+            whole = [_look_back(path, rest, background, choice.scale) for path in confirmed]
+        whole = join_parts(whole)
+        near += whole
+        if background.scene is not None:
+            whole = [one for one in whole if goes_own_way(one, background.scene, stream.start)]
+        new = _stitch([one for one in whole if _lasting(one)], (stream.width, stream.height))
+        new = [one for one in new if not _left_over(one, found)]
         passes.append(Pass(choice, len(new)))
         found += new
         near += new
@@ -126,60 +115,6 @@ def _lasting(path: Path) -> bool:
     windows = (path.t[-1] - path.t[0]) / path.window + 1
     size = np.median(np.trace(path.C, axis1=1, axis2=2))
     return bool(size > 2 * ONE_PIXEL**2 and len(path.t) >= FILL * windows)
-
-
-def _join_rigid(paths: list[Path]) -> list[Path]:
-    """Make one of paths that are in contact for all their lives and keep their distances.
-
-    Such are the two edges of an object, and pieces of its outline.
-    """
-    paths, k = sorted(paths, key=lambda path: path.n.sum(), reverse=True), 0
-    while k < len(paths):
-        part = next((i for i in range(k + 1, len(paths)) if _rigid(paths[k], paths[i])), None)
-        if part is None:
-            k += 1
-        else:
-            paths[k], k = _both(paths[k], paths.pop(part)), 0
-    return paths
-
-
-def _own_way(path: Path, scene: SceneMotion, stream: Stream) -> bool:
-    """Whether a path goes farther in the scene than its size."""
-    x, y = scene.in_scene(path.p[:, 0], path.p[:, 1], (path.t - stream.start) * 1e-6)
-    way = np.cov(np.stack([x, y])) if len(x) > 1 else np.zeros((2, 2))
-    ratio = np.linalg.solve(np.median(path.C, 0), way)
-    return bool(np.linalg.eigvals(ratio).real.max() > OWN_WAY**2)
-
-
-def _rigid(one: Path, other: Path) -> bool:
-    """Whether two paths are those of parts of one object."""
-    begin, end = max(one.begin, other.begin), min(one.end, other.end)
-    if end - begin < TOGETHER * max(one.end - one.begin, other.end - other.begin):
-        return False
-    t = one.t[(one.t >= begin) & (one.t < end)]
-    p, q = one.at(t), other.at(t)
-    apart = np.hypot(*(p - q).T)
-    reach = sum(np.interp(t, path.t, path.size[:, 0]) for path in (one, other))
-    if np.quantile(apart / reach, 0.9) >= CONTACT:
-        return False
-    far = min(float(np.ptp(path, axis=0).max()) for path in (p, q)) / np.median(reach)
-    rigid = np.ptp(np.quantile(apart, (0.02, 0.98))) < RIGID * np.median(reach)
-    return bool(far > (MOVED if rigid else FAR))
-
-
-def _both(one: Path, other: Path) -> Path:
-    """One path of two parts: the moments of the events of both, at the times of the first."""
-    t = one.t
-    share = np.median(one.n) / (np.median(one.n) + np.median(other.n))
-    row = np.clip(np.searchsorted(other.t, t), 0, len(other.t) - 1)
-    d = other.at(t) - one.p
-    C = share * one.C + (1 - share) * other.C[row]
-    C += share * (1 - share) * np.einsum("ti,tj->tij", d, d)
-    v = share * one.v + (1 - share) * other.v[row]
-    return dataclasses.replace(
-        one, p=one.p + (1 - share) * d, v=v, C=C, n=one.n + other.n[row],
-        agility=min(one.agility, other.agility),
-    )  # fmt: skip
 
 
 def _look_back(path: Path, rest: Stream, background: Background, scale: Scale) -> Path:
@@ -238,13 +173,14 @@ def _stitch(paths: list[Path], size: tuple[int, int]) -> list[Path]:
             distance, k = min(following, default=(np.inf, -1))
             if distance >= JOINS:
                 break
-            one = _after(one, paths.pop(k))
+            one = _after(one, _later(one, paths.pop(k)))
         done.append(one)
     return done
 
 
 def _gap(one: Path, other: Path, size: tuple[int, int]) -> float:
     """How far a path's beginning is from another's end, as `touching`; inf: not in time."""
+    other = _later(one, other)
     pause = int(other.t[0] - one.t[-1])
     shorter = min(one.end - one.begin, other.end - other.begin)
     if not 0 < pause <= max(min(PAUSE * one.window, 2 * REST * shorter), REST * shorter):
@@ -253,10 +189,29 @@ def _gap(one: Path, other: Path, size: tuple[int, int]) -> float:
     at_edge = (one.p[-1] < margin) | (one.p[-1] > np.array(size) - 1 - margin)
     if at_edge.any() and pause > 2 * one.window:
         return np.inf
-    ends = [one.p[-1]]
+    ends = [(one.p[-1], other.p[0])]
     if pause <= PAUSE * one.window:
-        ends.append(one.p[-1] + one.v[-1] * pause * 1e-6)
-    return min(float(touching(end, one.C[-1], other.p[0], other.C[0])) for end in ends)
+        # In the middle between both: so a bend does not matter.
+        half = pause * 0.5e-6
+        before, after = _speed(one, slice(-LAST, None)), _speed(other, slice(0, LAST))
+        ends += [(one.p[-1] + 2 * half * before, other.p[0])]
+        ends += [(one.p[-1] + half * before, other.p[0] - half * after)]
+    return min(float(touching(p, one.C[-1], q, other.C[0])) for p, q in ends)
+
+
+def _later(one: Path, other: Path) -> Path:
+    """Another path without rows before one's end, where a look back may have gone; if most stay."""
+    rest = other.t > one.t[-1]
+    if rest.mean() < FILL:
+        return other
+    cut = {name: getattr(other, name)[rest] for name in ("t", "p", "v", "C", "n")}
+    return dataclasses.replace(other, **cut)
+
+
+def _speed(path: Path, rows: slice) -> NDArray[np.float64]:
+    """px/s over some rows."""
+    t, p = path.t[rows] * 1e-6, path.p[rows]
+    return np.polyfit(t - t[0], p, 1)[0] if len(t) > 2 else np.zeros(2)
 
 
 def _left_over(path: Path, found: list[Path]) -> bool:

@@ -1,0 +1,79 @@
+"""Parts of one object, such as pieces of its outline, made one path.
+
+What is in contact with an object all its life and goes along with it is a part of it. Targets that
+meet or cross come from apart, and those that stand side by side do not go anywhere.
+"""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.blob.finding.detection import CONTACT
+from jaxevent.blob.finding.paths import Path
+
+TOGETHER = 0.9  # share of the shorter life at which two paths are in contact
+MOVED = 2.0  # sizes of the smaller one: least way
+EDGE, NEAR = 3.0, 3.0  # aspect from which a part is a piece of an edge, and how near, instead of
+# `CONTACT`, another part is: between them the edge may have too few events
+
+
+def join_parts(paths: list[Path]) -> list[Path]:
+    """Make one of paths that are parts of one object; all are seen in the same windows."""
+    paths, k = sorted(paths, key=lambda path: path.n.sum(), reverse=True), 0
+    while k < len(paths):
+        part = next((i for i in range(k + 1, len(paths)) if _one_object(paths[k], paths[i])), None)
+        if part is None:
+            k += 1
+        else:
+            # The whole may now touch what none of its parts did.
+            paths[k], k = unite(paths[k], paths.pop(part)), 0
+    return paths
+
+
+def _one_object(one: Path, other: Path) -> bool:
+    """Whether two paths are those of parts of one object."""
+    begin, end = max(one.begin, other.begin), min(one.end, other.end)
+    if end - begin < TOGETHER * min(one.end - one.begin, other.end - other.begin):
+        return False
+    t = np.union1d(one.t, other.t)
+    t = t[(t >= begin) & (t < end)]
+    p, q = one.at(t), other.at(t)
+    apart = np.hypot(*(p - q).T)
+    sizes = np.stack([np.interp(t, path.t, path.size[:, 0]) for path in (one, other)])
+    edge = any(np.median(path.size[:, 0] / path.size[:, 1]) > EDGE for path in (one, other))
+    if np.quantile(apart / sizes.sum(0), TOGETHER) >= (NEAR if edge else CONTACT):
+        return False
+    # Pieces slide along an edge, but less far than they go with it.
+    small, large = np.sort(np.median(sizes, 1))
+    far = min(float(np.ptp(path, axis=0).max()) for path in (p, q))
+    changed = np.ptp(np.quantile(apart, (0.02, 0.98)))
+    return bool(far > MOVED * small and changed < max(large, far if edge else far / 2))
+
+
+def unite(one: Path, other: Path) -> Path:
+    """One path of two parts: the moments of the events of both, of each while it is seen."""
+    t = np.union1d(one.t, other.t)
+    rows = [_at(path, t) for path in (one, other)]
+    n = rows[0].n + rows[1].n
+    share = rows[1].n / n
+    d = rows[1].p - rows[0].p
+    C = (1 - share)[:, None, None] * rows[0].C + share[:, None, None] * rows[1].C
+    C += (share * (1 - share))[:, None, None] * np.einsum("ti,tj->tij", d, d)
+    p = rows[0].p + share[:, None] * d
+    v = rows[0].v + share[:, None] * (rows[1].v - rows[0].v)
+    return Path(t, p, v, C, n, one.window, min(one.agility, other.agility))
+
+
+def _at(path: Path, t: NDArray[np.int64]) -> Path:
+    """A path at other times (us), on straight lines; without events before and after its life."""
+
+    def of(values: NDArray) -> NDArray[np.float64]:
+        flat = values.reshape(len(path.t), -1)
+        told = np.stack([np.interp(t, path.t, column) for column in flat.T], 1)
+        return told.reshape(len(t), *values.shape[1:])
+
+    alive = (t >= path.t[0]) & (t <= path.t[-1])
+    return dataclasses.replace(
+        path, t=t, p=of(path.p), v=of(path.v), C=of(path.C), n=np.where(alive, of(path.n), 0)
+    )
