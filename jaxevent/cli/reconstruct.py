@@ -58,7 +58,10 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--tone",
         choices=["linear", "log", "percentile", "clahe"],
-        help="how intensity becomes grey in PNG and MP4; default: linear",
+        help="how intensity becomes grey in PNG and MP4: linear (default), from the frames' black "
+        "to their white, so that images are as bright as frames and what is brighter is cut off; "
+        "log, the logarithm of 99 %% of the intensities, for high dynamic range; percentile, their "
+        "intensity; clahe, log with contrast evened out. All images have the same limits",
     )
     one.add_argument(
         "--colour",

@@ -52,6 +52,8 @@ def within(
     return chosen
 
 
+RARE = 1e-3  # of the pixels: fewer do not tell what range images use
+
 # Chunks of one image. What 204 images of 240x180 and their variances take, of `akf` on
 # slider_depth_crop at 200 Hz (experiments/storage.py):
 #                        CPU s: write     read     MB
@@ -125,23 +127,55 @@ def _write_video(
 ) -> str:
     rate = (len(times) - 1) / ((times[-1] - times[0]) / 1e6) if len(times) > 1 else 25.0
     fps = min(rate, 60.0)
+    range_used = Range(tone)
     with video_writer(out, fps) as write:
         for _, image in shown(video, times, tone, colours):
+            range_used.add(image)
             write(image)
-    return f", played at {fps:.4g} per s, {fps / rate:.3g} of real time"
+    return f", played at {fps:.4g} per s, {fps / rate:.3g} of real time{range_used}"
 
 
 def _write_images(
     video: ImageSequence, times: NDArray, out: Path, tone: str, name: str, colours: Colours
 ) -> str:
+    range_used = Range(tone)
     with complete(out, directory=True) as partial:
         lines = []
         for number, (at, image) in enumerate(shown(video, times, tone, colours)):
+            range_used.add(image)
             file = f"frame_{number:08d}.png"
             write_png(partial / file, image)
             lines.append(f"{at / 1e6:.6f} {file}\n")
         (partial / "images.txt").write_text("".join(lines))
-    return ""
+    return str(range_used)
+
+
+class Range:
+    """What part of the display's range the images of the tone "linear" use; str() says it.
+
+    That tone shows the frames' black and white as they are, so what is brighter is cut off, and
+    images are as dark as the frames.
+    """
+
+    def __init__(self, tone: str):
+        self._counts = np.zeros(256, np.int64) if tone == "linear" else None
+
+    def add(self, image: NDArray[np.uint8]) -> None:
+        """Count the values of an image."""
+        if self._counts is not None:
+            self._counts += np.bincount(image.ravel(), minlength=256)
+
+    def __str__(self) -> str:
+        if self._counts is None:
+            return ""
+        above = self._counts[::-1].cumsum()[::-1] / max(int(self._counts.sum()), 1)
+        if above[255] > RARE:
+            share = 100 * above[255]
+            return f", {share:.2g} % of the pixels at white or cut off there (--tone log shows all)"
+        if above[128] < RARE:
+            most = int(np.flatnonzero(above >= RARE)[-1])
+            return f", as dark as the frames, up to grey {most} of 255 (--tone percentile spreads)"
+        return ""
 
 
 def shown(

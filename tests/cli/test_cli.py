@@ -550,6 +550,20 @@ def test_reconstruct_to_images(folder):
             np.testing.assert_array_equal(np.asarray(stored_image), image)
 
 
+def test_images_are_as_bright_as_frames(folder, capsys):
+    """Linear images at frames are these frames, grey for grey; the range they use is said."""
+    ramp = np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH) % 122
+    for name, brightest, said in (("dark", 121, "121 of 255"), ("bright", 255, "--tone log")):
+        greys = np.where(ramp == 121, brightest, ramp).astype(np.uint8)
+        frames = Frames(STAMPS, np.broadcast_to(greys, (6, HEIGHT, WIDTH)), np.zeros_like(STAMPS))
+        jaxevent.save(small(frames=frames), folder / "small.h5")
+        argv = f"reconstruct {folder}/small.h5 --method blend --at frames --out {folder}/{name}"
+        assert cli.main(argv.split()) == 0
+        assert said in capsys.readouterr().out
+        with Image.open(folder / name / "frame_00000002.png") as image:
+            np.testing.assert_array_equal(np.asarray(image), greys)
+
+
 @pytest.mark.parametrize(
     ("rate", "fps", "factor"), [("500", 60, "0.12"), ("40", 40, "1")], ids=["slow", "real time"]
 )
