@@ -5,6 +5,9 @@
 Every image that is scored here was hidden from the methods: frames of the first half of
 slider_depth, at gaps of 2 to 16 frames, and true images of simulated HDR scenes and of moving
 objects, of the scenes and seeds that are for fitting. Prints the numbers as TOML.
+With --one-sided it fits those of the sign "one_sided" alone, all others as they are, to the same
+kinds of images of recordings whose frames end before the image or begin after it, and scores them
+on davis346_street and the second half of slider_depth, cut likewise. Do so after the others.
 Frames that serve as truth are noisy: their own variance is added to that of the images.
 """
 
@@ -189,6 +192,17 @@ def objects(seeds: range) -> Iterator[tuple]:
                 yield f"objects {rate:g} Hz", video, int(times[row]), truth, False
 
 
+def cut(targets: Iterator[tuple]) -> Iterator[tuple]:
+    """Targets that have the frames before them alone, and the same with those after them."""
+    for label, video, t, truth, hdr in targets:
+        frames = video.recording.frames
+        for rows in (np.flatnonzero(frames.t < t), np.flatnonzero(frames.t > t)):
+            if len(rows) > 1:
+                given = video.recording.with_frames(rows)
+                one = jaxevent.METHODS["mc"].estimate(given, video.params, progress=False)
+                yield label, one, t, truth, hdr
+
+
 def compared(targets: Iterator[tuple]) -> Iterator[dict[str, Any]]:
     compare = jax.jit(fusion.compare)
     for label, video, t, truth, hdr in targets:
@@ -265,6 +279,7 @@ def fit(
         )
     )
     mean, spread = X.mean(0).at[-1].set(0), X.std(0).at[-1].set(1)
+    spread = jnp.where(spread > 0, spread, 1)  # "one_sided" is 0 throughout
     X = (X - mean) / spread
     level = jnp.log(truth + I0)
 
@@ -312,6 +327,52 @@ def fit(
     return np.asarray(plain(W)), np.asarray(plain(w))
 
 
+def fit_one_sided(rows: list[dict], noises: dict[str, float], sub: int = 11) -> list[float]:
+    """The weights of the sign "one_sided": two of `choice` and one of `doubt`."""
+    params, at = Params(), SIGNS.index("one_sided")
+    shape = (len(OTHERS), len(SIGNS) + 1)
+    choice = jnp.asarray(params.choice).reshape(shape).at[:, at].set(0)
+    doubt = jnp.asarray(params.doubt).at[at].set(0)
+    parts = []
+    for row in rows:
+        X, Y = (row[n].reshape(len(row[n]), -1)[:, ::sub] for n in ("signs", "ingredients"))
+        truth = row["truth"].ravel()[::sub]
+        wrong = [float(errors(L, row["I0"], truth, row["hdr"]).mean()) for L in Y[:2]]
+        noise = np.ravel(noise_in(row, noises))[::sub] if noise_in(row, noises).any() else 0.0
+        parts.append((X, Y, truth, row["I0"], row["hdr"], noise, 1 / np.sqrt(np.prod(wrong))))
+
+    def image(weights, X, Y):
+        chosen = choice @ X + weights[:, None]
+        q = jax.nn.softmax(jnp.concatenate([jnp.zeros_like(chosen[:1]), chosen]), axis=0)
+        return (q * Y).sum(0)
+
+    def one(weights, part):
+        X, Y, truth, I0, hdr, _, scale = part
+        return scale * errors(image(weights, X, Y), I0, truth, hdr).mean()
+
+    def loss(weights):
+        return sum(one(weights, part) for part in parts) / len(parts)
+
+    optimiser, weights = optax.adam(0.1), jnp.zeros(len(OTHERS))
+    state, step = optimiser.init(weights), jax.jit(jax.value_and_grad(loss))
+    for _ in range(120):
+        _, gradient = step(weights)
+        change, state = optimiser.update(gradient, state)
+        weights = optax.apply_updates(weights, change)
+    groups: dict[str, list] = {}
+    for row, (X, Y, truth, I0, _, noise, _) in zip(rows, parts, strict=True):
+        squares = np.asarray(image(weights, X, Y) - jnp.log(truth + I0)) ** 2
+        groups.setdefault(row["label"], []).append((squares, np.exp(np.asarray(doubt @ X)), noise))
+    factor = 1.0
+    for _ in range(5):  # as `fit` scales variances
+        means = [
+            np.mean([np.log(np.mean(e / (factor * P + noise))) for e, P, noise in group])
+            for group in groups.values()
+        ]
+        factor *= float(np.exp(np.mean(means)))
+    return [*map(float, weights), float(np.log(factor))]
+
+
 def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:
     """Errors of the ingredients and of the choice, by label.
 
@@ -355,6 +416,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--one-sided", action="store_true", help="fit that sign alone")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     data = given.data / "data"
@@ -367,6 +429,43 @@ def main() -> None:
         return pickle.loads(path.read_bytes())
 
     slider, street = data / "slider_depth.zip", data / "davis346_street.npz"
+    noises = {path.stem: noise_of(frames_of(path)) for path in (slider, street)}
+    if given.one_sided:
+        few = {2: 6, 8: 6}
+        fitting = [
+            kept("slider_cut", cut(hidden(slider, Params(), few, 0))),
+            kept("hdr_cut", cut(panned(FITTING[:1], 11, 3))),
+            kept("textures_cut", cut(textures(range(1000, 1008)))),
+            kept("objects_cut", cut(objects(range(1, 2)))),
+        ]
+        testing = [
+            kept("slider_cut_test", cut(hidden(slider, Params(), few, 1))),
+            kept("street_cut_test", cut(hidden(street, Params(), few, None))),
+        ]
+        choice, doubt = (
+            np.asarray(getattr(Params(), n)).reshape(-1, len(SIGNS) + 1).copy()
+            for n in ("choice", "doubt")
+        )
+        found = fit_one_sided([row for part in fitting for row in part], noises)
+        choice[:, SIGNS.index("one_sided")] = found[:-1]
+        doubt[0, SIGNS.index("one_sided")] = found[-1]
+        print("one_sided =", [round(v, 3) for v in found])
+    else:
+        fitting, testing = _two_sided(kept, slider, street)
+        choice, doubt = fit([row for part in fitting for row in part], noises)
+    numbers = Params().replace(
+        choice=[round(float(v), 3) for v in choice.ravel()],
+        doubt=[round(float(v), 3) for v in doubt.ravel()],
+    )
+    print("choice =", numbers.values()["choice"], "\ndoubt =", numbers.values()["doubt"])
+    for name, parts in (("fitted", fitting), ("not seen", testing)):
+        print(name)
+        for part in parts:
+            show(part, numbers, noises)
+
+
+def _two_sided(kept: Callable[..., list[dict]], slider: Path, street: Path) -> tuple[list, list]:
+    """What is fitted to, and what is not."""
     fitting = [
         kept("slider", hidden(slider, Params(**SLIDER), GAPS, 0)),
         kept("slider_plain", hidden(slider, Params(), GAPS, 0)),
@@ -383,17 +482,7 @@ def main() -> None:
         kept("textures_test", textures(range(2000, 2030))),
         kept("objects_test", objects(range(11, 13))),
     ]
-    noises = {path.stem: noise_of(frames_of(path)) for path in (slider, street)}
-    choice, doubt = fit([row for part in fitting for row in part], noises)
-    numbers = Params().replace(
-        choice=[round(float(v), 3) for v in choice.ravel()],
-        doubt=[round(float(v), 3) for v in doubt],
-    )
-    print("choice =", numbers.values()["choice"], "\ndoubt =", numbers.values()["doubt"])
-    for name, parts in (("fitted", fitting), ("not seen", testing)):
-        print(name)
-        for part in parts:
-            show(part, numbers, noises)
+    return fitting, testing
 
 
 if __name__ == "__main__":

@@ -550,14 +550,14 @@ def test_a_later_clock_changes_nothing():
 
 @functools.cache
 def prepared():
-    """Prepared images, and what is made of them: a function of raw parameters."""
+    """Prepared images, and what is made of them: a function of raw parameters and targets."""
     times = np.array([190_000, 212_000])
     features, out = mc.prepare(slide(), times, params())
     weights = np.random.default_rng(0).normal(size=(2, 40 * 48)).astype(np.float32)
 
     @jax.jit
     @functools.partial(jax.value_and_grad, has_aux=True)
-    def value(raw):
+    def value(raw, out=out):
         p = params().with_raw(raw)
         estimate = mc.read(p, mc.run(p, features)[0], out)
         image, P, _ = estimate
@@ -574,6 +574,19 @@ def test_prepared_images_are_those_of_the_video():
     np.testing.assert_allclose(image.reshape(2, 40, 48), whole.mean, atol=2e-3)
     np.testing.assert_allclose(P.reshape(2, 40, 48), whole.covariance, rtol=0.1)
     assert valid.all()
+
+
+@pytest.mark.slow
+def test_prepared_images_of_frames_that_are_not_steady(monkeypatch):
+    """The video and prepared images leave out the smooth part alike; `test_steadiness`."""
+    times, value = prepared()
+    monkeypatch.setattr(estimator.Steadiness, "__call__", lambda *_: False)
+    whole = mc.estimate(slide(), params(), progress=False)(times)
+    assert np.abs(whole.mean - video()(times).mean).max() > 0.01
+    _, out = mc.prepare(slide(), times, params())
+    (_, (image, P, _)), _ = value(params().raw, out)
+    np.testing.assert_allclose(image.reshape(2, 40, 48), whole.mean, atol=2e-3)
+    np.testing.assert_allclose(P.reshape(2, 40, 48), whole.covariance, rtol=0.1)
 
 
 @pytest.mark.slow

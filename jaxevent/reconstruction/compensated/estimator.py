@@ -41,10 +41,16 @@ from jaxevent.reconstruction.compensated.fusion import (
     decide,
     fuse,
     views,
+    weight_after,
 )
 from jaxevent.reconstruction.compensated.implicit import Numbers, Seen, depending
 from jaxevent.reconstruction.compensated.instants import ROOM, Instants, Schedule, speed_of
 from jaxevent.reconstruction.compensated.parameters import Params
+from jaxevent.reconstruction.compensated.steadiness import (
+    Steadiness,
+    smooth_at_target,
+    smooth_part,
+)
 from jaxevent.reconstruction.compensated.thresholds import learn
 from jaxevent.reconstruction.compensated.warping import places, sample, warp, warp_purely
 from jaxevent.reconstruction.estimator import ImageEstimator
@@ -74,12 +80,13 @@ class Targets(Described):
     place: Place  # each (times, k) or (times,)
     p: Float[Numeric, "times rows columns 4"]  # trajectories
     taken: Taken  # each (times, n)
+    steady: Float[Numeric, " times"]  # 1 where frames keep their brightness, else 0
     # Of exposures; None: these are not looked at.
     samples: int | None = eqx.field(static=True, default=None)
 
     def images(self, rows: NDArray) -> "Targets":
         """Those of its images, in that order."""
-        each = (self.rows, self.place, self.p, self.taken)
+        each = (self.rows, self.place, self.p, self.taken, self.steady)
         chosen = jax.tree.map(lambda leaf: leaf[rows], each)
         return Targets(self.instants, *chosen, samples=self.samples)
 
@@ -200,6 +207,7 @@ class Followed(NamedTuple):
     V: NDArray[np.float32]
     clear: NDArray[np.float32]
     p: NDArray[np.float32]  # (rows, columns, 4), px at s = 1
+    smooth: NDArray[np.float32] | None = None  # (K, h, w), taken away from L; None: nothing is
 
 
 @runtime_checkable
@@ -259,12 +267,21 @@ class Follower:
         self.params, self.images, self.start = params, images, start
         self.schedule = schedule_of(recording, params, images)
         self.shutter = Shutter(recording, params, self.schedule.speed)
+        self.steady = Steadiness(recording, self.schedule.frames, float(params.I0))
         self._anchors: collections.OrderedDict[int, tuple[Instants, NDArray[np.float32]]]
         self._anchors = collections.OrderedDict()
         caution, floor, nu = (float(v) for v in (params.caution, params.floor, params.robust))
         numbers = (params.smooth, params.jump, params.edge, params.straight)
         self._caution = caution
         self._settings = (floor, nu, trajectories.Smoothness(*(float(v) for v in numbers)))
+
+    def _images(self, instants: Instants) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
+        """L, V and clear at instants, and what is taken away from L where frames are unsteady."""
+        L, V, clear = self.images(instants.t)
+        if self.steady(int(instants.t[0]), int(instants.t[-1])):
+            return L, V, clear, None
+        smooth = smooth_part(L)
+        return L - smooth, V, clear, smooth
 
     def _doubted(self, V: NDArray, clear: NDArray) -> NDArray[np.float32]:
         return (V * np.where(clear > 0, 1, self._caution)).astype(np.float32)
@@ -278,7 +295,7 @@ class Follower:
             self._anchors.move_to_end(at)
         else:
             instants = self.schedule(at)
-            L, V, clear = self.images(instants.t)
+            L, V, clear, _ = self._images(instants)
             pyramid = trajectories.Pyramid(L, self._doubted(V, clear), FADE)
             plan = trajectories.stages(instants.s, instants.first)
             motion = trajectories.follow(pyramid, instants.s, plan, *self._settings)
@@ -303,10 +320,10 @@ class Follower:
         instants = self.schedule(t)
         p = self._begin(t, instants)
         s = instants.s
-        L, V, clear = self.images(instants.t)
+        L, V, clear, smooth = self._images(instants)
         if self.start is not None and not self.start.refine:
             p = trajectories.Motion(p, 1).at(0, *L.shape[1:]).p
-            return Followed(instants, L, V, clear, p)
+            return Followed(instants, L, V, clear, p, smooth)
         doubted = self._doubted(V, clear)
         pyramid = trajectories.Pyramid(L, doubted, FADE)
         for _ in range(STEPS):
@@ -321,7 +338,7 @@ class Follower:
         packed = trajectories.pack(better, doubted)
         for _ in range(STEPS):
             p = trajectories.step(packed, s, p, *self._settings)
-        return Followed(instants, L, V, clear, p)
+        return Followed(instants, L, V, clear, p, smooth)
 
 
 def filled(values: NDArray, room: int, rest: float | int = 0) -> NDArray:
@@ -360,7 +377,7 @@ def _decide(params: Params, told: Agreement, seen: Views) -> Fused:
 
 def look(params: Params, target: Followed) -> tuple[Agreement, Views]:
     """What `fusion.compare` looks at, of a target's images along trajectories."""
-    instants, L, V, clear, p = target
+    instants, L, V, clear, p, _ = target
     along = warp(L, V, np.asarray(clear, np.float32), instants.s, p)
     place = place_of(instants, clear, len(instants))
     return agree(params, L, along, place), views(L, V, along, place)
@@ -369,6 +386,14 @@ def look(params: Params, target: Followed) -> tuple[Agreement, Views]:
 def fuse_images(params: Params, target: Followed) -> Fused:
     """The images at a target's instants along trajectories, in one."""
     return _decide(params, *look(params, target))
+
+
+def smoothed_back(target: Followed, fused: Fused) -> Fused:
+    """What is fused, with the smooth part that was taken away from a target's images."""
+    assert target.smooth is not None
+    place = place_of(target.instants, target.clear, len(target.instants))
+    L, P = smooth_at_target(target.smooth, place, weight_after(place))
+    return dataclasses.replace(fused, L=fused.L + L, P=fused.P + P)
 
 
 def follower_of(
@@ -450,6 +475,8 @@ class CompensatedVideo(ImageSequence[Params]):
     def _held(self, t: int, target: Followed) -> Fused:
         """What a target's images give, held to the frames next to it."""
         fused, shutter = fuse_images(self.params, target), self.follow.shutter
+        if target.smooth is not None:  # nor can it be held to frames of another brightness
+            return smoothed_back(target, fused)
         if shutter.samples is None:
             return fused
         taken = shutter(t, target.instants.unit)
@@ -482,9 +509,12 @@ class CompensatedVideo(ImageSequence[Params]):
         s = ((at - to) * 1e-6 / target.instants.unit).astype(np.float32)
         order = np.argsort(at, kind="stable")
         L, V, clear = (part[np.argsort(order)] for part in self.follow.images(at[order]))
+        M = np.asarray(fused.L, np.float32)
+        if target.smooth is not None:
+            L, M = L - smooth_part(L), M - smooth_part(M)
         along = warp(L, V, clear, s, target.p)
         seen = _carry(np.asarray(images, np.float32), s, target.p)
-        return np.asarray(seen), np.asarray(_shown(self.params, fused.L, along))
+        return np.asarray(seen), np.asarray(_shown(self.params, M, along))
 
     def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.float32]:
         """Optical flow (T, H, W, 2) at `times`, of x and y in px/s, of the points visible then.
@@ -553,16 +583,17 @@ class MotionCompensated(ImageEstimator[Params]):
             features, instants = features.weighted(factors), instants.weighted(factors)
         shape = (len(chosen), *trajectories.nodes(recording.height, recording.width, 0), 4)
         rows, p = np.zeros((len(chosen), room), np.int32), np.zeros(shape, np.float32)
-        places, taken = [], []
+        places, taken, steady = [], [], np.ones(len(chosen), np.float32)
         for n, one in enumerate(chosen):
-            _, _, _, clear, p[n] = follow(int(wanted[n]))
+            _, _, _, clear, p[n], smooth = follow(int(wanted[n]))
+            steady[n] = smooth is None
             rows[n, : len(one)] = np.searchsorted(every, one.t)
             places.append(place_of(one, clear, room))
             taken.append(follow.shutter(int(wanted[n]), one.unit))
         place, taken = (
             jax.tree.map(lambda *leaves: np.stack(leaves), *parts) for parts in (places, taken)
         )
-        targets = Targets(instants, rows, place, p, taken, follow.shutter.samples)
+        targets = Targets(instants, rows, place, p, taken, steady, follow.shutter.samples)
         return features, jax.device_put(targets)
 
     def run(self, params: Params, features: Features, state: Any = None) -> tuple[Any, Any]:
@@ -578,8 +609,9 @@ class MotionCompensated(ImageEstimator[Params]):
 
         @jax.checkpoint
         def one(target: tuple) -> tuple[Array, Array]:
-            rows, place, p, taken = target
-            images = (L[rows], V[rows], clear[rows])
+            rows, place, p, taken, steady = target
+            smooth = (1 - steady) * smooth_part(L[rows])
+            images = (L[rows] - smooth, V[rows], clear[rows])
             if self.through_motion:
                 p = self._moved(params, images, place, p)
             along = warp_purely(*images, place.s, p)
@@ -587,10 +619,13 @@ class MotionCompensated(ImageEstimator[Params]):
             if out.samples is not None:
                 at = taken.frame
                 seen = (frames.grey[at], frames.intensity[at], frames.response, frames.gain[at])
+                # Frames of another brightness hold nothing.
+                taken = taken._replace(present=taken.present * steady)
                 fused = constrain_purely(params, fused, p, taken, Shots(*seen), out.samples)
-            return fused.L, fused.P
+            base, doubt = smooth_at_target(smooth, place, weight_after(place))
+            return fused.L + base, fused.P + doubt
 
-        found, P = jax.lax.map(one, (out.rows, out.place, out.p, out.taken))
+        found, P = jax.lax.map(one, (out.rows, out.place, out.p, out.taken, out.steady))
         image = (jnp.exp(found) - params.I0).reshape(len(found), -1)
         P = P.reshape(image.shape)
         return Estimate(image, P, jnp.isfinite(image) & (jnp.sqrt(P) < params.vague))

@@ -40,15 +40,25 @@ class Views(NamedTuple):
     inside_before: Float[Numeric, "h w"]  # 1, or 0 beyond the image's border
     inside_after: Float[Numeric, "h w"]
     weight: Numeric  # (), of the frame after in the blend of the two
+    one_sided: Numeric  # (), 1 where frames are on one side of the target alone, else 0
 
 
 def views(L: Numeric, V: Numeric, along: Along, place: Place) -> Views:
     """Those of images (K, h, w)."""
-    a, b, one = place.before, place.after, jnp.float32(1)
+    a, b = place.before, place.after
+    # Where frames are on one side alone, that of the other side shows nothing.
+    one_sided = jnp.where(a == b, jnp.float32(1), 0)
+    before = along.inside[a] * (1 - one_sided * (place.s[a] > 0))
+    after = along.inside[b] * (1 - one_sided * (place.s[a] <= 0))
+    images = (L[a], L[b], along.L[a], along.L[b], before, after)
+    return Views(L[place.own], V[place.own], *images, weight_after(place), one_sided)
+
+
+def weight_after(place: Place) -> Numeric:
+    """That of the frame after in the blend of the two next to a target, ()."""
+    a, b = place.before, place.after
     apart = jnp.where(a == b, 1, place.s[b] - place.s[a])
-    weight = jnp.where(a == b, 0, jnp.clip(-place.s[a] / apart, 0, one))
-    images = (L[a], L[b], along.L[a], along.L[b], along.inside[a], along.inside[b])
-    return Views(L[place.own], V[place.own], *images, weight)
+    return jnp.where(a == b, 0, jnp.clip(-place.s[a] / apart, 0, jnp.float32(1)))
 
 
 class Fused(Described):
@@ -99,11 +109,13 @@ def compare(told: Agreement, seen: Views) -> Comparison:
         "from_blend": apartness(M, blend),
         "near_from_blend": apartness(near, blend),
         "activity": blur(told.activity, 1.5),
+        "one_sided": jnp.broadcast_to(seen.one_sided, M.shape),
     }
-    as_they_are = ("seen", "seen_twice")
+    as_they_are = ("seen", "seen_twice", "one_sided")
     X = [signs[n] if n in as_they_are else jnp.log(signs[n] + TINY) for n in SIGNS]
     X = jnp.stack([*X, jnp.ones_like(M)])
-    return Comparison(jnp.stack([M, smoothed, blend]), X, told.parts, told.seen, told.usual)
+    visible = told.seen * jnp.stack([seen.inside_before, seen.inside_after])
+    return Comparison(jnp.stack([M, smoothed, blend]), X, told.parts, visible, told.usual)
 
 
 def decide(params: Params, comparison: Comparison) -> Fused:

@@ -21,20 +21,21 @@ SIGNS = (
     "from_blend",
     "near_from_blend",
     "activity",
+    "one_sided",
 )
 OTHERS = ("smoothed", "blend")  # ingredients beside the mean along trajectories
 
 # Fitted by experiments/compensated_choice.py: a number for every sign and one more, for each of
-# `OTHERS`; and the same for the result's variance.
+# `OTHERS`; and the same for the result's variance. Those of "one_sided" by its --one-sided.
 # fmt: off
 CHOICE = (
     0.864, 0.09, -0.186, 0.812, 0.44, -5.523, -2.994, 0.176, -0.132, -0.656, 1.102, 0.116,
-    -0.156, -0.741, -0.076, 0.229, 8.942, 0.245, -0.238, -0.373, 0.145, 0.199, 1.508,
-    -2.626, -0.072, 0.484, 0.442, -0.067, -0.09, -0.424, -0.208, -0.412, -0.102, -8.12,
+    -0.156, -0.741, -0.076, 0.229, -0.033, 8.942, 0.245, -0.238, -0.373, 0.145, 0.199, 1.508,
+    -2.626, -0.072, 0.484, 0.442, -0.067, -0.09, -0.424, -0.208, -0.412, -0.102, -2.609, -8.12,
 )
 DOUBT = (
     0.478, 0.306, 0.329, 0.006, 0.573, -1.969, -2.776, 0.185, -0.231, 0.005, 0.084,
-    -0.097, 0.011, 0.352, -0.262, 0.011, 7.72,
+    -0.097, 0.011, 0.352, -0.262, 0.011, 0.276, 7.72,
 )
 # fmt: on
 

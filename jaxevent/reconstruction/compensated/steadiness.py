@@ -1,0 +1,103 @@
+"""Frames whose brightness changes where no events tell of it: an exposure that adapts, or flicker.
+
+Such frames show the same points with other values, so they do not agree along any trajectory. What
+they have in common is all that is left when what varies slowly over the image is taken away. So
+where frames around a target are not steady its images are compared and fused without their smooth
+part, and the result is given that of the smoother's image at the target, which goes from frame to
+frame as a blend does.
+
+Steadiness is told by pixels without events around them between two frames: a change there is none
+of the scene. On slider_depth and davis346_street the median change of blocks of such pixels is
+below 0.01 of ln I between any two frames, in evbench_seq3 with its three bright frames 0.1 to 0.4.
+"""
+
+import functools
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+
+from jaxevent.reconstruction.compensated.agreement import Place
+from jaxevent.reconstruction.features import Numeric
+from jaxevent.reconstruction.frames import FrameImages
+from jaxevent.recording import Recording
+
+REACH = 12.0  # px, of the Gaussian that leaves the smooth part
+LEAST = 0.05  # ln I, by which frames differ that are not steady
+BLOCK = 16  # px, over which the change of pixels without events is a median
+ENOUGH = 8  # such pixels in a block
+BLOCKS = 4  # such blocks at least
+SHOWN = (0.02, 0.98)  # grey values of pixels that are not clipped
+
+
+@functools.cache
+def _averages(size: int) -> NDArray[np.float32]:
+    """The matrix that blurs an axis; at the border by what is inside."""
+    at = np.arange(size)
+    weights = np.exp(-0.5 * ((at[:, None] - at) / REACH) ** 2)
+    return (weights / weights.sum(1, keepdims=True)).astype(np.float32)
+
+
+def smooth_part(L: Any) -> Any:
+    """What varies slowly over images (K, h, w), of NumPy or JAX."""
+    return _averages(L.shape[-2]) @ L @ _averages(L.shape[-1]).T
+
+
+def smooth_at_target(
+    smooth: Numeric, place: Place, weight: Numeric
+) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+    """The smooth part at the target, of those of its instants (K, h, w), and its variance.
+
+    `weight` is that of the frame after, 0..1. In between nothing tells which of the two the
+    brightness is of.
+    """
+    apart = smooth[place.after] - smooth[place.before]
+    return jnp.asarray(smooth[place.own]), weight * (1 - weight) * apart**2
+
+
+class Steadiness:
+    """Tells which frames of a recording keep their brightness; `mid` are their times (us)."""
+
+    def __init__(self, recording: Recording, mid: NDArray[np.int64], I0: float):
+        self._recording, self._mid, self._I0 = recording, mid, I0
+        self._images = FrameImages(recording, np.dtype(np.float32))
+        self._known: dict[int, bool] = {}
+
+    def __call__(self, first: int, last: int) -> bool:
+        """Whether the frames of these times (us) and those between do."""
+        low = int(np.searchsorted(self._mid, first, "left"))
+        high = int(np.searchsorted(self._mid, last, "right"))
+        return all(self._is_steady(k) for k in range(low, high - 1))
+
+    def _is_steady(self, frame: int) -> bool:
+        """Whether the next frame is as bright as this one."""
+        if frame not in self._known:
+            self._known[frame] = abs(self._change(frame)) < LEAST
+        return self._known[frame]
+
+    def _change(self, frame: int) -> float:
+        """The median over blocks of how far pixels without events change, in ln(I + I0)."""
+        source, size = self._recording.events, (self._recording.height, self._recording.width)
+        begin, end = (source.index(int(t)) for t in self._mid[frame : frame + 2])
+        grey, intensity, _, _ = self._images.read(slice(frame, frame + 2), 2)
+        shown = ((grey > SHOWN[0]) & (grey < SHOWN[1])).all(0).reshape(size)
+        events = source[begin:end]
+        counts = np.zeros(size, np.float32)
+        np.add.at(counts, (events.y, events.x), 1)
+        quiet = shown & (uniform_filter(counts, 3) < 1 / 18)
+        change = np.diff(np.log(intensity + self._I0), axis=0).reshape(size)
+        h, w = (length // BLOCK for length in size)
+
+        def blocks(image: NDArray) -> NDArray:
+            cut = image[: h * BLOCK, : w * BLOCK].reshape(h, BLOCK, w, BLOCK)
+            return cut.swapaxes(1, 2).reshape(h * w, BLOCK**2)
+
+        changes = [
+            abs(float(np.median(values[chosen])))
+            for values, chosen in zip(blocks(change), blocks(quiet), strict=True)
+            if chosen.sum() >= ENOUGH
+        ]
+        return float(np.median(changes)) if len(changes) >= BLOCKS else 0.0

@@ -1,0 +1,127 @@
+"""Frames whose brightness changes where no events tell of it."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from jaxevent.camera import UnknownResponse
+from jaxevent.methods import find
+from jaxevent.reconstruction.compensated import estimator, steadiness
+from jaxevent.recording import Events, Frames, Recording
+from jaxevent.simulate import Sensor, simulate
+
+mc = find("mc", "reconstruction")
+HEIGHT, WIDTH, STAMPS = 48, 64, np.arange(5) * 50_000
+BRIGHT = 2  # the frame that is brighter than all others
+
+
+class Pane:
+    """A texture that goes by below, before a wall that stands still."""
+
+    size, duration = (WIDTH, HEIGHT), 0.26
+
+    def intensity(self, t):
+        y, x = np.mgrid[:HEIGHT, :WIDTH].astype(float)
+        x = x - np.where(y < HEIGHT // 2, 0, 60 * t)
+        return 0.35 + 0.12 * np.sin(0.7 * x) * np.cos(0.5 * y) + 0.1 * np.sin(0.23 * x + 0.4 * y)
+
+
+def brightened(recording):
+    """The same with one brighter frame."""
+    images = recording.frames.images.copy()
+    images[BRIGHT] = (images[BRIGHT] * 1.25 + 20).clip(0, 250).astype(np.uint8)
+    return dataclasses.replace(
+        recording, frames=dataclasses.replace(recording.frames, images=images)
+    )
+
+
+@functools.cache
+def pane():
+    sensor = Sensor(
+        frame_rate=20.0,
+        exposure=1e-3,
+        background_rate=0.0,
+        hot_fraction=0.0,
+        read_noise=0.5,
+        response=UnknownResponse(),
+    )
+    return simulate(Pane(), sensor, 4, "pane")
+
+
+def still(images, moves=()):
+    """A recording of frames, with events at the columns `moves`, between all frames."""
+    x, y = (p.ravel().astype(np.uint16) for p in np.meshgrid(list(moves), range(HEIGHT)))
+    t = np.linspace(1_000, STAMPS[-1], 4 * len(x)).astype(np.int64)
+    events = Events(t, np.tile(x, 4), np.tile(y, 4), np.ones(len(t), bool))
+    return Recording("still", WIDTH, HEIGHT, events, Frames(STAMPS, images, np.zeros_like(STAMPS)))
+
+
+def steady(recording):
+    return steadiness.Steadiness(recording, recording.frames.t, 0.3)
+
+
+def test_frames_are_steady_unless_they_change_without_events():
+    rng = np.random.default_rng(3)
+    wall = rng.integers(40, 160, (1, HEIGHT, WIDTH)) + rng.integers(-3, 4, (5, HEIGHT, WIDTH))
+    wall = wall.astype(np.uint8)
+    assert steady(still(wall, [3]))(0, 200_000)
+    told = steady(brightened(still(wall, [3])))
+    assert not told(0, 200_000)
+    before, around, after = (0, 99_999), (50_000, 100_000), (100_001, 200_000)
+    assert [told(*span) for span in (before, around, after)] == [True, False, True]
+    # Where events are everywhere the change may be that of the scene.
+    assert steady(brightened(still(wall, range(0, WIDTH, 2))))(0, 200_000)
+    moving = wall.copy()
+    moving[BRIGHT, :, : WIDTH // 2] += 50
+    assert steady(still(moving, range(WIDTH // 2)))(0, 200_000)
+
+
+def test_smooth_part():
+    image = np.random.default_rng(5).normal(size=(2, HEIGHT, WIDTH)).astype(np.float32)
+    got, reach = steadiness.smooth_part(image), steadiness.REACH
+    ones = gaussian_filter(np.ones((HEIGHT, WIDTH)), reach, mode="constant", truncate=8)
+    for one, part in zip(image, got, strict=True):
+        expected = gaussian_filter(one, reach, mode="constant", truncate=8) / ones
+        np.testing.assert_allclose(part, expected, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_images_between_frames_of_different_brightness(monkeypatch):
+    recording = brightened(pane())
+    mid = recording.frames.t
+    t = np.array([(mid[BRIGHT] + mid[BRIGHT + 1]) // 2])
+    params = mc.Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4)
+    level = np.log(Pane().intensity(t[0] * 1e-6) + 0.1)
+
+    def error(image):
+        L = np.log(image.reshape(HEIGHT, WIDTH) + 0.1)
+        detail = (L - level) - steadiness.smooth_part((L - level)[None])[0]
+        return float((detail[HEIGHT // 2 + 4 : -4, 6:-6] ** 2).mean())
+
+    video = mc.estimate(recording, params, progress=False)
+    image, P, _ = video(t)
+    # Its brightness is between those of both frames, which is in doubt.
+    assert P.mean() > 0.2 * np.log(1.4) ** 2 / 4
+    low, high = (recording.frames.intensity[k].mean() for k in (BRIGHT + 1, BRIGHT))
+    assert low + 0.1 * (high - low) < image.mean() < high - 0.1 * (high - low)
+    monkeypatch.setattr(estimator.Steadiness, "__call__", lambda *_: True)
+    unaware = mc.estimate(recording, params, progress=False)(t).mean
+    assert error(image) < 0.5 * error(unaware)
+
+
+@pytest.mark.slow
+def test_frames_on_one_side_do_not_confirm_each_other():
+    given = pane().with_frames(slice(0, 3))
+    t = int(given.frames.t[-1]) + 40_000
+    video = mc.estimate(
+        given, mc.Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4), progress=False
+    )
+    told, seen = estimator.look(video.params, video.follow(t))
+    assert float(seen.one_sided) == 1 and seen.inside_before.max() == 1
+    assert np.asarray(seen.inside_after).max() == 0
+    sources = video.sources(np.array([t]))
+    assert sources["visible_after"].max() == 0 and sources["visible_before"].max() > 0.5
+    assert sources["blend"].mean() < 0.5  # what is last seen is no longer there
