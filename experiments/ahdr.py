@@ -7,9 +7,10 @@ hot pixels; a slow and a fast pan of each scene), fits every tunable method by
 configs/fit_ahdr.toml, gives the smoother's numbers to mc, and scores all on the test scenes against
 the true HDR images. Errors are geometric means over test recordings; after +- is the standard
 deviation over the seeds of such a mean, in per cent. Done parts are kept in the folder and not
-repeated. With --methods only those are fitted and scored. The tables are those of all recordings,
-of slow and of fast ones, and the calibration of each scene. Where ColorVideoVDP is installed (pip
-install '.[hdr]'), they have its quality Q too, of every sixth image.
+repeated. With --methods only those are fitted and scored, and nothing is fitted where none is
+tunable. The tables are those of all recordings, of slow and of fast ones, and the calibration of
+each scene. Where ColorVideoVDP is installed (pip install '.[hdr]'), they have its quality Q too, of
+every sixth image.
 """
 
 import argparse
@@ -81,7 +82,7 @@ def choose(labels: list[str], fitted: Path) -> list[tuple]:
 
     mc is not fitted: it has the smoother's numbers. A method whose extra is missing is left out.
     """
-    known = read_toml(fitted)
+    known = read_toml(fitted) if fitted.exists() else {}
     methods = []
     for label in labels:
         name = METHODS[label]
@@ -190,15 +191,15 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     out = arguments.out.absolute()
-    record(out / "fit", FITTING, range(1), arguments.sensor)
-    record(out / "validation", FITTING, range(1, 2), arguments.sensor)
     paths = record(out / "test", TESTING, range(2, 2 + arguments.seeds), arguments.sensor)
-    os.environ["AHDR"] = str(out)
     fitted = out / "fitted"
-    if not (fitted / "params.toml").exists():
-        wanted = {*arguments.methods, *({"aks"} if "mc" in arguments.methods else ())}
-        plan = read_toml(CONFIG)
-        plan["method"] = [m for m in plan["method"] if m.get("label", m["name"]) in wanted]
+    wanted = {*arguments.methods, *({"aks"} if "mc" in arguments.methods else ())}
+    plan = read_toml(CONFIG)
+    plan["method"] = [m for m in plan["method"] if m.get("label", m["name"]) in wanted]
+    if plan["method"] and not (fitted / "params.toml").exists():
+        record(out / "fit", FITTING, range(1), arguments.sensor)
+        record(out / "validation", FITTING, range(1, 2), arguments.sensor)
+        os.environ["AHDR"] = str(out)
         config = out / "fit.toml"
         config.write_text(toml.dump(plan))
         fit(config, fitted, resume=(fitted / "checkpoint").exists(), progress=sys.stderr.isatty())

@@ -7,6 +7,10 @@ Tables:
     objects     simulated objects, 25 Hz, halfway between frames, of the seeds that
                 experiments/motion_compensated.py scores: the motion found, the true one, and the
                 true visibility beside it; all errors, and those within 2 px of where surfaces meet
+    pans        fast pans of HDR scenes: MSE of ln(I + I0) of dark, well-exposed, bright pixels, of
+                the smoother, of `mc` with the motion found and the true one, of the fusion alone,
+                and with the best ingredient at every pixel; which part of the dark error of a pixel
+                is that of all instants along its true trajectory
     thresholds  fast pans of HDR scenes by sensors whose pixels' thresholds differ more and more:
                 MSE of ln(I + I0) of bright pixels and of all, with and without learning these
 
@@ -37,7 +41,7 @@ mc = jaxevent.METHODS["mc"]
 
 def truly_along(target: Followed, source: Objects, t: int) -> tuple[Along, NDArray[np.bool_]]:
     """A target's images along the true trajectories, and where the points are hidden."""
-    instants, L, V, clear, _ = target
+    instants, L, V, clear, *_ = target
     count, h, w = L.shape
     y, x = np.mgrid[:h, :w].astype(float)
     warped, hidden = np.zeros((4, count, h, w), np.float32), np.zeros((count, h, w), bool)
@@ -64,7 +68,7 @@ def objects(folder: Path) -> Iterator[str]:
             meet[1:] |= seen[1:] != seen[:-1]
             near = np.asarray(distance_transform_edt(~meet)) < EDGE
             target = video.follow(t)
-            instants, L, V, clear, p = target
+            instants, L, V, clear, p, _ = target
             place = place_of(instants, clear, len(instants))
             true, hidden = truly_along(target, source, t)
             cases = {
@@ -86,6 +90,77 @@ def objects(folder: Path) -> Iterator[str]:
     for name, rows in found.items():
         error, share = np.mean(rows, 0)
         yield f"| {name} | {100 * error:.4f} | {100 * share:.0f} % |"
+
+
+def truly_panned(target: Followed, source: Pan, t: int) -> Along:
+    """A target's images along the true trajectories of a pan."""
+    instants, L, V, clear, *_ = target
+    h, w = L.shape[1:]
+    at = np.mgrid[:h, :w].astype(float) - np.array([(h - 1) / 2, (w - 1) / 2])[:, None, None]
+
+    def turn(roll: float, x: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
+        cos, sin = np.cos(roll), np.sin(roll)
+        return cos * x - sin * y, sin * x + cos * y
+
+    (x, y), roll, zoom = source.pose(t * 1e-6)
+    right, down = turn(roll, zoom * at[1], zoom * at[0])
+    warped = np.zeros((4, *L.shape), np.float32)
+    for k, moment in enumerate(instants.t):
+        (x1, y1), roll, zoom = source.pose(float(moment) * 1e-6)
+        X, Y = turn(-roll, right + x - x1, down + y - y1)
+        X, Y = X / zoom + (w - 1) / 2, Y / zoom + (h - 1) / 2
+        for n, (image, order) in enumerate(((L[k], 3), (V[k], 1), (clear[k] * 1.0, 1))):
+            warped[n, k] = map_coordinates(image, [Y, X], order=order, mode="nearest")
+        warped[3, k] = (-0.5 <= X) & (w - 0.5 >= X) & (-0.5 <= Y) & (h - 0.5 >= Y)
+    return Along(*warped)
+
+
+def pans(folder: Path) -> Iterator[str]:
+    """The table, line by line: geometric means over recordings."""
+    params = mc.Params(preset="hdr", c_on=0.2, c_off=0.18, rho_ref=5e-4)
+    found: dict[str, list] = {}
+    common = []
+    for name in TESTING:
+        source = Pan(scene(name), speed="fast", duration=0.5, seed=SEEDS[0])
+        recording = simulate(source, Sensor(), SEEDS[0], name)
+        video = mc.estimate(recording, params, progress=False)
+        times, truths = recording.extra["hdr_t"], recording.extra["hdr"]
+        errors: dict[str, list] = {}
+        for row in np.unique(np.linspace(2, len(times) - 3, 4).round().astype(int)):
+            truth, t = np.asarray(truths[row]), int(times[row])
+            level = np.log(truth + params.I0)
+            low, high = recording.extra.get("clip", (0.01, 1.0))
+            regions = (truth < low, (truth >= low) & (truth <= high), truth > high)
+            target = video.follow(t)
+            instants, L, V, clear, p, _ = target
+            place = place_of(instants, clear, len(instants))
+            true = truly_panned(target, source, t)
+            images = {"smoother": L[instants.own]}
+            ways = {"found": warp(L, V, np.asarray(clear, np.float32), instants.s, p), "true": true}
+            for motion, along in ways.items():
+                told = fusion.compare(
+                    agree(params, L, along, place), fusion.views(L, V, along, place)
+                )
+                ingredients = np.asarray(told.ingredients)
+                images[f"`mc`, {motion} motion"] = np.asarray(fusion.decide(params, told).L)
+                images[f"fusion alone, {motion} motion"] = ingredients[0]
+                best = np.abs(ingredients - level).argmin(0)[None]
+                images[f"best ingredient, {motion} motion"] = np.take_along_axis(
+                    ingredients, best, 0
+                )[0]
+            for label, image in images.items():
+                squares = (image - level) ** 2
+                errors.setdefault(label, []).append([squares[r].mean() for r in regions])
+            inside = np.where(true.inside > 0, true.L - level, np.nan)[:, regions[0]]
+            common.append(np.nanmean(np.nanmean(inside, 0) ** 2) / np.nanmean(inside**2))
+        for label, values in errors.items():
+            found.setdefault(label, []).append(np.nanmean(values, 0))
+    yield "| log MSE | dark | well-exposed | bright |"
+    yield "|---|---:|---:|---:|"
+    for label, values in found.items():
+        cells = " | ".join(f"{v:.4f}" for v in np.exp(np.nanmean(np.log(values), 0)))
+        yield f"| {label} | {cells} |"
+    yield f"\nOf the dark error {100 * np.mean(common):.0f} % is common to all instants."
 
 
 def thresholds(folder: Path) -> Iterator[str]:
@@ -120,7 +195,7 @@ def thresholds(folder: Path) -> Iterator[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    tables = {"objects": objects, "thresholds": thresholds}
+    tables = {"objects": objects, "pans": pans, "thresholds": thresholds}
     parser.add_argument("--tables", nargs="+", default=list(tables), choices=tables)
     parser.add_argument("--out", type=Path, required=True, help="folder for everything made")
     arguments = parser.parse_args()

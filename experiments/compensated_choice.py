@@ -353,7 +353,8 @@ def fit_one_sided(rows: list[dict], noises: dict[str, float], sub: int = 11) -> 
     def loss(weights):
         return sum(one(weights, part) for part in parts) / len(parts)
 
-    optimiser, weights = optax.adam(0.1), jnp.zeros(len(OTHERS))
+    optimiser = optax.adam(0.1)
+    weights: Any = jnp.zeros(len(OTHERS))
     state, step = optimiser.init(weights), jax.jit(jax.value_and_grad(loss))
     for _ in range(120):
         _, gradient = step(weights)
@@ -370,7 +371,7 @@ def fit_one_sided(rows: list[dict], noises: dict[str, float], sub: int = 11) -> 
             for group in groups.values()
         ]
         factor *= float(np.exp(np.mean(means)))
-    return [*map(float, weights), float(np.log(factor))]
+    return [*np.asarray(weights).tolist(), float(np.log(factor))]
 
 
 def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:

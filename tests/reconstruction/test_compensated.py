@@ -582,7 +582,7 @@ def test_prepared_images_of_frames_that_are_not_steady(monkeypatch):
     times, value = prepared()
     monkeypatch.setattr(estimator.Steadiness, "__call__", lambda *_: False)
     whole = mc.estimate(slide(), params(), progress=False)(times)
-    assert np.abs(whole.mean - video()(times).mean).max() > 0.01
+    assert (whole.mean != video()(times).mean).any()
     _, out = mc.prepare(slide(), times, params())
     (_, (image, P, _)), _ = value(params().raw, out)
     np.testing.assert_allclose(image.reshape(2, 40, 48), whole.mean, atol=2e-3)

@@ -1,0 +1,102 @@
+"""Hidden frames of real recordings, without settings: `mc` beside what a user would pick instead.
+
+    python experiments/frames_without_settings.py --out hidden [--data DIR]
+
+DIR/data holds the recordings; by default DIR is $JAXEVENT_DATA. Of each every 2nd, 4th or 8th
+frame is given, as `jaxevent evaluate` does it; methods have their default parameters. A few of the
+hidden frames are scored, evenly chosen: those between given frames, and apart from these those
+after the last one. MSE; MSE after the brightness of each image is fitted to the hidden frame
+(a I + b), since the frames of evbench_seq3 are not equally bright; SSIM; z2. The last column of
+`mc` is its MSE as part of the least of its ingredients, `aks` and `blend`. Makes table.md; rows
+that the folder holds are kept.
+"""
+
+import argparse
+import functools
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from compensated_choice import noise_of
+from motion_compensated import Row, Store, evenly, markdown
+from numpy.typing import NDArray
+
+import jaxevent
+from jaxevent.metrics import ssim
+from jaxevent.recording import Frames, Recording
+from jaxevent.runs.protocols import frame_times, held_out
+
+RECORDINGS = ("slider_depth.zip", "davis346_street.npz", "evbench_seq3_calibrated.npz")
+METHODS = ("last-frame", "blend", "flow", "akf", "aks", "mc")
+INGREDIENTS = ("aks", "blend")
+GAPS, IMAGES = (2, 4, 8), 8
+COLUMNS = (
+    ("MSE x 1e-2", "mse", 100, 4), ("brightness fitted", "fitted", 100, 4), ("SSIM", "ssim", 1, 3),
+    ("z2", "z2", 1, 2), ("of the best ingredient", "ratio", 1, 2),
+)  # fmt: skip
+
+
+def brightness_fitted(image: NDArray, truth: NDArray) -> NDArray:
+    a, b = np.polyfit(image.ravel().astype(float), truth.ravel().astype(float), 1)
+    return a * image + b
+
+
+def score(method: Any, params: Any, given: Recording, truth: Frames, noise: float) -> Row:
+    made = method.estimate(given, params, progress=False)
+    images, P, _ = made(frame_times(truth, params), extrapolate=True)
+    images, true = images.clip(0, 1).astype(np.float32), truth.intensity
+    pairs = list(zip(images, true, strict=True))
+    row: Row = {
+        "mse": float(((images - true) ** 2).mean()),
+        "fitted": float(np.mean([((brightness_fitted(i, t) - t) ** 2).mean() for i, t in pairs])),
+        "ssim": float(np.mean([ssim(i, t) for i, t in pairs])),
+        "images": len(true),
+    }
+    if method.has_covariance:
+        I0 = float(params.I0)
+        squares = np.log((images + I0) / (true + I0)) ** 2
+        row["z2"] = float(np.nanmean(squares / (P + noise / (true + I0) ** 2)))
+    return row
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--data", type=Path, default=Path(os.environ.get("JAXEVENT_DATA", ".")))
+    parser.add_argument("--out", type=Path, required=True, help="folder for everything made")
+    parser.add_argument("--recordings", nargs="+", default=RECORDINGS, metavar="NAME")
+    parser.add_argument("--methods", nargs="+", default=METHODS, metavar="NAME")
+    arguments = parser.parse_args()
+    out = arguments.out.absolute()
+    out.mkdir(parents=True, exist_ok=True)
+    store = Store(out / "rows.json")
+    methods = {n: (jaxevent.METHODS[n], jaxevent.METHODS[n].Params()) for n in arguments.methods}
+    for name in arguments.recordings:
+        recording = jaxevent.load(arguments.data / "data" / name)
+        assert recording.frames is not None
+        noise = noise_of(recording.frames)
+        for gap in GAPS:
+            given, hidden = held_out(recording, gap)
+            assert given.frames is not None
+            last = int(np.searchsorted(hidden.t, given.frames.t[-1]))
+            parts = {"between": np.arange(last), "after the last": np.arange(last, len(hidden))}
+            for where, rows in parts.items():
+                if len(rows):
+                    truth = hidden[evenly(rows, IMAGES)]
+                    one = functools.partial(score, given=given, truth=truth, noise=noise)
+                    key = {"recording": recording.name, "gap": gap, "frames": where}
+                    store.add(key, methods, one)
+    keys = ("recording", "frames", "gap", "method")
+    rows = store.means(keys, tuple(methods))
+    for row in rows:
+        same = [r for r in rows if all(r[k] == row[k] for k in keys[:-1])]
+        least = min((r["mse"] for r in same if r["method"] in INGREDIENTS), default=np.nan)
+        if row["method"] == "mc":
+            row["ratio"] = row["mse"] / least
+    text = markdown(rows, {key: key for key in keys}, COLUMNS)
+    (out / "table.md").write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
