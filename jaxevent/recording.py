@@ -8,7 +8,7 @@ means seconds, both on the recording's clock.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -74,6 +74,26 @@ class EventSource(Protocol):
 
     def index(self, time: int) -> int:
         """The number of events earlier than `time` (us)."""
+        ...
+
+
+class EventColumns(NamedTuple):
+    """Events as they are stored, for those who check order and places while they use them."""
+
+    t: NDArray[np.int64]  # us after `offset`
+    x: NDArray[np.uint16]
+    y: NDArray[np.uint16]
+    p: NDArray[np.uint8]  # 1 ON, 0 OFF
+    offset: int
+    previous: int  # t of the event before them; of the first, one that is not later
+
+
+@runtime_checkable
+class ColumnSource(EventSource, Protocol):
+    """Events that can be read without being checked."""
+
+    def columns(self, rows: slice, room: EventColumns | None = None) -> EventColumns | None:
+        """A range of rows, written over those of `room` if they fit; None where types differ."""
         ...
 
 

@@ -54,6 +54,7 @@ from jaxevent.io.hdf5_files import array, attribute, dataset, open_file
 from jaxevent.io.output import complete_hdf5
 from jaxevent.progress import bar
 from jaxevent.recording import (
+    EventColumns,
     Events,
     EventSource,
     Frames,
@@ -194,6 +195,29 @@ class StoredEvents:
             x, y, p = self._x[part], self._y[part], self._p[part]
         events = checked_events(t, x, y, p, self._size, self._source, first_row=start - lead)
         return events[lead:] if lead else events
+
+    def columns(self, rows: slice, room: EventColumns | None = None) -> EventColumns | None:
+        """See `recording.ColumnSource`."""
+        kinds = [getattr(c, "dtype", None) for c in (self._t, self._x, self._y, self._p)]
+        stored: list[Any] = [self._t, self._x, self._y, self._p]
+        if not all(isinstance(column, h5py.Dataset) for column in stored):
+            return None
+        if kinds not in ([t, np.uint16, np.uint16, np.uint8] for t in (np.int64, np.uint32)):
+            return None
+        start, stop, _ = rows.indices(len(self))
+        lead = min(start, 1)
+        count = max(stop - start, 0) + lead
+        if room is None or len(room.t) < count:
+            t, x, y, p = (np.empty(count + count // 4, kind) for kind in ("i8", "u2", "u2", "u1"))
+            room = EventColumns(t, x, y, p, 0, 0)
+        read = [column[:count] for column in (room.t, room.x, room.y, room.p)]
+        with reading(f"{self._source}: events"):
+            for column, values in zip(stored, read, strict=True):
+                if count:
+                    column.read_direct(values, np.s_[start - lead : start - lead + count])
+        previous = int(read[0][0]) if lead else np.iinfo(np.int64).min
+        t, x, y, p = (values[lead:] for values in read)
+        return EventColumns(t, x, y, p, self._offset, previous)
 
     def index(self, time: int) -> int:
         """The number of events earlier than `time` (us): a few small reads."""

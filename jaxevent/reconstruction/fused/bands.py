@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.kernels import compiled
+from jaxevent.reconstruction.fused.timeline import NEVER
+from jaxevent.recording import EventColumns
 
 # Room for pixels of a band and its border. A dozen numbers each fill half a megabyte, of a
 # second-level cache of one; each number begins a cache line further than a power of two.
@@ -28,70 +30,91 @@ class BandLayout:
             rows = stride // (width + 2) - 2
             if rows >= min(LEAST_ROWS, height):
                 break
-        if rows < 1:
+        if rows < min(3, height):  # a row borders on one other band at most
             return None
         number = -(-height // rows)
         return cls(stride, np.arange(number + 1) * height // number)
 
     def divide(
         self,
-        t: NDArray[np.int64],
-        x: NDArray[np.uint16],
-        y: NDArray[np.uint16],
-        p: NDArray[np.bool_],
+        stored: EventColumns,
         weight: NDArray,
         width: int,
         origin: int,
-    ) -> tuple[NDArray[np.int64], NDArray, NDArray[np.int64]]:
+        room: NDArray[np.int64],
+    ) -> tuple[NDArray[np.int64], NDArray, NDArray[np.int64]] | None:
         """Events band by band, in order of time, with their weights; where each band's begin.
 
         An event is one number: time, place in the band, polarity (`loop.Bands`). It is given to
-        every band that it lies in or borders on.
+        every band that it lies in or borders on. They are written into `room` if they fit. None:
+        the events are not in order or not on the sensor.
         """
+        counts = _count_bands(stored.y, self.edges)
+        if counts[0] < 0:
+            return None
         first = np.zeros(len(self.edges), np.int64)
-        np.cumsum(_count_bands(y, self.edges), out=first[1:])
-        events, weights = np.empty(first[-1], np.int64), np.empty(0, weight.dtype)
-        if len(weight):
-            weights = np.empty(first[-1], weight.dtype)
-        cursor = first[:-1].copy()
-        _divide(t, x, y, p, weight, self.edges, width + 2, origin, cursor, events, weights)
-        return events, weights, first
+        np.cumsum(counts, out=first[1:])
+        total = int(first[-1])
+        events = room if len(room) >= total else np.empty(total + total // 4, np.int64)
+        weights = np.empty(total if len(weight) else 0, weight.dtype)
+        good = _divide(
+            stored.t, stored.x, stored.y, stored.p, weight, self.edges, width,
+            origin - stored.offset, stored.previous, first, events, weights,
+        )  # fmt: skip
+        return (events, weights, first) if good else None
 
 
 @compiled
 def _count_bands(y, edges):
+    """How many events each band gets; the first number is -1 for a row outside the image."""
     bands, height = len(edges) - 1, edges[-1]
-    rows = np.zeros(height + 2, np.int64)
+    rows = np.zeros(65536 + 2, np.int64)
     for i in range(len(y)):
         rows[y[i] + 1] += 1
     counts = np.zeros(bands, np.int64)
     for band in range(bands):
-        counts[band] = rows[edges[band] : edges[band + 1] + 2].sum()
+        for row in range(edges[band], edges[band + 1] + 2):
+            counts[band] += rows[row]
+    for row in range(height + 1, len(rows)):
+        if rows[row] > 0:
+            counts[0] = -1
     return counts
 
 
 @compiled
-def _divide(t, x, y, p, weight, edges, padded, origin, cursor, events, weights):
-    bands, height = len(edges) - 1, edges[-1]
-    # Of each row: its band, and the bands above and below that it borders on; else -1.
-    member, base = np.full((3, height), -1), np.zeros((3, height), np.int64)
+def _divide(t, x, y, p, weight, edges, width, origin, previous, cursor, events, weights):
+    """Write each event to its band and to one that it borders on; whether all are valid."""
+    bands, height, padded = len(edges) - 1, edges[-1], width + 2
+    # Of each row its band and where it begins, and the same of a band above or below. Places are
+    # unsigned, as others are tried for being negative.
+    mine, beside = np.empty(height, np.uint64), np.full(height, bands, np.uint64)
+    base, aside = np.empty(height, np.int64), np.zeros(height, np.int64)
     for band in range(bands):
         top, bottom = edges[band], edges[band + 1]
         for row in range(max(top - 1, 0), min(bottom + 1, height)):
-            place = 1 if row < top else 2 if row >= bottom else 0
-            member[place, row] = band
-            base[place, row] = (row - top + 1) * padded + 1
-    inner = member[1] + member[2] == -2
-    weighted = len(weight) > 0
+            place = ((row - top + 1) * padded + 1) << 1
+            if top <= row < bottom:
+                mine[row], base[row] = band, place
+            else:
+                beside[row], aside[row] = band, place
+    at, weighted, bad = cursor.astype(np.uint64), len(weight) > 0, False
+    none, one = np.uint64(bands), np.uint64(1)
     for i in range(len(t)):
-        row = np.int64(y[i])
-        now = (t[i] - origin) << 17
-        low = np.int64(x[i]) << 1 | (1 if p[i] else 0)
-        for place in range(1 if inner[row] else 3):
-            band = member[place, row]
-            if band >= 0:
-                at = cursor[band]
-                cursor[band] = at + 1
-                events[at] = now | ((base[place, row] << 1) + low)
-                if weighted:
-                    weights[at] = weight[i]
+        row, column, up = y[i], np.int64(x[i]), np.int64(p[i])
+        bad |= (t[i] < previous) | (column >= width) | (up > 1)
+        previous = t[i]
+        event = ((t[i] - origin) << 17) + (column << 1 | up)
+        band = mine[row]
+        events[at[band]] = event + base[row]
+        if weighted:
+            weights[at[band]] = weight[i]
+        at[band] += one
+        band = beside[row]
+        if band != none:
+            events[at[band]] = event + aside[row]
+            if weighted:
+                weights[at[band]] = weight[i]
+            at[band] += one
+    if len(t) > 0:
+        bad |= (t[0] - origin < -NEVER) | (t[-1] - origin > NEVER)
+    return not bad

@@ -126,9 +126,7 @@ def _enter(band, stretch, now, given, cells, place):
     follows = frame == before + 1
     if follows and frame >= 2:
         for k in range(len(places.shifted)):
-            to, of = places.shifted[k, 0] * stride, places.shifted[k, 1] * stride
-            for z in range(stride):
-                cells[to + z] = cells[of + z]
+            copy(cells, places.shifted[k, 0] * stride, places.shifted[k, 1] * stride, stride)
     fresh = 0 if not follows else 3 if frame == 0 else 2
     counted = 0 if not follows else 2 if frame == 0 else 1
     for row in range(fresh, 3):
@@ -140,15 +138,13 @@ def _enter(band, stretch, now, given, cells, place):
                     frames.images, frames.tables, frames.values, frames.gain[k], kind, k,
                     bands.width, bands.edges[band], bands.edges[band + 1], cells, field * stride,
                 )  # fmt: skip
+            elif field >= 0 and rows > 0:
+                copy(cells, field * stride, places.image[kind, row - 1] * stride, stride)
             elif field >= 0:
-                of = places.image[kind, row - 1] * stride
-                for z in range(stride):
-                    none = 0.5 if kind < 2 else 0.0
-                    cells[field * stride + z] = cells[of + z] if rows > 0 else none
+                fill(cells, field * stride, stride, 0.5 if kind < 2 else 0.0)
         if len(places.total) > 0:
             for total in places.total[:, row]:
-                for z in range(total * stride, (total + 1) * stride):
-                    cells[z] = 0
+                fill(cells, total * stride, stride, 0.0)
             if row < rows:
                 sum_segments(
                     events, weights, a, b, lefts[k], mids[k], rights[k], given.functions.excess,
@@ -183,6 +179,23 @@ def _enter(band, stretch, now, given, cells, place):
     place[band, 2] = frame
 
 
+# Compilers take several numbers at once where no place can be negative: in parts from 0 on.
+@part
+def copy(cells, to, of, count):
+    """Copy some numbers from one place to another."""
+    out, given = cells[to : to + count], cells[of : of + count]
+    for z in range(len(out)):
+        out[z] = given[z]
+
+
+@part
+def fill(cells, at, count, value):
+    """Set some numbers to one value."""
+    out = cells[at : at + count]
+    for z in range(len(out)):
+        out[z] = value
+
+
 @part
 def edge_of(time):
     """Events earlier than this whole number of us are before the time."""
@@ -197,15 +210,21 @@ def _note(what, row, on, off, left, right):
 @part
 def load_image(images, tables, values, gain, kind, k, width, top, bottom, cells, at):
     """A frame's grey values, intensities or certainties, into a field of `cells`."""
-    by = gain if kind == 1 else gain / gain  # 1 of the same type
+    is_plain = kind != 1 or gain == 1  # divisions take longest
     for line in range(top, bottom):
         z, pixel = at + (line - top + 1) * (width + 2) + 1, line * width
+        out = cells[z : z + width]
         if len(values) == 0:
-            for column in range(width):
-                cells[z + column] = tables[kind, images[k, pixel + column]] / by
+            table, levels = tables[kind], images[k, pixel : pixel + width]
+            for column in range(len(out)):
+                out[column] = table[levels[column]]
         else:
-            for column in range(width):
-                cells[z + column] = values[kind, k, pixel + column] / by
+            given = values[kind, k, pixel : pixel + width]
+            for column in range(len(out)):
+                out[column] = given[column]
+        if not is_plain:
+            for column in range(len(out)):
+                out[column] /= gain
 
 
 @part
@@ -224,14 +243,14 @@ def find(events, begin, end, time):
 def count_events(events, weights, begin, end, left, right, cells, stride, what):
     """Count the events of every pixel with left <= t < right into the fields what[:2]."""
     on, off, weighted = what[0] * stride, what[1] * stride, len(weights) > 0
-    for z in range(stride):
-        cells[on + z] = 0
-        cells[off + z] = 0
-    i = find(events, begin, end, left)
-    while i < end and events[i] >> 17 < right:
-        z = ((events[i] >> 1) & 0xFFFF) + (on if events[i] & 1 else off)
+    fill(cells, on, stride, 0.0)
+    fill(cells, off, stride, 0.0)
+    for i in range(find(events, begin, end, left), end):
+        event = events[i]
+        if event >> 17 >= right:
+            break
+        z = np.uint64(((event >> 1) & 0xFFFF) + (on if event & 1 else off))
         cells[z] += weights[i] if weighted else 1
-        i += 1
 
 
 @part
@@ -281,7 +300,8 @@ def run(begin, end, given, memory, enter, times, until, images):
     events, starts, place, width = bands.events, line.start, memory.place, np.int64(bands.width)
     weighted, padded, pixels = np.int64(len(bands.weights) > 0), width + 2, images.mean.shape[1]
     size = np.int64(images.slopes.shape[2] * images.slopes.shape[3])
-    room = np.empty(max(given.places.room, given.places.factors * width), images.mean.dtype)
+    spare = max(given.places.room, (given.places.factors + 1) * width)
+    room = np.empty(spare, images.mean.dtype)
     for band in range(begin, end):
         cells, whole, last = memory.cells[band], memory.whole[band], memory.last[band]
         rows, i, s, row = (

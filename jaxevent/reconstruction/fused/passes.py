@@ -18,7 +18,7 @@ from jaxevent.reconstruction.fused.pixel import Directions
 from jaxevent.reconstruction.fused.timeline import NEVER, make_line
 from jaxevent.reconstruction.stream import Stream, StreamState, weigh
 from jaxevent.reconstruction.windows import WindowedRecording
-from jaxevent.recording import Recording
+from jaxevent.recording import ColumnSource, EventColumns, Recording
 
 FRAME_PIXELS = 1 << 26  # of a window's frames, as they are stored
 
@@ -56,6 +56,8 @@ class DividedRecording:
         layout = BandLayout.of(recording.width, recording.height)
         if layout is None:
             raise Untranslatable(f"a sensor {recording.width} pixels wide")
+        if recording.stop - recording.start >= NEVER:
+            raise Untranslatable("a recording of over a year")
         whole = max(len(recording.events), 1)
         self.recording, self.layout = recording, layout
         self.windows = WindowedRecording(
@@ -68,6 +70,9 @@ class DividedRecording:
         none = np.zeros((3, 1), self.dtype)
         self._tables = self.images.tables() if len(self.windows.clock) else none
         self._response = self.images.response()
+        # What windows are read and divided into, one after another.
+        self._stored: EventColumns | None = None
+        self._divided = np.empty(0, np.int64)
 
     @property
     def dtype(self) -> np.dtype:
@@ -120,19 +125,38 @@ class DividedRecording:
         return Window(start, stop, bands, line, self.frames(used), state)
 
     def divide(self, state: StreamState, context: int, finish: int) -> tuple[Bands, StreamState]:
-        """A range of rows of the events, divided among the bands; the state moved to its begin."""
-        windows, around = self.windows, self.recording.events[context:finish]
+        """A range of rows of the events, divided among the bands; the state moved to its begin.
+
+        Bands that were divided before are overwritten.
+        """
+        windows, source = self.windows, self.recording.events
         weight = np.empty(0, self.dtype)
+        if state.last_then is None and isinstance(source, ColumnSource):
+            stored = source.columns(slice(context, finish), self._stored)
+            self._stored = stored
+            bands = None if stored is None else self._bands_of(stored, weight)
+            if bands is not None:
+                return bands, state
+        around = source[context:finish]  # raises `InputError` for what is not valid
         if state.last_then is not None:
             state = windows.move_context(state, context)
             assert state.last_then is not None
             stream = Stream.of(around, self.recording.width)
             weight = weigh(stream, state.last_then.copy(), windows.dead).astype(self.dtype)
-        width = self.recording.width
-        events, weights, first = self.layout.divide(
-            around.t, around.x, around.y, around.p, weight, width, self.origin
+        least = np.iinfo(np.int64).min
+        checked = EventColumns(around.t, around.x, around.y, around.p.view(np.uint8), 0, least)
+        bands = self._bands_of(checked, weight)
+        assert bands is not None
+        return bands, state
+
+    def _bands_of(self, stored: EventColumns, weight: NDArray) -> Bands | None:
+        divided = self.layout.divide(
+            stored, weight, self.recording.width, self.origin, self._divided
         )
-        return Bands(events, weights, first, self.layout.edges, width), state
+        if divided is None:
+            return None
+        self._divided, weights, first = divided
+        return Bands(self._divided, weights, first, self.layout.edges, self.recording.width)
 
     def frames(self, used: slice) -> FrameRows:
         clock, frames = self.windows.clock, self.recording.frames

@@ -22,11 +22,11 @@ from jaxevent.reconstruction.fused.frame_loop import (
 )
 from jaxevent.reconstruction.fused.frame_passes import FramePasses, Stretch
 from jaxevent.reconstruction.fused.passes import DividedRecording
+from jaxevent.reconstruction.fused.room import ImageRoom
 from jaxevent.reconstruction.fused.smoothing import LATER, LINK, STATE, SmoothingMethod
 from jaxevent.reconstruction.video import ImageSequence, P
 from jaxevent.recording import Recording
 
-IMAGE_PIXELS = 1 << 22  # made in one pass, 9 bytes each
 STRETCH_EVENTS = 1 << 22  # 8 bytes each
 KEPT_PIXELS = 3_000_000  # of a stretch's frames, 24 bytes each
 
@@ -70,6 +70,7 @@ class SmoothedVideo(ImageSequence[P]):
         self._stretches = stretches_of(self._passes.clock, recording, window_events)
         most = max(stretch.end - stretch.begin for stretch in self._stretches)
         self._memory = self._passes.memory(self._passes.bands, most)
+        self._room = ImageRoom(divided.windows.pixels, self.dtype)
         self._field("given")[:] = self._passes.shares
         self._context = divided.windows.initial()
         self._states: list[NDArray] = []  # before each stretch
@@ -85,18 +86,20 @@ class SmoothedVideo(ImageSequence[P]):
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         passes, done = self._passes, 0
-        pixels, origin = passes.divided.windows.pixels, passes.divided.origin
-        room, frame = max(1, IMAGE_PIXELS // pixels), passes.frame_before(times - origin)
+        room, origin = self._room, passes.divided.origin
+        frame = passes.frame_before(times - origin)
         begins = [stretch.begin for stretch in self._stretches]
         while done < len(times):
             place = max(int(np.searchsorted(begins, frame[done], "right")) - 1, 0)
             last = place == len(begins) - 1
             end = len(times) if last else int(np.searchsorted(frame, self._stretches[place].end))
-            batch = times[done : min(end, done + room)]
-            given, images = self._opened(place), passes.room(len(batch))
+            batch = times[done : min(end, done + room.times)]
+            given, images = self._opened(place), room.take(len(batch))
             instants = passes.instants(batch - origin, begins[place])
             self._over_bands(read_images, given, self._memory, instants, images)
-            yield batch, Estimate(images.mean, images.variance, images.valid.view(bool))
+            made = Estimate(images.mean, images.variance, images.valid.view(bool))
+            del images
+            yield batch, made
             done += len(batch)
 
     def _over_bands(self, loop: Any, *args: Any) -> None:

@@ -14,12 +14,13 @@ from jaxevent.estimator import Estimate
 from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.fused.passes import DividedRecording, Held, Passes, Window
+from jaxevent.reconstruction.fused.room import ImageRoom
 from jaxevent.reconstruction.fused.timeline import NEVER
 from jaxevent.reconstruction.stream import StreamState
-from jaxevent.reconstruction.video import BEGINS, WINDOW_EVENTS, ImageSequence, P
+from jaxevent.reconstruction.video import BEGINS, ImageSequence, P
 from jaxevent.recording import Recording
 
-IMAGE_PIXELS = 1 << 22  # made in one pass, 9 bytes each
+WINDOW_EVENTS = 1 << 21  # 8 bytes each, and 13 where they are read from a file
 
 
 class Begin(NamedTuple):
@@ -56,6 +57,7 @@ class FusedVideo(ImageSequence[P]):
         # Divided for the parameters' own clock: the lag is exactly 0.
         kernel = self._divided.kernel(estimator, params, params.clock_offset)
         self._passes = Passes(kernel, self._divided.layout, self.dtype)
+        self._room = ImageRoom(self._divided.windows.pixels, self.dtype)
         self._begins = [Begin(None, self._divided.windows.initial(), None)]
         self._open: Window | None = None
         self._done = -NEVER  # the time up to which the open window is passed over
@@ -65,20 +67,21 @@ class FusedVideo(ImageSequence[P]):
         return self._divided.dtype
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
-        pixels = self._divided.windows.pixels
-        room, done, origin = max(1, IMAGE_PIXELS // pixels), 0, self._divided.origin
+        room, done, origin = self._room, 0, self._divided.origin
         while done < len(times):
             window = self._window_of(int(times[done]))
             end = len(times)
             if window.stop is not None:
                 end = int(np.searchsorted(times, window.stop))
-            batch = times[done : min(end, done + room)]
-            images = self._passes.room(len(batch), pixels)
+            batch = times[done : min(end, done + room.times)]
+            images = room.take(len(batch))
             last = int(batch[-1]) - origin
             self._passes.run(window, last + 1, batch - origin, images)
             self._done = last
             done += len(batch)
-            yield batch, Estimate(images.mean, images.variance, images.valid.view(bool))
+            made = Estimate(images.mean, images.variance, images.valid.view(bool))
+            del images
+            yield batch, made
 
     def _window_of(self, time: int) -> Window:
         """The open window that contains `time`, not passed over beyond it."""
