@@ -15,10 +15,32 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from jaxevent import cli
+import jaxevent
+from jaxevent import cli, events
 
+PACKAGED = "data/slider_depth_crop.h5"
 BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 SHOWN = ("shell", "text", "toml")
+
+
+def shortened(text: str, path: Path) -> str:
+    """The page about a sixth of the packaged recording, written to a file, and of shorter scenes.
+
+    What is absolute replaces all before it: `files("jaxevent") / "/..."`.
+    """
+    whole = jaxevent.load(Path(jaxevent.__file__).parent / PACKAGED)
+    jaxevent.save(events.crop(whole[0.6:1.0], 40, 30, 160, 120), path)
+    assert f'"{PACKAGED}"' in text
+    text = re.sub(r"^export crop=.*$", f"export crop=$(echo {path})", text, flags=re.MULTILINE)
+    for long, short in (
+        (f'"{PACKAGED}"', f'"{path}"'),
+        ("--duration 0.1", "--duration 0.04"),
+        ("--duration 0.3", "--duration 0.2"),
+        ("dot[:0.1]", "dot[:0.06]"),
+        ("duration=0.3", "duration=0.26"),
+    ):
+        text = text.replace(long, short)
+    return text
 
 
 def run_page(text: str) -> dict[str, Any]:

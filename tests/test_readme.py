@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from commands import decoded
-from pages import run_page
+from pages import run_page, shortened
 from PIL import Image
 
 from jaxevent.methods import names
@@ -21,9 +21,10 @@ def test_examples_run_in_order(tmp_path, monkeypatch, capsys, float32):
     pytest.importorskip("matplotlib").use("Agg")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "environ", os.environ.copy())
-    scope = run_page(README)
+    monkeypatch.setattr("jaxevent.runs.demo.RECORDING", tmp_path / "short.h5")
+    scope = run_page(shortened(README, tmp_path / "short.h5"))
     recording = scope["recording"]
-    assert scope["image"].shape == (len(recording.frames), 180, 240)
+    assert scope["image"].shape == (len(recording.frames), 120, 160)
     assert scope["gradient"].raw["c_on"] != 0
     for name in ("jaxevent-demo", "slider.mp4", "dot", "moved", "fitted/params.toml"):
         assert (tmp_path / name).exists()
@@ -45,8 +46,8 @@ def check_demo(out: Path, said: str) -> None:
     assert by_hand < errors["akf"] < errors["cf"] < errors["last-frame"]
     with Image.open(out / "comparison.png") as figure:
         assert figure.width > 1000
-    images, about = decoded(out / "video.mp4", 360, 480)
-    assert len(images) == 180 and " 30 fps" in about
+    images, about = decoded(out / "video.mp4", 240, 320)
+    assert len(images) == 80 and " 30 fps" in about
 
 
 def test_the_fit_sees_no_frame_that_the_filter_was_given():

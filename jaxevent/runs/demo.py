@@ -16,6 +16,7 @@ from jaxevent.runs.scores import score
 from jaxevent.show.export import evenly, shown
 from jaxevent.show.report import Kind, comparison_figure, markdown_table, video_writer
 
+RECORDING = resources.files("jaxevent") / "data/slider_depth_crop.h5"
 # The thresholds of the demo's sensor, and the lag of its frames' clock, set by hand.
 BY_HAND = {"c_on": 0.083, "c_off": 0.059, "clock_offset": 0.0075}
 
@@ -31,7 +32,7 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
     False.
     """
     check_folder(out, FILES, replace=replace)
-    with resources.as_file(resources.files("jaxevent") / "data/slider_depth_crop.h5") as path:
+    with resources.as_file(RECORDING) as path:
         recording = load(path)
     by_hand = {name: find(name).Params.of(BY_HAND) for name in ("akf", "augmented")}
     runs: list[tuple[str, Any, Any]] = [

@@ -8,7 +8,8 @@ import numpy as np
 import oracles
 import own_filter
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from noise import small
 from test_own_filter import by_hand
@@ -57,7 +58,7 @@ def check(name, recording, values, **options):
 
 
 @pytest.mark.slow
-@settings(max_examples=8)
+@examples(4)
 @given(recording=recordings(fewest_frames=1), events=st.sampled_from([7, 1000]))
 def test_kernel_of_edi_equals_loop_over_events(recording, events):
     check("edi", recording, ALL, window_events=events)
@@ -65,7 +66,7 @@ def test_kernel_of_edi_equals_loop_over_events(recording, events):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["akf", "cf", "cf-augmented", "high-pass", "augmented"])
-@settings(max_examples=10)
+@examples(6)
 @given(
     recording=recordings(fewest_frames=1),
     values=st.sampled_from([PARAMS, DEAD, ALL]),
@@ -76,7 +77,7 @@ def test_kernel_equals_loop_over_events(name, recording, values, events):
 
 
 @pytest.mark.slow
-@settings(max_examples=25)
+@examples(9)
 @given(
     recording=recordings(fewest_frames=1),
     values=st.sampled_from([PARAMS, DEAD, {**ALL, "spread": 0.0}]),
@@ -118,7 +119,7 @@ def test_smoothers_of_one_kernel_equal_the_scan(monkeypatch):
 
 
 @pytest.mark.slow
-@settings(max_examples=6)
+@examples(3)
 @given(recording=recordings())
 def test_kernel_without_frames(recording):
     recording = dataclasses.replace(recording, frames=None)

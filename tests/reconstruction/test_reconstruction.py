@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from noise import small
 
@@ -118,7 +119,7 @@ METHODS = [
 
 
 @pytest.mark.parametrize("name", METHODS)
-@settings(max_examples=20)
+@examples(8)
 @given(
     recording=recordings(),
     offset=st.sampled_from([0.0, 0.0007, -0.0021]),
@@ -144,6 +145,7 @@ def test_chain_equals_loop_over_events(name, recording, offset, values):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["akf", "cf"])
+@examples(8)
 @given(recording=recordings())
 def test_float32_chain(name, recording):
     method = jaxevent.METHODS[name]
@@ -185,7 +187,7 @@ def whole_at(images, i):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["akf", "aks", "cf", "edi"])
-@settings(max_examples=15)  # each window takes 30 ms, however short it is
+@examples(6)  # each window takes 30 ms, however short it is
 @given(recording=recordings(fewest_frames=1, most=24), events=st.sampled_from([1, 5, 13]))
 def test_windows_do_not_change_the_result(name, recording, events):
     method = jaxevent.METHODS[name]
@@ -245,7 +247,7 @@ def test_many_frames_and_uneven_pixels_in_windows():
 
 
 @pytest.mark.slow
-@settings(max_examples=10)
+@examples(4)
 @given(recording=recordings())
 def test_reading_more_times_changes_nothing(recording):
     params = params_of(jaxevent.akf, **PARAMS)
@@ -259,7 +261,7 @@ def test_reading_more_times_changes_nothing(recording):
 
 
 @pytest.mark.slow
-@settings(max_examples=10)
+@examples(4)
 @given(recording=recordings())
 def test_later_clock_changes_nothing(recording):
     shift = 10**9
@@ -278,7 +280,7 @@ def test_later_clock_changes_nothing(recording):
 
 
 @pytest.mark.slow
-@settings(max_examples=10)
+@examples(4)
 @given(recording=recordings(fewest_frames=1))
 def test_order_of_pixels_changes_nothing(recording):
     """Mirrored in x and y, the neighbourhoods stay and every pixel gets another number."""
@@ -596,7 +598,7 @@ LIKELIHOOD = jax.jit(jaxevent.aks.log_likelihood)
 
 
 @pytest.mark.slow
-@settings(max_examples=15)
+@examples(6)
 @given(recording=recordings(fewest_frames=1), one_sided=st.booleans())
 def test_likelihood_equals_that_of_measurements_one_by_one(recording, one_sided):
     params = params_of(jaxevent.aks, **{**OPTIONS, "one_sided": one_sided})
