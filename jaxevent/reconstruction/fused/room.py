@@ -24,7 +24,7 @@ class ImageRoom:
 
     def take(self, times: int) -> Images:
         """Room for some images, which their holder alone reads from then on."""
-        free = [arrays for arrays in self._sets if not _held(arrays)]
+        free = [arrays for arrays in self._sets if _references(arrays) == _ALONE]
         if free:
             arrays = free[0]
         else:
@@ -35,6 +35,10 @@ class ImageRoom:
         return Images(mean, variance, valid, np.empty((times, self._pixels, 0, 0), self._dtype))
 
 
-def _held(arrays: tuple[NDArray, ...]) -> bool:
-    """Whether somebody has one of the arrays or a part of it, beside the tuple."""
-    return any(sys.getrefcount(array) > 3 for array in arrays)  # tuple, `array`, the argument
+def _references(arrays: tuple[NDArray, ...]) -> int:
+    """How many references there are to the arrays; each part of one that somebody has is one."""
+    return sum(sys.getrefcount(array) for array in arrays)
+
+
+# To arrays that nobody else has. Versions of Python count their own references differently.
+_ALONE = _references((np.empty(1), np.empty(1), np.empty(1)))
