@@ -388,6 +388,8 @@ def _stored(number: Number, value: Any, dtype: Any = None) -> Array:
     """What is stored of a value, which is checked unless it is an array."""
     if not isinstance(value, Array):
         number.check(value)
+        # By NumPy, as JAX compiles a conversion.
+        value = np.asarray(value, jnp.result_type(float) if dtype is None else dtype)
     value = jnp.asarray(value, jnp.result_type(float) if dtype is None else dtype)
     return number.unconstrained(value)
 

@@ -7,6 +7,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 from numpy.typing import NDArray
@@ -134,6 +135,14 @@ def run(closed: Any, values: list[NDArray]) -> list[NDArray]:
         made = evaluate(eqn, [of(a) for a in eqn.invars])
         known |= dict(zip(eqn.outvars, made, strict=True))
     return [of(a) for a in closed.jaxpr.outvars]
+
+
+def evaluated(function: Callable[..., Any], *arrays: NDArray) -> NDArray:
+    """What a function makes of arrays, one array; traced by JAX, and not compiled."""
+    closed = jax.make_jaxpr(function)(*arrays)
+    given = [np.asarray(a, v.aval.dtype) for a, v in zip(arrays, closed.jaxpr.invars, strict=True)]
+    (made,) = run(closed, given)
+    return made
 
 
 def _scan(eqn: Any, values: list[NDArray]) -> list[NDArray]:

@@ -22,7 +22,10 @@ import numba
 from numba.core import sigutils
 from numba.core.caching import FunctionCache, NullCache
 from numba.core.ccallback import CFunc
+from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
+from numba.cpython import hashing  # noqa: F401  (its symbols: loaded code may refer to them)
+from numba.experimental import function_type  # noqa: F401  (the type of kernels as arguments)
 
 _HASH = 32  # bytes at the beginning of a file
 
@@ -63,6 +66,12 @@ class _Cache(FunctionCache):
     def save_overload(self, sig: Any, data: Any) -> None:
         with contextlib.suppress(OSError):
             super().save_overload(sig, data)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """As numba's, but without what only compiling needs: imports that take half a second."""
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
 
 
 def source_of(function: Callable) -> str:

@@ -1,10 +1,10 @@
 """Features of the frames in a window, and the event counts that tie them together."""
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.kernels import compiled
+from jaxevent.kernels.host import evaluated
 from jaxevent.reconstruction.clock import Clock, rates
 from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Segments
 from jaxevent.reconstruction.memory import aligned
@@ -22,7 +22,7 @@ class FrameImages:
 
     def response(self) -> NDArray:
         """Intensities of 256 evenly spaced grey values."""
-        return np.asarray(self._tables[1](jnp.linspace(0, 1, 256)), self.dtype)
+        return evaluated(self._tables[1], np.linspace(0, 1, 256)).astype(self.dtype)
 
     def tables(self) -> NDArray:
         """Grey values, intensities and certainties of the levels that whole numbers stand for."""
@@ -33,7 +33,7 @@ class FrameImages:
 
     def values(self, images: NDArray) -> NDArray:
         """Grey values, intensities and certainties [3, ...] of images in [0, 1]."""
-        made = [np.asarray(table(jnp.asarray(images)), self.dtype) for table in self._tables]
+        made = [evaluated(table, images).astype(self.dtype) for table in self._tables]
         return np.stack(made)
 
     def read(self, used: slice, room: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
