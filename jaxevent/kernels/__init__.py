@@ -3,11 +3,14 @@
 import functools
 import inspect
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numba
+import numpy as np
+from numpy.typing import NDArray
 
 from jaxevent.kernels import kept
 
@@ -34,6 +37,23 @@ def fast(function: Callable) -> Any:
 def fast_part(function: Callable) -> Any:
     """The same for what such functions alone call."""
     return numba.njit(nogil=True, **_LOOSE)(inspect.unwrap(function))
+
+
+class Blank:
+    """Arrays of zeros that functions fill and make 0 again: one of each shape for each thread.
+
+    To lay out a new one takes longer than a few events of a large image.
+    """
+
+    def __init__(self, dtype: Any):
+        self.dtype, self._of = dtype, threading.local()
+
+    def __call__(self, *shape: int) -> NDArray:
+        """The array of a shape."""
+        known = self._of.__dict__
+        if shape not in known:
+            known[shape] = np.zeros(shape, self.dtype)
+        return known[shape]
 
 
 THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

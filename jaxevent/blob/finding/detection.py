@@ -7,9 +7,12 @@ from numpy.typing import NDArray
 
 from jaxevent.blob.finding.background import CELL, Background, evidence, look_up
 from jaxevent.blob.finding.stream import Part
-from jaxevent.kernels import compiled
+from jaxevent.kernels import Blank, compiled
+from jaxevent.kernels import part as kernel_part
 
+_cells = Blank(np.int32)
 FALSE_ALARMS = 0.1  # per recording
+MOST_FEW = 1000  # events that are looked at wherever they are
 CONTACT = 2.0  # what is nearer than this many times the sum of both sizes touches
 
 
@@ -44,67 +47,89 @@ def detect(
     """
     g = scale.cell
     rows, columns = -(-size[0] // g), -(-size[1] // g)
-    place, filled, around = _count(part.x, part.y, g, rows, columns)
-    y, x = np.divmod(filled, columns)
-    middle = x * g + g // 2, y * g + g // 2
-    mu = background.at(*middle, t, 3 * g) * scale.window * 9 * g * g
+    usual = scale.window * 9 * g * g
     tests = rows * columns * background.duration / scale.window
-    hit = evidence(around, mu, scale.dispersion_at(*background.place(*middle, t))) > np.log(
-        tests / FALSE_ALARMS
-    )
-    return _label(place, filled[hit], rows, columns)
+    enough = np.log(tests / FALSE_ALARMS)
+    # Fewer events are no evidence even where the background is darkest.
+    few = np.arange(MOST_FEW)
+    darkest = background.rate.min() * background.activity[background.slice(t)] * usual
+    few = int(np.argmin(evidence(few, darkest, scale.dispersion.min()) <= enough)) or MOST_FEW
+    cells = _cells(rows + 2, columns + 2)
+    across, down = (np.arange(n, dtype=np.int32) // g + 1 for n in size[::-1])
+    place, many, around = _count(part.x, part.y, across, down, few, cells)
+    y, x = np.divmod(many, columns + 2)
+    middle = (x - 1) * g + g // 2, (y - 1) * g + g // 2
+    mu = background.at(*middle, t, 3 * g) * usual
+    hit = evidence(around, mu, scale.dispersion_at(*background.place(*middle, t))) > enough
+    return _label(place, many[hit], cells)
 
 
-# Windows hold far fewer events than there are cells: only those that are not empty are touched.
+# Windows hold far fewer events than there are cells: only those that are not empty are touched, and
+# made 0 again. Around all of them is a border of one cell.
 
 
 @compiled
-def _count(x: Any, y: Any, g: int, rows: int, columns: int) -> Any:
-    """The cell of each event, the cells that are not empty, and the events in their 3x3."""
-    n, place = np.zeros((rows + 2, columns + 2), np.int32), np.empty(len(x), np.int64)
+def _count(x: Any, y: Any, across: Any, down: Any, few: int, cells: Any) -> Any:
+    """The cell of each event, the cells whose 3x3 hold at least `few` events, and how many."""
+    n, wide, place = cells.ravel(), cells.shape[1], np.empty(len(x), np.int64)
     filled, number = np.empty(len(x), np.int64), 0
     for i in range(len(x)):
-        row, column = np.int64(y[i]) // g, np.int64(x[i]) // g
-        place[i] = row * columns + column
-        if n[row + 1, column + 1] == 0:
-            filled[number] = place[i]
+        cell = np.int64(down[y[i]]) * wide + across[x[i]]
+        place[i] = cell
+        if n[cell] == 0:
+            filled[number] = cell
             number += 1
-        n[row + 1, column + 1] += 1
-    filled = np.sort(filled[:number])
-    around = np.zeros(number, np.int64)
+        n[cell] += 1
+    many, count = np.empty(number, np.int64), 0
     for k in range(number):
-        row, column = filled[k] // columns, filled[k] % columns
-        for down in range(3):
-            for right in range(3):
-                around[k] += n[row + down, column + right]
-    return place, filled, around
+        if _sum_around(n, filled[k], wide) >= few:
+            many[count] = filled[k]
+            count += 1
+    many = np.sort(many[:count])
+    around = np.empty(count, np.int64)
+    for k in range(count):
+        around[k] = _sum_around(n, many[k], wide)
+    for k in range(number):
+        n[filled[k]] = 0
+    return place, many, around
+
+
+@kernel_part
+def _sum_around(n: Any, cell: int, wide: int) -> Any:
+    total = 0
+    for row in (cell - wide, cell, cell + wide):
+        total += n[row - 1] + n[row] + n[row + 1]
+    return total
 
 
 @compiled
-def _label(place: Any, hit: Any, rows: int, columns: int) -> Any:
+def _label(place: Any, hit: Any, cells: Any) -> Any:
     """The blob of each event, and how many there are: neighbours, also across corners."""
-    labels, waiting = np.zeros((rows + 2, columns + 2), np.int32), np.empty(len(hit), np.int64)
+    labels, wide, waiting = cells.ravel(), cells.shape[1], np.empty(len(hit), np.int64)
     for cell in hit:
-        labels[cell // columns + 1, cell % columns + 1] = -1
+        labels[cell] = -1
     number = 0
     for cell in hit:
-        if labels[cell // columns + 1, cell % columns + 1] > 0:
+        if labels[cell] > 0:
             continue
         number += 1
-        labels[cell // columns + 1, cell % columns + 1] = number
+        labels[cell] = number
         waiting[0], count = cell, 1
         while count > 0:
             count -= 1
-            row, column = waiting[count] // columns, waiting[count] % columns
-            for down in range(3):
-                for right in range(3):
-                    if labels[row + down, column + right] == -1:
-                        labels[row + down, column + right] = number
-                        waiting[count] = (row + down - 1) * columns + column + right - 1
+            middle = waiting[count]
+            for row in (middle - wide, middle, middle + wide):
+                for near in range(row - 1, row + 2):
+                    if labels[near] == -1:
+                        labels[near] = number
+                        waiting[count] = near
                         count += 1
     of_event = np.zeros(len(place), np.int32)
-    for i in range(len(place)):
-        of_event[i] = labels[place[i] // columns + 1, place[i] % columns + 1]
+    if number:
+        for i in range(len(place)):
+            of_event[i] = labels[place[i]]
+    for cell in hit:
+        labels[cell] = 0
     return of_event, number
 
 

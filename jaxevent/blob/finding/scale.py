@@ -20,8 +20,9 @@ from scipy.sparse.csgraph import connected_components
 from jaxevent.blob.finding.background import Background, measure_dispersion
 from jaxevent.blob.finding.detection import CONTACT, Blobs, Scale, detect, measure_blobs, touching
 from jaxevent.blob.finding.stream import Part, Stream
-from jaxevent.kernels import compiled
+from jaxevent.kernels import Blank, compiled
 
+_bins = Blank(np.int32)
 WINDOWS = 500 * 2 ** np.arange(12)  # us
 CELLS = (2, 4, 8, 16)  # px
 LEAST_WINDOWS = 8  # in a recording
@@ -167,7 +168,10 @@ def _predict(
     places = second.x[drawn] + moved[:, 0], second.y[drawn] + moved[:, 1]
     density = np.empty((len(x), 1 + len(WIDTHS)))
     density[:, 0] = _intensity(x, y, last.n, p, S)
-    density[:, 1:] = _smooth(x, y, *places, size, WIDTHS, BINS)
+    for i, (r, g) in enumerate(zip(WIDTHS, BINS, strict=True)):
+        reach = int(r / g + 0.5)
+        bins = _bins(*(n // g + 2 * reach + 1 for n in size))
+        density[:, 1 + i] = _smooth(x, y, *places, r, g, reach, bins)
     large = last.n >= 3
     # By ellipses: pieces along an outline touch each other, both of its sides do not.
     p, C = last.p[large], last.C[large]
@@ -225,30 +229,29 @@ def _intensity(x: NDArray, y: NDArray, n: NDArray, p: NDArray, S: NDArray) -> ND
 
 
 @compiled
-def _smooth(x: Any, y: Any, px: Any, py: Any, size: Any, radii: Any, bins: Any) -> Any:
-    """Kernels of radii r, 3 / (pi r^2) (1 - d^2 / r^2)^2, about places, summed at pixels.
+def _smooth(x: Any, y: Any, px: Any, py: Any, r: Any, g: Any, reach: int, counts: Any) -> Any:
+    """Kernels of radius r, 3 / (pi r^2) (1 - d^2 / r^2)^2, about places, summed at pixels.
 
-    Places are counted in bins (px, one width for each radius) and lie in their middles.
+    Places are counted in bins of g px, `counts`, and lie in their middles.
     """
-    out = np.zeros((len(x), len(radii)))
-    for i in range(len(radii)):
-        r, g = radii[i], bins[i]
-        reach = int(r / g + 0.5)
-        rows, columns = size[0] // g + 2 * reach + 1, size[1] // g + 2 * reach + 1
-        counts = np.zeros((rows, columns), np.int32)
-        for k in range(len(px)):
-            row, column = int(py[k] / g + reach), int(px[k] / g + reach)
-            if 0 <= row < rows and 0 <= column < columns:
-                counts[row, column] += 1
-        for j in range(len(x)):
-            row, column = y[j] // g + reach, x[j] // g + reach
-            total = 0.0
-            for a in range(row - reach, row + reach + 1):
-                for b in range(column - reach, column + reach + 1):
-                    if counts[a, b] > 0:
-                        dy, dx = (a - reach + 0.5) * g - y[j], (b - reach + 0.5) * g - x[j]
-                        u = 1 - (dx * dx + dy * dy) / (r * r)
-                        if u > 0:
-                            total += counts[a, b] * u * u
-            out[j, i] = 3 / (np.pi * r * r) * total
+    out, (rows, columns) = np.zeros(len(x)), counts.shape
+    for k in range(len(px)):
+        row, column = int(py[k] / g + reach), int(px[k] / g + reach)
+        if 0 <= row < rows and 0 <= column < columns:
+            counts[row, column] += 1
+    for j in range(len(x)):
+        row, column = y[j] // g + reach, x[j] // g + reach
+        total = 0.0
+        for a in range(row - reach, row + reach + 1):
+            for b in range(column - reach, column + reach + 1):
+                if counts[a, b] > 0:
+                    dy, dx = (a - reach + 0.5) * g - y[j], (b - reach + 0.5) * g - x[j]
+                    u = 1 - (dx * dx + dy * dy) / (r * r)
+                    if u > 0:
+                        total += counts[a, b] * u * u
+        out[j] = 3 / (np.pi * r * r) * total
+    for k in range(len(px)):
+        row, column = int(py[k] / g + reach), int(px[k] / g + reach)
+        if 0 <= row < rows and 0 <= column < columns:
+            counts[row, column] = 0
     return out

@@ -1,12 +1,13 @@
 """The events that the search for targets looks at, window by window."""
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob.finding.paths import NOBODY, Path, candidates, join
+from jaxevent.kernels import compiled
 from jaxevent.recording import Recording
 
 BATCH = 1 << 20  # events read at a time
@@ -79,8 +80,17 @@ class Stream:
 
     def _rows(self, first: int, last: int) -> Part:
         events = self.recording.events[first:last]
-        kept = ~self.hot[events.y, events.x]
-        if self._kept is not None:
-            kept &= self._kept[first - self._first : last - self._first]
-        t = np.asarray((events.t[kept] - self.start) * 1e-6, np.float64)
-        return Part(t, events.x[kept].astype(np.int64), events.y[kept].astype(np.int64))
+        kept = None if self._kept is None else self._kept[first - self._first : last - self._first]
+        return Part(*_keep(events.t, events.x, events.y, self.start, self.hot, kept))
+
+
+@compiled
+def _keep(t: Any, x: Any, y: Any, start: int, hot: Any, kept: Any) -> Any:
+    """Times (s), x and y of the events that are not left out."""
+    out_t, out_x, out_y = np.empty(len(t)), np.empty(len(t), np.int64), np.empty(len(t), np.int64)
+    n = 0
+    for i in range(len(t)):
+        if (kept is None or kept[i]) and not hot[y[i], x[i]]:
+            out_t[n], out_x[n], out_y[n] = (t[i] - start) * 1e-6, x[i], y[i]
+            n += 1
+    return out_t[:n], out_x[:n], out_y[:n]
