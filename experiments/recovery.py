@@ -102,14 +102,16 @@ def by_frames(recording: Recording, start: Any, names: list[str], search: Any, i
 Recovered = tuple[dict[str, float], Findings]
 
 
-def model_recovery(seed: int, more: dict[str, float] | None = None) -> Recovered:
+def model_recovery(
+    seed: int, more: dict[str, float] | None = None, size: tuple[int, int] = (40, 32)
+) -> Recovered:
     """Of the smoother, from a start that is wrong by a factor of 2 or so."""
     true = {**TRUE, **(more or {})}
     start = jaxevent.aks.Params(
         c_on=0.2, c_off=0.2, I0=0.2, sigma_event=0.3, sigma_bg=0.4, sigma_frame=0.03,
         sigma_floor=1e-4, w_min=1.0, share=0.0,
     )  # fmt: skip
-    return true, by_frames(from_model(true, seed), start, list(true), None, 100)
+    return true, by_frames(from_model(true, seed, size), start, list(true), None, 100)
 
 
 AKF = {"c_on": 0.12, "c_off": 0.09, "sigma_proc": 0.3, "sigma_iso": 0.6, "sigma_ref": 0.04}
@@ -154,13 +156,13 @@ def from_akf(seed: int, size: tuple[int, int] = (64, 48)) -> Recording:
     return Recording("akf", width, height, events, frames, extra=extra).check()
 
 
-def akf_recovery(seed: int, size: tuple[int, int] = (64, 48)) -> Recovered:
+def akf_recovery(seed: int) -> Recovered:
     """Of the AKF, by the likelihood of an image at the end; frames tell nothing but the start."""
     start = jaxevent.akf.Params(
         c_on=0.2, c_off=0.2, sigma_proc=0.1, sigma_iso=0.2, sigma_ref=0.1, rho=RHO, I0=I0, P0=P0,
         kappa=1e-9, calibrate=False, deblur=False,
     )  # fmt: skip
-    drawn = parts(from_akf(seed, size), "reference")
+    drawn = parts(from_akf(seed), "reference")
     problem = Problem(Objective(jaxevent.akf, "nll", False), drawn)
     settings = Settings(iterations=80, learning_rate=0.1, rounds=2)
     return AKF, found_by(problem.objective, start, list(AKF), problem, settings)

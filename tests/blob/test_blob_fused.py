@@ -46,8 +46,10 @@ CASES = {
         "events_per_step": 6, "association": "nearest", "gate_shape": "circle",
     },
     "moving_moments": {"events_per_step": 6},
-    "batches": {"events_per_step": 8, "tau_q": 0.01, "t_still": 1e-3},
-    "clutter": {"events_per_step": 5, "clutter": 1e-3, "polarity_offset": True},
+    "options": {
+        "events_per_step": 5, "tau_q": 0.01, "t_still": 1e-3, "clutter": 1e-3,
+        "polarity_offset": True,
+    },
 }  # fmt: skip
 
 

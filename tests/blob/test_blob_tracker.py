@@ -161,7 +161,8 @@ NEAREST = {"association": "nearest", "gate_shape": "circle", "events_per_step": 
     "setting", [{}, NEAREST, {"clutter": 1e-3, "gate_min": 2.0, "gate_decay": 20.0}]
 )
 def test_equals_a_plain_loop(pair, setting):
-    rec, seeds = pair
+    rec = pair[0][0.03:0.09]  # they pass at 60 ms
+    seeds = [(*line(60, 80, 900)(0.03), 8.0), (*line(168, 92, -900)(0.03), 8.0)]
     params = Params(**setting)
     ids, weights, _, at = oracle(rec, params, seeds)
     assert (ids == -1).sum() > 20
@@ -172,8 +173,8 @@ def test_equals_a_plain_loop(pair, setting):
     assert np.array_equal(np.concatenate([e.id for e in told]), ids)
     np.testing.assert_allclose(np.concatenate([e.weight for e in told]), weights, atol=1e-9)
     assert np.array_equal(np.concatenate([e.row for e in told]), np.arange(len(rec.events)))
-    part = np.concatenate([e.row for e in tracks.events(0.02, 0.021)])
-    assert np.array_equal(part, np.arange(*map(rec.events.index, (20_000, 21_000))))
+    part = np.concatenate([e.row for e in tracks.events(0.05, 0.052)])
+    assert np.array_equal(part, np.arange(*map(rec.events.index, (50_000, 52_000))))
     times = np.array([rec.start, rec.start + 3001, 61_234, int(rec.events.t[200]), rec.stop])
     states = tracks(times)
     assert states.valid.all()
@@ -282,16 +283,15 @@ def test_life_cycle():
 
 @pytest.mark.slow
 def test_pause_and_crossing():
-    """50 and 100 ms without events at 600 px/s, and a head-on crossing at 1200 px/s."""
+    """100 ms without events at 600 px/s, and a head-on crossing at 1200 px/s."""
     rng = np.random.default_rng(4)
     path = line(20, 90, 600)
-    for gap in (0.05, 0.1):
-        rec = recording(*cloud(rng, path, (5, 4), 50_000, (0, 0.3), (0.1, 0.1 + gap)))
-        tracks = follow(rec, Params(t_coast=0.2), [(20, 90, 10), (20, 20, 5)])
-        states = tracks([0.09, 0.1 + gap, 0.29])
-        assert np.linalg.norm(states.mean[2, 0, :2] - path(0.29)) < 2
-        assert states.covariance[1, 0, 0, 0] > 20 * states.covariance[0, 0, 0, 0]
-    for _ in range(5):
+    rec = recording(*cloud(rng, path, (5, 4), 50_000, (0, 0.3), (0.1, 0.2)))
+    tracks = follow(rec, Params(t_coast=0.2), [(20, 90, 10), (20, 20, 5)])
+    states = tracks([0.09, 0.2, 0.29])
+    assert np.linalg.norm(states.mean[2, 0, :2] - path(0.29)) < 2
+    assert states.covariance[1, 0, 0, 0] > 20 * states.covariance[0, 0, 0, 0]
+    for _ in range(2):
         paths = line(60, 90, 600), line(180, 90, -600)
         rec = together(*(cloud(rng, p, (6, 4), 50_000, (0, 0.19)) for p in paths))
         tracks = follow(rec, Params(t_coast=0.2), [(60, 90, 10), (180, 90, 10)])

@@ -386,7 +386,7 @@ def test_bad_input_is_said_before_the_work(folder, capsys):
 
 def test_without_matplotlib_the_tables_are_written(folder, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    run(folder, folder / "planar.h5", "--model", "planar", "--flow", "--seed", 3, "--stop", 0.2)
+    run(folder, folder / "planar.h5", "--model", "planar", "--flow", "--seed", 3, "--stop", 0.1)
     names = sorted(one.name for one in (folder / "out").iterdir())
     assert names == ["flow.h5", "motion.csv", "motion.h5"]
     said = capsys.readouterr().out
