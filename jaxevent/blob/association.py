@@ -8,6 +8,7 @@ Cameras". Soft association, JPDA: Bar-Shalom, Fortmann, "Tracking and Data Assoc
 import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
@@ -91,6 +92,9 @@ def share(
         return (inside & first).astype(density.dtype)
     clutter = params.raw["clutter"] + math.log(2 * math.pi)  # the logarithm: -inf for none
     cluttered = clutter > -jnp.inf
+    if len(density) == 1:  # the same: without clutter certainly the one target's
+        over = jnp.where(inside, density, 0) - jnp.where(cluttered, clutter, 0)
+        return jnp.where(inside, jnp.where(cluttered, jax.nn.sigmoid(over), 1), 0)
     top = density.max()
     top = lax.stop_gradient(jnp.where(cluttered, jnp.maximum(top, clutter), top))
     top = jnp.where(jnp.isfinite(top), top, 0)

@@ -28,6 +28,7 @@ from jaxevent.recording import Recording, Times, check_times
 
 STEPS = (4, 8, 16, 32, 64, 128, 256)  # per chunk
 STRETCH_STEPS = 8192
+STRETCH_EVENTS = 65536  # at least, where a kernel follows targets
 READ_ROWS = 65536  # events read from a file at a time
 NEAR = 3.5  # standard deviations from a found path within which events may be the target's
 LONGEST = 2**29  # us between boundaries; two of them fit into int32
@@ -160,6 +161,10 @@ class Packing:
         self.steps = steps
         self.chunks = max(1, STRETCH_STEPS // steps) if chunks is None else chunks
         self.first = Mark(self.rows[0], begin, begin, 0)
+
+    def lengthen(self) -> None:
+        """Make stretches longer, so that a kernel seldom waits for one to be laid out."""
+        self.chunks = max(self.chunks, STRETCH_EVENTS // (self.steps * self.events))
 
     def pack(self, mark: Mark, *, more: bool = False) -> Stretch:
         """The stretch that begins there.

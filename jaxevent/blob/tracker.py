@@ -199,6 +199,8 @@ class Tracker(Estimator[P]):
         packing = Packing(recording, params, seeds, start, stop, detect, found=found)
         steps = (packing.rows[1] - packing.rows[0]) // packing.events
         fused = self._fused(params, compiler, steps, packing)
+        if fused is not None:
+            packing.lengthen()
         return Tracks(self.filter, packing, params, progress, smooth, fused)
 
     def live(

@@ -67,6 +67,8 @@ COMPUTED = {
     "to_b": bool,
 }
 
+COMPARED = ("lt", "le", "gt", "ge", "eq", "ne")
+
 
 class Untranslatable(Exception):
     """A function uses what there is no translation for; the scan serves it."""
@@ -153,11 +155,46 @@ class Graph:
                 if value[k] is not None:
                     return args[1 - k] if value[k] == (op == "and") else args[k]
         if op == "select_n":
-            if args[1] is args[2]:
-                return args[1]
             if value[0] is not None:
                 return args[1 + int(value[0])]
+            return self._selected(*args)
+        if op in COMPARED:
+            return self._compared(op, args, value[1])
         return None
+
+    def _selected(self, which: Node, no: Node, yes: Node) -> Node | None:
+        """`select_n` in simpler form: a truth value as a number is known where it chooses."""
+        number = self._number_of(which)
+        if number is not None and number in (no, yes):
+            no = self.constant(0.0) if no is number else no
+            yes = self.constant(1.0) if yes is number else yes
+            return self.apply("select_n", (which, no, yes), yes.kind)
+        if (value_of(no), value_of(yes), yes.kind) == (0, 1, "f"):
+            return self.apply("to_f", (which,), "f")
+        return no if no is yes else None
+
+    def _compared(self, op: str, args: tuple[Any, ...], bound: Any) -> Node | None:
+        """A truth value as a number, compared with a constant: itself, or a constant."""
+        number = args[0]
+        if bound is None or number.op != "to_f" or number.args[0].kind != "b":
+            return None
+        no, yes = (bool(COMPUTED[op](float(b), bound)) for b in (False, True))
+        if no == yes:
+            return self.constant(yes)
+        return number.args[0] if yes else self.apply("not", (number.args[0],), "b")
+
+    def _number_of(self, truth: Node) -> Node | None:
+        """The node that makes a number of a truth value, if there is one."""
+        return self._known.get(("to_f", "f", truth.level, truth.number))
+
+    def suppose(self, results: dict[str, Node], truth: Node, value: bool) -> dict[str, Node]:
+        """The results where a truth value is known."""
+        found = {truth: self.constant(value)}
+        for node in needed([*results.values()], {truth}):
+            if node not in found:
+                args = tuple(found.get(a, a) if isinstance(a, Node) else a for a in node.args)
+                found[node] = node if args == node.args else self.apply(node.op, args, node.kind)
+        return {name: found[node] for name, node in results.items()}
 
 
 def value_of(node: Any) -> Any:

@@ -338,6 +338,27 @@ class LoopWriter(Writer):
                 out.append(f"{' ' * indent}{store[key].format(self.name(node))}")
         return out
 
+    def branches(
+        self,
+        first: Node,
+        cases: list[tuple[str, dict[str, Node]]],
+        store: Mapping[str, str],
+        indent: int = 4,
+    ) -> list[str]:
+        """The lines of a function without loops, some results of which are computed in some cases.
+
+        `cases` are lines such as "if {}:", which may name `first`, and what is computed then.
+        """
+        known = set(needed([first]))
+        used = {node for _, case in cases for node in needed([*case.values()], known)}
+        out, margin = self.assign(known, {first} | (known & used), indent), " " * indent
+        for line, case in cases:
+            out.append(margin + line.format(self.name(first)))
+            out += self.lines([*case.values()], indent + 4, set(known))
+            for key, node in case.items():
+                out.append(f"{margin}    {store[key].format(self.name(node))}")
+        return out
+
     def _loop(
         self,
         name: str,

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
@@ -17,6 +18,7 @@ from jaxevent.kernels import kept
 
 F = np.float32
 INFINITE, NAN = F(np.inf), F(np.nan)
+ROOT = F(0.5**0.5)  # mantissas are taken between it and its double
 
 
 def part(function: Callable) -> Any:
@@ -50,11 +52,24 @@ def _as_bits(context: Any, x: Any):
     return types.int32(types.float32), make
 
 
+@operation
+def _choose(context: Any, truth: Any, one: Any, other: Any):
+    """One number or another, without a branch: of those, a wait at each costs more than both."""
+
+    def make(context, builder, signature, arguments):
+        truth = builder.trunc(arguments[0], ir.IntType(1))
+        chosen = builder.select(truth, *arguments[1:])
+        chosen.set_metadata("unpredictable", builder.module.add_metadata([]))
+        return chosen
+
+    return one(types.boolean, one, one), make
+
+
 @part
 def exp32(x):
     n = np.floor(x * F(1.44269504) + F(0.5))
-    n = n if n > F(-126) else F(-126)
-    n = n if n < F(127) else F(127)
+    n = _choose(n > F(-126), n, F(-126))
+    n = _choose(n < F(127), n, F(127))
     r = x - n * F(0.693359375) + n * F(2.12194440e-4)
     p = F(1.9875691500e-4)
     p = p * r + F(1.3981999507e-3)
@@ -64,19 +79,16 @@ def exp32(x):
     p = p * r + F(5.0000001201e-1)
     p = p * r * r + r + F(1)
     p = p * _as_real((np.int32(n) + np.int32(127)) << np.int32(23))
-    p = p if x < F(88.37) else np.float32(np.inf)
-    p = p if x > F(-87.33) else F(0)
-    return p if x == x else x
+    p = _choose(x < F(88.37), p, INFINITE)
+    p = _choose(x > F(-87.33), p, F(0))
+    return _choose(x == x, p, x)
 
 
 @part
 def log32(x):
     bits = _as_bits(x)
-    e = F((bits >> np.int32(23)) - np.int32(127))
-    m = _as_real((bits & np.int32(0x7FFFFF)) | np.int32(0x3F800000))
-    high = m > F(1.41421356)
-    m = m * F(0.5) if high else m
-    e = e + F(1) if high else e
+    n = (bits - _as_bits(ROOT)) >> np.int32(23)
+    m, e = _as_real(bits - (n << np.int32(23))), F(n)
     y = m - F(1)
     z = y * y
     p = F(7.0376836292e-2)
@@ -90,17 +102,16 @@ def log32(x):
     p = p * y + F(3.3333331174e-1)
     p = y * z * p - F(2.12194440e-4) * e - F(0.5) * z
     p = y + p + F(0.693359375) * e
-    p = p if x < INFINITE else x
-    p = p if x > F(0) else -INFINITE
-    return p if x >= F(0) else NAN
+    p = _choose(x < INFINITE, p, x)
+    p = _choose(x > F(0), p, -INFINITE)
+    return _choose(x >= F(0), p, NAN)
 
 
 @part
 def log1p32(x):
     y = F(1) + x
-    d = y - F(1)
-    exact = d == F(0)
-    return x if exact else log32(y) * (x / (F(1) if exact else d))
+    lost = (x - (y - F(1))) / y
+    return log32(y) + _choose((y > F(0)) & (y < INFINITE), lost, F(0))
 
 
 @part
@@ -137,8 +148,8 @@ def sin32(x):
     if not abs(x) < F(8000):  # the reduction loses digits
         return np.sin(x)
     r, n = _reduced(x)
-    value = _cosine(r) if n & 1 else _sine(r)
-    return -value if n & 2 else value
+    value = _choose((n & 1) != 0, _cosine(r), _sine(r))
+    return _choose((n & 2) != 0, -value, value)
 
 
 @part
@@ -146,8 +157,8 @@ def cos32(x):
     if not abs(x) < F(8000):
         return np.cos(x)
     r, n = _reduced(x)
-    value = _sine(r) if n & 1 else _cosine(r)
-    return -value if (n + 1) & 2 else value
+    value = _choose((n & 1) != 0, _sine(r), _cosine(r))
+    return _choose(((n + 1) & 2) != 0, -value, value)
 
 
 @part

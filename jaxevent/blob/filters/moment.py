@@ -53,7 +53,7 @@ def predict(params: TrackerParams, state: State, dt: Array) -> State:
     return State(
         state.motion.predict(params, dt),
         state.log_size,
-        state.P_size + params.Q_lambda * dt * jnp.exp(-2 * state.log_size),
+        state.P_size + params.Q_lambda * dt / jnp.exp(state.log_size) ** 2,
         jnp.stack([theta + to_theta * q, to_q * q]),
         jnp.stack(
             [

@@ -160,20 +160,22 @@ def _begin_track(functions, given, cells, whole, k, x, y, size, time, serial, co
 def _run_steps(functions, given, settings, chunks, memory, chunk, work, marks):
     """The steps of a chunk; the grid counts the events that are near no target."""
     cells, whole, sums = memory.cells, memory.whole, memory.sums
-    steps, room = chunks.t.shape[1], chunks.t.shape[2]
+    t, xi, polarity = chunks.t[chunk], chunks.xi[chunk], chunks.polarity[chunk]
+    valid = chunks.valid[chunk]
+    steps, room = t.shape
     owned, micro = len(chunks.owner) > 0, work.dtype.type(1e-6)
     targets = np.empty(len(cells), np.int64)
     stop, faded = np.int64(chunks.stop[chunk]), False
     for step in range(steps):
-        if not chunks.valid[chunk, step, 0]:
+        if not valid[step, 0]:
             break  # the rest fills up
-        time = np.int64(chunks.t[chunk, step, room - 1])
+        time = np.int64(t[step, room - 1])
         for i in range(room):
-            work[X, i] = chunks.xi[chunk, step, i, 0]
-            work[Y, i] = chunks.xi[chunk, step, i, 1]
-            work[AGE, i] = work.dtype.type(time - chunks.t[chunk, step, i]) * micro
-            work[POLARITY, i] = chunks.polarity[chunk, step, i]
-            work[VALID, i] = chunks.valid[chunk, step, i]
+            work[X, i] = xi[step, i, 0]
+            work[Y, i] = xi[step, i, 1]
+            work[AGE, i] = work.dtype.type(time - t[step, i]) * micro
+            work[POLARITY, i] = polarity[step, i]
+            work[VALID, i] = valid[step, i]
         if owned:
             for i in range(room):
                 marks[i] = chunks.owner[chunk, step, i]
@@ -183,8 +185,9 @@ def _run_steps(functions, given, settings, chunks, memory, chunk, work, marks):
                 targets[alive] = k
                 whole[k, TIME] = time
                 alive += 1
-        if alive == 1 and room == 1:
-            functions.solo(*given, targets[0], TARGETS, room, room)
+        if alive == 1:
+            wanted = room if room > 1 or settings.births else 0
+            functions.solo(*given, targets[0], TARGETS, room, wanted)
         elif alive > 0:
             for a in range(alive):
                 functions.ahead(*given, targets[a], TARGETS + ROWS * a, room, room)
@@ -197,9 +200,7 @@ def _run_steps(functions, given, settings, chunks, memory, chunk, work, marks):
                 if some:
                     functions.update(*given, k, row, room, room)
         if settings.births:
-            faded = _count_strays(
-                settings, sums, memory.at, chunks.t[chunk, step], stop, alive, work, faded
-            )
+            faded = _count_strays(settings, sums, memory.at, t[step], stop, alive, work, faded)
 
 
 @part

@@ -41,6 +41,7 @@ from jaxevent.kernels.expressions import Graph, Untranslatable
 from jaxevent.kernels.host import HostProgram
 from jaxevent.kernels.loops import (
     MARK,
+    Function,
     Kernels,
     Loop,
     LoopWriter,
@@ -93,6 +94,7 @@ class TargetProgram(Program):
 
     slot: Any  # the shapes of one target
     single: bool
+    graph: Graph
 
 
 def program_of(
@@ -145,6 +147,7 @@ def program_of(
         return {
             "slot": update_slot(filter, params, slot, seen, time, batch, weight),
             "ahead.near": seen.near,
+            "touched": (weight > 0).any(),
         }
 
     def limit(params, slot):
@@ -188,7 +191,7 @@ def program_of(
         for name, (function, values, alone) in functions.items()
     }
     layout = _layout({"slot": slot, "ahead": looked, "now": now})
-    return TargetProgram(made, host, layout, dtype, slot, single)
+    return TargetProgram(made, host, layout, dtype, slot, single, graph)
 
 
 def _aged(batch: Batch, single: bool) -> Batch:
@@ -243,6 +246,23 @@ def _of_targets(row: str, i: str) -> tuple[dict[str, str], dict[str, str]]:
     return read, {"weight.0": f"work[({row} + {WEIGHT}) * room + {i}] = {{}}"}
 
 
+def _branches(
+    writer: LoopWriter, program: TargetProgram, function: Function, stores: dict[str, str]
+) -> list[str]:
+    """The lines of a step of one event, which is the target's or leaves it as it is.
+
+    Whether it is near the target is told where `count` is not 0.
+    """
+    truth, cases = function.results["touched.0"], []
+    for line, value in (("if {}:", True), ("else:", False)):
+        case = program.graph.suppose(function.results, truth, value)
+        changed = {k: n for k, n in case.items() if k.startswith("slot") and n.args != (k,)}
+        if changed:
+            cases.append((line, changed))
+    cases.append(("if count:", {"ahead.near.0": function.results["ahead.near.0"]}))
+    return writer.branches(truth, cases, stores)
+
+
 def write(program: TargetProgram) -> tuple[str, Numbers]:
     """The text of a program's module."""
     read, store = _elements(program.single)
@@ -267,7 +287,11 @@ def write(program: TargetProgram) -> tuple[str, Numbers]:
                 for key, text in (stores | store).items()
                 if key in function.results and function.results[key].args != (key,)
             }
-            lines = writer.body(name, function, changed, EVENTS)
+            truth = function.results.get("touched.0")
+            if program.single and truth is not None:
+                lines = _branches(writer, program, function, stores | store)
+            else:
+                lines = writer.body(name, function, changed, EVENTS)
         out.append(
             FUNCTION.format(
                 name=name,

@@ -43,6 +43,7 @@ class FusedRun:
         self, state: State, features: Features, begins: bool = False
     ) -> tuple[State, Telling]:
         """The state at the end, births and deaths, and, if asked for, targets at chunks' starts."""
+        state = jax.device_get(state)
         memory = self._memory_of(state, features)
         chunks, events = len(features.t), features.t.shape[2]
         targets = len(memory.whole)
