@@ -28,13 +28,9 @@ from jaxevent.progress import bar
 
 GATE = 3.0  # standard deviations
 BORN, FILL = 4, 0.5  # windows, and share of its windows, in which a confirmed target was seen
-HOLD, HOLD_NEW = (
-    24,
-    2,
-)  # windows that silent targets are held: confirmed ones (and twice those seen), others
-HOLD_MOVING = (
-    4  # before a scene that moves, where what is silent is hidden and does not stand still
-)
+# Windows that silent targets are held: confirmed ones (and twice those seen), others; and confirmed
+# ones before a scene that moves, where what is silent is hidden and does not stand still.
+HOLD, HOLD_NEW, HOLD_MOVING = 24, 2, 4
 SEEN, SEEN_NEW = 1e-3, 1e-5  # false alarms of a look where a target is known to be
 FAINT = 0.02  # of its own rate: a target with fewer events is silent
 GAIN = 0.2  # of size and rate

@@ -14,8 +14,8 @@ from jaxevent.blob.finding.paths import Path
 
 TOGETHER = 0.9  # share of the shorter life at which two paths are in contact
 MOVED = 2.0  # sizes of the smaller one: least way
-EDGE, NEAR = 3.0, 3.0  # aspect from which a part is a piece of an edge, and how near, instead of
-# `CONTACT`, another part is: between them the edge may have too few events
+EDGE = 3.0  # aspect from which a part is a piece of an edge
+NEAR = 3.0  # for `CONTACT`, of pieces of an edge: between them it may have too few events
 
 
 def join_parts(paths: list[Path]) -> list[Path]:
