@@ -17,7 +17,7 @@ root, in % of the speed, of sequences of other seeds.
 
 import argparse
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -128,7 +128,7 @@ class Problem:
             "test": [],
         }
 
-    def __call__(self, params: Params) -> tuple[Loss, list, list]:
+    def __call__(self, params: Params) -> tuple[Loss, Sequence[Any], Sequence[Any]]:
         """The loss, and windows to fit to and unseen ones."""
         goal = Simulated(voting, Loss(), self.model, "", RUNS, SETTLE, {}, self.truths)
         return goal.loss, *goal.problem(self.sources, None, None)(params)
@@ -146,7 +146,7 @@ WAYS: dict[str, tuple[Callable, str, dict[str, Any]]] = {
 }
 
 
-def percent(loss: Loss, params: Params, batches: list) -> float:
+def percent(loss: Loss, params: Params, batches: Sequence[Any]) -> float:
     """The root of the loss over all windows, in %."""
     return 100 * float(np.sqrt(np.mean([float(loss_of(loss, params, b)) for b in batches])))
 

@@ -46,11 +46,13 @@ class Blank:
     """
 
     def __init__(self, dtype: Any):
-        self.dtype, self._of = dtype, threading.local()
+        self.dtype, self._threads = dtype, threading.local()
 
     def __call__(self, *shape: int) -> NDArray:
         """The array of a shape."""
-        known = self._of.__dict__
+        if not hasattr(self._threads, "known"):
+            self._threads.known = {}
+        known: dict[tuple[int, ...], NDArray] = self._threads.known
         if shape not in known:
             known[shape] = np.zeros(shape, self.dtype)
         return known[shape]

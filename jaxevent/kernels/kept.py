@@ -22,7 +22,7 @@ import numba
 from numba.core import sigutils
 from numba.core.caching import FunctionCache, NullCache
 from numba.core.ccallback import CFunc
-from numba.core.runtime import rtsys
+from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 from numba.cpython import hashing  # noqa: F401  (its symbols: loaded code may refer to them)
 from numba.experimental import function_type  # noqa: F401  (the type of kernels as arguments)
