@@ -205,18 +205,17 @@ class StoredEvents:
         if kinds not in ([t, np.uint16, np.uint16, np.uint8] for t in (np.int64, np.uint32)):
             return None
         start, stop, _ = rows.indices(len(self))
-        lead = min(start, 1)
-        count = max(stop - start, 0) + lead
+        count, previous = max(stop - start, 0), np.iinfo(np.int64).min
         if room is None or len(room.t) < count:
-            t, x, y, p = (np.empty(count + count // 4, kind) for kind in ("i8", "u2", "u2", "u1"))
-            room = EventColumns(t, x, y, p, 0, 0)
-        read = [column[:count] for column in (room.t, room.x, room.y, room.p)]
+            t, x, y, p = (np.empty(count, kind) for kind in ("i8", "u2", "u2", "u1"))
+        else:
+            t, x, y, p = room.t[:count], room.x[:count], room.y[:count], room.p[:count]
         with reading(f"{self._source}: events"):
-            for column, values in zip(stored, read, strict=True):
+            if start and count:
+                previous = int(self._t[start - 1])
+            for column, values in zip(stored, (t, x, y, p), strict=True):
                 if count:
-                    column.read_direct(values, np.s_[start - lead : start - lead + count])
-        previous = int(read[0][0]) if lead else np.iinfo(np.int64).min
-        t, x, y, p = (values[lead:] for values in read)
+                    column.read_direct(values, np.s_[start:stop])
         return EventColumns(t, x, y, p, self._offset, previous)
 
     def index(self, time: int) -> int:

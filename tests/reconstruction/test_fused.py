@@ -1,7 +1,9 @@
 """Kernels, which numba compiles from filters' own functions, against loops over events."""
 
 import dataclasses
+import shutil
 
+import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,11 +31,12 @@ from jaxevent.kernels import numeric
 from jaxevent.kernels.host import HostProgram, run
 from jaxevent.methods import METHODS
 from jaxevent.reconstruction.compensated.estimator import evidence
-from jaxevent.reconstruction.fused import bands
+from jaxevent.reconstruction.fused import bands, room
 from jaxevent.reconstruction.fused.images import FusedImages
 from jaxevent.reconstruction.fused.smoothed import SmoothedVideo
 from jaxevent.reconstruction.fused.video import FusedVideo
 from jaxevent.reconstruction.video import Video
+from jaxevent.recording import ColumnSource
 
 # Of the same choices, so that the functions are traced once; conditions on numbers choose the way.
 DEAD = {**PARAMS, "rho_ref": 0.0008, "clock_offset": 0.0007}
@@ -155,6 +158,44 @@ def test_bands_and_cores_do_not_change_a_bit(monkeypatch):
     np.testing.assert_array_equal(images(), whole)
     monkeypatch.setattr(kernels, "THREADS", 1)
     np.testing.assert_array_equal(images(), whole)
+
+
+def test_stored_events_are_checked_while_they_are_divided(tmp_path):
+    recording = random_recording(7, 900, 5, size=(11, 9), exposure=0)
+    times, params = times_of(recording), params_of(jaxevent.high_pass, **PARAMS)
+    path = tmp_path / "stored.h5"
+    jaxevent.save(recording, path)
+
+    def images(given):
+        options: dict = {"compiler": "numba", "window_events": 90}
+        return look(jaxevent.high_pass.estimate(given, params, **options), times)
+
+    stored = jaxevent.load(path, in_memory=False)
+    np.testing.assert_array_equal(images(stored), images(recording))
+    assert isinstance(stored.events, ColumnSource)
+    for name, value in {"t": 0, "x": 11, "y": 9, "p": 2}.items():
+        wrong = shutil.copy(path, tmp_path / f"{name}.h5")
+        with h5py.File(wrong, "r+") as file:
+            file[f"events/{name}"][500] = value
+        with pytest.raises(jaxevent.InputError, match="500"):
+            images(jaxevent.load(wrong, in_memory=False))
+
+
+def test_images_that_are_held_are_not_written_over(monkeypatch):
+    monkeypatch.setattr(room, "IMAGE_PIXELS", 2 * 11 * 9)  # two images at once
+    recording = random_recording(7, 900, 5, size=(11, 9), exposure=0)
+    times = np.linspace(recording.start, recording.stop, 9).astype(np.int64)
+    params = params_of(jaxevent.high_pass, **PARAMS)
+    video = jaxevent.high_pass.estimate(recording, params, compiler="numba")
+    parts = [(estimate.mean[1:], estimate) for _, estimate in video.batches(times)]
+    assert len(parts) > 3
+    held = np.concatenate([estimate.mean for _, estimate in parts])
+    np.testing.assert_array_equal(held, video(times).mean)
+    arrays = video._room.take(2).mean.base  # used again once nobody has them
+    assert video._room.take(1).mean.base is not arrays
+    address = arrays.ctypes.data
+    del arrays
+    assert video._room.take(1).mean.ctypes.data == address
 
 
 def test_float_frames_are_those_of_their_levels():
