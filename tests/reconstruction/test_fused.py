@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+from typing import Any
 
 import h5py
 import jax
@@ -176,7 +177,8 @@ def test_stored_events_are_checked_while_they_are_divided(tmp_path):
     for name, value in {"t": 0, "x": 11, "y": 9, "p": 2}.items():
         wrong = shutil.copy(path, tmp_path / f"{name}.h5")
         with h5py.File(wrong, "r+") as file:
-            file[f"events/{name}"][500] = value
+            column: Any = file[f"events/{name}"]
+            column[500] = value
         with pytest.raises(jaxevent.InputError, match="500"):
             images(jaxevent.load(wrong, in_memory=False))
 
