@@ -74,6 +74,10 @@ def test_frames_are_steady_unless_they_change_without_events():
     assert [told(*span) for span in (before, around, after)] == [True, False, True]
     # Where events are everywhere the change may be that of the scene.
     assert steady(brightened(still(wall, range(0, WIDTH, 2))))(0, 200_000)
+    # What goes by without events is brighter here and darker there.
+    passing = wall.astype(float)
+    passing[BRIGHT] *= np.where(np.arange(WIDTH) < WIDTH // 2, 1.3, 1 / 1.3)
+    assert steady(still(passing.astype(np.uint8), [3]))(0, 200_000)
     moving = wall.copy()
     moving[BRIGHT, :, : WIDTH // 2] += 50
     assert steady(still(moving, range(WIDTH // 2)))(0, 200_000)

@@ -96,7 +96,7 @@ class Steadiness:
             return cut.swapaxes(1, 2).reshape(h * w, BLOCK**2)
 
         changes = [
-            abs(float(np.median(values[chosen])))
+            float(np.median(values[chosen]))
             for values, chosen in zip(blocks(change), blocks(quiet), strict=True)
             if chosen.sum() >= ENOUGH
         ]
