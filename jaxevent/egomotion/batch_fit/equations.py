@@ -17,11 +17,13 @@ from jaxevent.egomotion.batch_fit.loops import (
     System,
     back,
     blocks,
+    chained,
     conjugate_gradients,
     differentiate,
     forward,
     subtract_mean,
     weigh,
+    weighed_squares,
 )
 from jaxevent.egomotion.batch_fit.path import ROWS, Path, Prior, normalised
 from jaxevent.egomotion.batch_fit.rows import (
@@ -219,10 +221,13 @@ def linearise(problem: Problem, seen: Seen, settling: bool) -> Equations:
     stiff[:-1] += down[1:]
     lumped += 2 * stiff.ravel()
 
+    mixed = np.empty((nodes, FREE + 4), real)
+    chained(raw_mixed, (information * whole).astype(real), mixed)
+
     return Equations(
         problem, seen, slopes, by, unit, now, left,
         0.7 * information * diagonal + 4 * float(prior.flat) + TINY, known, side, held, upper,
-        information * raw_mixed @ whole, lumped, across, down,
+        mixed, lumped, across, down,
     )  # fmt: skip
 
 
@@ -269,9 +274,10 @@ def system_of(equations: Equations, damping: float) -> System:
     tracks, real = equations.problem.tracks, equations.seen.e.dtype
     n = FREE + len(equations.slopes.more)
     stiff = equations.stiff[:n]
-    eased_by, mixed, lumped = 1 + damping, equations.mixed[:, :n], equations.lumped
-    small = equations.upper[:n, :n] + damping * np.diag(stiff)
-    small = small - mixed.T @ (mixed / (eased_by * lumped)[:, None])
+    eased_by, lumped = 1 + damping, equations.lumped
+    mixed, of_depths = np.ascontiguousarray(equations.mixed[:, :n]), np.empty((n, n))
+    weighed_squares(mixed, 1 / (eased_by * lumped), of_depths)
+    small = equations.upper[:n, :n] + damping * np.diag(stiff) - of_depths
     small = (small + small.T) / 2 + 1e-3 * np.diag(stiff)
     known = (equations.known + equations.held)[:n, :n] + damping * np.diag(stiff)
 

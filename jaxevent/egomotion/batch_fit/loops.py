@@ -537,6 +537,29 @@ def blocks(slopes, weight, begin, width, columns, upper, mixed, lumped, diagonal
                     diagonal[k + i * width + j] += w * share * share
 
 
+@fast
+def chained(rows, by, out):
+    """Write rows @ by. NumPy would wake BLAS's threads, which then spin: twice the time in all."""
+    for k in range(len(rows)):
+        own, to = rows[k], out[k]
+        to[:] = 0
+        for i in range(len(own)):
+            for j in range(len(to)):
+                to[j] += own[i] * by[i, j]
+
+
+@fast
+def weighed_squares(rows, weight, out):
+    """Write rows' diag(weight) rows, for the same reason."""
+    out[:] = 0
+    for k in range(len(rows)):
+        row = rows[k]
+        for i in range(len(row)):
+            scaled = weight[k] * row[i]
+            for j in range(len(row)):
+                out[i, j] += scaled * row[j]
+
+
 @fast_part
 def _add_priors(map_, depth, flat, tiny, diagonal, lumped, across, down, out, out_depth):
     """Add what the priors' part of H makes of map and depths, of these bonds between nodes."""
