@@ -12,13 +12,14 @@ gradient by 8 parameters. CPU seconds of one process, minima of repeats in turn.
 import argparse
 import dataclasses
 import functools
-import time
 from typing import Any
 
 import jax
 import numba
 import numpy as np
-from bench import machine, stream
+from bench import machine
+from bench_images import stream
+from timing import least_cpu
 
 import jaxevent
 from jaxevent.recording import Recording
@@ -161,15 +162,14 @@ def losses(recording: Recording) -> dict[str, Any]:
     return tasks
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--repeat", type=int, default=5)
-    parser.add_argument("--exposed", action="store_true")
-    arguments = parser.parse_args()
+def smoother_bench(
+    repeat: int = 3, exposed: bool = False
+) -> tuple[dict[str, float], dict[str, float]]:
+    """M events per CPU second, and ratios."""
     recording = stream(5_000_000, 2.0, 0)
     frames = recording.frames
     assert frames is not None
-    if arguments.exposed:
+    if exposed:
         exposure = np.full(len(frames.t), 10_000)
         frames = dataclasses.replace(frames, exposure=exposure)
         recording = dataclasses.replace(recording, frames=frames)
@@ -180,24 +180,30 @@ def main() -> int:
         "compiled by XLA": lambda: images_by(recording, times, "xla"),
         "kernel, one image": lambda: images_by(recording, times[:1], "numba"),
     }
-    made = {name: way() for name, way in ways.items()}
-    slopes = losses(recording)
-    for task in slopes.values():
-        task()
-    ways |= slopes
-    if not arguments.exposed:
-        worst = abs(made["kernel"] - made["numba program"]).max()
+    if not exposed:
+        worst = abs(ways["kernel"]() - ways["numba program"]()).max()
         assert worst < 1e-4, worst
-    seconds = dict.fromkeys(ways, np.inf)
-    for _ in range(arguments.repeat):
-        for name, way in ways.items():
-            start = time.process_time()
-            way()
-            seconds[name] = min(seconds[name], time.process_time() - start)
-    print(f"{machine()}; {len(times)} images; M events per CPU second")
-    for name, cpu in seconds.items():
-        ratio = seconds["numba program"] / cpu
-        print(f"{name:25} {len(recording.events) / cpu / 1e6:7.2f} {ratio:6.2f} x the program")
+    least = least_cpu(ways | losses(recording), repeat)
+    speed = {f"smoother, {n}": len(recording.events) / 1e6 / cpu for n, cpu in least.items()}
+    whole, gradient = least["numba program"], "loss and gradient, kernel"
+    ratio = {
+        "smoother / numba program": whole / least["kernel"],
+        "smoother, one image / numba program": whole / least["kernel, one image"],
+        "smoother / the same compiled by XLA": least["compiled by XLA"] / least["kernel"],
+        "smoother: loss and 8 gradients / loss": least[gradient] / least["loss, kernel"],
+    }
+    return speed, ratio
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--exposed", action="store_true")
+    arguments = parser.parse_args()
+    speed, ratio = smoother_bench(arguments.repeat, arguments.exposed)
+    print(f"{machine()}; M events per CPU second, and ratios")
+    for name, value in (speed | ratio).items():
+        print(f"{name:45} {value:7.2f}")
     return 0
 
 

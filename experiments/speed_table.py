@@ -11,7 +11,7 @@ from pathlib import Path
 def main() -> None:
     bench = json.loads(Path(sys.argv[1]).read_text())
     print(bench["machine"])
-    for name, value in bench["M events/s"].items():
+    for name, value in bench["M events per CPU second"].items():
         print(f"| {name} | {value:.1f} |")
     for name, value in bench["ratios"].items():
         print(f"{name}: {value:.2f}")

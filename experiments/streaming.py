@@ -12,12 +12,14 @@ in a process of its own. The table says its time, compilation included, and its 
 """
 
 import argparse
+import os
 import subprocess
 import sys
 import tempfile
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from bench import machine
@@ -95,9 +97,9 @@ def recording(count: int) -> Recording:
     )
 
 
-def measured(arguments: list[str]) -> tuple[float, float]:
-    """Seconds and peak memory (GB) of a process; raises if it fails."""
-    clock, peak = time.perf_counter(), 0
+def measured(arguments: list[str]) -> tuple[float, float, float]:
+    """Seconds, CPU seconds and peak memory (GB) of a process; raises if it fails."""
+    clock, spent, peak = time.perf_counter(), children_cpu(), 0
     process = subprocess.Popen(arguments)
 
     def watch() -> None:
@@ -117,7 +119,38 @@ def measured(arguments: list[str]) -> tuple[float, float]:
         raise SystemExit(f"{' '.join(arguments)} ended with {process.returncode}")
     seconds = time.perf_counter() - clock
     watcher.join()
-    return seconds, peak / 2**20
+    return seconds, children_cpu() - spent, peak / 2**20
+
+
+def children_cpu() -> float:
+    """CPU seconds of the processes that this one has started and waited for."""
+    times = os.times()
+    return times.children_user + times.children_system
+
+
+def measure(count: int, disk: Path | None = None) -> dict[str, Any]:
+    """Make a recording of so many events, and reconstruct it."""
+    with tempfile.TemporaryDirectory(dir=disk) as folder:
+        source, images = Path(folder) / "events.h5", Path(folder) / "images.h5"
+        clock = time.perf_counter()
+        save(recording(count), source, progress=sys.stderr.isatty())
+        made = time.perf_counter() - clock
+        seconds, cpu, peak = measured(
+            [
+                *(sys.executable, "-m", "jaxevent.cli", "reconstruct", str(source)),
+                *("--method", "akf", "--rate", "100", "--out", str(images)),
+            ]
+        )
+        return {
+            "events": f"{count:.0e}",
+            "disk": source.stat().st_size / 1e9,
+            "made": made,
+            "seconds": seconds,
+            "cpu": cpu,
+            "rate": count / seconds / 1e6,
+            "peak": peak,
+            "written": images.stat().st_size / 1e9,
+        }
 
 
 def main() -> int:
@@ -129,33 +162,13 @@ def main() -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     rows = []
     for count in map(int, arguments.events):
-        with tempfile.TemporaryDirectory(dir=arguments.disk) as folder:
-            source, images = Path(folder) / "events.h5", Path(folder) / "images.h5"
-            clock = time.perf_counter()
-            save(recording(count), source, progress=sys.stderr.isatty())
-            made = time.perf_counter() - clock
-            seconds, peak = measured(
-                [
-                    *(sys.executable, "-m", "jaxevent.cli", "reconstruct", str(source)),
-                    *("--method", "akf", "--rate", "100", "--out", str(images)),
-                ]
-            )
-            rows.append(
-                {
-                    "events": f"{count:.0e}",
-                    "disk": source.stat().st_size / 1e9,
-                    "made": made,
-                    "seconds": seconds,
-                    "rate": count / seconds / 1e6,
-                    "peak": peak,
-                    "written": images.stat().st_size / 1e9,
-                }
-            )
-            print(rows[-1], file=sys.stderr, flush=True)
+        rows.append(measure(count, arguments.disk))
+        print(rows[-1], file=sys.stderr, flush=True)
     columns = [
         ("events GB", "disk", 1, 2),
         ("made s", "made", 1, 1),
         ("reconstructed s", "seconds", 1, 1),
+        ("CPU s", "cpu", 1, 1),
         ("M events/s", "rate", 1, 2),
         ("peak GB", "peak", 1, 2),
         ("images GB", "written", 1, 2),

@@ -2,14 +2,18 @@
 
 import math
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
+from jaxevent.io.deflate import shuffled
 from jaxevent.io.description import CLOCK
 from jaxevent.io.output import complete, complete_hdf5
+from jaxevent.kernels import THREADS
 from jaxevent.progress import bar
 from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
 from jaxevent.reconstruction.video import BATCH, ImageSequence
@@ -54,15 +58,7 @@ def within(
 
 RARE = 1e-3  # of the pixels: fewer do not tell what range images use
 
-# Chunks of one image. What 204 images of 240x180 and their variances take, of `akf` on
-# slider_depth_crop at 200 Hz (experiments/storage.py):
-#                        CPU s: write     read     MB
-#     uncompressed                 0.07     0.02   70.5
-#     lzf                          0.50     0.14   63.3
-#     lzf, shuffled                0.57     0.17   57.5
-#     gzip 1                       1.55     0.32   55.4
-#     gzip 1, shuffled             1.30     0.27   52.7
-# gzip is the smallest and read by every HDF5 library, lzf by h5py alone.
+# Chunks of one image, read by every HDF5 library; `deflate` writes them faster than h5py.
 _SMALLER = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 Colours = Callable[[NDArray], NDArray] | None  # what `colour_video` returns; None: grey
@@ -109,17 +105,32 @@ def write_hdf5(
         for field, unit in units.items():
             fields[field].attrs["unit"] = unit
         row, finite = 0, False
-        for batch, values in _batches(video, times, colours):
-            for field, images in values.items():
-                fields[field][row : row + len(batch)] = images
-            check()
-            finite = finite or bool(np.isfinite(values["image"]).any())
-            row += len(batch)
+        with ThreadPoolExecutor(THREADS) as pool:
+            waiting: list[tuple[h5py.Dataset, int, Future[bytes]]] = []
+            # One batch is compressed while the next one is made.
+            for batch, values in _batches(video, times, colours):
+                jobs = [
+                    (fields[field], row + n, pool.submit(shuffled, np.asarray(image, "<f4")))
+                    for field, images in values.items()
+                    for n, image in enumerate(images)
+                ]
+                _store(waiting)
+                check()
+                waiting = jobs
+                finite = finite or bool(np.isfinite(values["image"]).any())
+                row += len(batch)
+            _store(waiting)
         if not finite:
             raise InputError(
                 f"{out}: the images hold no finite number; choose other times or parameters"
             )
     return ""
+
+
+def _store(compressed: list[tuple[h5py.Dataset, int, Future[bytes]]]) -> None:
+    """Write images as they are compressed: their dataset, their row, and what they become."""
+    for stored, row, job in compressed:
+        stored.id.write_direct_chunk((row, *[0] * (len(stored.shape) - 1)), job.result())
 
 
 def _write_video(

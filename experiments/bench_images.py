@@ -1,0 +1,375 @@
+"""Speed of images, as part of `bench.py`: filters, files, losses and gradients.
+
+    python experiments/bench.py images xla
+
+A stream of 5 M events at 346x260 (gamma-distributed pixel rates, 2 s, 25 frames per second) is
+read, filtered and shown. Beside it run, on one core: the whole filter as a plain numba program
+over events, which is what a C++ program does; its recursion with and without the look-up of
+neighbours; and, where it is installed, the Accumulator of dv-processing.
+"""
+
+import functools
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numba
+import numpy as np
+from timing import cpu_seconds, least_cpu
+
+import jaxevent
+from jaxevent.io import load, save
+from jaxevent.io.hdf5_files import search_heaps
+from jaxevent.reconstruction.filtering import Observation, Observer, State, Trajectory
+from jaxevent.reconstruction.windows import WindowedRecording
+from jaxevent.recording import Events, Frames, Recording
+
+WIDTH, HEIGHT = 346, 260
+NUMBERS = (0.1, 5e-4, 0.03, 0.01, 0.01, 7e5, 0.09)  # of the filter, as the programs take them
+
+
+def stream(
+    events: int, seconds: float, seed: int, size: tuple[int, int] = (WIDTH, HEIGHT)
+) -> Recording:
+    """Events at gamma-distributed rates per pixel, frames of noise at 25 per second."""
+    rng = np.random.default_rng(seed)
+    width, height = size
+    rate = rng.gamma(2.0, 1.0, width * height)
+    pixel = rng.choice(width * height, events, p=rate / rate.sum())
+    t = np.sort(rng.integers(0, int(seconds * 1e6), events))
+    y, x = np.divmod(pixel, width)
+    frames = int(25 * seconds)
+    return Recording(
+        "bench",
+        width,
+        height,
+        Events(t, x.astype(np.uint16), y.astype(np.uint16), rng.random(events) < 0.5),
+        Frames(
+            (np.arange(frames) * 40_000 + 5_000).astype(np.int64),
+            rng.integers(0, 256, (frames, height, width), np.uint8),
+            np.zeros(frames, np.int64),
+        ),
+    )
+
+
+@numba.njit
+def program(t, x, y, p, grey, mid, c, Q_proc, Q_iso, Q_ref, rho, kappa, w_min):
+    """The whole AKF as an event-by-event program: calibration per frame, then event after event.
+
+    Double precision, one core, exposures not known; the arithmetic of the library's filter.
+    """
+    frames, height, width = grey.shape
+    L, P = np.log(grey[0] + 1), np.full((height, width), 0.09)
+    last = np.zeros((height, width), np.int64)
+    density = 1 / (kappa * np.maximum(4 * grey * (1 - grey), w_min))
+    S, total = np.zeros((height, width)), np.zeros((height, width))
+    base, ratio = np.log(grey[0] + 1), np.ones((height, width))
+    end, k = base, -1
+    for i in range(len(t)):
+        while k + 1 < frames and t[i] >= mid[k + 1]:
+            k += 1
+            base, ratio = np.log(grey[k] + 1), np.ones((height, width))
+            S[:] = 0
+            if k + 1 < frames:  # look ahead for the interval's events, (10)
+                end = np.log(grey[k + 1] + 1)
+                total[:] = 0
+                j = i
+                while j < len(t) and t[j] < mid[k + 1]:
+                    total[y[j], x[j]] += c if p[j] else -c
+                    j += 1
+                for row in range(height):
+                    for column in range(width):
+                        if total[row, column] != 0:
+                            r = (end[row, column] - base[row, column]) / total[row, column]
+                            if 0.01 <= r <= 1 / 0.6:
+                                ratio[row, column] = r
+        a, b = np.int64(y[i]), np.int64(x[i])
+        near = np.int64(0)
+        for row in range(max(a - 1, 0), min(a + 2, height)):
+            for column in range(max(b - 1, 0), min(b + 2, width)):
+                near = max(near, last[row, column])
+        if k < 0:
+            u, bright, R = base[a, b] + S[a, b], grey[0, a, b], density[0, a, b]
+        elif k + 1 == frames:
+            u, bright, R = base[a, b] + S[a, b], grey[k, a, b], density[k, a, b]
+        else:
+            v = (t[i] - mid[k]) / (mid[k + 1] - mid[k])
+            forward = base[a, b] + ratio[a, b] * S[a, b]
+            backward = end[a, b] - ratio[a, b] * (total[a, b] - S[a, b])
+            u = (1 - v) * forward + v * backward
+            bright = (1 - v) * grey[k, a, b] + v * grey[k + 1, a, b]
+            R = (1 - v) * density[k, a, b] + v * density[k + 1, a, b]
+        dt = (t[i] - last[a, b]) * 1e-6
+        gain = 1 / (1 + P[a, b] * dt * (bright + 1) ** 2 / R)
+        change = c if p[i] else -c
+        L[a, b] = (L[a, b] - u) * gain + u + change
+        Q = Q_proc * dt + Q_iso * (t[i] - near) * 1e-6 + (Q_ref if dt <= rho else 0.0)
+        P[a, b] = P[a, b] * gain + Q
+        S[a, b] += change
+        last[a, b] = t[i]
+    return L, P
+
+
+@numba.njit
+def event_loop(t, x, y, p, u, rate, near, L, P, last, c, Q_proc, Q_iso, Q_ref, rho, search):
+    """The recursion alone, event after event, what the frames say given; near given or searched."""
+    height, width = L.shape
+    for i in range(len(t)):
+        a, b = np.int64(y[i]), np.int64(x[i])
+        dt = (t[i] - last[a, b]) * np.float32(1e-6)
+        gap = near[i]
+        if search:
+            latest = np.int64(0)
+            for row in range(max(a - 1, 0), min(a + 2, height)):
+                for column in range(max(b - 1, 0), min(b + 2, width)):
+                    latest = max(latest, last[row, column])
+            gap = (t[i] - latest) * np.float32(1e-6)
+        gain = 1 / (1 + P[a, b] * dt * rate[i])
+        L[a, b] = (L[a, b] - u[i]) * gain + u[i] + (c if p[i] else -c)
+        P[a, b] = P[a, b] * gain + Q_proc * dt + Q_iso * gap + (Q_ref if dt <= rho else 0.0)
+        last[a, b] = t[i]
+
+
+class Given(Observer):
+    """Observations that are already there, carried in place of the points' weights."""
+
+    def __call__(self, points):
+        return Observation(points.weight, points.blend)
+
+
+def loop_seconds(recording: Recording, search: bool) -> float:
+    e = recording.events
+    assert isinstance(e, Events)
+    n = len(e)
+    u, rate, near = (np.full(n, v, np.float32) for v in (0.4, 1e5, 1e-3))
+
+    def run():
+        L, P = np.zeros((HEIGHT, WIDTH), np.float32), np.full((HEIGHT, WIDTH), 0.09, np.float32)
+        last = np.zeros((HEIGHT, WIDTH), np.int64)
+        c, Q_proc, Q_iso, Q_ref, rho = (np.float32(v) for v in (0.1, 5e-4, 0.03, 0.01, 0.01))
+        event_loop(
+            e.t, e.x, e.y, e.p, u, rate, near, L, P, last, c, Q_proc, Q_iso, Q_ref, rho, search
+        )
+
+    return cpu_seconds(run, 20)
+
+
+def filter_seconds(recording: Recording) -> float:
+    """All windows' filters, with what the frames say and the features already on the device."""
+    params = jaxevent.akf.Params()
+    look = jax.jit(lambda observer, tiles: observer(tiles.points))
+    windows = []
+    for _, features in WindowedRecording(recording):
+        features = jax.device_put(features)
+        observer = jaxevent.akf.observe(params, features.frames)
+        known = look(observer, features.tiles)
+        tiles = eqx.tree_at(
+            lambda t: (t.points.weight, t.points.blend), features.tiles, (known.level, known.rate)
+        )
+        windows.append((tiles, features.last))
+
+    @jax.jit
+    def scan(params, tiles, last, state):
+        path = jaxevent.akf.scan(params, Given(), tiles, state)
+        return Trajectory(Given(), state, path).at(last), path
+
+    pixels = WIDTH * HEIGHT
+    first = State(jax.numpy.zeros(pixels), jax.numpy.full(pixels, 0.09))
+
+    def run():
+        state = first
+        for tiles, last in windows:
+            state, path = scan(params, tiles, last, state)
+            jax.block_until_ready(path)
+
+    return cpu_seconds(run, 20)
+
+
+def prepare_seconds(recording: Recording) -> float:
+    def run():
+        for _ in WindowedRecording(recording, reuse=True):
+            pass
+
+    return cpu_seconds(run)
+
+
+def losses(recording: Recording) -> dict[str, Callable[[], object]]:
+    """The mean squared error at 8 images, and it with its gradient by 8 parameters."""
+    names = ("c_on", "c_off", "I0", "kappa", "w_min", "sigma_proc", "sigma_iso", "sigma_ref")
+    frames = recording.frames
+    assert frames is not None
+    start, rows = jaxevent.akf.Params(preset="paper"), slice(1, 49, 6)
+    truth = jax.numpy.asarray(frames.intensity[rows].reshape(8, -1))
+
+    # Everything but the parameters is given as an argument, lest it be compiled as constants.
+    def loss(raw, images, truth):
+        image, _, _ = images(start.with_raw(raw), variance=False)
+        return ((image - truth) ** 2).mean()
+
+    raw, tasks = {name: start.raw[name] for name in names}, {}
+    functions = {"loss": jax.jit(loss), "gradient": jax.jit(jax.value_and_grad(loss))}
+    for compiler in ("numba", "xla"):
+        times = frames.t[rows] + 20_000
+        images = jaxevent.akf.prepare_images(recording, times, start, compiler=compiler)
+        for name, function in functions.items():
+            given = functools.partial(function, raw, images, truth)
+            tasks[f"{compiler} {name}"] = lambda given=given: jax.block_until_ready(given())
+    return tasks
+
+
+def images_bench(recording: Recording, path: Path) -> tuple[dict[str, float], dict[str, float]]:
+    """The complete path by both compilers, losses and gradients.
+
+    The numba program makes no images. Beside it: 100 and 500 images per second, read from the file
+    as `jaxevent reconstruct` does; and 5 M events of a sensor of 1280x720 in 2 s with 25 images per
+    second, from memory.
+    """
+    e, frames = recording.events, recording.frames
+    assert isinstance(e, Events) and frames is not None
+    grey = frames.intensity.astype(np.float64)
+    check_program(recording, grey)
+    large = stream(5_000_000, 2.0, 1, (1280, 720))
+
+    def read(in_memory: bool) -> Recording:
+        search_heaps.cache_clear()  # as a process that reads the file for the first time
+        return load(path, in_memory=in_memory)
+
+    def images(given: Recording | None, compiler: Any, rate: int) -> None:
+        given = read(False) if given is None else given
+        times = np.arange(given.start, given.stop, 1_000_000 // rate)
+        video = jaxevent.akf.estimate(given, compiler=compiler)
+        for _ in video.batches(times):
+            pass
+
+    tasks: dict[str, Callable[[], object]] = {
+        "program": lambda: program(e.t, e.x, e.y, e.p, grey, frames.t, *NUMBERS),
+        "reading": lambda: read(True),
+        "numba memory": lambda: images(recording, "numba", 100),
+        **losses(recording),
+    }
+    for compiler in ("numba", "xla"):
+        for name, given, rate in (("100", None, 100), ("500", None, 500), ("large", large, 25)):
+            if (compiler, name) != ("xla", "500"):
+                tasks[f"{compiler} {name}"] = functools.partial(images, given, compiler, rate)
+    least, n = least_cpu(tasks), len(e) / 1e6
+    extra = (least["numba 500"] - least["numba 100"]) / (800 * WIDTH * HEIGHT)
+    shown = {
+        "numba program": "program",
+        "reading HDF5, with checks": "reading",
+        "complete path": "numba 100",
+        "complete path, events in memory": "numba memory",
+        "complete path compiled by XLA": "xla 100",
+        "1280x720 at 25 Hz": "numba large",
+        "1280x720 at 25 Hz compiled by XLA": "xla large",
+        "loss": "numba loss",
+        "loss and gradient of 8 parameters": "numba gradient",
+        "loss compiled by XLA": "xla loss",
+        "loss and gradient compiled by XLA": "xla gradient",
+    }
+    speed = {name: n / least[task] for name, task in shown.items()}
+    ratio = {
+        "complete path / numba program": least["program"] / least["numba 100"],
+        "the same, events in memory": least["program"] / least["numba memory"],
+        "complete path / the same compiled by XLA": least["xla 100"] / least["numba 100"],
+        "1280x720 at 25 Hz / numba program of 346x260": least["program"] / least["numba large"],
+        "ns per pixel of an image more": 1e9 * extra,
+        "pixel of an image more / event of the numba program": 5e6 * extra / least["program"],
+        "loss and 8 gradients / loss": least["numba gradient"] / least["numba loss"],
+        "loss and 8 gradients / loss compiled by XLA": least["numba gradient"] / least["xla loss"],
+    }
+    return speed, ratio
+
+
+def check_program(recording: Recording, grey: np.ndarray) -> None:
+    """The program is the same filter: at the last event of a pixel both must agree."""
+    e, frames = recording.events, recording.frames
+    assert isinstance(e, Events) and frames is not None
+    L, _ = program(e.t, e.x, e.y, e.p, grey, frames.t, *NUMBERS)
+    features, _ = jaxevent.akf.prepare(recording, [recording.stop])
+    _, end = jax.jit(jaxevent.akf.run)(jaxevent.akf.Params(), features)
+    assert np.abs(end.L.reshape(L.shape) - L).max() < 1e-3, "the program is another filter"
+
+
+def xla_bench(recording: Recording) -> tuple[dict[str, float], dict[str, float]]:
+    """What runs where there is no kernel: the scan alone, features, compilations."""
+    e, frames = recording.events, recording.frames
+    assert isinstance(e, Events) and frames is not None
+    grey, n = frames.intensity.astype(np.float64), len(e) / 1e6
+    whole = n / cpu_seconds(lambda: program(e.t, e.x, e.y, e.p, grey, frames.t, *NUMBERS))
+    loop, given = (n / loop_seconds(recording, search) for search in (True, False))
+    filtering, preparing = n / filter_seconds(recording), n / prepare_seconds(recording)
+    speed = {
+        "numba loop, recursion and neighbour look-up": loop,
+        "numba loop, recursion alone": given,
+        "filter alone, by XLA": filtering,
+        "features and packing": preparing,
+    }
+    ratio = {
+        "filter by XLA / numba program": filtering / whole,
+        "filter by XLA / numba loop with neighbour look-up": filtering / loop,
+        "features and packing / numba program": preparing / whole,
+        "compilations for a second recording": compilations(),
+    }
+    return speed, ratio
+
+
+def files_bench(recording: Recording) -> tuple[dict[str, float], dict[str, float]]:
+    """`images_bench` of the recording in a file; with dv-processing where it is installed."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "bench.h5"
+        save(recording, path)
+        speed, ratio = images_bench(recording, path)
+    try:
+        accumulator = len(recording.events) / 1e6 / accumulator_seconds(recording)
+    except ImportError:
+        print("dv-processing is not installed: its Accumulator is left out")
+        return speed, ratio
+    speed["dv-processing Accumulator at 100 Hz, events in memory"] = accumulator
+    name = "complete path / dv-processing Accumulator"
+    return speed, ratio | {name: speed["complete path"] / accumulator}
+
+
+def accumulator_seconds(recording: Recording) -> float:
+    """dv-processing's Accumulator at 100 Hz on the same events, which it has in memory."""
+    import dv_processing as dv  # type: ignore[import-not-found]
+
+    e = recording.events
+    assert isinstance(e, Events)
+    slices = []
+    for begin in range(0, recording.stop, 10_000):
+        store = dv.EventStore()
+        part = e[e.index(begin) : e.index(begin + 10_000)]
+        for t, x, y, p in zip(*(v.tolist() for v in (part.t, part.x, part.y, part.p)), strict=True):
+            store.push_back(t, x, y, p)
+        slices.append(store)
+
+    def run():
+        accumulator = dv.Accumulator((WIDTH, HEIGHT))
+        for store in slices:
+            accumulator.accept(store)
+            accumulator.generateFrame()
+
+    return cpu_seconds(run, 3)
+
+
+def compilations() -> int:
+    """How often XLA compiles for a second recording of the same sensor."""
+    heard = []
+
+    def listen(event: str, duration_secs: float, **_: str | int) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            heard.append(event)
+
+    def run(seed: int, events: int) -> None:
+        recording = stream(events, 1.0 + seed, seed)
+        times = np.arange(50_000, 10**6, 50_000)
+        jaxevent.akf.estimate(recording, compiler="xla")(times)
+
+    run(0, 300_000)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    run(1, 2_500_000)
+    jax.monitoring.clear_event_listeners()
+    return len(heard)
