@@ -154,7 +154,7 @@ class LiveTracks:
         """Tracking begins."""
         self._packing = packing = Packing(
             self._recording, self.params, [], start, NEVER - 1, self._detect,
-            steps=STEPS, chunks=CHUNKS,
+            steps=STEPS, chunks=CHUNKS, as_stored=True,
         )  # fmt: skip
         self._fused = self._kernel(packing)
         self._mark = packing.first

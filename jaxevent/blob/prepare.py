@@ -24,12 +24,14 @@ from jaxevent.errors import InputError
 from jaxevent.estimator import Described
 from jaxevent.events.filters import supported
 from jaxevent.kernels import compiled
+from jaxevent.kernels import part as kernel_part
 from jaxevent.recording import Recording, Times, check_times
 
 STEPS = (4, 8, 16, 32, 64, 128, 256)  # per chunk
 STRETCH_STEPS = 8192
 STRETCH_EVENTS = 65536  # at least, where a kernel follows targets
 READ_ROWS = 65536  # events read from a file at a time
+TIES = 16  # more events of one time are in the order of a readout, and not of the scene
 NEAR = 3.5  # standard deviations from a found path within which events may be the target's
 LONGEST = 2**29  # us between boundaries; two of them fit into int32
 NEVER = np.iinfo(np.int64).max  # us
@@ -101,6 +103,7 @@ class Packing:
         found: Targets that were found: they are the seeds and say whose events may be.
         steps: Of a chunk; None: as suits the recording.
         chunks: Of a stretch; None: as suits the steps.
+        as_stored: Whether events of one time are taken as they are stored, and not spread.
 
     Raises:
         InputError: A seed is outside the sensor or the time, there is no time to track, or events
@@ -119,6 +122,7 @@ class Packing:
         found: Found | None = None,
         steps: int | None = None,
         chunks: int | None = None,
+        as_stored: bool = False,
     ):
         if params.association == "authors" and params.events_per_step > 1:
             raise InputError(
@@ -161,6 +165,7 @@ class Packing:
         self.steps = steps
         self.chunks = max(1, STRETCH_STEPS // steps) if chunks is None else chunks
         self.first = Mark(self.rows[0], begin, begin, 0)
+        self._as_stored = as_stored or params.association == "authors"
 
     def lengthen(self) -> None:
         """Make stretches longer, so that a kernel seldom waits for one to be laid out."""
@@ -189,15 +194,11 @@ class Packing:
         stop = NEVER if more else self.stop
         bounds = _Bounds(self.start, stop, self.period, self.seeds.t)
         place = _Place(0, 0, 0, mark.previous, mark.start, 0, mark.seed)
-        at, done = mark.row, False
+        at, done, rows = mark.row, False, []
         while not done and not (more and at == self.rows[1]):
             upto = min(at + READ_ROWS, self.rows[1])
-            events = self.recording.events[at:upto]
-            kept, owner = self._kept(events, at), np.full(len(events), ANYBODY, np.int32)
-            if self.joined is not None and len(events):
-                owner = candidates(events, self.joined, NEAR)
-                kept &= owner != NOBODY
-            given = _Given(events.t, events.x, events.y, events.p, kept, owner)
+            given, row = self._read(at, upto)
+            rows.append(row)
             final = upto == self.rows[1] and not more
             done, used, place = _pack(given, at, final, bounds, place, out)
             at += used
@@ -213,7 +214,33 @@ class Packing:
         )  # fmt: skip
         ended = place.previous == place.begin == stop
         following = None if ended else Mark(at, place.previous, place.begin, place.seed)
-        return Stretch(features, out.start, out.row, following)
+        row = np.concatenate([*rows, np.zeros(1, np.int64)])[np.maximum(out.row - mark.row, 0)]
+        return Stretch(features, out.start, np.where(out.row >= 0, row, -1), following)
+
+    def _read(self, at: int, upto: int) -> tuple["_Given", NDArray[np.int64]]:
+        """Events of some places in the order in which they are taken, and their rows.
+
+        Places are rows, but for many events of one time. A readout stores these line by line; here
+        every step gets events of all lines, see `_spread`.
+        """
+        events, first, last = self.recording.events, at, upto
+        if not self._as_stored and upto > at:
+            begin, end = (int(events[row : row + 1].t[0]) for row in (at, upto - 1))
+            first = max(events.index(begin), self.rows[0])
+            last = min(events.index(end + 1), self.rows[1])
+        part = events[first:last]
+        kept, owner = self._kept(part, first), np.full(len(part), ANYBODY, np.int32)
+        if self.joined is not None and len(part):
+            owner = candidates(part, self.joined, NEAR)
+            kept &= owner != NOBODY
+        given = _Given(part.t, part.x, part.y, part.p, kept, owner)
+        order = _spread(part.t, len(part) if self._as_stored else TIES)
+        if not len(order):
+            order = np.arange(len(part))
+            if first == at and last == upto:
+                return given, order + first
+        order = order[at - first : upto - first]
+        return _Given(*(values[order] for values in given)), order + first
 
     def whole(self) -> Features:
         """All chunks at once, for recordings that fit into memory."""
@@ -340,6 +367,39 @@ def _leave_open(place: _Place, out: _Chunks) -> tuple[int, _Place]:
     out.row[chunk], out.seed[sown], out.elapsed[chunk] = -1, -1, 0
     begun = place.seed - int(sown.sum())
     return row, _Place(chunk, 0, 0, place.previous, place.begin, 0, begun)
+
+
+@compiled
+def _spread(t: Any, least: int) -> Any:
+    """An order in which runs of at least so many equal times are spread; empty if there are none.
+
+    Places of a run of n are taken in steps of about .618 n, so that a few that follow each other
+    are of all parts of the run.
+    """
+    order = np.empty(0, np.int64)
+    begin = 0
+    for end in range(1, len(t) + 1):
+        if end < len(t) and t[end] == t[begin]:
+            continue
+        n = end - begin
+        if n > least:
+            if len(order) == 0:
+                order = np.arange(len(t))
+            step = np.int64(0.618034 * n)
+            while _common(step, n) > 1:
+                step += 1
+            for k in range(n):
+                order[begin + k] = begin + k * step % n
+        begin = end
+    return order
+
+
+@kernel_part
+def _common(a: int, b: int) -> int:
+    """The greatest common divisor."""
+    while b:
+        a, b = b, a % b
+    return a
 
 
 @compiled
