@@ -589,8 +589,8 @@ class Smoother(PixelEstimator[Params]):
     ) -> ImageSequence[Params]:
         """As `Filter.estimate`: by a kernel on CPUs, in single precision.
 
-        `run` and `read` serve in double precision, on other devices, on several, and where changes
-        are spread over time. Raises `InputError`.
+        `run` and `read` serve in double precision, on other devices and on several. `factors` (2,
+        pixels) are those of ON and OFF thresholds of single pixels. Raises `InputError`.
         """
         params = self.Params() if params is None else params
         fused = video_by_kernel(SmoothedVideo, self, recording, params, compiler, options)

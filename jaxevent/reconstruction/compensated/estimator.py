@@ -56,7 +56,7 @@ from jaxevent.reconstruction.compensated.warping import places, sample, warp, wa
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.features import Features, Numeric, ReadOut
 from jaxevent.reconstruction.frames import FrameImages
-from jaxevent.reconstruction.video import ImageSequence, Video
+from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.reconstruction.windows import WINDOW_EVENTS, prepare
 from jaxevent.recording import Recording, Times, microseconds
 
@@ -108,12 +108,10 @@ class Images:
         window_events: int,
         factors: NDArray[np.floating] | None = None,
     ):
-        self.factors, given = factors, (recording, params)
-        options: dict[str, Any] = {"window_events": window_events, "progress": False}
-        if factors is None:
-            self._video = evidence.estimate(*given, **options)
-        else:  # kernels know of no factors
-            self._video = Video(evidence, *given, factors=factors, **options)
+        self.factors = factors
+        self._video = evidence.estimate(
+            recording, params, window_events=window_events, progress=False, factors=factors
+        )
         self._kept: collections.OrderedDict[int, Estimate] = collections.OrderedDict()
 
     @property

@@ -77,6 +77,8 @@ class GivenFrames(NamedTuple):
     functions: FrameFunctions
     numbers: NDArray
     slot: NDArray[np.int64]  # of each band in the memory
+    rates: NDArray[np.float64]  # see `follow_events`; empty: no change is spread
+    reach: int  # us, the longest time over which a change is spread
 
 
 class Instants(NamedTuple):
@@ -87,6 +89,88 @@ class Instants(NamedTuple):
     elapsed: NDArray[np.float64]  # s since then
     seconds: NDArray[np.float64]  # until the next; 0 after the last
     here: NDArray[np.float64]  # 1 in the middle of the frame's exposure
+
+
+class Spreading(NamedTuple):
+    """A pixel's last event before the time that a pass has come to, [stride]."""
+
+    last: NDArray[np.float64]  # us
+    rate: NDArray[np.float64]  # of its count until the next event, 1/us; of OFF events negative
+
+
+@compiled
+def follow_events(bands, stride, reach):
+    """Of each event the rate (1/us) at which its pixel's count grows until the next, OFF negative.
+
+    An event is late: where no more than `reach` (us) lies between two, the second's change is
+    spread over that time (`Timing`). Else the rate is 0, as after one at the recording's start.
+    """
+    events, weights, first = bands.events, bands.weights, bands.first
+    rates = np.zeros(first[-1], np.float64)
+    for band in range(len(first) - 1):
+        ahead = np.full(stride, -1)
+        for j in range(first[band + 1] - first[band]):
+            i = first[band + 1] - 1 - j
+            z, now = (events[i] >> 1) & 0xFFFF, events[i] >> 17
+            k = ahead[z]
+            ahead[z] = i
+            if k >= 0 and now > 0:
+                gap = (events[k] >> 17) - now
+                if 0 < gap <= reach:
+                    one = np.float64(weights[k]) if len(weights) > 0 else 1.0
+                    rates[i] = (one if events[k] & 1 else -one) / gap
+    return rates
+
+
+@part
+def _blank(stride):
+    return Spreading(np.zeros(stride, np.float64), np.zeros(stride, np.float64))
+
+
+@part
+def _advance(given, i, end, until, spreading):
+    """Note events from place i on that are before a time; the place of the first that is not."""
+    events, rates, last, rate = given.bands.events, given.rates, spreading.last, spreading.rate
+    while i < end and events[i] >> 17 < until:
+        z = (events[i] >> 1) & 0xFFFF
+        last[z] = events[i] >> 17
+        rate[z] = rates[i]
+        i += 1
+    return i
+
+
+@part
+def _come_to(given, band, time, spreading):
+    """The same from as early as matters."""
+    for z in range(len(spreading.rate)):
+        spreading.rate[z] = 0
+    a, b = given.bands.first[band], given.bands.first[band + 1]
+    begin = find(given.bands.events, a, b, time - given.reach)
+    return _advance(given, begin, b, time, spreading)
+
+
+@part
+def _add_begun(out, on, off, time, spreading, sign):
+    """Add (sign 1) or take away (-1) the parts of pixels' next events that have happened."""
+    last, rate = spreading.last, spreading.rate
+    for z in range(len(last)):
+        begun = sign * rate[z] * (time - last[z])
+        out[on + z] += begun if rate[z] > 0 else 0.0
+        out[off + z] -= begun if rate[z] < 0 else 0.0
+
+
+@part
+def _count_between(given, band, left, right, cells, what, spreading):
+    """`count_events` with changes spread over time."""
+    bands, stride, spread = given.bands, given.places.stride, len(given.rates) > 0
+    a, b = bands.first[band], bands.first[band + 1]
+    count_events(bands.events, bands.weights, a, b, left, right, cells, stride, what)
+    if spread and right > left:
+        on, off = what[0] * stride, what[1] * stride
+        i = _come_to(given, band, left, spreading)
+        _add_begun(cells, on, off, left, spreading, -1.0)
+        _advance(given, i, b, right, spreading)
+        _add_begun(cells, on, off, right, spreading, 1.0)
 
 
 @part
@@ -100,7 +184,7 @@ def _sum_around(cells, of, to, above, width, rows, stride):
 
 
 @part
-def _look(band, k, given, cells):
+def _look(band, k, given, cells, spreading):
     """A frame's image, and what events say of its exposure."""
     bands, frames, places = given.bands, given.frames, given.places
     stride, top, bottom = places.stride, bands.edges[band], bands.edges[band + 1]
@@ -122,9 +206,7 @@ def _look(band, k, given, cells):
     )  # fmt: skip
     if places.inside >= 0:
         what = np.full(2, places.inside)
-        count_events(
-            bands.events, bands.weights, a, b, edge_of(left), edge_of(right), cells, stride, what
-        )
+        _count_between(given, band, edge_of(left), edge_of(right), cells, what, spreading)
 
 
 @part
@@ -154,26 +236,22 @@ def filter_frames(begin, end, given, memory, starts, linked):
     bands, line, places, functions = given.bands, given.line, given.places, given.functions
     numbers, stride, counts = given.numbers, places.stride, places.counts
     width, padded = np.int64(bands.width), np.int64(bands.width + 2)
-    above = np.zeros(stride, numbers.dtype)
+    above, spreading = np.zeros(stride, numbers.dtype), _blank(stride)
     for band in range(begin, end):
         cells, rows = memory[given.slot[band]], bands.edges[band + 1] - bands.edges[band]
-        a, b = bands.first[band], bands.first[band + 1]
         first, last = padded, (rows + 1) * padded
         if starts:
             functions.start(cells.ctypes, numbers.ctypes, 0, first, last, 0.0, 0.0, 0.0)
         for k in range(len(line.mid)):
             row = np.int64((places.work + k * places.kept) * stride)
-            _look(band, k, given, cells)
+            _look(band, k, given, cells, spreading)
             gain, seconds = np.float64(given.frames.gain[k]), line.seconds[k]
             functions.frame(
                 cells.ctypes, numbers.ctypes, row, first, last, gain, line.exists[k], 0.0
             )
             if places.sided:
                 _measure_clipped(k, row, given, cells, first, last)
-            count_events(
-                bands.events, bands.weights, a, b, line.mid[k], line.following[k], cells, stride,
-                counts,
-            )  # fmt: skip
+            _count_between(given, band, line.mid[k], line.following[k], cells, counts, spreading)
             _sum_around(cells, counts[0], counts[2], above, width, rows, stride)
             _sum_around(cells, counts[1], counts[3], above, width, rows, stride)
             functions.move(cells.ctypes, numbers.ctypes, row, first, last, seconds, 0.0, 0.0)
@@ -197,33 +275,73 @@ def smooth_frames(begin, end, given, memory):
             )  # fmt: skip
 
 
+@part
+def _count_since(given, band, f, known, i, now, cells, held, spreading):
+    """Count the events from the middle of frame f to a time, both given in us.
+
+    The counts so far of the frame `known` are in `held`, the events before place i are in them.
+    Returns the next place.
+    """
+    bands, counts, stride = given.bands, given.places.counts, given.places.stride
+    events, weights, spread = bands.events, bands.weights, len(given.rates) > 0
+    weighted, b, mid = len(weights) > 0, bands.first[band + 1], given.line.mid[f]
+    on, off = counts[0] * stride, counts[1] * stride
+    if f != known:
+        for z in range(2 * stride):
+            held[z] = 0
+        i = find(events, bands.first[band], b, mid)
+        if spread:
+            _come_to(given, band, mid, spreading)
+            _add_begun(held, 0, stride, mid, spreading, -1.0)
+    begin = i
+    while i < b and events[i] >> 17 <= now:
+        z = ((events[i] >> 1) & 0xFFFF) + (0 if events[i] & 1 else stride)
+        held[z] += weights[i] if weighted else 1
+        i += 1
+    for z in range(stride):
+        cells[on + z], cells[off + z] = held[z], held[stride + z]
+    if spread:
+        _advance(given, begin, b, now + 1, spreading)
+        _add_begun(cells, on, off, now, spreading, 1.0)
+    return i
+
+
+@part
+def _count_until(given, band, now, cells, spreading):
+    """Count the events after a time (us) until the middle of the first frame."""
+    counts, stride, mid = given.places.counts, given.places.stride, given.line.mid[0]
+    bands = given.bands
+    a, b = bands.first[band], bands.first[band + 1]
+    count_events(bands.events, bands.weights, a, b, now + 1, mid, cells, stride, counts)
+    if len(given.rates) > 0 and mid > now:
+        on, off = counts[0] * stride, counts[1] * stride
+        i = _come_to(given, band, now + 1, spreading)
+        _add_begun(cells, on, off, now, spreading, -1.0)
+        _advance(given, i, b, mid, spreading)
+        _add_begun(cells, on, off, mid, spreading, 1.0)
+
+
 @compiled
 def read_images(begin, end, given, memory, instants, images):
     """Images at sorted instants of a smoothed stretch."""
-    bands, line, places, functions = given.bands, given.line, given.places, given.functions
-    events, weights, weighted = bands.events, bands.weights, len(bands.weights) > 0
+    bands, places, functions = given.bands, given.places, given.functions
     numbers, stride, counts = given.numbers, places.stride, places.counts
     width, pixels = np.int64(bands.width), images.mean.shape[1]
     size = np.int64(images.slopes.shape[2] * images.slopes.shape[3])
-    padded, above = width + 2, np.zeros(places.stride, numbers.dtype)
+    padded, above, spreading = width + 2, np.zeros(stride, numbers.dtype), _blank(stride)
+    held = np.zeros(2 * stride, numbers.dtype)
     for band in range(begin, end):
         cells, rows = memory[given.slot[band]], bands.edges[band + 1] - bands.edges[band]
-        a, b, known, i = bands.first[band], bands.first[band + 1], -1, 0
-        on, off = counts[0] * stride, counts[1] * stride
+        known, i = -1, np.int64(0)
         for image in range(len(instants.time)):
             f, now = instants.frame[image], instants.time[image]
             row = np.int64((places.work + max(f, 0) * places.kept) * stride)
             at = np.int64(image * pixels + bands.edges[band] * width)
             if f < 0:
-                count_events(events, weights, a, b, now + 1, line.mid[0], cells, stride, counts)
-            elif f != known:
-                i, known = find(events, a, b, line.mid[f]), f
-                for z in range(stride):
-                    cells[on + z] = cells[off + z] = 0
-            while f >= 0 and i < b and events[i] >> 17 <= now:
-                z = ((events[i] >> 1) & 0xFFFF) + (on if events[i] & 1 else off)
-                cells[z] += weights[i] if weighted else 1
-                i += 1
+                _count_until(given, band, now, cells, spreading)
+            else:
+                i = _count_since(given, band, f, known, i, now, cells, held, spreading)
+                known = f
             _sum_around(cells, counts[0], counts[2], above, width, rows, stride)
             _sum_around(cells, counts[1], counts[3], above, width, rows, stride)
             if f < 0:

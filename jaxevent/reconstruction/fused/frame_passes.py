@@ -13,6 +13,7 @@ from jaxevent.reconstruction.fused.frame_loop import (
     FramePlaces,
     GivenFrames,
     Instants,
+    follow_events,
 )
 from jaxevent.reconstruction.fused.loop import Bands, Images
 from jaxevent.reconstruction.fused.passes import DividedRecording
@@ -134,22 +135,24 @@ class FramePasses:
     def divide(self, stretch: Stretch, state: StreamState) -> tuple[Bands, StreamState]:
         """The events that tell of a stretch of frames; the state moved to their beginning."""
         clock, source, (begin, end) = self.clock, self.divided.recording.events, stretch
+        reach = self.divided.windows.reach
         # Before the first frame and after the last one all events count.
         rows = [0, len(source)]
         if begin:
             first = min(clock.left[begin:end].min(), clock.mid[begin])
-            rows[0] = source.index(int(np.ceil(first)) + clock.origin)
+            rows[0] = source.index(int(np.ceil(first)) + clock.origin - reach)
         if end < len(clock):
             last = max(clock.right[begin:end].max(), clock.mid[end])
-            rows[1] = source.index(int(np.ceil(last)) + clock.origin)
+            rows[1] = source.index(int(np.ceil(last)) + clock.origin + reach)
         return self.divided.divide(state, *rows)
 
     def given(self, stretch: Stretch, bands: Bands, slot: NDArray[np.int64]) -> GivenFrames:
         """What passes over a stretch rest on; each band has a `slot` of the memory."""
-        frames = self.divided.frames(slice(*stretch))
+        frames, reach = self.divided.frames(slice(*stretch)), self.divided.windows.reach
+        rates = follow_events(bands, self.layout.stride, reach) if reach else np.empty(0)
         return GivenFrames(
             bands, _line(self.clock, stretch), frames, self.places, self.kernel.functions,
-            self.kernel.numbers, slot,
+            self.kernel.numbers, slot, rates, reach,
         )  # fmt: skip
 
     def room(self, times: int) -> Images:

@@ -44,22 +44,26 @@ class Window(NamedTuple):
 class DividedRecording:
     """Cuts a recording into windows whose events are divided among bands of rows.
 
-    `events` bounds a window's events; None: one window is the whole. Raises `Untranslatable` for
-    what kernels cannot do.
+    `events` bounds a window's events; None: one window is the whole. `factors` (2, pixels) are
+    those of single pixels' ON and OFF thresholds. Raises `Untranslatable` for what kernels cannot
+    do.
     """
 
     def __init__(
-        self, recording: Recording, timing: Timing, filtering: bool, events: int | None = None
+        self,
+        recording: Recording,
+        timing: Timing,
+        filtering: bool,
+        events: int | None = None,
+        factors: NDArray[np.floating] | None = None,
     ):
-        if timing.spread and not filtering:
-            raise Untranslatable("changes that are spread over time")
         layout = BandLayout.of(recording.width, recording.height)
         if layout is None:
             raise Untranslatable(f"a sensor {recording.width} pixels wide")
         if recording.stop - recording.start >= NEVER:
             raise Untranslatable("a recording of over a year")
         whole = max(len(recording.events), 1)
-        self.recording, self.layout = recording, layout
+        self.recording, self.layout, self._factors = recording, layout, factors
         self.windows = WindowedRecording(
             recording, timing, filtering=filtering, events=whole if events is None else events
         )
@@ -131,7 +135,8 @@ class DividedRecording:
         """
         windows, source = self.windows, self.recording.events
         weight = np.empty(0, self.dtype)
-        if state.last_then is None and isinstance(source, ColumnSource):
+        plain = state.last_then is None and self._factors is None
+        if plain and isinstance(source, ColumnSource):
             stored = source.columns(slice(context, finish), self._stored)
             self._stored = stored
             bands = None if stored is None else self._bands_of(stored, weight)
@@ -143,6 +148,10 @@ class DividedRecording:
             assert state.last_then is not None
             stream = Stream.of(around, self.recording.width)
             weight = weigh(stream, state.last_then.copy(), windows.dead).astype(self.dtype)
+        if self._factors is not None:
+            pixel = around.y.astype(np.int64) * self.recording.width + around.x
+            factors = self._factors[np.where(around.p, 0, 1), pixel]
+            weight = (factors * weight if len(weight) else factors).astype(self.dtype)
         least = np.iinfo(np.int64).min
         checked = EventColumns(around.t, around.x, around.y, around.p.view(np.uint8), 0, least)
         bands = self._bands_of(checked, weight)

@@ -52,6 +52,7 @@ class SmoothedVideo(ImageSequence[P]):
 
     Args:
         window_events: Most events of a stretch of frames, if it has more than one frame.
+        factors: (2, pixels), of ON and OFF thresholds of single pixels.
     """
 
     def __init__(
@@ -62,10 +63,11 @@ class SmoothedVideo(ImageSequence[P]):
         *,
         window_events: int = STRETCH_EVENTS,
         progress: bool | None = None,
+        factors: NDArray[np.floating] | None = None,
     ):
         super().__init__(estimator, recording, params, progress=progress)
         self._method = estimator
-        divided = DividedRecording(recording, Timing.of(params), False, window_events)
+        divided = DividedRecording(recording, Timing.of(params), False, window_events, factors)
         self._passes = FramePasses(divided, estimator, params, params.clock_offset)
         self._stretches = stretches_of(self._passes.clock, recording, window_events)
         most = max(stretch.end - stretch.begin for stretch in self._stretches)
