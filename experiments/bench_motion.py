@@ -24,9 +24,10 @@ from jaxevent.egomotion import voting
 from jaxevent.egomotion.batch_fit import photometric, sequence
 from jaxevent.egomotion.batch_fit import windows as batch
 from jaxevent.egomotion.batch_fit.equations import FREE, Unknowns, linearise, look
-from jaxevent.egomotion.batch_fit.loops import POWERS, subtract_mean
 from jaxevent.egomotion.batch_fit.path import Path, advanced
+from jaxevent.egomotion.batch_fit.placing import POWERS
 from jaxevent.egomotion.batch_fit.tracks import Scene
+from jaxevent.egomotion.batch_fit.weighing import subtract_mean
 from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import Motion

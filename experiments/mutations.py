@@ -130,7 +130,7 @@ MUTATIONS = (
     ),
     Mutation(
         "conjugate gradients forget the direction before",
-        "jaxevent/egomotion/batch_fit/loops.py",
+        "jaxevent/egomotion/batch_fit/solving.py",
         "share = new / max(size, 1e-30)",
         "share = 0.0",
         "tests/egomotion/test_photometric_equations.py -k gradients",

@@ -7,8 +7,8 @@ import pytest
 
 from jaxevent.egomotion.batch_fit import gauss_newton, rows
 from jaxevent.egomotion.batch_fit.gauss_newton import Acceptance, accept
-from jaxevent.egomotion.batch_fit.loops import POWERS
 from jaxevent.egomotion.batch_fit.path import SEGMENTS, Path, Prior
+from jaxevent.egomotion.batch_fit.placing import POWERS
 
 K = 3
 HALF = 0.15

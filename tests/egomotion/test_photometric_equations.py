@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from jaxevent.egomotion.batch_fit import equations as fit
-from jaxevent.egomotion.batch_fit import loops
+from jaxevent.egomotion.batch_fit import solving
 from jaxevent.egomotion.batch_fit.path import ROWS, SEGMENTS, Path, Prior
 from jaxevent.egomotion.batch_fit.rows import with_rows
 from jaxevent.egomotion.batch_fit.tracks import Scene, Tracks, read
+from jaxevent.egomotion.batch_fit.weighing import subtract_mean
 
 pytestmark = pytest.mark.slow
 
@@ -173,7 +174,7 @@ def test_the_gradient_is_that_of_what_is_minimised():
         parts = apart(v, equations)
         new = moved(scene, equations, parts)
         left = misfits_before_means(new, problem.tracks)
-        loops.subtract_mean(left, seen.weight, problem.tracks.begin)
+        subtract_mean(left, seen.weight, problem.tracks.begin)
         depth = new.path.log_rho.reshape(rows, columns)
         bonds = maps = 0.0
         for axis in (0, 1):
@@ -193,12 +194,12 @@ def test_the_gradient_is_that_of_what_is_minimised():
     assert abs(expected[-rows * columns :]).max() > 1e-3
 
 
-def times(system: loops.System, v: fit.Unknowns) -> fit.Unknowns:
+def times(system: solving.System, v: fit.Unknowns) -> fit.Unknowns:
     """H v."""
     out, out_depth = np.empty(SHAPE), np.empty(system.hold.shape)
     t = np.ascontiguousarray(v[1][: len(system.known)])
     depth = np.ascontiguousarray(v[2]).reshape(system.hold.shape)
-    found = loops.multiply(
+    found = solving.multiply(
         system, np.ascontiguousarray(v[0]), t, depth, np.empty(PIXELS * EACH), out, out_depth
     )
     return out, found, out_depth
@@ -220,7 +221,7 @@ def test_the_matrix_is_that_of_least_squares():
     m = n + free
     J = np.array([equations.change(apart(v, equations)) for v in np.eye(sum(size_of(equations)))])
     for row in J:
-        loops.subtract_mean(row, seen.weight, begin)
+        subtract_mean(row, seen.weight, begin)
     H = matrix(0.0)
     priors = H - equations.problem.information * (J * seen.weight) @ J.T
     held = (equations.known + equations.held)[:free, :free]
@@ -241,7 +242,7 @@ def test_the_preconditioner_is_exact_where_the_matrix_is_of_blocks(damping):
     for v in np.eye(free + nodes):
         depth = v[free:].reshape(system.hold.shape)
         out = np.empty_like(depth)
-        t = loops._ease_rest(system, v[:free].copy(), depth.copy(), out)
+        t = solving._ease_rest(system, v[:free].copy(), depth.copy(), out)
         eased.append(np.append(t, out))
     upper, mixed = equations.upper[:free, :free], equations.mixed[:, :free]
     stiff = (damping + 1e-3) * np.diag(equations.stiff[:free])
@@ -262,9 +263,9 @@ def test_conjugate_gradients_solve():
     given = side[: size[0]].reshape(SHAPE), side[size[0] : size[0] + size[1]], depth
     exact, steps = np.linalg.solve(H, side), []
     for enough, near in ((0.1, 0.3), (1e-3, 3e-3), (1e-9, 1e-7)):
-        *found, done = loops.conjugate_gradients(system, *given, 2000, enough)
+        *found, done = solving.conjugate_gradients(system, *given, 2000, enough)
         off = joined(found, size[1]) - exact
         assert np.sqrt(off @ H @ off) < near * np.sqrt(exact @ side)
         steps.append(done)
     assert 0 < steps[0] < steps[1] < steps[2] < 30  # 22; steepest descent needs 45
-    assert loops.conjugate_gradients(system, *given, 5, 0.0)[3] == 5
+    assert solving.conjugate_gradients(system, *given, 5, 0.0)[3] == 5

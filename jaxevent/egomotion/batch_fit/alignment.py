@@ -17,8 +17,14 @@ from numpy.typing import NDArray
 
 from jaxevent.egomotion.batch_fit import images
 from jaxevent.egomotion.batch_fit.gauss_newton import DEEPEST, bonds, limit_step
-from jaxevent.egomotion.batch_fit.loops import POWERS, Cells, Points, assign, slopes_by_coefficients
 from jaxevent.egomotion.batch_fit.path import SEGMENTS, Path, Prior, normalised, warp
+from jaxevent.egomotion.batch_fit.placing import (
+    POWERS,
+    Cells,
+    Points,
+    assign,
+    slopes_by_coefficients,
+)
 from jaxevent.egomotion.batch_fit.rows import (
     chain,
     gauge_of_rows,

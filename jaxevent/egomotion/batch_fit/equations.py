@@ -10,22 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.egomotion.batch_fit.gauss_newton import bonds
-from jaxevent.egomotion.batch_fit.loops import (
-    POWERS,
-    Free,
-    Slopes,
-    System,
-    back,
-    blocks,
-    chained,
-    conjugate_gradients,
-    differentiate,
-    forward,
-    subtract_mean,
-    weigh,
-    weighed_squares,
-)
 from jaxevent.egomotion.batch_fit.path import ROWS, Path, Prior, normalised
+from jaxevent.egomotion.batch_fit.placing import POWERS
 from jaxevent.egomotion.batch_fit.rows import (
     chain,
     gauge_of_rows,
@@ -34,7 +20,19 @@ from jaxevent.egomotion.batch_fit.rows import (
     rows_of,
     units_of_rows,
 )
+from jaxevent.egomotion.batch_fit.slopes import (
+    Free,
+    Slopes,
+    back,
+    blocks,
+    chained,
+    differentiate,
+    forward,
+    weighed_squares,
+)
+from jaxevent.egomotion.batch_fit.solving import System, conjugate_gradients
 from jaxevent.egomotion.batch_fit.tracks import Places, Scene, Tracks, read
+from jaxevent.egomotion.batch_fit.weighing import subtract_mean, weigh
 
 BEND = 0.1  # a larger difference of log depth between nodes is an edge
 FREE = 6 * ROWS  # numbers of a path's rows; after them come the skew and the plane's normal

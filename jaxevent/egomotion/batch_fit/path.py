@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.egomotion.batch_fit import loops
+from jaxevent.egomotion.batch_fit import placing
 
 SEGMENTS = 8
 ROWS = 5  # of a path: T and Omega are polynomials of the fourth degree
@@ -60,9 +60,9 @@ class Path:
         factorials = np.array([math.factorial(k + 1) for k in range(len(O))])[:, None]
         return O / factorials, C / factorials
 
-    def motion(self, f: float) -> loops.Motion:
+    def motion(self, f: float) -> placing.Motion:
         """The same for the loops, of a camera of focal length f (px)."""
-        return loops.Motion(*self.polynomials(), f)
+        return placing.Motion(*self.polynomials(), f)
 
     def twist(self, tau: float | int | NDArray) -> tuple[NDArray, NDArray]:
         """Unit heading R' C' and Omega to second order, (times, 3) each, at times tau (s)."""
@@ -93,7 +93,7 @@ def warp(
     parts = [np.ascontiguousarray(one) for one in np.broadcast_arrays(x, y, tau, rho)]
     X, Y = np.empty_like(parts[0]), np.empty_like(parts[0])
     flat = [part.reshape(-1) for part in (*parts, X, Y)]
-    loops.warp(loops.Points(*flat[:3]), flat[3], path.motion(f), *flat[4:])
+    placing.warp(placing.Points(*flat[:3]), flat[3], path.motion(f), *flat[4:])
     return X, Y
 
 

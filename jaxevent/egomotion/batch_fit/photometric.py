@@ -52,10 +52,10 @@ from jaxevent.egomotion.batch_fit.gauss_newton import (
     accept,
     limit_step,
 )
-from jaxevent.egomotion.batch_fit.loops import subtract_mean
 from jaxevent.egomotion.batch_fit.path import LEAST, ROWS, Path, Prior, normalised, rays_of
 from jaxevent.egomotion.batch_fit.rows import with_rows
 from jaxevent.egomotion.batch_fit.tracks import Scene, Tracks
+from jaxevent.egomotion.batch_fit.weighing import subtract_mean
 
 CELLS = 24, 48  # px, whose errors are alike
 

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.egomotion.batch_fit.equations import look
-from jaxevent.egomotion.batch_fit.loops import subtract_mean
 from jaxevent.egomotion.batch_fit.path import Path, Prior
 from jaxevent.egomotion.batch_fit.photometric import adjust, begin
 from jaxevent.egomotion.batch_fit.tracks import Scene, Tracks
+from jaxevent.egomotion.batch_fit.weighing import subtract_mean
 
 CELL = 48  # px, within which errors are alike
 FAR = -9.0  # log inverse depth that makes no parallax

@@ -5,8 +5,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.egomotion.batch_fit.loops import POWERS
 from jaxevent.egomotion.batch_fit.path import ROWS, SEGMENTS, Path, Prior
+from jaxevent.egomotion.batch_fit.placing import POWERS
 
 
 def rows_of(path: Path, k: int = ROWS) -> NDArray[np.float64]:

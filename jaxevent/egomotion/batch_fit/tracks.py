@@ -7,8 +7,9 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from jaxevent.egomotion.batch_fit.loops import Grids, Points, place, read_map, subtract_mean
 from jaxevent.egomotion.batch_fit.path import Path
+from jaxevent.egomotion.batch_fit.placing import Grids, Points, place
+from jaxevent.egomotion.batch_fit.weighing import read_map, subtract_mean
 
 SIDE = 4  # nodes about an event among whose depths its own is
 
@@ -82,7 +83,7 @@ class Places(NamedTuple):
 
 
 def placed(path: Path, tracks: Tracks) -> tuple[NDArray, NDArray]:
-    """Where events are in the reference view (`loops.place`)."""
+    """Where events are in the reference view (`placing.place`)."""
     X, Y = np.empty_like(tracks.x), np.empty_like(tracks.x)
     # Of nodes within reach the nearest and the farthest depth.
     depth = np.ascontiguousarray(path.log_rho)
