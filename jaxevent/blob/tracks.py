@@ -35,6 +35,7 @@ from jaxevent.shown import Shown
 
 BEGINS = 32  # stretches from which tracking can be taken up again
 READS = 64  # times read per call
+KEPT = 2**24  # numbers of what later events say that are kept between readings
 
 _begin = jax.jit(begin, static_argnames="filter")
 _nothing_later = jax.jit(lambda begins: nothing_later(jax.tree.map(lambda a: a[-1], begins)))
@@ -170,6 +171,7 @@ class Tracks(Shown):
         self.start, self.stop = packing.start, packing.stop
         self._filter, self._packing, self._progress = filter, packing, progress
         self._begins: list[tuple[Mark, int, Any]] = []
+        self._following: dict[Mark, list[_Following]] = {}  # of the last stretches, up to `KEPT`
         self._number(self._follow())
 
     def __len__(self) -> int:
@@ -361,7 +363,7 @@ class Tracks(Shown):
         done = 0
         while done < len(times):
             assert mark is not None
-            stretch = self._packing.pack(mark)
+            now, stretch = mark, self._packing.pack(mark)
             mark = stretch.next
             upto = len(times) if mark is None else int(np.searchsorted(times, mark.start))
             state, told = self._run(state, stretch.features)
@@ -369,7 +371,10 @@ class Tracks(Shown):
                 following = None
                 if self.smooth:
                     assert told.slots is not None
-                    following, _ = self._look_back(stretch, told.slots, self._later)
+                    later = self._later  # fills what is kept
+                    following = self._following.get(now)
+                    if following is None:
+                        following, _ = self._look_back(stretch, told.slots, later)
                 yield stretch, told.slots, following
             done = upto
             if done < len(times) and mark is not None:
@@ -410,6 +415,7 @@ class Tracks(Shown):
     def _later(self) -> dict[Mark, Later]:
         """What later events say at the starts of all stretches, found from the last one on."""
         found: dict[Mark, Later] = {}
+        room = KEPT
         rows = self._packing.rows
         with bar(
             total=rows[1] - rows[0], unit="event", unit_scale=True, desc="smooth",
@@ -419,8 +425,11 @@ class Tracks(Shown):
                 stretch = self._packing.pack(mark)
                 _, told = self._run(state, stretch.features)
                 assert told.slots is not None
-                _, first = self._look_back(stretch, told.slots, found)
+                following, first = self._look_back(stretch, told.slots, found)
                 found[mark] = jax.device_get(first)
+                room -= len(following) * sum(leaf.size for leaf in jax.tree.leaves(found[mark]))
+                if room >= 0:
+                    self._following[mark] = following
                 shown.update(int(np.count_nonzero(stretch.features.valid)))
         return found
 

@@ -78,7 +78,10 @@ def draw_frames(
                 f"{recording.name}: image {k} of {len(t)} behind the tracks is {found}; give uint8 "
                 f"of {size}, grey or colour, for each time"
             )
-        large = Image.fromarray(image.repeat(scale, 0).repeat(scale, 1)).convert("RGB")
+        large = Image.fromarray(image).convert("RGB")
+        if scale > 1:
+            wide, high = (scale * side for side in large.size)
+            large = large.resize((wide, high), Image.Resampling.NEAREST)
         draw = ImageDraw.Draw(large)
         first = now - round(trail * 1e6)
         ways = {int(i): ways.get(int(i), []) for i in np.flatnonzero(valid)}

@@ -48,6 +48,9 @@ class Background:
     duration: float
     scene: SceneMotion | None = None
     corner: tuple[int, int] = (0, 0)
+    _means: dict[int, NDArray[np.float64]] = dataclasses.field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def slice(self, t: NDArray | float | int) -> Any:
         """Which slices hold times (s)."""
@@ -60,7 +63,10 @@ class Background:
         """Rates, 1/(px s), at some pixels at a time (s); in a scene means of `over` x `over` px."""
         rate = self.rate
         if self.scene is not None:
-            rate = np.maximum(ndimage.uniform_filter(rate, max(1, round(over / FINE))), rate.min())
+            cells = max(1, round(over / FINE))
+            if cells not in self._means:
+                self._means[cells] = np.maximum(ndimage.uniform_filter(rate, cells), rate.min())
+            rate = self._means[cells]
         return look_up(rate, FINE, *self.place(x, y, t)) * self.activity[self.slice(t)]
 
     @property

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from jaxevent.blob.finding.stream import Part, Stream
+from jaxevent.kernels import compiled
+from jaxevent.kernels import part as kernel_part
 
 REFERENCE = np.array([[60.0, 60], [180, 60], [60, 180], [180, 180]])  # px
 STEPS = 128  # motions of a recording, at most
@@ -136,28 +138,69 @@ def _shift(one: NDArray, other: NDArray) -> NDArray[np.float64]:
 
 def _align(one: NDArray, other: NDArray, motion: NDArray) -> NDArray[np.float64]:
     """The motion (3,), in bins of `_fields`, that takes one image to the other."""
-    fields = _fields(one.shape)
-    y, x = np.mgrid[: one.shape[0], : one.shape[1]]
     for blur in BLURS:
         a, b = (ndimage.gaussian_filter(image, blur, mode="constant") for image in (one, other))
         for _ in range(ROUNDS):
-            half_x, half_y = np.moveaxis(motion @ fields, 2, 0) / 2
-            before, after = (
-                ndimage.map_coordinates(i, [y + s * half_y, x + s * half_x], order=1, cval=np.nan)
-                for i, s in ((a, -1), (b, 1))
-            )
-            known = np.isfinite(before) & np.isfinite(after)
-            e = np.where(known, after - before, 0)
-            gy, gx = np.gradient(np.where(known, (after + before) / 2, 0))
-            usual = np.sqrt((e**2).sum() / max(known.sum(), 1)) + 1e-12
-            weight = (known / (1 + (e / (ODD * usual)) ** 2)).ravel()
-            slopes = (gx[..., None] * fields[..., 0] + gy[..., None] * fields[..., 1]).reshape(
-                -1, 3
-            )
-            H = slopes.T @ (slopes * weight[:, None])
+            H, slope = _normal_equations(a, b, motion, ODD)
             H += np.eye(3) * (1e-4 * np.trace(H) / 3 + 1e-12)
-            step = np.linalg.solve(H, slopes.T @ (weight * e.ravel()))
+            step = np.linalg.solve(H, slope)
             motion = motion - step
             if abs(step).max() < SMALL:
                 break
     return motion
+
+
+@compiled
+def _normal_equations(a: Any, b: Any, motion: Any, odd: float | int) -> Any:
+    """Of Gauss and Newton: J^T W J and J^T W e of two images, each moved half the way.
+
+    Bins that differ by `odd` times the usual have half the weight.
+    """
+    rows, columns = a.shape
+    quarter = (rows + columns) / 4
+    e, mean, known = np.zeros(a.shape), np.zeros(a.shape), np.zeros(a.shape, np.bool_)
+    total, number = 0.0, 0
+    for row in range(rows):
+        y = (row - (rows - 1) / 2) / quarter
+        for column in range(columns):
+            x = (column - (columns - 1) / 2) / quarter
+            half_x, half_y = (motion[1] - motion[0] * y) / 2, (motion[2] + motion[0] * x) / 2
+            before = _value(a, row - half_y, column - half_x)
+            after = _value(b, row + half_y, column + half_x)
+            if before == before and after == after:
+                known[row, column] = True
+                e[row, column] = after - before
+                mean[row, column] = (after + before) / 2
+                total += (after - before) ** 2
+                number += 1
+    scale = 1 / (odd * (np.sqrt(total / max(number, 1)) + 1e-12))
+    H, slope, s = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    for row in range(rows):
+        y = (row - (rows - 1) / 2) / quarter
+        above, below = max(row - 1, 0), min(row + 1, rows - 1)
+        for column in range(columns):
+            if not known[row, column]:
+                continue
+            x = (column - (columns - 1) / 2) / quarter
+            left, right = max(column - 1, 0), min(column + 1, columns - 1)
+            s[1] = (mean[row, right] - mean[row, left]) / (right - left)
+            s[2] = (mean[below, column] - mean[above, column]) / (below - above)
+            s[0] = x * s[2] - y * s[1]
+            weight = 1 / (1 + (e[row, column] * scale) ** 2)
+            for i in range(3):
+                slope[i] += weight * s[i] * e[row, column]
+                for j in range(3):
+                    H[i, j] += weight * s[i] * s[j]
+    return H, slope
+
+
+@kernel_part
+def _value(image: Any, y: float, x: float) -> float:
+    """Between bins on straight lines; NaN outside."""
+    rows, columns = image.shape
+    if not (0 <= y <= rows - 1 and 0 <= x <= columns - 1):
+        return np.nan
+    row, column = min(int(y), rows - 2), min(int(x), columns - 2)
+    v, u = y - row, x - column
+    top = (1 - u) * image[row, column] + u * image[row, column + 1]
+    return (1 - v) * top + v * ((1 - u) * image[row + 1, column] + u * image[row + 1, column + 1])

@@ -1,0 +1,68 @@
+"""What `jaxevent track` spends its time on: finding, following, reading, tables and the video.
+
+    python experiments/bench_track.py --data DIR [--only NAME ...]
+
+CPU seconds of this process and of ffmpeg, of the second of two runs in one process, so without
+compilation; the video's time is what a folder with it takes more than one without. Makes no file.
+"""
+
+import argparse
+import resource
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from jaxevent.blob import find, moment
+from jaxevent.io import load
+from jaxevent.show.tracks import Output
+
+NAMES = ("spinning_dot.npz", "davis346_street.npz", "atis.es")
+
+
+def cpu() -> float:
+    """Of this process and of those it waited for, s."""
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + children.ru_utime + children.ru_stime
+
+
+def timed(work: Callable[[], Any]) -> tuple[float, Any]:
+    begin = cpu()
+    told = work()
+    return cpu() - begin, told
+
+
+def parts_of(path: Path, folder: Path) -> list[float]:
+    recording = load(path, in_memory=False)
+    found_in, found = timed(lambda: find(recording, progress=False))
+    params = moment.Params(**found.settings())
+
+    def follow() -> Any:
+        return moment.estimate(recording, params, found=found, progress=False)
+
+    followed_in, _ = timed(follow)
+    table, _ = timed(lambda: Output(folder / "t.csv").write(follow(), False))
+    video, _ = timed(lambda: Output(folder / "t.mp4").write(follow(), False))
+    events = len(recording.events) / (found_in + followed_in) * 1e-6
+    return [found_in, followed_in, table - followed_in, video - followed_in, events]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--only", nargs="+", default=NAMES)
+    args = parser.parse_args()
+    print("| recording | find s | follow s | table s | video s | find and follow, M events/s |")
+    print("|---|" + "---:|" * 5)
+    for name in args.only:
+        with tempfile.TemporaryDirectory() as folder:
+            for _ in range(2):
+                told = parts_of(args.data / name, Path(folder))
+        print(f"| {name} | " + " | ".join(f"{one:.2f}" for one in told) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
