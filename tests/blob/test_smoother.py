@@ -151,6 +151,10 @@ def test_stretches_chunks_and_births_do_not_matter(three):
     assert len(short._later) > len(short._begins) > 8
     for one, other in zip(tracks(times), short(times), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8)
+    assert len(short._following) == len(short._later)
+    short._following = {}  # as where there is no room for what later events say
+    for one, other in zip(tracks(times), short(times), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8)
     # At its end a track rests on the same events either way.
     ends = np.minimum(tracks.death - 1, rec.stop)
     both = (tracks(ends), tracks.filtered(ends))
