@@ -242,7 +242,7 @@ def test_the_preconditioner_is_exact_where_the_matrix_is_of_blocks(damping):
     for v in np.eye(free + nodes):
         depth = v[free:].reshape(system.hold.shape)
         out = np.empty_like(depth)
-        t = solving._ease_rest(system, v[:free].copy(), depth.copy(), out)
+        t = solving.ease_rest(system, v[:free].copy(), depth.copy(), out)
         eased.append(np.append(t, out))
     upper, mixed = equations.upper[:free, :free], equations.mixed[:, :free]
     stiff = (damping + 1e-3) * np.diag(equations.stiff[:free])
@@ -269,3 +269,16 @@ def test_conjugate_gradients_solve():
         steps.append(done)
     assert 0 < steps[0] < steps[1] < steps[2] < 30  # 22; steepest descent needs 45
     assert solving.conjugate_gradients(system, *given, 5, 0.0)[3] == 5
+
+
+def test_several_sides_are_solved_together():
+    """Against the dense matrix; one side twice is no harm."""
+    _, equations = linearised()
+    size, rows = size_of(equations), [0, 4, 15, 4]
+    found = np.array([joined(v, size[1]) for v in fit.inverse_of(equations, rows)]).T
+    sides = np.zeros((sum(size), len(rows)))
+    sides[size[0] + np.array(rows), range(len(rows))] = equations.unit[rows]
+    exact = np.linalg.solve(matrix(0.0), sides)
+    np.testing.assert_allclose(found[size[0] :], exact[size[0] :], atol=0.02 * abs(exact).max())
+    own = (sides * found).sum(0) / (sides * exact).sum(0)
+    assert (own < 1 + 1e-6).all() and (own > 0.95).all()

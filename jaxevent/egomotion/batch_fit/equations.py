@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.egomotion.batch_fit import together
 from jaxevent.egomotion.batch_fit.gauss_newton import bonds
 from jaxevent.egomotion.batch_fit.path import ROWS, Path, Prior, normalised
 from jaxevent.egomotion.batch_fit.placing import POWERS
@@ -289,6 +290,20 @@ def system_of(equations: Equations, damping: float) -> System:
         on(equations.across), on(equations.down), on(1 / (eased_by * equations.diagonal)),
         on(1 / (eased_by * lumped)), on(mixed), np.linalg.inv(small).astype(np.float64),
     )  # fmt: skip
+
+
+def inverse_of(equations: Equations, rows: list[int]) -> list[Unknowns]:
+    """Columns of H^-1, undamped, of so many of the path's rows, each in its own unit."""
+    n = FREE + len(equations.slopes.more)
+    sides = np.zeros((len(rows), n))
+    sides[range(len(rows)), rows] = equations.unit[rows]
+    found = together.solve(system_of(equations, 0.0), sides)
+    shape = equations.problem.tracks.shape
+    size = math.prod(shape)
+    return [
+        (rest[:size].reshape(shape), np.append(t, np.zeros(FREE + 4 - n)), rest[size:])
+        for t, rest in zip(*found, strict=True)
+    ]
 
 
 def solve(equations: Equations, damping: float, side: Unknowns, left: float = LEFT) -> Unknowns:

@@ -42,6 +42,7 @@ from jaxevent.egomotion.batch_fit.equations import (
     Problem,
     Seen,
     gradient_of,
+    inverse_of,
     linearise,
     look,
     solve,
@@ -209,11 +210,7 @@ def spread(equations: Equations) -> NDArray[np.float64]:
     down, across = ((tracks.y - tracks.corner[1]), (tracks.x - tracks.corner[0]))
     cell = (down // CELLS[0] * columns + across // CELLS[0]).astype(np.int64)
     told, own = [], []
-    for i in (*range(3 * ROWS, 3 * ROWS + 3), *range(3)):
-        side = np.zeros(FREE + 4)
-        side[i] = equations.unit[i]
-        nodes = np.zeros(math.prod(tracks.nodes))
-        v = solve(equations, 0.0, (np.zeros(tracks.shape), side, nodes), 0.0)
+    for v in inverse_of(equations, [*range(3 * ROWS, 3 * ROWS + 3), *range(3)]):
         score = problem.information * weight * left * equations.change(v)
         told.append(np.bincount(cell, score, rows * columns))
         own.append(v[1])

@@ -105,7 +105,7 @@ def multiply(system, map_, t, depth, value, out, out_depth):
 
 
 @fast_part
-def _ease_rest(system, t, depth, out_depth):
+def ease_rest(system, t, depth, out_depth):
     """About H^-1 of path and depths, these lumped: writes depths, returns t."""
     n, nodes, to = len(t), depth.reshape(-1), out_depth.reshape(-1)
     side = t.copy()
@@ -150,7 +150,7 @@ def conjugate_gradients(system, side_map, side_t, side_depth, steps, enough):
     )  # fmt: skip
     way = left * system.ease_map
     d = way.reshape(-1)
-    way_t = _ease_rest(system, left_t, left_depth, better)
+    way_t = ease_rest(system, left_t, left_depth, better)
     way_depth = better.copy()
     size = _dot(q, d) + _dot(left_t, way_t) + _dot(left_depth.reshape(-1), way_depth.reshape(-1))
     first, done = size, 0
@@ -169,7 +169,7 @@ def conjugate_gradients(system, side_map, side_t, side_depth, steps, enough):
         left_t -= length * out_t
         found_depth += step * way_depth
         left_depth -= step * out_depth
-        better_t = _ease_rest(system, left_t, left_depth, better)
+        better_t = ease_rest(system, left_t, left_depth, better)
         new += _dot(left_t, better_t) + _dot(left_depth.reshape(-1), better.reshape(-1))
         share = new / max(size, 1e-30)
         more = left.dtype.type(share)
