@@ -10,8 +10,10 @@ from jaxevent.reconstruction.fused.timeline import NEVER
 from jaxevent.recording import EventColumns
 
 # Room for pixels of a band and its border. A dozen numbers each fill half a megabyte, of a
-# second-level cache of one; each number begins a cache line further than a power of two.
+# second-level cache of one; each number begins a cache line further than a power of two. Where
+# derivatives lie beside them the smaller bands are a tenth faster.
 STRIDES = (8208, 16400, 32784, 65488)
+SMALLER = (4112, *STRIDES)
 LEAST_ROWS = 6  # the two rows of a border are read for nothing
 
 
@@ -23,10 +25,10 @@ class BandLayout:
     edges: NDArray[np.int64]
 
     @classmethod
-    def of(cls, width: int, height: int) -> "BandLayout | None":
+    def of(cls, width: int, height: int, smaller: bool = False) -> "BandLayout | None":
         """None for sensors too wide for a band."""
         rows, stride = 0, 0
-        for stride in STRIDES:
+        for stride in SMALLER if smaller else STRIDES:
             rows = stride // (width + 2) - 2
             if rows >= min(LEAST_ROWS, height):
                 break

@@ -16,6 +16,7 @@ from jaxevent.reconstruction.fused.kernel import Kernel, kernel_of, program_of
 from jaxevent.reconstruction.fused.loop import Bands, FrameRows, Given, Images, Line, Memory, run
 from jaxevent.reconstruction.fused.pixel import Directions
 from jaxevent.reconstruction.fused.timeline import NEVER, make_line
+from jaxevent.reconstruction.memory import aligned
 from jaxevent.reconstruction.stream import Stream, StreamState, weigh
 from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import ColumnSource, EventColumns, Recording
@@ -44,9 +45,9 @@ class Window(NamedTuple):
 class DividedRecording:
     """Cuts a recording into windows whose events are divided among bands of rows.
 
-    `events` bounds a window's events; None: one window is the whole. `factors` (2, pixels) are
-    those of single pixels' ON and OFF thresholds. Raises `Untranslatable` for what kernels cannot
-    do.
+    `events` bounds a window's events; None: one window is the whole, for images with derivatives.
+    `factors` (2, pixels) are those of single pixels' ON and OFF thresholds. Raises `Untranslatable`
+    for what kernels cannot do.
     """
 
     def __init__(
@@ -57,7 +58,8 @@ class DividedRecording:
         events: int | None = None,
         factors: NDArray[np.floating] | None = None,
     ):
-        layout = BandLayout.of(recording.width, recording.height)
+        smaller = filtering and events is None
+        layout = BandLayout.of(recording.width, recording.height, smaller)
         if layout is None:
             raise Untranslatable(f"a sensor {recording.width} pixels wide")
         if recording.stop - recording.start >= NEVER:
@@ -197,7 +199,7 @@ class Passes:
         fields, bands = kernel.source.fields, len(layout.edges) - 1
         self.kernel, self.layout, self.dtype = kernel, layout, dtype
         self._memory = Memory(
-            np.zeros((bands, fields.size), dtype),
+            aligned((bands, fields.size), dtype),
             np.zeros((bands, max(len(fields.whole), 1) * layout.stride), np.int64),
             np.zeros((bands, layout.stride)),
             np.zeros((bands, 3), np.int64),
