@@ -16,11 +16,14 @@ os.environ.setdefault(
 )
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
+import checked
 import hypothesis
 import jax
+import jaxtyping
 import pytest
 
 # jaxevent must not be imported here: the shape checker only sees what is imported after it.
+jaxtyping.jaxtyped = checked.jaxtyped
 jax.config.update("jax_enable_x64", True)
 
 # Tracing makes many objects and little garbage: looking for it as often as usual costs 2 %.
