@@ -5,9 +5,9 @@
 Every image that is scored here was hidden from the methods: frames of the first half of
 slider_depth, at gaps of 2 to 16 frames, and true images of simulated HDR scenes and of moving
 objects, of the scenes and seeds that are for fitting. Prints the numbers as TOML.
-With --one-sided it fits those of the sign "one_sided" alone, all others as they are, to the same
-kinds of images of recordings whose frames end before the image or begin after it, and scores them
-on davis346_street and the second half of slider_depth, cut likewise. Do so after the others.
+With --beyond it fits `choice_beyond` and `doubt_beyond` to the same kinds of images of recordings
+whose frames end before the image or begin after it, textures that hardly move among them, and
+scores them on davis346_street and the second half of slider_depth, cut likewise.
 Frames that serve as truth are noisy: their own variance is added to that of the images.
 """
 
@@ -34,6 +34,7 @@ from jaxevent.simulate import FITTING, SENSORS, TESTING, Objects, Pan, Sensor, s
 from jaxevent.simulate.scenes import Speed
 
 BLOCK = 8  # px, over which the noise of frames is averaged
+CUTS, AWAY = 4, (1, 2, 4, 8)  # places at which a recording is cut; frames from there
 GAPS = {2: 12, 4: 12, 8: 12, 16: 8}  # frames from one that is given to the next: images scored
 # What `jaxevent fit` finds with the likelihood of frames: configs/fit_slider_depth.toml, and the
 # same for davis346_street.
@@ -116,14 +117,17 @@ def panned(names: tuple[str, ...], seed: int, images: int) -> Iterator[tuple]:
 
 
 class Texture:
-    """A random texture that slides by on an accelerated path, before another one or without."""
+    """A random texture that slides by on an accelerated path, before another one or without.
+
+    It is `pace` times as fast as others.
+    """
 
     size, duration = (96, 72), 0.6
 
-    def __init__(self, seed: int):
+    def __init__(self, seed: int, pace: float = 1.0):
         self.rng = rng = np.random.default_rng(seed)
         self.y, self.x = np.mgrid[:72, :96].astype(float)
-        self.speed = float(np.exp(rng.uniform(np.log(15), np.log(300))))
+        self.speed = pace * float(np.exp(rng.uniform(np.log(15), np.log(300))))
         self.layers = [self._layer() for _ in range(int(rng.integers(1, 3)))]
         self.edge = rng.uniform(25, 70)
 
@@ -155,7 +159,7 @@ class Texture:
         return np.exp(level).clip(0.01, 1.5)
 
 
-def textures(seeds: range) -> Iterator[tuple]:
+def textures(seeds: range, pace: float = 1.0) -> Iterator[tuple]:
     """Targets among the true images of sliding textures."""
     for seed in seeds:
         rng = np.random.default_rng(seed)
@@ -165,7 +169,7 @@ def textures(seeds: range) -> Iterator[tuple]:
             c_on=c_on, c_off=c_off, frame_rate=rate, exposure=1e-3,
             background_rate=rng.uniform(0, 0.5), read_noise=rng.uniform(0.3, 2), truth_rate=20.0,
         )  # fmt: skip
-        recording = simulate(Texture(seed), sensor, seed, f"texture {seed}")
+        recording = simulate(Texture(seed, pace), sensor, seed, f"texture {seed}")
         wrong = np.exp(rng.normal(0, 0.12, 2))
         params = Params(
             c_on=c_on * wrong[0], c_off=c_off * wrong[1], I0=float(rng.choice([0.01, 0.05, 0.3])),
@@ -175,7 +179,8 @@ def textures(seeds: range) -> Iterator[tuple]:
         video = jaxevent.METHODS["mc"].estimate(recording, params, progress=False)
         times, truths = recording.extra["hdr_t"], recording.extra["hdr"]
         for row in np.unique(np.linspace(1, len(times) - 2, 3).round().astype(int)):
-            yield "textures", video, int(times[row]), np.asarray(truths[row]), False
+            label = f"textures x {pace:g}"
+            yield label, video, int(times[row]), np.asarray(truths[row]), False
 
 
 def objects(seeds: range) -> Iterator[tuple]:
@@ -203,6 +208,22 @@ def cut(targets: Iterator[tuple]) -> Iterator[tuple]:
                 yield label, one, t, truth, hdr
 
 
+def ended(path: Path, params: Params) -> Iterator[tuple]:
+    """Targets some frames after the last one given, or before the first; of the first half."""
+    recording = jaxevent.load(path)
+    assert recording.frames is not None
+    times = frame_times(recording.frames, params)
+    for at in np.linspace(0, len(times) // 2, CUTS + 2).round().astype(int)[1:-1]:
+        for rows, step in ((slice(0, at), 1), (slice(at, None), -1)):
+            given = recording.with_frames(rows)
+            video = jaxevent.METHODS["mc"].estimate(given, params, progress=False)
+            for away in AWAY:
+                row = at - 1 + away if step > 0 else at - away
+                if 0 <= row < len(times) // 2:
+                    truth = np.asarray(recording.frames[row : row + 1].intensity[0])
+                    yield f"{path.stem} + {away}", video, int(times[row]), truth, False
+
+
 def compared(targets: Iterator[tuple]) -> Iterator[dict[str, Any]]:
     compare = jax.jit(fusion.compare)
     for label, video, t, truth, hdr in targets:
@@ -212,6 +233,7 @@ def compared(targets: Iterator[tuple]) -> Iterator[dict[str, Any]]:
             "ingredients": np.asarray(told.ingredients),
             "signs": np.asarray(told.signs),
             "usual": np.asarray(told.usual),
+            "beyond": np.asarray(told.beyond),
             "truth": truth.astype(np.float32),
             "I0": float(video.params.I0),
             "hdr": hdr,
@@ -230,6 +252,12 @@ def noise_in(row: dict[str, Any], noises: dict[str, float]) -> np.ndarray:
     """The variance of the true ln(I + I0) of a row: frames are noisy, simulated truth is not."""
     noise = noises.get(row["label"].split()[0], 0.0)
     return noise / (row["truth"] + row["I0"]) ** 2
+
+
+def difficulty(row: dict[str, Any]) -> float:
+    """What the first two ingredients get wrong, so that hard images do not outweigh."""
+    known = (row["I0"], row["truth"], row["hdr"])
+    return float(np.sqrt(np.prod([errors(L, *known).mean() for L in row["ingredients"][:2]])))
 
 
 def fit(
@@ -263,23 +291,9 @@ def fit(
     )
     share = share / share.sum()
     hdr = column(lambda r: np.full(len(some(r["truth"])), r["hdr"])) > 0
-    # Every image counts by what its ingredients get wrong, so that hard ones do not outweigh.
-    scale = column(
-        lambda r: np.full(
-            len(some(r["truth"])),
-            1
-            / np.sqrt(
-                np.prod(
-                    [
-                        float(errors(r["ingredients"][k], r["I0"], r["truth"], r["hdr"]).mean())
-                        for k in (0, 1)
-                    ]
-                )
-            ),
-        )
-    )
+    scale = column(lambda r: np.full(len(some(r["truth"])), 1 / difficulty(r)))
     mean, spread = X.mean(0).at[-1].set(0), X.std(0).at[-1].set(1)
-    spread = jnp.where(spread > 0, spread, 1)  # "one_sided" is 0 throughout
+    spread = jnp.where(spread > 1e-3, spread, 1)  # "seen_twice" is 0 beyond the frames
     X = (X - mean) / spread
     level = jnp.log(truth + I0)
 
@@ -327,53 +341,6 @@ def fit(
     return np.asarray(plain(W)), np.asarray(plain(w))
 
 
-def fit_one_sided(rows: list[dict], noises: dict[str, float], sub: int = 11) -> list[float]:
-    """The weights of the sign "one_sided": two of `choice` and one of `doubt`."""
-    params, at = Params(), SIGNS.index("one_sided")
-    shape = (len(OTHERS), len(SIGNS) + 1)
-    choice = jnp.asarray(params.choice).reshape(shape).at[:, at].set(0)
-    doubt = jnp.asarray(params.doubt).at[at].set(0)
-    parts = []
-    for row in rows:
-        X, Y = (row[n].reshape(len(row[n]), -1)[:, ::sub] for n in ("signs", "ingredients"))
-        truth = row["truth"].ravel()[::sub]
-        wrong = [float(errors(L, row["I0"], truth, row["hdr"]).mean()) for L in Y[:2]]
-        noise = np.ravel(noise_in(row, noises))[::sub] if noise_in(row, noises).any() else 0.0
-        parts.append((X, Y, truth, row["I0"], row["hdr"], noise, 1 / np.sqrt(np.prod(wrong))))
-
-    def image(weights, X, Y):
-        chosen = choice @ X + weights[:, None]
-        q = jax.nn.softmax(jnp.concatenate([jnp.zeros_like(chosen[:1]), chosen]), axis=0)
-        return (q * Y).sum(0)
-
-    def one(weights, part):
-        X, Y, truth, I0, hdr, _, scale = part
-        return scale * errors(image(weights, X, Y), I0, truth, hdr).mean()
-
-    def loss(weights):
-        return sum(one(weights, part) for part in parts) / len(parts)
-
-    optimiser = optax.adam(0.1)
-    weights: Any = jnp.zeros(len(OTHERS))
-    state, step = optimiser.init(weights), jax.jit(jax.value_and_grad(loss))
-    for _ in range(120):
-        _, gradient = step(weights)
-        change, state = optimiser.update(gradient, state)
-        weights = optax.apply_updates(weights, change)
-    groups: dict[str, list] = {}
-    for row, (X, Y, truth, I0, _, noise, _) in zip(rows, parts, strict=True):
-        squares = np.asarray(image(weights, X, Y) - jnp.log(truth + I0)) ** 2
-        groups.setdefault(row["label"], []).append((squares, np.exp(np.asarray(doubt @ X)), noise))
-    factor = 1.0
-    for _ in range(5):  # as `fit` scales variances
-        means = [
-            np.mean([np.log(np.mean(e / (factor * P + noise))) for e, P, noise in group])
-            for group in groups.values()
-        ]
-        factor *= float(np.exp(np.mean(means)))
-    return [*np.asarray(weights).tolist(), float(np.log(factor))]
-
-
 def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:
     """Errors of the ingredients and of the choice, by label.
 
@@ -389,6 +356,7 @@ def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:
             jnp.zeros((3, 1, 1)),
             jnp.zeros((2, 1, 1)),
             jnp.asarray(r["usual"]),
+            jnp.asarray(r["beyond"]),
         )
         fused = decide(params, told)
         line = []
@@ -417,7 +385,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--one-sided", action="store_true", help="fit that sign alone")
+    parser.add_argument("--beyond", action="store_true", help="where frames are on one side alone")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     data = given.data / "data"
@@ -431,34 +399,14 @@ def main() -> None:
 
     slider, street = data / "slider_depth.zip", data / "davis346_street.npz"
     noises = {path.stem: noise_of(frames_of(path)) for path in (slider, street)}
-    if given.one_sided:
-        few = {2: 6, 8: 6}
-        fitting = [
-            kept("slider_cut", cut(hidden(slider, Params(), few, 0))),
-            kept("hdr_cut", cut(panned(FITTING[:1], 11, 3))),
-            kept("textures_cut", cut(textures(range(1000, 1008)))),
-            kept("objects_cut", cut(objects(range(1, 2)))),
-        ]
-        testing = [
-            kept("slider_cut_test", cut(hidden(slider, Params(), few, 1))),
-            kept("street_cut_test", cut(hidden(street, Params(), few, None))),
-        ]
-        choice, doubt = (
-            np.asarray(getattr(Params(), n)).reshape(-1, len(SIGNS) + 1).copy()
-            for n in ("choice", "doubt")
-        )
-        found = fit_one_sided([row for part in fitting for row in part], noises)
-        choice[:, SIGNS.index("one_sided")] = found[:-1]
-        doubt[0, SIGNS.index("one_sided")] = found[-1]
-        print("one_sided =", [round(v, 3) for v in found])
-    else:
-        fitting, testing = _two_sided(kept, slider, street)
-        choice, doubt = fit([row for part in fitting for row in part], noises)
-    numbers = Params().replace(
-        choice=[round(float(v), 3) for v in choice.ravel()],
-        doubt=[round(float(v), 3) for v in doubt.ravel()],
-    )
-    print("choice =", numbers.values()["choice"], "\ndoubt =", numbers.values()["doubt"])
+    fitting, testing = (_beyond if given.beyond else _two_sided)(kept, slider, street)
+    choice, doubt = fit([row for part in fitting for row in part], noises)
+    ending = "_beyond" if given.beyond else ""
+    found = {f"choice{ending}": choice.ravel(), f"doubt{ending}": doubt}
+    found = {name: [round(float(v), 3) for v in values] for name, values in found.items()}
+    for name, values in found.items():
+        print(name, "=", values)
+    numbers = Params().replace(**found)
     for name, parts in (("fitted", fitting), ("not seen", testing)):
         print(name)
         for part in parts:
@@ -482,6 +430,24 @@ def _two_sided(kept: Callable[..., list[dict]], slider: Path, street: Path) -> t
         kept("hdr_test", panned(TESTING, 2, 4)),
         kept("textures_test", textures(range(2000, 2030))),
         kept("objects_test", objects(range(11, 13))),
+    ]
+    return fitting, testing
+
+
+def _beyond(kept: Callable[..., list[dict]], slider: Path, street: Path) -> tuple[list, list]:
+    """The same of recordings that are cut."""
+    few = {2: 8, 8: 8}
+    fitting = [
+        kept("slider_cut", cut(hidden(slider, Params(), few, 0))),
+        kept("slider_ended", ended(slider, Params())),
+        kept("hdr_cut", cut(panned(FITTING[:1], 11, 3))),
+        kept("textures_cut", cut(textures(range(1000, 1012)))),
+        kept("still_cut", cut(textures(range(1100, 1106), 0.02))),
+        kept("objects_cut", cut(objects(range(1, 2)))),
+    ]
+    testing = [
+        kept("slider_cut_test", cut(hidden(slider, Params(), few, 1))),
+        kept("street_cut_test", cut(hidden(street, Params(), few, None))),
     ]
     return fitting, testing
 

@@ -9,11 +9,16 @@ after the last one. MSE; MSE after the brightness of each image is fitted to the
 (a I + b), since the frames of evbench_seq3 are not equally bright; SSIM; z2. The last column of
 `mc` is its MSE as part of the least of its ingredients, `aks` and `blend`. Makes table.md; rows
 that the folder holds are kept.
+
+With --beyond frames of the second half are scored that lie 1, 2 and 4 frames after the last one
+given, and as far before the first: the recording is cut there at three places, its events are not.
+Makes beyond.md; a line is of all places, and its gap is how far away the frame is.
 """
 
 import argparse
 import functools
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +36,7 @@ RECORDINGS = ("slider_depth.zip", "davis346_street.npz", "evbench_seq3_calibrate
 METHODS = ("last-frame", "blend", "flow", "akf", "aks", "mc")
 INGREDIENTS = ("aks", "blend")
 GAPS, IMAGES = (2, 4, 8), 8
+CUTS, AWAY = (0.55, 0.7, 0.85), (1, 2, 4)  # parts of a recording's frames; frames from the cut
 COLUMNS = (
     ("MSE x 1e-2", "mse", 100, 4), ("brightness fitted", "fitted", 100, 4), ("SSIM", "ssim", 1, 3),
     ("z2", "z2", 1, 2), ("of the best ingredient", "ratio", 1, 2),
@@ -60,32 +66,53 @@ def score(method: Any, params: Any, given: Recording, truth: Frames, noise: floa
     return row
 
 
+def between_and_after(recording: Recording) -> Iterator[tuple[Row, Recording, Frames]]:
+    """Cells of the table, with the recording that is given and the frames that are not."""
+    for gap in GAPS:
+        given, hidden = held_out(recording, gap)
+        assert given.frames is not None
+        last = int(np.searchsorted(hidden.t, given.frames.t[-1]))
+        parts = {"between": np.arange(last), "after the last": np.arange(last, len(hidden))}
+        for where, rows in parts.items():
+            if len(rows):
+                yield {"gap": gap, "frames": where}, given, hidden[evenly(rows, IMAGES)]
+
+
+def beyond(recording: Recording) -> Iterator[tuple[Row, Recording, Frames]]:
+    """The same of recordings that are cut."""
+    frames = recording.frames
+    assert frames is not None
+    for cut in CUTS:
+        at = round(cut * len(frames))
+        early, late = (recording.with_frames(s) for s in (slice(0, at), slice(at, None)))
+        for away in AWAY:
+            after, before = at - 1 + away, at - away
+            cell = {"gap": away, "cut": cut}
+            if after < len(frames):
+                yield {"frames": "after the last", **cell}, early, frames[after : after + 1]
+            yield {"frames": "before the first", **cell}, late, frames[before : before + 1]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("JAXEVENT_DATA", ".")))
     parser.add_argument("--out", type=Path, required=True, help="folder for everything made")
     parser.add_argument("--recordings", nargs="+", default=RECORDINGS, metavar="NAME")
     parser.add_argument("--methods", nargs="+", default=METHODS, metavar="NAME")
+    parser.add_argument("--beyond", action="store_true", help="frames after the last, or before")
     arguments = parser.parse_args()
     out = arguments.out.absolute()
     out.mkdir(parents=True, exist_ok=True)
-    store = Store(out / "rows.json")
+    kind, cells = ("beyond", beyond) if arguments.beyond else ("table", between_and_after)
+    store = Store(out / ("beyond.json" if arguments.beyond else "rows.json"))
     methods = {n: (jaxevent.METHODS[n], jaxevent.METHODS[n].Params()) for n in arguments.methods}
     for name in arguments.recordings:
         recording = jaxevent.load(arguments.data / "data" / name)
         assert recording.frames is not None
         noise = noise_of(recording.frames)
-        for gap in GAPS:
-            given, hidden = held_out(recording, gap)
-            assert given.frames is not None
-            last = int(np.searchsorted(hidden.t, given.frames.t[-1]))
-            parts = {"between": np.arange(last), "after the last": np.arange(last, len(hidden))}
-            for where, rows in parts.items():
-                if len(rows):
-                    truth = hidden[evenly(rows, IMAGES)]
-                    one = functools.partial(score, given=given, truth=truth, noise=noise)
-                    key = {"recording": recording.name, "gap": gap, "frames": where}
-                    store.add(key, methods, one)
+        for cell, given, truth in cells(recording):
+            one = functools.partial(score, given=given, truth=truth, noise=noise)
+            store.add({"recording": recording.name, **cell}, methods, one)
     keys = ("recording", "frames", "gap", "method")
     rows = store.means(keys, tuple(methods))
     for row in rows:
@@ -94,7 +121,7 @@ def main() -> None:
         if row["method"] == "mc":
             row["ratio"] = row["mse"] / least
     text = markdown(rows, {key: key for key in keys}, COLUMNS)
-    (out / "table.md").write_text(text)
+    (out / f"{kind}.md").write_text(text)
     print(text)
 
 

@@ -181,20 +181,28 @@ def still(L, V=0.01):
 @pytest.mark.slow
 def test_agreement_is_that_of_the_pure_function():
     L, V, clear, s, p = warped_case()
-    along, at = warping.warp(L, V, clear, s, p), place(3, 1, 0, 2)
+    along = warping.warp(L, V, clear, s, p)
     L[0, 4:9, 5:12] += 1.0  # a thing in front
-    one = agreement.agree(Params(), L, along, at)
-    given = jax.tree.map(jnp.asarray, (along, at))
-    other = agreement.agree_purely(Params(), jnp.asarray(L), *given)
-    for name, quick, pure in zip(agreement.Agreement._fields, one, other, strict=True):
-        np.testing.assert_allclose(quick, pure, rtol=3e-5, atol=3e-5, err_msg=name)
+    # Activity is what changes between frames; where none follows, or is before, up to the target.
+    activity = ((3, 1, 0, 2), 0), ((3, 2, 0, 0), L[2] - L[1]), ((3, 0, 2, 2), L[1] - L[0])
+    for numbers, change in activity:
+        at = place(*numbers)
+        one = agreement.agree(Params(), L, along, at)
+        given = jax.tree.map(jnp.asarray, (along, at))
+        other = agreement.agree_purely(Params(), jnp.asarray(L), *given)
+        for name, quick, pure in zip(agreement.Agreement._fields, one, other, strict=True):
+            np.testing.assert_allclose(quick, pure, rtol=3e-5, atol=3e-5, err_msg=name)
+        np.testing.assert_allclose(one.activity, np.broadcast_to(change, L[0].shape) ** 2, 1e-6)
 
 
-def only(name):
-    """Params that choose one ingredient."""
-    rows = np.zeros((len(OTHERS), len(SIGNS) + 1))
-    rows[:, -1] = [40.0 if name == other else -40.0 for other in OTHERS]
-    return Params(choice=rows.ravel().tolist())
+def only(name, beyond="none"):
+    """Params that choose one ingredient; `beyond` where frames are on one side alone."""
+    chosen = []
+    for one in (name, beyond):
+        rows = np.zeros((len(OTHERS), len(SIGNS) + 1))
+        rows[:, -1] = [40.0 if one == other else -40.0 for other in OTHERS]
+        chosen.append(rows.ravel().tolist())
+    return Params(choice=chosen[0], choice_beyond=chosen[1])
 
 
 def test_what_differs_is_hidden():
@@ -220,6 +228,13 @@ def test_other_ingredients_can_be_chosen(name):
     w = (at.s[2] - at.s[1]) / (at.s[5] - at.s[1])
     expected = {"smoothed": L[2], "blend": (1 - w) * L[1] + w * L[5]}[name]
     np.testing.assert_allclose(fused.L, expected, atol=1e-5)
+    # Beyond the frames weights are others, and the blend is the frame.
+    for numbers in ((9, 8, 3, 3), (9, 0, 4, 4)):
+        _, own, frame, _ = numbers
+        params = only("none", beyond=name)
+        fused = fuse(params, L, np.full_like(L, 0.01), still(L), place(*numbers))
+        expected = {"smoothed": L[own], "blend": L[frame]}[name]
+        np.testing.assert_allclose(fused.L, expected, atol=1e-5)
 
 
 def test_instants_that_fill_up_change_nothing():

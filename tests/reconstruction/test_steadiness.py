@@ -83,6 +83,23 @@ def test_frames_are_steady_unless_they_change_without_events():
     assert steady(still(moving, range(WIDTH // 2)))(0, 200_000)
 
 
+def test_brightness_is_in_doubt_where_frames_differ_from_those_around():
+    wall = np.full((5, HEIGHT, WIDTH), 100, np.uint8)
+    assert steady(still(wall, [3])).doubt(75_000) == 0
+    wall[BRIGHT] = 145
+    told = steady(still(wall, [3]))
+    b = np.log((145 / 255 + 0.3) / (100 / 255 + 0.3))
+    left_out = np.mean([(b / 2) ** 2, b**2, (b / 2) ** 2])  # frames 1 to 3, from their neighbours
+    np.testing.assert_allclose(told.doubt(75_000), left_out, rtol=1e-5)
+    np.testing.assert_allclose(told.doubt(62_500), 0.75 * left_out, rtol=1e-5)
+    np.testing.assert_allclose(told.doubt(250_000), left_out, rtol=1e-5)
+    assert told.doubt(100_000) == 0
+    # An exposure that adapts evenly leaves nothing in doubt.
+    wall = np.exp(np.linspace(-1, -0.4, 5))[:, None, None] * np.ones((5, HEIGHT, WIDTH))
+    told = steady(still((255 * wall - 0.3 * 255).round().astype(np.uint8), [3]))
+    assert not told(0, 200_000) and told.doubt(75_000) == 0
+
+
 def test_smooth_part():
     image = np.random.default_rng(5).normal(size=(2, HEIGHT, WIDTH)).astype(np.float32)
     got, reach = steadiness.smooth_part(image), steadiness.REACH
@@ -124,7 +141,7 @@ def test_frames_on_one_side_do_not_confirm_each_other():
         given, mc.Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4), progress=False
     )
     told, seen = estimator.look(video.params, video.follow(t))
-    assert float(seen.one_sided) == 1 and seen.inside_before.max() == 1
+    assert float(seen.beyond) == 1 and seen.inside_before.max() == 1
     assert np.asarray(seen.inside_after).max() == 0
     sources = video.sources(np.array([t]))
     assert sources["visible_after"].max() == 0 and sources["visible_before"].max() > 0.5

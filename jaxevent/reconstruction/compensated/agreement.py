@@ -40,7 +40,7 @@ class Agreement(NamedTuple):
     near: Float[Numeric, "h w"]  # the mean of the near instants
     near_information: Float[Numeric, "h w"]
     frame_information: Float[Numeric, "h w"]
-    activity: Float[Numeric, "h w"]  # squared changes in place between the frames next to it
+    activity: Float[Numeric, "h w"]  # squared changes in place over `stretch`
     parts: Float[Numeric, "3 h w"]  # shares in M: frames before, frames after, all others
     seen: Float[Numeric, "2 h w"]  # how far the frames before and after see the point, 0..1
     usual: Float[Numeric, "h w"]  # mean variance of the images, as in M, 0 of frames unclipped
@@ -82,6 +82,17 @@ def steepness(image: Array) -> Array:
     return total
 
 
+def stretch(place: Place) -> tuple[Numeric, Numeric]:
+    """Between which instants activity is gathered: the frames next to the target, both left out.
+
+    Where frames are on one side alone, from there to the target, which takes part.
+    """
+    a, b, own = place.before, place.after, place.own
+    last = place.s[a] <= 0  # no frame follows
+    low = jnp.where((a == b) & ~last, own - 1, a)
+    return low, jnp.where((a == b) & last, own + 1, b)
+
+
 def agree_purely(params: Params, L: Float[Array, "k h w"], along: Along, place: Place) -> Agreement:
     """The robust mean along trajectories, begun from the target's own image; differentiable.
 
@@ -119,7 +130,8 @@ def agree_purely(params: Params, L: Float[Array, "k h w"], along: Along, place: 
     near_information = (W * place.near[:, None, None]).sum(0)
     near = (W * place.near[:, None, None] * along.L).sum(0) / jnp.maximum(near_information, 1e-9)
     order = jnp.arange(count)
-    between = ((order > place.before) & (order + 1 < place.after))[:-1, None, None]
+    low, high = stretch(place)
+    between = ((order > low) & (order + 1 < high))[:-1, None, None]
     share = R / total
     parts = [(share * framed * side).sum(0) for side in (s < 0, s > 0)]
     return Agreement(
@@ -152,6 +164,8 @@ class _Settings(NamedTuple):
     place: Any  # variances of the place of points and between pixels
     between: Any
     tolerance: Any
+    low: Any  # the stretch of activity
+    high: Any
 
 
 @part
@@ -350,7 +364,7 @@ def _finish(begin, end, L, along, misfits, steep, settings, place, taps, out, ex
                 out.seen[0, y] = seen * along.inside[k, y]
             if k == b:
                 out.seen[1, y] = seen * along.inside[k, y]
-            if a < k and k + 1 < b:
+            if settings.low < k and k + 1 < settings.high:
                 _change(L[k, y], L[k + 1, y], out.activity[y])
         out.total[y] = sums[0]
         _divide(sums[1], sums[0], out.M[y])
@@ -379,7 +393,7 @@ def agree(params: Params, L: NDArray, along: Along, place: Place) -> Agreement:
     p = params
     count, h, w = L.shape
     numbers = (p.information, p.floor, p.sigma_place**2, p.sigma_between**2, p.tolerance)
-    settings = _Settings(*(np.float32(v) for v in numbers))
+    settings = _Settings(*(np.float32(v) for v in numbers), *(int(k) for k in stretch(place)))
     own, taps = int(place.own), taps_of(MISFIT)
     weights = np.exp(-2 * place.s**2).astype(np.float32)
     place = place._replace(own=own, before=int(place.before), after=int(place.after))

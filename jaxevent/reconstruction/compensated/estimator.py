@@ -81,12 +81,13 @@ class Targets(Described):
     p: Float[Numeric, "times rows columns 4"]  # trajectories
     taken: Taken  # each (times, n)
     steady: Float[Numeric, " times"]  # 1 where frames keep their brightness, else 0
+    doubt: Float[Numeric, " times"]  # `Steadiness.doubt`
     # Of exposures; None: these are not looked at.
     samples: int | None = eqx.field(static=True, default=None)
 
     def images(self, rows: NDArray) -> "Targets":
         """Those of its images, in that order."""
-        each = (self.rows, self.place, self.p, self.taken, self.steady)
+        each = (self.rows, self.place, self.p, self.taken, self.steady, self.doubt)
         chosen = jax.tree.map(lambda leaf: leaf[rows], each)
         return Targets(self.instants, *chosen, samples=self.samples)
 
@@ -386,11 +387,12 @@ def fuse_images(params: Params, target: Followed) -> Fused:
     return _decide(params, *look(params, target))
 
 
-def smoothed_back(target: Followed, fused: Fused) -> Fused:
+def smoothed_back(target: Followed, fused: Fused, doubt: float) -> Fused:
     """What is fused, with the smooth part that was taken away from a target's images."""
     assert target.smooth is not None
     place = place_of(target.instants, target.clear, len(target.instants))
-    L, P = smooth_at_target(target.smooth, place, weight_after(place))
+    unknown = np.asarray(doubt, np.float32)
+    L, P = smooth_at_target(target.smooth, place, weight_after(place), unknown)
     return dataclasses.replace(fused, L=fused.L + L, P=fused.P + P)
 
 
@@ -472,11 +474,17 @@ class CompensatedVideo(ImageSequence[Params]):
 
     def _held(self, t: int, target: Followed) -> Fused:
         """What a target's images give, held to the frames next to it."""
-        fused, shutter = fuse_images(self.params, target), self.follow.shutter
+        fused, doubt = fuse_images(self.params, target), self.follow.steady.doubt(t)
         if target.smooth is not None:  # nor can it be held to frames of another brightness
-            return smoothed_back(target, fused)
-        if shutter.samples is None:
-            return fused
+            return smoothed_back(target, fused, doubt)
+        if self.follow.shutter.samples is not None:
+            fused = self._constrained(t, target, fused)
+        return dataclasses.replace(fused, P=fused.P + doubt)
+
+    def _constrained(self, t: int, target: Followed, fused: Fused) -> Fused:
+        """What is fused, held to exposures and clipped pixels."""
+        shutter = self.follow.shutter
+        assert shutter.samples is not None
         taken = shutter(t, target.instants.unit)
         low, high = int(taken.frame.min()), int(taken.frame.max()) + 1
         grey, intensity, _, gain = self._frames.read(slice(low, high), high - low)
@@ -581,17 +589,19 @@ class MotionCompensated(ImageEstimator[Params]):
             features, instants = features.weighted(factors), instants.weighted(factors)
         shape = (len(chosen), *trajectories.nodes(recording.height, recording.width, 0), 4)
         rows, p = np.zeros((len(chosen), room), np.int32), np.zeros(shape, np.float32)
-        places, taken, steady = [], [], np.ones(len(chosen), np.float32)
+        places, taken = [], []
+        steady, doubt = np.ones((2, len(chosen)), np.float32)
         for n, one in enumerate(chosen):
             _, _, _, clear, p[n], smooth = follow(int(wanted[n]))
-            steady[n] = smooth is None
+            steady[n], doubt[n] = smooth is None, follow.steady.doubt(int(wanted[n]))
             rows[n, : len(one)] = np.searchsorted(every, one.t)
             places.append(place_of(one, clear, room))
             taken.append(follow.shutter(int(wanted[n]), one.unit))
         place, taken = (
             jax.tree.map(lambda *leaves: np.stack(leaves), *parts) for parts in (places, taken)
         )
-        targets = Targets(instants, rows, place, p, taken, steady, follow.shutter.samples)
+        each = (rows, place, p, taken, steady, doubt)
+        targets = Targets(instants, *each, samples=follow.shutter.samples)
         return features, jax.device_put(targets)
 
     def run(self, params: Params, features: Features, state: Any = None) -> tuple[Any, Any]:
@@ -607,7 +617,7 @@ class MotionCompensated(ImageEstimator[Params]):
 
         @jax.checkpoint
         def one(target: tuple) -> tuple[Array, Array]:
-            rows, place, p, taken, steady = target
+            rows, place, p, taken, steady, doubt = target
             smooth = (1 - steady) * smooth_part(L[rows])
             images = (L[rows] - smooth, V[rows], clear[rows])
             if self.through_motion:
@@ -620,10 +630,11 @@ class MotionCompensated(ImageEstimator[Params]):
                 # Frames of another brightness hold nothing.
                 taken = taken._replace(present=taken.present * steady)
                 fused = constrain_purely(params, fused, p, taken, Shots(*seen), out.samples)
-            base, doubt = smooth_at_target(smooth, place, weight_after(place))
-            return fused.L + base, fused.P + doubt
+            base, variance = smooth_at_target(smooth, place, weight_after(place), doubt)
+            return fused.L + base, fused.P + variance
 
-        found, P = jax.lax.map(one, (out.rows, out.place, out.p, out.taken, out.steady))
+        each = (out.rows, out.place, out.p, out.taken, out.steady, out.doubt)
+        found, P = jax.lax.map(one, each)
         image = (jnp.exp(found) - params.I0).reshape(len(found), -1)
         P = P.reshape(image.shape)
         return Estimate(image, P, jnp.isfinite(image) & (jnp.sqrt(P) < params.vague))

@@ -33,25 +33,28 @@ class Views(NamedTuple):
 
     own: Float[Numeric, "h w"]  # the target's, in place
     V: Float[Numeric, "h w"]  # its variance
-    before: Float[Numeric, "h w"]  # of the frames before and after, in place
+    # Of the frames before and after, in place. Where frames are on one side alone `before` is that,
+    # and `after` the target's own image: what is known at the other end.
+    before: Float[Numeric, "h w"]
     after: Float[Numeric, "h w"]
     along_before: Float[Numeric, "h w"]  # the same along trajectories
     along_after: Float[Numeric, "h w"]
     inside_before: Float[Numeric, "h w"]  # 1, or 0 beyond the image's border
     inside_after: Float[Numeric, "h w"]
     weight: Numeric  # (), of the frame after in the blend of the two
-    one_sided: Numeric  # (), 1 where frames are on one side of the target alone, else 0
+    beyond: Numeric  # (), 1 where frames are on one side of the target alone, else 0
 
 
 def views(L: Numeric, V: Numeric, along: Along, place: Place) -> Views:
     """Those of images (K, h, w)."""
     a, b = place.before, place.after
     # Where frames are on one side alone, that of the other side shows nothing.
-    one_sided = jnp.where(a == b, jnp.float32(1), 0)
-    before = along.inside[a] * (1 - one_sided * (place.s[a] > 0))
-    after = along.inside[b] * (1 - one_sided * (place.s[a] <= 0))
-    images = (L[a], L[b], along.L[a], along.L[b], before, after)
-    return Views(L[place.own], V[place.own], *images, weight_after(place), one_sided)
+    beyond = jnp.where(a == b, jnp.float32(1), 0)
+    before = along.inside[a] * (1 - beyond * (place.s[a] > 0))
+    after = along.inside[b] * (1 - beyond * (place.s[a] <= 0))
+    other = L[jnp.where(a == b, place.own, b)]
+    images = (L[a], other, along.L[a], along.L[b], before, after)
+    return Views(L[place.own], V[place.own], *images, weight_after(place), beyond)
 
 
 def weight_after(place: Place) -> Numeric:
@@ -78,6 +81,7 @@ class Comparison(Described):
     parts: Float[Array, "3 h w"]  # of the mean along trajectories: frames before, after, events
     visible: Float[Array, "2 h w"]  # as in `Fused`
     usual: Float[Array, "h w"]  # the variance of single images along trajectories
+    beyond: Float[Array, ""]  # as in `Views`
 
 
 SOURCES = ("before", "after", "events", *OTHERS)
@@ -109,21 +113,26 @@ def compare(told: Agreement, seen: Views) -> Comparison:
         "from_blend": apartness(M, blend),
         "near_from_blend": apartness(near, blend),
         "activity": blur(told.activity, 1.5),
-        "one_sided": jnp.broadcast_to(seen.one_sided, M.shape),
     }
-    as_they_are = ("seen", "seen_twice", "one_sided")
+    as_they_are = ("seen", "seen_twice")
     X = [signs[n] if n in as_they_are else jnp.log(signs[n] + TINY) for n in SIGNS]
     X = jnp.stack([*X, jnp.ones_like(M)])
     visible = told.seen * jnp.stack([seen.inside_before, seen.inside_after])
-    return Comparison(jnp.stack([M, smoothed, blend]), X, told.parts, visible, told.usual)
+    ingredients = jnp.stack([M, smoothed, blend])
+    return Comparison(ingredients, X, told.parts, visible, told.usual, jnp.asarray(seen.beyond))
 
 
 def decide(params: Params, comparison: Comparison) -> Fused:
-    """Choose between the ingredients by the signs."""
+    """Choose between the ingredients by the signs.
+
+    These mean other things where frames are on one side alone, and have other weights there.
+    """
     X, ingredients = comparison.signs, comparison.ingredients
-    choice = jnp.tensordot(params.choice.reshape(len(OTHERS), -1), X, 1)
+    beyond = comparison.beyond > 0
+    weights = jnp.where(beyond, params.choice_beyond, params.choice)
+    choice = jnp.tensordot(weights.reshape(len(OTHERS), -1), X, 1)
     q = jax.nn.softmax(jnp.concatenate([jnp.zeros_like(choice[:1]), choice]), axis=0)
-    P = jnp.exp(jnp.tensordot(params.doubt, X, 1))
+    P = jnp.exp(jnp.tensordot(jnp.where(beyond, params.doubt_beyond, params.doubt), X, 1))
     # Where frames are clipped all instants rest on the same events; more of them tell no more.
     P = jnp.maximum(P, params.common * comparison.usual)
     sources = jnp.concatenate([q[:1] * comparison.parts, q[1:]])

@@ -21,21 +21,30 @@ SIGNS = (
     "from_blend",
     "near_from_blend",
     "activity",
-    "one_sided",
 )
 OTHERS = ("smoothed", "blend")  # ingredients beside the mean along trajectories
 
 # Fitted by experiments/compensated_choice.py: a number for every sign and one more, for each of
-# `OTHERS`; and the same for the result's variance. Those of "one_sided" by its --one-sided.
+# `OTHERS`; and the same for the result's variance. Those called beyond, by its --beyond, are of
+# times after the last frame and before the first.
 # fmt: off
 CHOICE = (
     0.864, 0.09, -0.186, 0.812, 0.44, -5.523, -2.994, 0.176, -0.132, -0.656, 1.102, 0.116,
-    -0.156, -0.741, -0.076, 0.229, -0.033, 8.942, 0.245, -0.238, -0.373, 0.145, 0.199, 1.508,
-    -2.626, -0.072, 0.484, 0.442, -0.067, -0.09, -0.424, -0.208, -0.412, -0.102, -2.609, -8.12,
+    -0.156, -0.741, -0.076, 0.229, 8.942, 0.245, -0.238, -0.373, 0.145, 0.199, 1.508, -2.626,
+    -0.072, 0.484, 0.442, -0.067, -0.09, -0.424, -0.208, -0.412, -0.102, -8.12,
 )
 DOUBT = (
     0.478, 0.306, 0.329, 0.006, 0.573, -1.969, -2.776, 0.185, -0.231, 0.005, 0.084,
-    -0.097, 0.011, 0.352, -0.262, 0.011, 0.276, 7.72,
+    -0.097, 0.011, 0.352, -0.262, 0.011, 7.72,
+)
+CHOICE_BEYOND = (
+    0.579, 0.576, 0.186, 0.312, 0.0, -3.939, 0.0, 0.185, -0.239, -0.335, 0.488, 0.148, 0.315,
+    -0.654, -0.418, 0.031, 6.969, 0.289, -0.367, -0.665, 0.88, 0.0, -4.32, 0.0, 0.743, -0.219,
+    -0.135, 0.332, -0.014, -0.344, -0.396, -0.294, -0.887, -10.023,
+)
+DOUBT_BEYOND = (
+    0.714, 0.263, 0.499, 0.457, 0.0, -3.924, 0.0, 0.072, -0.353, 0.198, 0.21, -0.066, 0.107,
+    -0.045, 0.056, -0.011, 6.277,
 )
 # fmt: on
 
@@ -80,6 +89,12 @@ class Params(smoother.Params):
         "how signs choose smoother and blend instead of the mean along trajectories",
     )
     doubt = Number(DOUBT, "1", "how signs tell the logarithm of the result's variance")
+    choice_beyond = Number(
+        CHOICE_BEYOND, "1", "the same as `choice`, after the last frame and before the first"
+    )
+    doubt_beyond = Number(
+        DOUBT_BEYOND, "1", "the same as `doubt`, after the last frame and before the first"
+    )
     common = Positive(0.6, "1", "part of the variance of images from events that all of them share")
     integrate = Choice(
         (True, False), "whether images are held to what exposures and clipped pixels tell of them"

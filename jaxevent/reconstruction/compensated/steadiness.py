@@ -9,6 +9,10 @@ frame as a blend does.
 Steadiness is told by pixels without events around them between two frames: a change there is none
 of the scene. On slider_depth and davis346_street the median change of blocks of such pixels is
 below 0.01 of ln I between any two frames, in evbench_seq3 with its three bright frames 0.1 to 0.4.
+
+Where some frames are brighter than those before and after, an image between frames may be so, too,
+and nothing tells. How much brightness is in doubt is how badly those of the frames around, left out
+one by one, follow from their neighbours.
 """
 
 import functools
@@ -30,6 +34,7 @@ LEAST = 0.05  # ln I, by which frames differ that are not steady
 BLOCK = 16  # px, over which the change of pixels without events is a median
 ENOUGH = 8  # such pixels in a block
 BLOCKS = 4  # such blocks at least
+AROUND = 8  # frames on either side, whose brightness tells how far it is in doubt
 SHOWN = (0.02, 0.98)  # grey values of pixels that are not clipped
 
 
@@ -47,15 +52,16 @@ def smooth_part(L: Any) -> Any:
 
 
 def smooth_at_target(
-    smooth: Numeric, place: Place, weight: Numeric
+    smooth: Numeric, place: Place, weight: Numeric, doubt: Numeric
 ) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """The smooth part at the target, of those of its instants (K, h, w), and its variance.
 
     `weight` is that of the frame after, 0..1. In between nothing tells which of the two the
-    brightness is of.
+    brightness is of, nor whether it is that of either: `doubt` (), `Steadiness.doubt`.
     """
     apart = smooth[place.after] - smooth[place.before]
-    return jnp.asarray(smooth[place.own]), weight * (1 - weight) * apart**2
+    variance = jnp.maximum(weight * (1 - weight) * apart**2, doubt)
+    return jnp.asarray(smooth[place.own]), variance
 
 
 class Steadiness:
@@ -64,21 +70,41 @@ class Steadiness:
     def __init__(self, recording: Recording, mid: NDArray[np.int64], I0: float):
         self._recording, self._mid, self._I0 = recording, mid, I0
         self._images = FrameImages(recording, np.dtype(np.float32))
-        self._known: dict[int, bool] = {}
+        self._known: dict[int, float] = {}
 
     def __call__(self, first: int, last: int) -> bool:
         """Whether the frames of these times (us) and those between do."""
         low = int(np.searchsorted(self._mid, first, "left"))
         high = int(np.searchsorted(self._mid, last, "right"))
-        return all(self._is_steady(k) for k in range(low, high - 1))
+        return all(abs(self._change(k)) < LEAST for k in range(low, high - 1))
 
-    def _is_steady(self, frame: int) -> bool:
-        """Whether the next frame is as bright as this one."""
-        if frame not in self._known:
-            self._known[frame] = abs(self._change(frame)) < LEAST
-        return self._known[frame]
+    def doubt(self, t: int) -> float:
+        """The variance of brightness, (ln I)^2, at a time (us) of which no frame tells.
+
+        It is 0 at the frames and largest halfway between two, and beyond the last and the first.
+        """
+        right = int(np.searchsorted(self._mid, t, "right"))
+        left = int(np.searchsorted(self._mid, t, "left"))
+        low, high = max(left - AROUND, 0), min(right + AROUND, len(self._mid))
+        if left < right or high - low < 3:
+            return 0.0
+        mid = (self._mid[low:high] - t) * 1e-6
+        level = np.cumsum([0.0, *(self._change(k) for k in range(low, high - 1))])
+        w = (mid[1:-1] - mid[:-2]) / (mid[2:] - mid[:-2])
+        error = level[1:-1] - (1 - w) * level[:-2] - w * level[2:]
+        error = np.where(np.abs(error) < LEAST, 0, error)
+        if not low < right < high:
+            return float((error**2).mean())
+        w = -mid[left - 1 - low] / (mid[right - low] - mid[left - 1 - low])
+        return float((error**2).mean() * 4 * w * (1 - w))
 
     def _change(self, frame: int) -> float:
+        """How much brighter the next frame is than this one, in ln(I + I0)."""
+        if frame not in self._known:
+            self._known[frame] = self._measure(frame)
+        return self._known[frame]
+
+    def _measure(self, frame: int) -> float:
         """The median over blocks of how far pixels without events change, in ln(I + I0)."""
         source, size = self._recording.events, (self._recording.height, self._recording.width)
         begin, end = (source.index(int(t)) for t in self._mid[frame : frame + 2])
