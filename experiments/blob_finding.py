@@ -10,8 +10,8 @@ optimal assignment, births after three and deaths after five images, as motpy do
 that library's tracker on them (`pip install norfair filterpy`; else there is no such row); `mean`,
 the centred mean of a window's events within three sizes of the mean before, told where each target
 begins. All get the window and cell that `find` chose. `by hand` is `moment`, smoothed, from seeds
-at the true beginnings, with scales of length and time from the truth, and of 7 noises of the
-velocity the one with which the filter has the least error on the seed before the first. Makes
+at the true beginnings, with the truth's sizes, times and changes of velocity (Q_v is the rms
+acceleration times the median speed: squared, times the time in which it turns). Makes
 table.md and results.json. With --data, a folder that holds spinning_dot.npz and
 davis346_street.npz, these are tracked too.
 
@@ -45,7 +45,6 @@ from jaxevent.simulate.blobs import Truth
 NORFAIR = importlib.util.find_spec("norfair") is not None
 
 TIMES = 200
-AGILITIES = tuple(10.0 ** np.arange(-4, 2.1, 1.0))
 DOT_CENTRE = (314.29, 202.35)  # px, of a circle fitted to the same events
 
 
@@ -180,14 +179,8 @@ def means(recording: Recording, found: Found, truth: Truth, times: NDArray[np.in
     return _of_lines(lines, times)
 
 
-def by_hand(
-    recording: Recording,
-    truth: Truth,
-    times: NDArray[np.int64],
-    agility: float,
-    smooth: bool = True,
-) -> Answer:
-    """`moment` from seeds with scales of the truth; Q_v is `agility` length^2 / time^3."""
+def by_hand(recording: Recording, truth: Truth, times: NDArray[np.int64]) -> Answer:
+    """`moment` from seeds with scales of the truth; Q_v is acceleration times speed."""
     states, t = truth(times), times
     seen = truth.visible(times)
     real = np.flatnonzero((states[..., 4] > 0.5).any(0) & seen.any(0))
@@ -195,6 +188,8 @@ def by_hand(
         return Answer(np.full((len(times), 0, 2), np.nan))
     L = float(np.median(states[:, real, 4]))
     speed = float(np.median(np.hypot(*np.moveaxis(states[:, real, 2:4], 2, 0))))
+    change = np.gradient(states[:, real, 2:4], t * 1e-6, axis=0)
+    hard = float(np.sqrt((change**2).sum(-1).mean())) * speed
     W = float(np.clip(L / max(speed, 1e-9), 1e-3, 0.5))
     seeds = []
     for k in real:
@@ -203,28 +198,15 @@ def by_hand(
         seeds.append((float(x), float(y), float(states[first, k, 4]), int(t[first])))
     rest: dict[str, Any] = {"lambda_max": 6 * L, "t_coast": 1e3, "t_merge": 1e3, "aspect_max": 1e3}
     params = moment.Params(
-        Q_p=1e-4 * L**2 / W, Q_v=agility * L**2 / W**3, Q_lambda=(0.05 * L) ** 2 / W,
+        Q_p=1e-4 * L**2 / W, Q_v=max(hard, 1e-4 * L**2 / W**3), Q_lambda=(0.05 * L) ** 2 / W,
         Q_theta=0.01 / W, Q_q=0.01 / W**3, P0_p=L**2 / 4, P0_v=4 * speed**2 + (L / W) ** 2,
         P0_lambda=(0.5 * L) ** 2, P0_q=(0.1 / W) ** 2, lambda0=L, gate_decay=1 / W,
         gate_min=max(2.0, 1.5 * L), gate_max=24 * L, t_still=2 * W, sigma_max=1e3,
         events_per_step=8, **rest,
     )  # fmt: skip
-    tracks = moment.estimate(recording, params, seeds=seeds, smooth=smooth, progress=False)
+    tracks = moment.estimate(recording, params, seeds=seeds, progress=False)
     states = tracks(times)
     return Answer(np.where(states.valid[..., None], states.mean[..., :2], np.nan))
-
-
-def choose_agility(name: str, seed: int) -> float:
-    """The one of `AGILITIES` that has the least error in a scene of another seed."""
-    recording, truth = (SCENES | VARIED)[name](seed)
-    times = np.linspace(0, truth.duration * 1e6 - 1, TIMES + 2)[1:-1].astype(np.int64)
-    size = recording.width, recording.height
-
-    def error(agility: float) -> float:
-        told = score(by_hand(recording, truth, times, agility, False), truth, times, size)
-        return told["rms"] / max(told["idf1"], 1e-9) if np.isfinite(told["rms"]) else np.inf
-
-    return min(AGILITIES, key=error)
 
 
 def _of_lines(lines: list[_Line], times: NDArray[np.int64]) -> Answer:
@@ -263,7 +245,6 @@ def main() -> None:
     rows, scenes = [], SCENES | VARIED
     args.out.mkdir(parents=True, exist_ok=True)
     for name in args.scenes or (VARIED if args.varied else SCENES):
-        agility = 1.0 if args.search else choose_agility(name, args.first - 1)
         for seed in range(args.first, args.first + args.seeds):
             recording, truth = scenes[name](seed)
             times = np.linspace(0, truth.duration * 1e6 - 1, TIMES + 2)[1:-1].astype(np.int64)
@@ -282,7 +263,7 @@ def main() -> None:
             if NORFAIR:
                 answers["norfair"] = norfair(recording, found, times)
             if not args.search:
-                answers["by hand"] = by_hand(recording, truth, times, agility)
+                answers["by hand"] = by_hand(recording, truth, times)
             for method, answer in answers.items():
                 row = score(answer, truth, times, (recording.width, recording.height))
                 rows.append({"scene": name, "seed": seed, "method": method, "cpu": seconds} | row)

@@ -59,6 +59,13 @@ def add(commands: Any) -> None:
         help="states rest on the events up to each time, as they are known while events come; "
         "default: on all, where the method can",
     )
+    one.add_argument(
+        "--accuracy",
+        metavar="SHARE",
+        type=float,
+        help="events share steps while positions are at most by this share less certain than event "
+        "by event, e.g. 0.05; default: about 32 steps in the window that is found",
+    )
     when = one.add_mutually_exclusive_group()
     when.add_argument(
         "--rate", metavar="HZ", type=float, default=1000.0, help="rows per second; default: 1000"
@@ -105,6 +112,7 @@ def run(
     seeds: list[tuple[float, ...]] | None,
     detect: bool,
     filtered: bool,
+    accuracy: float | int | None,
     rate: float | int,
     at: str | None,
     start: float | int | None,
@@ -119,6 +127,7 @@ def run(
 ) -> None:
     from jaxevent import methods
     from jaxevent.blob import find
+    from jaxevent.blob.finding.found import check_accuracy
     from jaxevent.io import load, toml
     from jaxevent.show.tracks import Output
 
@@ -130,16 +139,24 @@ def run(
     recording = dataclasses.replace(recording, name=str(path))  # for messages
     if not len(recording.events):
         raise InputError(f"{path}: holds no events to track; choose another recording")
+    check_accuracy(accuracy)
+    if accuracy is not None and (seeds is not None or detect):
+        raise InputError("--accuracy is for targets that are found; leave out --seed and --detect")
     span: dict[str, Any] = {"start": start, "stop": stop}
     clock = time.perf_counter()
     options: dict[str, Any] = {"seeds": seeds, "detect": detect, **span}
     if seeds is None and not detect:
         found = find(recording, **span, progress=show_progress())
         print(found.summary())
-        settings = found.settings()
+        settings = found.settings(accuracy)
         given = tracker.Params(**settings)
         if params is not None:
             given = tracker.Params.load(params, method, settings)
+        if accuracy is not None and given.events_per_step == settings.get("events_per_step"):
+            print(
+                f"{given.events_per_step} events per step, so that positions are at most "
+                f"{100 * accuracy:.3g} % less certain than event by event"
+            )
         options = {"found": found, **span}
     smooth = False if filtered else None
     tracks = tracker.estimate(recording, given, **options, smooth=smooth, progress=show_progress())

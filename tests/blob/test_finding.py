@@ -11,6 +11,7 @@ from scipy import stats
 from jaxevent import blob
 from jaxevent.blob.finding.agility import GRID, _log_likelihood, fit_agility
 from jaxevent.blob.finding.background import evidence, find_hot_pixels, measure_background
+from jaxevent.blob.finding.found import Found, most_events
 from jaxevent.blob.finding.parts import join_parts
 from jaxevent.blob.finding.paths import ANYBODY, NOBODY, candidates, join
 from jaxevent.blob.finding.paths import Path as TargetPath
@@ -287,6 +288,41 @@ def test_agility_is_the_most_likely():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("accuracy", [0.02, 0.1, 0.5])
+def test_steps_of_several_events_keep_the_accuracy_asked_for(accuracy):
+    size, rate, agility = 6.0, 5e4, 2e6
+    M = float(most_events(accuracy, np.array([size]), np.array([rate]), np.array([agility]))[0])
+
+    def sigma(M):
+        """Of the position just before an update, by Riccati's equation step by step."""
+        dt, P = M / rate, np.diag([size**2, 1e6])
+        F = np.array([[1, dt], [0, 1]])
+        Q = agility * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        for _ in range(round(5e3 / M)):
+            P = F @ P @ F.T + Q
+            before, K = P[0, 0], P[:, 0] / (P[0, 0] + size**2 / M)
+            P = P - np.outer(K, P[0])
+        return np.sqrt(before)
+
+    told = sigma(M) / sigma(1) - 1
+    assert 0.3 * accuracy < told <= accuracy
+
+
+def test_steps_follow_the_accuracy():
+    t = np.arange(0, 1_000_000, 10_000)
+    path = dataclasses.replace(_path(t, 50 + 1e-5 * t, 60 + 0 * t, 5.0, 3.0), agility=1e3)
+    recording = Recording("none", 100, 100, Events.empty())
+    one = Found((path,), (), 0, 0.0, recording)
+    two = Found((path, path), (), 0, 0.0, recording)
+    told = [one.settings(a)["events_per_step"] for a in (1e-4, 0.02, 0.1, 1.0)]
+    # The time constant is that of 161 events.
+    assert told == [1, 4, 16, 32]
+    assert two.settings(0.02)["events_per_step"] == 8
+    for bad in (0.0, -1.0, np.nan):
+        with pytest.raises(InputError, match="accuracy"):
+            one.settings(bad)
+
+
 def test_targets_do_not_depend_on_the_clock(crossed):
     recording, _, found = crossed
     events = recording.events[:]

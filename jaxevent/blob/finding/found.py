@@ -10,9 +10,13 @@ from numpy.typing import NDArray
 from jaxevent.blob.finding.paths import STILL, Path
 from jaxevent.blob.finding.scale import Choice
 from jaxevent.blob.params import TrackerParams
+from jaxevent.errors import InputError
 from jaxevent.recording import Recording
 
 P = TypeVar("P", bound=TrackerParams)
+
+# Of x in 1 + sqrt(2) x + x^2 + x^3 / (3 sqrt(2)), see `most_events`.
+LONGER = (1 / (3 * 2**0.5), 1.0, 2**0.5)
 
 FIRST = 4  # windows that tell the size at the start
 FOREVER = 1e3  # s; what was found tells when targets end
@@ -81,11 +85,15 @@ class Found:
             out.append((float(x), float(y), float(size), at))
         return out
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self, accuracy: float | int | None = None) -> dict[str, Any]:
         """Values of parameters that suit what was found: scales of length, time and rate.
 
-        Of what differs between targets these are the median ones, weighted by events.
+        Of what differs between targets these are the median ones, weighted by events. `accuracy`
+        is by which share the standard deviation of positions may be larger than event by event,
+        and chooses `events_per_step`, see `most_events`; None: about 32 steps in a window. Raises
+        `InputError` for an accuracy that is not positive.
         """
+        check_accuracy(accuracy)
         if not len(self):
             return {}
         sizes, _, rates = self._numbers()
@@ -93,8 +101,12 @@ class Found:
         most, least = self._typical(sizes, 0.95), self._typical(sizes, 0.05)
         W = self._typical(windows)
         steps = self._typical(rates) * self._together() * W / 32
+        events = int(2 ** np.clip(np.round(np.log2(max(steps, 1e-9))), 0, 5))
+        if accuracy is not None:
+            most = self._typical(self._most_events(float(accuracy)), 0.05)
+            events = int(2 ** np.clip(np.floor(np.log2(max(most, 1e-9))), 0, 5))
         return {name: self._typical(values) for name, values in self._each().items()} | {
-            "events_per_step": int(2 ** np.clip(np.round(np.log2(max(steps, 1e-9))), 0, 5)),
+            "events_per_step": events,
             "lambda_min": min(0.5, least / 3),
             "lambda_max": 6 * most,
             "t_coast": FOREVER,
@@ -134,6 +146,15 @@ class Found:
             "t_still": STILL * W,
         }
 
+    def _most_events(self, accuracy: float) -> NDArray[np.float64]:
+        """Events per step that each target may have, while those go along that live as long."""
+        begin, end = (np.array([getattr(p, name) for p in self.paths]) for name in ("begin", "end"))
+        rate = np.array([np.quantile(p.n, 0.25) / (p.window * 1e-6) for p in self.paths])
+        along = (begin <= begin[:, None]) & (end >= end[:, None])
+        size = np.array([np.median(path.size[:, 1]) for path in self.paths])
+        agility = np.array([path.agility for path in self.paths])
+        return most_events(accuracy, size, rate, agility) * (along @ rate) / rate
+
     def _numbers(self) -> tuple[NDArray, NDArray, NDArray]:
         """Of each target: size of the longer axis (px), speed (px/s), rate (events/s)."""
         paths = self.paths
@@ -155,3 +176,25 @@ class Found:
         times = np.sort([path.begin for path in self.paths])
         ends = np.sort([path.end for path in self.paths])
         return int((np.arange(1, len(times) + 1) - np.searchsorted(ends, times, "right")).max())
+
+
+def check_accuracy(accuracy: float | int | None) -> None:
+    """Raise `InputError` for an accuracy that is not positive."""
+    if accuracy is not None and not 0 < accuracy < np.inf:
+        raise InputError(f"an accuracy of {accuracy:g} is not possible; give a share above 0")
+
+
+def most_events(
+    accuracy: float, size: NDArray, rate: NDArray, agility: NDArray
+) -> NDArray[np.float64]:
+    """Events per step with which positions are by a share of `accuracy` less certain, at most.
+
+    Of targets (targets,) of `size` px, `rate` events/s and `agility` px^2/s^3. In its steady state
+    a filter of constant velocity has the variances sqrt(2) q s^3 of position and sqrt(2) q s of
+    velocity and their covariance q s^2, with q the agility and s = (size^2 / rate / q)^(1/4) its
+    time constant. Before the next step, x s later, that of position is 1 + sqrt(2) x + x^2 +
+    x^3 / (3 sqrt(2)) times as large.
+    """
+    roots = np.roots([*LONGER, 1 - (1 + accuracy) ** 2])
+    x = float(roots[abs(roots.imag) < 1e-9].real.max())
+    return x * rate * (size**2 / rate / agility) ** 0.25
