@@ -265,11 +265,12 @@ class ReadOut(Described):
         return [self.points.on, self.points.off]
 
     def images(self, rows: NDArray) -> "ReadOut":
-        """Those of its images, in that order."""
-        parts, growth = (self.points, self.slot, self.since), self.growth
-        chosen = jax.tree.map(lambda leaf: leaf[rows], parts)
-        if growth is not None:
-            growth = Growth([count[rows] for count in growth.counts], growth.rho_ref)
+        """Those of its images, in that order; chosen on the host."""
+        parts = (self.points, self.slot, self.since)
+        counts = None if self.growth is None else self.growth.counts
+        # JAX takes 4 ms of CPU for each array, a quarter of a fit that searches.
+        chosen, counts = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (parts, counts))
+        growth = None if self.growth is None else Growth(counts, self.growth.rho_ref)
         points, slot, since = chosen
         return ReadOut(points, slot, since, growth)
 
