@@ -112,7 +112,7 @@ def write_png(path: str | Path, image: NDArray) -> None:
 
 @contextlib.contextmanager
 def video_writer(
-    path: str | Path, fps: float | int, preset: str = "medium"
+    path: str | Path, fps: float | int, preset: str = "veryfast"
 ) -> Iterator[Callable[[NDArray], None]]:
     """Open an MP4 file (H.264, yuv420p) and give the function that appends a frame to it.
 

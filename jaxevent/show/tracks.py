@@ -190,7 +190,7 @@ class Output:
                 recording = tracks.recording
                 behind = _high_pass(recording, pictures) if self.background != "events" else None
                 fps = min(often, _FPS)
-                with video_writer(places[".mp4"], fps, "veryfast") as show:
+                with video_writer(places[".mp4"], fps) as show:
                     for image in draw_frames(recording, pictures, tracks.id, states(), behind):
                         show(image)
             else:
