@@ -185,8 +185,8 @@ def tracker_bench() -> tuple[dict[str, float], dict[str, float]]:
     tasks[found] = functools.partial(find, scene, progress=False)
     events[found] = len(scene.events)
     least = least_cpu(tasks)
-    speed = {f"{name}, per CPU second": events[name] / 1e6 / least[name] for name in tasks}
-    base = speed[f"{loop}, per CPU second"]
+    speed = {name: events[name] / 1e6 / least[name] for name in tasks}
+    base = speed[loop]
     ratio = {
         f"{name} / numba loop": v / base for name, v in speed.items() if name.startswith("tracker")
     }

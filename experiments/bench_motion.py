@@ -1,6 +1,7 @@
 """Speed of egomotion, as part of `bench.py`: events scored per second, and seconds per window.
 
-    python experiments/bench.py --motion
+    python experiments/bench.py voting
+    python experiments/bench.py motion
 
 Filters run over prepared candidates of simulated scenes, one event in 8, neighbours up to R px
 away, by the kernel that `estimate` uses; beside them by XLA, and the same sums over candidates and
