@@ -199,7 +199,13 @@ def choose(recording: Recording, camera: PinholeCamera | None = None) -> Choice:
         f"{one} explains events left out {_than(value)} {other} (z = {value:.1f})"
         for (one, other), value in z.items()
     ]
-    return Choice(chosen, (*lines, f"chosen: {chosen.title}"), z)
+    lines.append(f"chosen: {chosen.title}")
+    if chosen is Rotation:
+        lines.append(
+            "this is not sure: general motion with little parallax, as before one wall, looks the "
+            "same in short windows; --model general fits longer ones and says whether there is any"
+        )
+    return Choice(chosen, tuple(lines), z)
 
 
 def _than(z: float) -> str:

@@ -90,6 +90,7 @@ def test_models_are_told_apart():
     turns, slides = choose(turning), choose(sliding)
     assert turns.model.name == "rotation" and slides.model.name == "general"
     assert turns.z["rotation", "planar"] > 3 and "better than" in " ".join(turns.lines)
+    assert "not sure" in turns.lines[-1] and "not sure" not in " ".join(slides.lines)
     flat, several = layers(plane), layers(sliding)
     assert flat is None or not flat.several
     assert several is not None and several.several and 0.2 < several.spread < 0.9

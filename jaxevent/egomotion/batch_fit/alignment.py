@@ -193,7 +193,8 @@ def linearise(
     v = np.stack([found.vx, found.vy], -1).reshape(n, 2)
     MJ = W @ J
     cells = lattice.X.shape[1]
-    upper = J.reshape(-1, FREE).T @ MJ.reshape(-1, FREE)
+    # By einsum: larger products wake BLAS's threads, which spin then, beside other starts' steps.
+    upper = np.einsum("ep,eq->pq", J.reshape(-1, FREE), MJ.reshape(-1, FREE))
     mixed = np.einsum("ekp,ek->ep", MJ, r).reshape(SEGMENTS, cells, FREE).sum(0).T
     lower = np.einsum("ek,ekl,el->e", r, W, r).reshape(SEGMENTS, cells).sum(0)
     H = np.block([[upper, mixed], [mixed.T, np.diag(lower)]])
@@ -203,7 +204,7 @@ def linearise(
     depth = path.log_rho.reshape(window.cells)
     bound = bond_matrix(*bonds(depth, prior.smooth, EDGE)[:2])
     H[FREE:, FREE:] += bound
-    g[FREE:] += bound @ path.log_rho
+    g[FREE:] += np.einsum("ij,j->i", bound, path.log_rho)
     H[FREE:, FREE:] += prior.relief * np.eye(cells)
     g[FREE:] += prior.relief * (path.log_rho - path.log_rho.mean())
     known, side, _ = priors_of_rows(prior, unit, half)

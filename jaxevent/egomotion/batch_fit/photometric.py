@@ -168,8 +168,10 @@ def tilt(path: Path, tracks: Tracks, change: NDArray) -> NDArray[np.float64]:
     usual = float(np.median(level))
     rays = rays_of(*tracks.places, tracks.f)
     told = np.where(level > 1.5 * LEAST * usual, rays.T, 0)
-    normal = np.linalg.solve(told @ rays + 1e-6 * np.eye(3), told @ level)
-    return np.log(np.maximum(rays @ (normal + usual * change), LEAST * usual))
+    # By einsum: larger products wake BLAS's threads, which spin then.
+    normal = np.linalg.solve(told @ rays + 1e-6 * np.eye(3), np.einsum("in,n->i", told, level))
+    level = np.einsum("ni,i->n", rays, normal + usual * change)
+    return np.log(np.maximum(level, LEAST * usual))
 
 
 def report(problem: Problem, kept: Seen) -> Report:
