@@ -1,5 +1,7 @@
 """Targets before a scene that moves past the camera, and the scene's motion against the truth."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -97,6 +99,9 @@ def test_what_another_depth_does_is_no_own_way():
         us = 5_000_000 + np.rint(t * 1e6).astype(np.int64)
         path = Path(us, p, np.zeros_like(p), C, np.full(51, 30.0), 20_000, 1.0)
         assert goes_own_way(path, scene, 5_000_000) == bool(own)
+        # What leaves its way by its size in every window is none.
+        astray = dataclasses.replace(path, agility=3 * 9.0 / 0.02**3)
+        assert not goes_own_way(astray, scene, 5_000_000)
 
 
 @pytest.mark.slow

@@ -28,6 +28,7 @@ SCENE = 0.3  # share of the bright that is edges
 TOLD = 0.1  # of the stretches may be told worse by a map that moves than by one at rest
 MOVED = 2.0  # px
 OWN_WAY = 2.0  # sizes: deviation, along any axis, of a target's own way from its mean
+STEADY = 0.5  # sizes by which a target may leave its velocity's way in a window
 STEP = 0.01  # s before and after, between which the scene's motion at a target is told
 
 
@@ -100,8 +101,12 @@ def goes_own_way(path: Path, scene: SceneMotion, start: int) -> bool:
     """Whether a target goes farther than its size, and a cell, on a way that no depth goes.
 
     What is nearer or farther than most of the scene goes the scene's way, faster or slower. So the
-    path across the scene's motion counts, and along it only what goes against it. `start`: us.
+    path across the scene's motion counts, and along it only what goes against it. What goes another
+    way in every window is no target, but parts of the scene that are seen by turns. `start`: us.
     """
+    window, size = path.window * 1e-6, float(np.median(path.size[:, 0]))
+    if path.agility * window**3 / 3 > (STEADY * size) ** 2:
+        return False
     t = (path.t - start) * 1e-6
     if len(t) < 2:
         return False
