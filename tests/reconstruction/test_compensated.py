@@ -595,9 +595,14 @@ def test_prepared_images_are_those_of_the_video():
 def test_prepared_images_of_frames_that_are_not_steady(monkeypatch):
     """The video and prepared images leave out the smooth part alike; `test_steadiness`."""
     times, value = prepared()
+    sure = video()(times)
+    # What is in doubt of brightness is in the variance, of steady frames too.
+    monkeypatch.setattr(estimator.Steadiness, "doubt", lambda *_: 0.02)
+    steady = mc.estimate(slide(), params(), progress=False)(times)
+    np.testing.assert_allclose(steady.covariance, sure.covariance + 0.02, rtol=1e-5)
     monkeypatch.setattr(estimator.Steadiness, "__call__", lambda *_: False)
     whole = mc.estimate(slide(), params(), progress=False)(times)
-    assert (whole.mean != video()(times).mean).any()
+    assert (whole.mean != sure.mean).any() and whole.covariance.min() > 0.02
     _, out = mc.prepare(slide(), times, params())
     (_, (image, P, _)), _ = value(params().raw, out)
     np.testing.assert_allclose(image.reshape(2, 40, 48), whole.mean, atol=2e-3)
