@@ -88,6 +88,9 @@ SKEW = 0.03  # standard deviation of the thresholds' skew by counts, at least
 # events are fitted exactly, and the others are outliers, for any motion. Simulated without noise
 # the stage NOISY shows 0.07 C, real sensors 0.13 C and more.
 NOISY, NOISE = 1, 0.1  # the stage, C
+# The share of inliers below which rivals are compared, whatever they cost. Walls seen with uneven
+# thresholds have 0.70, whichever motion; ideal ones 0.97.
+AGREED = 0.8
 HARDLY = -3.0  # added to log inverse depths where translation is not told
 TELLING = 3.0  # z, from which there is a translation
 # Rivals whose cost is so many times the least in the end are compared on pixels left out: fitted
@@ -443,7 +446,9 @@ class Windows:
         if not left:
             return None
         ranked = self.ranked(left)
-        few = least > 0 or self.parallax(ranked[0][0].path, half) < PARALLAX
+        first, seen = ranked[0]
+        parallax = self.parallax(first.path, half)
+        few = least > 0 or parallax < PARALLAX or seen.inliers < AGREED
         limit = np.inf if few else ALIKE * self.cost(*ranked[0])
         close = [one for one in ranked if self.cost(*one) <= limit]
         trial = self.trial(centre) if few or len(close) > 1 else None
