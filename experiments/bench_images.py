@@ -29,6 +29,7 @@ from jaxevent.recording import Events, Frames, Recording
 
 WIDTH, HEIGHT = 346, 260
 NUMBERS = (0.1, 5e-4, 0.03, 0.01, 0.01, 7e5, 0.09)  # of the filter, as the programs take them
+OF_AKF = ("c_on", "c_off", "I0", "kappa", "w_min", "sigma_proc", "sigma_iso", "sigma_ref")
 
 
 def stream(
@@ -196,12 +197,20 @@ def prepare_seconds(recording: Recording) -> float:
     return cpu_seconds(run)
 
 
-def losses(recording: Recording) -> dict[str, Callable[[], object]]:
-    """The mean squared error at 8 images, and it with its gradient by 8 parameters."""
-    names = ("c_on", "c_off", "I0", "kappa", "w_min", "sigma_proc", "sigma_iso", "sigma_ref")
+def losses(
+    recording: Recording,
+    method: Any = jaxevent.akf,
+    start: Any = None,
+    names: tuple[str, ...] = OF_AKF,
+) -> dict[str, Callable[[], object]]:
+    """The mean squared error at 8 images, and it with its gradient by these parameters.
+
+    Keys are those of a compiler, "numba" or "xla", and "loss" or "gradient".
+    """
+    start = jaxevent.akf.Params(preset="paper") if start is None else start
     frames = recording.frames
     assert frames is not None
-    start, rows = jaxevent.akf.Params(preset="paper"), slice(1, 49, 6)
+    rows = slice(1, 49, 6)
     truth = jax.numpy.asarray(frames.intensity[rows].reshape(8, -1))
 
     # Everything but the parameters is given as an argument, lest it be compiled as constants.
@@ -213,7 +222,7 @@ def losses(recording: Recording) -> dict[str, Callable[[], object]]:
     functions = {"loss": jax.jit(loss), "gradient": jax.jit(jax.value_and_grad(loss))}
     for compiler in ("numba", "xla"):
         times = frames.t[rows] + 20_000
-        images = jaxevent.akf.prepare_images(recording, times, start, compiler=compiler)
+        images = method.prepare_images(recording, times, start, compiler=compiler)
         for name, function in functions.items():
             given = functools.partial(function, raw, images, truth)
             tasks[f"{compiler} {name}"] = lambda given=given: jax.block_until_ready(given())

@@ -12,18 +12,25 @@ of repeats in turn.
 
 import argparse
 import dataclasses
-import functools
 from typing import Any
 
-import jax
 import numba
 import numpy as np
 from bench import machine
-from bench_images import stream
+from bench_images import losses, stream
 from timing import least_cpu
 
 import jaxevent
 from jaxevent.recording import Recording
+
+# The parameters that losses are differentiated by, and how they are called here.
+OF_AKS = ("c_on", "c_off", "I0", "sigma_event", "sigma_bg", "sigma_frame", "sigma_floor", "share")
+SHOWN = {
+    "numba loss": "loss, kernel",
+    "numba gradient": "loss and gradient, kernel",
+    "xla loss": "loss, XLA",
+    "xla gradient": "loss and gradient, XLA",
+}
 
 
 @numba.njit
@@ -134,38 +141,6 @@ def images_by(
     return np.concatenate([np.asarray(part.mean) for _, part in made.batches(times)])
 
 
-def losses(recording: Recording) -> dict[str, Any]:
-    """The mean squared error at 8 images, and it with its gradient by 8 parameters."""
-    names = (
-        "c_on",
-        "c_off",
-        "I0",
-        "sigma_event",
-        "sigma_bg",
-        "sigma_frame",
-        "sigma_floor",
-        "share",
-    )
-    start, frames = jaxevent.aks.Params(), recording.frames
-    assert frames is not None
-    rows, tasks = slice(1, 49, 6), {}
-    truth = jax.numpy.asarray(frames.intensity[rows].reshape(8, -1))
-
-    def loss(raw, images, truth):
-        image, _, _ = images(start.with_raw(raw), variance=False)
-        return ((image - truth) ** 2).mean()
-
-    raw = {name: start.raw[name] for name in names}
-    functions = {"loss": jax.jit(loss), "loss and gradient": jax.jit(jax.value_and_grad(loss))}
-    for compiler, by in (("numba", "kernel"), ("xla", "XLA")):
-        times = frames.t[rows] + 20_000
-        images = jaxevent.aks.prepare_images(recording, times, start, compiler=compiler)
-        for name, function in functions.items():
-            given = functools.partial(function, raw, images, truth)
-            tasks[f"{name}, {by}"] = lambda given=given: jax.block_until_ready(given())
-    return tasks
-
-
 def smoother_bench(
     repeat: int = 3, exposed: bool = False
 ) -> tuple[dict[str, float], dict[str, float]]:
@@ -189,7 +164,9 @@ def smoother_bench(
     if not exposed:
         worst = abs(ways["kernel"]() - ways["numba program"]()).max()
         assert worst < 1e-4, worst
-    least = least_cpu(ways | losses(recording), repeat)
+    of_losses = losses(recording, jaxevent.aks, jaxevent.aks.Params(), OF_AKS)
+    ways |= {shown: of_losses[name] for name, shown in SHOWN.items()}
+    least = least_cpu(ways, repeat)
     speed = {f"smoother, {n}": len(recording.events) / 1e6 / cpu for n, cpu in least.items()}
     whole, gradient = least["numba program"], "loss and gradient, kernel"
     ratio = {

@@ -6,6 +6,7 @@ that name arrays.
 """
 
 import functools
+import types
 from collections.abc import Callable
 from typing import Any
 
@@ -19,7 +20,7 @@ def jaxtyped(one: Any = None, *, typechecker: Any) -> Any:
     """Stands for `jaxtyping.jaxtyped` where jaxtyping's import hook decorates modules."""
     if one is None:
         return functools.partial(jaxtyped, typechecker=typechecker)
-    if not isinstance(one, FUNCTION):
+    if not isinstance(one, types.FunctionType):
         return one if writes_its_init(one) else usual(one, typechecker=typechecker)
     # beartype writes a checking function for each that it is given, in a millisecond; what is
     # defined inside a function is defined at every call.
@@ -53,4 +54,3 @@ def with_axes(checked: Callable[..., Any]) -> Callable[..., Any]:
 
 
 usual = jaxtyping.jaxtyped
-FUNCTION = type(jaxtyped)

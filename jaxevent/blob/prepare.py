@@ -7,6 +7,7 @@ recording.
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -24,7 +25,6 @@ from jaxevent.errors import InputError
 from jaxevent.estimator import Described
 from jaxevent.events.filters import supported
 from jaxevent.kernels import compiled
-from jaxevent.kernels import part as kernel_part
 from jaxevent.recording import Recording, Times, check_times
 
 STEPS = (4, 8, 16, 32, 64, 128, 256)  # per chunk
@@ -386,20 +386,12 @@ def _spread(t: Any, least: int) -> Any:
             if len(order) == 0:
                 order = np.arange(len(t))
             step = np.int64(0.618034 * n)
-            while _common(step, n) > 1:
+            while math.gcd(step, n) > 1:
                 step += 1
             for k in range(n):
                 order[begin + k] = begin + k * step % n
         begin = end
     return order
-
-
-@kernel_part
-def _common(a: int, b: int) -> int:
-    """The greatest common divisor."""
-    while b:
-        a, b = b, a % b
-    return a
 
 
 @compiled

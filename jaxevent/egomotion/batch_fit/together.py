@@ -107,7 +107,7 @@ def solve(system: System, sides: NDArray[np.float64]) -> Columns:
         share = -inverse @ product(image, better)
         advance(better, share, way)
         # Each of about size 1, that they neither vanish nor overflow.
-        scale = 1 / np.maximum(np.sqrt(np.abs(better.t).max(1) ** 2), 1e-30)
+        scale = 1 / np.maximum(np.abs(better.t).max(1), 1e-30)
         np.multiply(better.t, scale[:, None], out=way.t)
         np.multiply(better.rest, scale[:, None].astype(real), out=way.rest)
         if step % EVERY == 0:
