@@ -7,7 +7,7 @@ flicker are, cells are smaller, and how its counts disperse is measured for each
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ from scipy import ndimage
 from jaxevent.blob.finding.scene import SceneMotion
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.events.filters import busiest_neighbour
+from jaxevent.kernels import compiled
+from jaxevent.kernels import part as kernel_part
 
 SLICES = 64  # of the recording's time
 CELL, FINE = 16, 4  # px; fine cells where the background is bright:
@@ -25,6 +27,26 @@ FEWEST = 50  # events per slice in the calm cells from which the sensor's activi
 MOST_WINDOWS = 400  # in which the dispersion is measured
 GOLDEN = 0.5 * (5**0.5 - 1)
 FULL = 5.0  # counts in a cell whose dispersion is measured
+UNMOVED = np.eye(2, 3)
+
+
+class Field(NamedTuple):
+    """Values of places at one moment, for kernels: `value_at(field, x, y)` at a pixel."""
+
+    values: NDArray[np.float64]  # (rows, columns)
+    cell: int  # px
+    factor: float | int
+    place: NDArray[np.float64]  # (2, 3), from pixels to px in the cells
+
+
+@kernel_part
+def value_at(field: Any, x: Any, y: Any) -> Any:
+    """As `look_up`."""
+    (rows, columns), A = field.values.shape, field.place
+    row = int(A[1, 0] * x + A[1, 1] * y + A[1, 2]) // field.cell
+    column = int(A[0, 0] * x + A[0, 1] * y + A[0, 2]) // field.cell
+    row, column = min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)
+    return field.values[row, column] * field.factor
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,13 +83,32 @@ class Background:
         self, x: NDArray | float | int, y: NDArray | float | int, t: Any, over: int = FINE
     ) -> Any:
         """Rates, 1/(px s), at some pixels at a time (s); in a scene means of `over` x `over` px."""
-        rate = self.rate
-        if self.scene is not None:
-            cells = max(1, round(over / FINE))
-            if cells not in self._means:
-                self._means[cells] = np.maximum(ndimage.uniform_filter(rate, cells), rate.min())
-            rate = self._means[cells]
-        return look_up(rate, FINE, *self.place(x, y, t)) * self.activity[self.slice(t)]
+        place = self.place(x, y, t)
+        return look_up(self._rates(over), FINE, *place) * self.activity[self.slice(t)]
+
+    def field(self, t: float | int, over: int = FINE) -> Field:
+        """The same of all pixels at one time, for kernels."""
+        return Field(self._rates(over), FINE, float(self.activity[self.slice(t)]), self.placing(t))
+
+    def field_of(self, values: NDArray[np.float64], cell: int, t: float | int) -> Field:
+        """Other values of the same places, in cells of so many px."""
+        return Field(values, cell, 1.0, self.placing(t))
+
+    def _rates(self, over: int) -> NDArray[np.float64]:
+        if self.scene is None:
+            return self.rate
+        cells = max(1, round(over / FINE))
+        if cells not in self._means:
+            mean = ndimage.uniform_filter(self.rate, cells)
+            self._means[cells] = np.maximum(mean, self.rate.min())
+        return self._means[cells]
+
+    def placing(self, t: float | int) -> NDArray[np.float64]:
+        """`place` at one time as a map (2, 3)."""
+        if self.scene is None:
+            return UNMOVED
+        (x, a, b), (y, c, d) = self.place(*np.array([[0.0, 1, 0], [0, 0, 1]]), t)
+        return np.array([[a - x, b - x, x], [c - y, d - y, y]])
 
     @property
     def mean(self) -> float:
@@ -108,6 +149,12 @@ def evidence(
     return np.where(n > mu, told, 0) / dispersion
 
 
+@kernel_part
+def nats(n: float | int, mu: float | int) -> float:
+    """`evidence` for kernels, of a dispersion of 1."""
+    return n * np.log(n / mu) - n + mu if n > mu else 0.0
+
+
 def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
     """Pixels that fire far more often than all of their eight neighbours.
 
@@ -120,15 +167,14 @@ def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
 
 def measure_background(stream: Stream) -> Background:
     """The background of a stream; hot pixels are marked in the stream."""
-    pixels = np.zeros(stream.height * stream.width, np.int64)
-    for part in stream.batches():
-        pixels += np.bincount(part.y * stream.width + part.x, minlength=len(pixels))
-    stream.hot = find_hot_pixels(pixels.reshape(stream.height, stream.width))
+    counts = np.zeros((stream.height, stream.width), np.int32)
+    stream.add_cells(0, stream.duration, UNMOVED, 1, counts)
+    stream.hot = find_hot_pixels(counts)
     fine = -(-stream.height // CELL) * CELL // FINE, -(-stream.width // CELL) * CELL // FINE
     cells = np.zeros((SLICES, *fine), np.int32)
-    for part in stream.batches():
-        slices = np.minimum(part.t / stream.duration * SLICES, SLICES - 1).astype(np.int64)
-        np.add.at(cells, (slices, part.y // FINE, part.x // FINE), 1)
+    edges = np.linspace(0, stream.duration, SLICES + 1)
+    for begin, end, now in zip(edges[:-1], edges[1:], cells, strict=True):
+        stream.add_cells(begin, end, UNMOVED, FINE, now)
     return _of_counts(cells, stream.duration)
 
 
@@ -189,22 +235,44 @@ def measure_dispersion(
     # At no fixed steps, for flicker has a period.
     middles = (np.arange(number) + np.arange(number) * GOLDEN % 1) / number * stream.duration
     slices = background.slice(middles)
-    calm = background.calm[slices]
-    activity = background.activity[slices][:, None, None]
-    N = np.zeros((number, rows, columns))
+    N = np.zeros((number, rows, columns), np.int32)
     for k, middle in enumerate(middles):
-        part = stream.window(middle - window / 2, middle + window / 2)
-        x, y = background.place(part.x, part.y, part.t)
-        row = np.clip(np.asarray(y // CELL, np.int64), 0, rows - 1)
-        place = row * columns + np.clip(np.asarray(x // CELL, np.int64), 0, columns - 1)
-        N[k] = np.bincount(place, minlength=rows * columns).reshape(rows, columns)
-    mean = (N * calm).sum(0) / np.maximum((activity * calm).sum(0), 1)
-    squares = (calm * (N - mean * activity) ** 2).sum(0)
-    expected = (calm * mean * activity).sum(0)
+        begin, end = middle - window / 2, middle + window / 2
+        stream.add_cells(begin, end, background.placing(middle), CELL, N[k])
+    calm, activity = background.calm[slices], background.activity[slices]
+    mean, squares, expected, fullest, seen = _moments(N, calm, activity, background.bright)
     full = expected >= FULL
     own = np.where(full, squares / np.maximum(expected, FULL), 1.0)
     usual = max(1.0, float(np.median(own[full]))) if full.mean() >= 0.5 else 1.0
     # Of many windows chance alone makes the fullest one as unlikely as there are windows.
-    fullest = evidence(N * calm, mean * activity, 1).max(0) / np.log(np.maximum(calm.sum(0), 10))
-    own = np.maximum(own, fullest)
+    own = np.maximum(own, fullest / np.log(np.maximum(seen, 10)))
     return np.where(background.bright & full, np.maximum(own, usual), usual)
+
+
+@compiled
+def _moments(N: Any, calm: Any, activity: Any, bright: Any) -> Any:
+    """Of calm counts (windows, rows, columns) of each cell: mean, squares about it, expected sum.
+
+    And the nats of the fullest window, where it is bright, and how many windows are calm.
+    """
+    windows, rows, columns = N.shape
+    mean, squares, expected = np.zeros((3, rows, columns))
+    usual, fullest, seen = np.zeros((3, rows, columns))
+    for k in range(windows):
+        for i in range(rows):
+            for j in range(columns):
+                if calm[k, i, j]:
+                    mean[i, j] += N[k, i, j]
+                    usual[i, j] += activity[k]
+                    seen[i, j] += 1
+    mean /= np.maximum(usual, 1)
+    for k in range(windows):
+        for i in range(rows):
+            for j in range(columns):
+                if calm[k, i, j]:
+                    mu = mean[i, j] * activity[k]
+                    squares[i, j] += (N[k, i, j] - mu) ** 2
+                    expected[i, j] += mu
+                    if bright[i, j] and N[k, i, j] > mu:
+                        fullest[i, j] = max(fullest[i, j], nats(N[k, i, j], mu))
+    return mean, squares, expected, fullest, seen

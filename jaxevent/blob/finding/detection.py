@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.finding.background import CELL, Background, evidence, look_up
-from jaxevent.blob.finding.stream import Part
+from jaxevent.blob.finding.background import CELL, Background, Field, look_up, nats, value_at
+from jaxevent.blob.finding.stream import Part, Pixels
 from jaxevent.kernels import Blank, compiled
 from jaxevent.kernels import part as kernel_part
 
@@ -25,8 +25,13 @@ class Scale(NamedTuple):
 
     def dispersion_at(self, x: Any, y: Any) -> Any:
         """That of counts in 3x3 of the scale's cells, in which flicker adds up."""
-        usual, cells = self.dispersion.min(), max(1.0, (3 * self.cell / CELL) ** 2)
-        return usual + (look_up(self.dispersion, CELL, x, y) - usual) * cells
+        usual = self.dispersion.min()
+        return usual + (look_up(self.dispersion, CELL, x, y) - usual) * self.flicker
+
+    @property
+    def flicker(self) -> float:
+        """Cells of 16 px in 3x3 of the scale's cells, at least 1."""
+        return max(1.0, (3 * self.cell / CELL) ** 2)
 
 
 class Blobs(NamedTuple):
@@ -37,61 +42,112 @@ class Blobs(NamedTuple):
     C: NDArray[np.float64]  # (blobs, 2, 2) px^2
 
 
+class Ground(NamedTuple):
+    """What tells blobs from background in a window, for kernels."""
+
+    rates: Field
+    dispersion: Field
+    cell: int
+    usual: float | int  # s px^2, of 3x3 cells
+    more: float | int  # times the dispersion of 3x3 cells exceeds that of 16 px more than the least
+    least: float | int  # dispersion
+    darkest: float | int  # events of 3x3 cells where the background is darkest
+    enough: float | int  # nats against background
+
+
+def ground_of(
+    background: Background, scale: Scale, size: tuple[int, int], t: float | int
+) -> Ground:
+    """Of a window about t (s) on a sensor of `size`: rows and columns, px."""
+    g = scale.cell
+    usual = scale.window * 9 * g * g
+    tests = -(-size[0] // g) * -(-size[1] // g) * background.duration / scale.window
+    rates, least = background.field(t, 3 * g), float(scale.dispersion.min())
+    return Ground(
+        rates, background.field_of(scale.dispersion, CELL, t), g, float(usual), scale.flicker,
+        least, float(background.rate.min() * rates.factor * usual),
+        float(np.log(tests / FALSE_ALARMS)),
+    )  # fmt: skip
+
+
 def detect(
-    part: Part, background: Background, scale: Scale, size: tuple[int, int], t: float | int
+    part: Part | Pixels, background: Background, scale: Scale, size: tuple[int, int], t: float | int
 ) -> tuple[NDArray[np.int32], int]:
     """Which blob each event is of, from 1 on, 0: none; and how many there are.
 
     A blob is made of neighbouring cells that are not empty and whose 3x3 surroundings hold more
-    events than background would give to one in 10 recordings. `size`: rows and columns, px.
+    events than background would give to one in 10 recordings. Blobs come in the order of their
+    cells' first events. `size`: rows and columns, px.
     """
-    g = scale.cell
-    rows, columns = -(-size[0] // g), -(-size[1] // g)
-    usual = scale.window * 9 * g * g
-    tests = rows * columns * background.duration / scale.window
-    enough = np.log(tests / FALSE_ALARMS)
-    # Fewer events are no evidence even where the background is darkest.
-    few = np.arange(MOST_FEW)
-    darkest = background.rate.min() * background.activity[background.slice(t)] * usual
-    few = int(np.argmin(evidence(few, darkest, scale.dispersion.min()) <= enough)) or MOST_FEW
-    cells = _cells(rows + 2, columns + 2)
-    across, down = (np.arange(n, dtype=np.int32) // g + 1 for n in size[::-1])
-    place, many, around = _count(part.x, part.y, across, down, few, cells)
-    y, x = np.divmod(many, columns + 2)
-    middle = (x - 1) * g + g // 2, (y - 1) * g + g // 2
-    mu = background.at(*middle, t, 3 * g) * usual
-    hit = evidence(around, mu, scale.dispersion_at(*background.place(*middle, t))) > enough
-    return _label(place, many[hit], cells)
+    ground = ground_of(background, scale, size, t)
+    return _detect(part.x, part.y, _events_of(part), ground, blank_cells(size, scale.cell))
+
+
+def blank_cells(size: tuple[int, int], cell: int) -> NDArray[np.int32]:
+    """Cells of a sensor and a border of one cell around them, to be counted in."""
+    return _cells(*(-(-n // cell) + 2 for n in size))
 
 
 # Windows hold far fewer events than there are cells: only those that are not empty are touched, and
-# made 0 again. Around all of them is a border of one cell.
+# made 0 again.
 
 
 @compiled
-def _count(x: Any, y: Any, across: Any, down: Any, few: int, cells: Any) -> Any:
-    """The cell of each event, the cells whose 3x3 hold at least `few` events, and how many."""
-    n, wide, place = cells.ravel(), cells.shape[1], np.empty(len(x), np.int64)
-    filled, number = np.empty(len(x), np.int64), 0
+def _detect(x: Any, y: Any, number: Any, ground: Any, cells: Any) -> Any:
+    return find_blobs(x, y, number, ground, cells)
+
+
+@kernel_part
+def find_blobs(x: Any, y: Any, number: Any, ground: Any, cells: Any) -> Any:
+    """`detect`, of pixels with so many events each. `cells` are 0, and are again."""
+    place, filled = _count(x, y, number, ground.cell, cells)
+    hit = _significant(filled, ground, cells)
+    for cell in filled:
+        cells.ravel()[cell] = 0
+    return _label(place, hit, cells)
+
+
+@kernel_part
+def _count(x: Any, y: Any, number: Any, cell: int, cells: Any) -> Any:
+    """The cell of each pixel, and all that are not empty."""
+    n, (rows, wide), place = cells.ravel(), cells.shape, np.empty(len(x), np.int64)
+    across, down = np.empty(wide * cell, np.int32), np.empty(rows * cell, np.int32)
+    for table in (across, down):
+        for i in range(len(table)):
+            table[i] = i // cell + 1
+    filled, count = np.empty(len(x), np.int64), 0
     for i in range(len(x)):
-        cell = np.int64(down[y[i]]) * wide + across[x[i]]
-        place[i] = cell
-        if n[cell] == 0:
-            filled[number] = cell
-            number += 1
-        n[cell] += 1
-    many, count = np.empty(number, np.int64), 0
-    for k in range(number):
-        if _sum_around(n, filled[k], wide) >= few:
-            many[count] = filled[k]
+        at = np.int64(down[y[i]]) * wide + across[x[i]]
+        place[i] = at
+        if n[at] == 0:
+            filled[count] = at
             count += 1
-    many = np.sort(many[:count])
-    around = np.empty(count, np.int64)
-    for k in range(count):
-        around[k] = _sum_around(n, many[k], wide)
-    for k in range(number):
-        n[filled[k]] = 0
-    return place, many, around
+        n[at] += number[i]
+    return place, filled[:count]
+
+
+@kernel_part
+def _significant(filled: Any, ground: Any, cells: Any) -> Any:
+    """Cells that are not empty whose 3x3 hold more events than background gives."""
+    n, wide, g = cells.ravel(), cells.shape[1], ground.cell
+    # Fewer events are no evidence even where the background is darkest.
+    few = 1
+    while few < MOST_FEW and nats(few, ground.darkest) <= ground.enough * ground.least:
+        few += 1
+    many, count = np.empty(len(filled), np.int64), 0
+    for cell in filled:
+        if _sum_around(n, cell, wide) >= few:
+            many[count] = cell
+            count += 1
+    some, count = many[:count], 0
+    for cell in some:
+        x, y = (cell % wide - 1) * g + g // 2, (cell // wide - 1) * g + g // 2
+        mu = value_at(ground.rates, x, y) * ground.usual
+        F = ground.least + (value_at(ground.dispersion, x, y) - ground.least) * ground.more
+        if nats(_sum_around(n, cell, wide), mu) > ground.enough * F:
+            many[count] = cell
+            count += 1
+    return many[:count]
 
 
 @kernel_part
@@ -102,7 +158,7 @@ def _sum_around(n: Any, cell: int, wide: int) -> Any:
     return total
 
 
-@compiled
+@kernel_part
 def _label(place: Any, hit: Any, cells: Any) -> Any:
     """The blob of each event, and how many there are: neighbours, also across corners."""
     labels, wide, waiting = cells.ravel(), cells.shape[1], np.empty(len(hit), np.int64)
@@ -133,34 +189,45 @@ def _label(place: Any, hit: Any, cells: Any) -> Any:
     return of_event, number
 
 
-def measure_blobs(part: Part, labels: NDArray[np.int32], number: int) -> Blobs:
+def measure_blobs(part: Part | Pixels, labels: NDArray[np.int32], number: int) -> Blobs:
     """Moments of all blobs. A pixel's own extent is added to the covariance."""
+    return Blobs(*_measure(part.x, part.y, _events_of(part), labels, number))
 
-    n, p, C = _moments(part.x, part.y, labels, number)
-    return Blobs(n, p, C + np.eye(2) / 12)
+
+def _events_of(part: Part | Pixels) -> NDArray[np.int32]:
+    return part.n if isinstance(part, Pixels) else np.ones(len(part), np.int32)
 
 
 @compiled
-def _moments(x: Any, y: Any, labels: Any, number: int) -> Any:
+def _measure(x: Any, y: Any, events: Any, labels: Any, number: int) -> Any:
+    return blob_moments(x, y, events, labels, number)
+
+
+@kernel_part
+def blob_moments(x: Any, y: Any, events: Any, labels: Any, number: int) -> Any:
+    """`measure_blobs`, of pixels with so many events each."""
     n, p, C = np.zeros(number), np.zeros((number, 2)), np.zeros((number, 2, 2))
     for i in range(len(labels)):
         k = labels[i] - 1
         if k >= 0:
-            n[k] += 1
-            p[k, 0] += x[i]
-            p[k, 1] += y[i]
+            n[k] += events[i]
+            p[k, 0] += events[i] * x[i]
+            p[k, 1] += events[i] * y[i]
     for k in range(number):
-        p[k] /= max(n[k], 1.0)
+        p[k, 0] /= max(n[k], 1.0)
+        p[k, 1] /= max(n[k], 1.0)
     for i in range(len(labels)):
         k = labels[i] - 1
         if k >= 0:
             ex, ey = x[i] - p[k, 0], y[i] - p[k, 1]
-            C[k, 0, 0] += ex * ex
-            C[k, 0, 1] += ex * ey
-            C[k, 1, 1] += ey * ey
+            C[k, 0, 0] += events[i] * ex * ex
+            C[k, 0, 1] += events[i] * ex * ey
+            C[k, 1, 1] += events[i] * ey * ey
     for k in range(number):
-        C[k] /= max(n[k], 1.0)
-        C[k, 1, 0] = C[k, 0, 1]
+        over = 1 / max(n[k], 1.0)
+        C[k, 0, 0] = C[k, 0, 0] * over + 1 / 12
+        C[k, 0, 1] = C[k, 1, 0] = C[k, 0, 1] * over
+        C[k, 1, 1] = C[k, 1, 1] * over + 1 / 12
     return n, p, C
 
 

@@ -21,12 +21,13 @@ from jaxevent.blob.finding.detection import (
     measure_blobs,
     touching,
 )
+from jaxevent.blob.finding.gates import GATE, Look
 from jaxevent.blob.finding.parts import unite
 from jaxevent.blob.finding.paths import STILL, Path
 from jaxevent.blob.finding.stream import Part, Stream
+from jaxevent.blob.finding.targets import JITTER, larger, start_targets
 from jaxevent.progress import bar
 
-GATE = 3.0  # standard deviations
 BORN, FILL = 4, 0.5  # windows, and share of its windows, in which a confirmed target was seen
 # Windows that silent targets are held: confirmed ones (and twice those seen), others; and confirmed
 # ones before a scene that moves, where what is silent is hidden and does not stand still.
@@ -38,76 +39,6 @@ YOUNG = 3  # windows: what is in contact then may be a part, what comes in conta
 PARTS = 5  # windows of common motion in contact that make two targets one
 LONGISH, APART = 3.0, 0.25  # aspect of a target, and share of its events in the smaller of two
 FREE = 0.7  # share of a blob's events that are nobody's, where a target begins
-CLAIMED, OWNS = 0.3, 0.1  # shares of a blob that is claimed, and of those who own the rest of it
-JITTER = 0.05  # of the size: error of a window's mean, for events of an edge are not independent
-
-
-@dataclasses.dataclass
-class Live:
-    """The targets of one moment; arrays begin with the number of targets."""
-
-    id: NDArray[np.int64]
-    t: NDArray[np.float64]  # s, of the last window seen
-    p: NDArray[np.float64]  # (n, 2) px
-    v: NDArray[np.float64]  # (n, 2) px/s
-    P: NDArray[np.float64]  # (n, 3): variance of p, covariance, variance of v; of each axis alike
-    C: NDArray[np.float64]  # (n, 2, 2) px^2, covariance of events
-    n: NDArray[np.float64]  # events per window
-    top: NDArray[np.float64]  # and most of them, slowly forgotten
-    q: NDArray[np.float64]  # px^2/s^3
-    nis: NDArray[np.float64]  # mean square of standardised innovations
-    born: NDArray[np.float64]  # s
-    hits: NDArray[np.int64]  # windows seen
-    miss: NDArray[np.int64]  # windows of silence
-    path: NDArray[np.float64]  # px
-    nats: NDArray[np.float64]  # against background
-    confirmed: NDArray[np.bool_]
-    part: NDArray[np.bool_]  # of another one
-
-    def keep(self, which: NDArray) -> "Live":
-        return Live(*(value[which] for value in vars(self).values()))
-
-    def add(self, other: "Live") -> "Live":
-        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
-        return Live(*(np.concatenate(pair) for pair in pairs))
-
-    @property
-    def size(self) -> NDArray[np.float64]:
-        """(n,) px, standard deviation along the longer axis."""
-        return np.sqrt(_larger(self.C))
-
-    @property
-    def agility(self) -> NDArray[np.float64]:
-        """Noise of the velocity, px^2/s^3."""
-        return self.q * np.clip(self.nis, 0.05, 50)
-
-    def predict(self, t: float | int) -> tuple[NDArray, NDArray]:
-        """Positions (n, 2) and P (n, 3) at t; what stands still is not driven any more."""
-        dt, (a, b, c), q = t - self.t, self.P.T, np.where(self.miss < STILL, self.agility, 0)
-        P = [a + 2 * b * dt + c * dt**2 + q * dt**3 / 3, b + c * dt + q * dt**2 / 2, c + q * dt]
-        return self.p + self.v * dt[:, None], np.stack(P, 1)
-
-
-def _begin(
-    ids: NDArray, t: float | int, p: NDArray, C: NDArray, n: NDArray, window: float | int
-) -> Live:
-    number, square = len(ids), _larger(C)
-    zero, none = np.zeros(number), np.zeros(number, np.int64)
-    P = np.stack(
-        [square / np.maximum(n, 1) + JITTER * square, zero, 9 * (square + 1) / window**2], 1
-    )
-    # An error of 0.3 sizes after one window.
-    q = 0.3**2 * (square + 0.5) * 3 / window**3
-    return Live(
-        ids, zero + t, p, np.zeros((number, 2)), P, C, n, n, q, zero + 1, zero + t, none + 1, none,
-        zero, zero, np.zeros(number, bool), np.zeros(number, bool),
-    )  # fmt: skip
-
-
-def _larger(C: NDArray) -> NDArray[np.float64]:
-    """Larger eigenvalues of (..., 2, 2)."""
-    half = (C[..., 0, 0] - C[..., 1, 1]) / 2
-    return (C[..., 0, 0] + C[..., 1, 1]) / 2 + np.hypot(half, C[..., 0, 1])
 
 
 @dataclasses.dataclass
@@ -131,7 +62,7 @@ class Links:
         self.stream, self.background, self.scale = stream, background, scale
         self.size = stream.height, stream.width
         none, no_C = np.zeros((0, 2)), np.zeros((0, 2, 2))
-        self.live = _begin(np.zeros(0, np.int64), 0.0, none, no_C, np.zeros(0), scale.window)
+        self.live = start_targets(np.zeros(0, np.int64), 0.0, none, no_C, np.zeros(0), scale.window)
         self.next_id = 0
         self.rows: list[_Row] = []
         self.contacts: dict[tuple[int, int], tuple[float, NDArray, float]] = {}
@@ -163,7 +94,7 @@ class Links:
         for one in sorted(self.confirmed | set(self.parts)):
             at = np.flatnonzero(ids == one)
             p, v, C, n, m, R = (values[at] for values in joined)
-            agility = fit_agility(t[at], m, R, np.median(_larger(C)) / w**3)
+            agility = fit_agility(t[at], m, R, np.median(larger(C)) / w**3)
             paths[one] = Path(us[at], p, v, C, n, round(1e6 * w), agility)
         for part, whole in self.parts.items():  # in order of time: a whole may become a part
             if whole in paths:
@@ -178,7 +109,7 @@ class Links:
         labels, blobs = detect(part, self.background, self.scale, self.size, t)
         owner = np.full(len(part), -1)
         if len(self.live.id):
-            seen = _Look(self.live, part, t)
+            seen = Look(self.live, part, t)
             owner = seen.share_out(labels, blobs)
             self._update(seen, owner, labels > 0)
             self._part(part, owner, labels, blobs)
@@ -186,7 +117,7 @@ class Links:
             self._end(self._over())
         self._begin_targets(part, t, owner, labels, blobs)
 
-    def _update(self, seen: "_Look", owner: NDArray, in_blob: NDArray) -> None:
+    def _update(self, seen: Look, owner: NDArray, in_blob: NDArray) -> None:
         """All targets after a window's events."""
         live, t = self.live, seen.t
         n, z, D = seen.moments(owner, in_blob)
@@ -206,11 +137,11 @@ class Links:
         live.miss = np.where(heard, 0, live.miss + 1)
         still = live.miss == STILL
         # If it does go on, then no faster than before, or by its size in the time that it is held.
-        fast = (live.v**2).sum(1) + _larger(live.C) / (HOLD * self.scale.window) ** 2
+        fast = (live.v**2).sum(1) + larger(live.C) / (HOLD * self.scale.window) ** 2
         live.P[still, 2] = np.minimum(live.P[:, 2], fast)[still]
         live.v[still], live.P[still, 1] = 0, 0
 
-        square = _larger(D)
+        square = larger(D)
         R = square / 2 / np.maximum(n, 1) + square * JITTER**2 + 1e-3
         total = seen.P[:, 0] + R
         free = heard & ~seen.soft
@@ -264,7 +195,7 @@ class Links:
         Of parts of one object, such as both sides of an outline, the distance does not double.
         """
         live = self.live
-        longish = _larger(live.C) > LONGISH**2 * np.linalg.det(live.C) / _larger(live.C)
+        longish = larger(live.C) > LONGISH**2 * np.linalg.det(live.C) / larger(live.C)
         before, self.pairs = self.pairs, {}
         for i in np.flatnonzero(longish & live.confirmed & (live.miss == 0)):
             at = (owner == i) & (labels > 0)
@@ -358,78 +289,5 @@ class Links:
         ids = np.arange(self.next_id, self.next_id + number)
         self.next_id += number
         p, C, n = found.p[new], found.C[new], found.n[new]
-        self.live = self.live.add(_begin(ids, t, p, C, n, self.scale.window))
-        self.rows.append(_Row(t, ids, p, np.zeros_like(p), C, n, p, _larger(C) / 2 / n))
-
-
-class _Look:
-    """What targets see of a window: residuals of its events, and in whose gates they are."""
-
-    def __init__(self, live: Live, part: Part, t: float | int):
-        self.live, self.t = live, t
-        self.p, self.P = live.predict(t)
-        S = live.C * (1 + 2 / live.n)[:, None, None]
-        S = S + (self.P[:, 0] + 0.1)[:, None, None] * np.eye(2)
-        a, b, c = S[:, 0, 0, None], S[:, 0, 1, None], S[:, 1, 1, None]
-        late = part.t - t
-        self.ex = part.x - self.p[:, :1] - live.v[:, :1] * late
-        self.ey = part.y - self.p[:, 1:] - live.v[:, 1:] * late
-        determinant = a * c - b * b
-        squared = (c * self.ex**2 - 2 * b * self.ex * self.ey + a * self.ey**2) / determinant
-        self.distance = squared + np.log(determinant) + np.where(live.confirmed, 0, 2)[:, None]
-        self.inside = squared < GATE**2
-        self.soft = self._in_contact()
-
-    def _in_contact(self) -> NDArray:
-        """Confirmed targets that touch another one: events between them are shared."""
-        live = self.live
-        near = touching(self.p[:, None], live.C[:, None], self.p, live.C) < CONTACT
-        np.fill_diagonal(near, False)
-        near &= live.confirmed & live.confirmed[:, None]
-        return np.asarray(near.any(1))
-
-    def share_out(self, labels: NDArray, blobs: int) -> NDArray[np.int64]:
-        """Whose each event is; -1: nobody's."""
-        distance = np.where(self.inside, self.distance, np.inf)
-        owner = np.where(self.inside.any(0), distance.argmin(0), -1)
-        number = len(self.live.id)
-        at = (labels > 0) & (owner >= 0)
-        table = np.bincount(labels[at] * number + owner[at], minlength=(blobs + 1) * number)
-        table = table.reshape(blobs + 1, number)
-        counts = np.maximum(np.bincount(labels, minlength=blobs + 1), 1)
-        share = table / counts[:, None]
-        # The rest of a blob goes with its owners: targets may grow at once or pass their gates.
-        for one in range(1, blobs + 1):
-            if share[one].sum() < CLAIMED:
-                continue
-            own = np.flatnonzero((share[one] >= min(OWNS, share[one].max())) & (share[one] > 0))
-            rest = np.flatnonzero((labels == one) & ~np.isin(owner, own))
-            if len(rest):
-                owner[rest] = own[self.distance[own][:, rest].argmin(0)]
-        return owner
-
-    def moments(self, owner: NDArray, which: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Number (n,), mean (n, 2) and covariance (n, 2, 2) of residuals of some events."""
-        number = len(self.live.id)
-        shared = (self.inside & self.soft[:, None]).sum(0) > 1
-        i = np.flatnonzero((owner >= 0) & which & ~shared)
-        k, weight = owner[i], np.ones(len(i))
-        if shared.any():
-            both = np.flatnonzero(shared & which)
-            inside = self.inside[:, both] & self.soft[:, None]
-            density = np.where(inside, -0.5 * self.distance[:, both], -np.inf)
-            density = np.exp(density - density.max(0)) * self.live.n[:, None]
-            of, event = np.nonzero(inside)
-            weight = np.concatenate([weight, (density / density.sum(0))[of, event]])
-            i, k = np.concatenate([i, both[event]]), np.concatenate([k, of])
-
-        def total(values: NDArray) -> NDArray:
-            return np.bincount(k, weight * values, number)
-
-        n = total(np.ones(len(i)))
-        ex, ey, over = self.ex[k, i], self.ey[k, i], 1 / np.maximum(n, 1e-9)
-        x, y = total(ex) * over, total(ey) * over
-        xy = total(ex * ey) * over - x * y
-        xx, yy = total(ex**2) * over - x**2, total(ey**2) * over - y**2
-        C = np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2) + np.eye(2) / 12
-        return n, np.stack([x, y], 1), C
+        self.live = self.live.add(start_targets(ids, t, p, C, n, self.scale.window))
+        self.rows.append(_Row(t, ids, p, np.zeros_like(p), C, n, p, larger(C) / 2 / n))

@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob.finding.paths import NOBODY, Path, candidates, join
-from jaxevent.kernels import compiled
-from jaxevent.recording import Recording
+from jaxevent.kernels import Blank, compiled
+from jaxevent.recording import Events, Recording
 
+_counts = Blank(np.int32)
 BATCH = 1 << 20  # events read at a time
 
 
@@ -17,11 +18,22 @@ class Part(NamedTuple):
     """Consecutive events: t in s since the stream's start, x and y in px."""
 
     t: NDArray[np.float64]
-    x: NDArray[np.int64]
-    y: NDArray[np.int64]
+    x: NDArray[np.int32]
+    y: NDArray[np.int32]
 
     def __len__(self) -> int:
         return len(self.t)
+
+
+class Pixels(NamedTuple):
+    """Distinct pixels, int32, and how many events each has, n."""
+
+    x: NDArray[np.int32]
+    y: NDArray[np.int32]
+    n: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.n)
 
 
 class Stream:
@@ -62,9 +74,25 @@ class Stream:
 
     def window(self, begin: float | int, end: float | int) -> Part:
         """The events of begin <= t < end (s since the start)."""
-        us = [self.start + round(1e6 * t) for t in (begin, end)]
-        first, last = (self.recording.events.index(min(t, self.stop)) for t in us)
-        return self._rows(first, last)
+        return self._rows(*self._span(begin, end))
+
+    def pixels(self, begin: float | int, end: float | int) -> Pixels:
+        """The pixels of these events, by their first event."""
+        events, kept = self._of_rows(*self._span(begin, end))
+        counts = _counts(self.height, self.width)
+        return Pixels(*_count(events.x, events.y, self.hot, kept, counts))
+
+    def add_cells(
+        self, begin: float | int, end: float | int, place: NDArray, cell: int, counts: NDArray
+    ) -> None:
+        """Count these events in cells (rows, columns) of the px to which a map (2, 3) takes them.
+
+        What is beyond them is counted at their edge.
+        """
+        first, last = self._span(begin, end)
+        for row in range(first, last, BATCH):
+            events, kept = self._of_rows(row, min(row + BATCH, last))
+            _add_cells(events.x, events.y, self.hot, kept, place, cell, counts)
 
     def batches(self) -> Iterator[Part]:
         """All events, one batch after another."""
@@ -78,19 +106,56 @@ class Stream:
         us = [int(self.recording.events[row : row + 1].t[0]) for row in rows]
         return (np.array(us) - self.start) * 1e-6
 
-    def _rows(self, first: int, last: int) -> Part:
-        events = self.recording.events[first:last]
+    def _span(self, begin: float | int, end: float | int) -> tuple[int, int]:
+        us = [self.start + round(1e6 * t) for t in (begin, end)]
+        us = [min(max(t, self.start), self.stop) for t in us]
+        first, last = (self.recording.events.index(t) for t in us)
+        return first, last
+
+    def _of_rows(self, first: int, last: int) -> tuple[Events, NDArray[np.bool_] | None]:
+        """Some events, and which of them are kept; None: all."""
         kept = None if self._kept is None else self._kept[first - self._first : last - self._first]
+        return self.recording.events[first:last], kept
+
+    def _rows(self, first: int, last: int) -> Part:
+        events, kept = self._of_rows(first, last)
         return Part(*_keep(events.t, events.x, events.y, self.start, self.hot, kept))
 
 
 @compiled
 def _keep(t: Any, x: Any, y: Any, start: int, hot: Any, kept: Any) -> Any:
     """Times (s), x and y of the events that are not left out."""
-    out_t, out_x, out_y = np.empty(len(t)), np.empty(len(t), np.int64), np.empty(len(t), np.int64)
+    out_t, out_x, out_y = np.empty(len(t)), np.empty(len(t), np.int32), np.empty(len(t), np.int32)
     n = 0
     for i in range(len(t)):
         if (kept is None or kept[i]) and not hot[y[i], x[i]]:
             out_t[n], out_x[n], out_y[n] = (t[i] - start) * 1e-6, x[i], y[i]
             n += 1
     return out_t[:n], out_x[:n], out_y[:n]
+
+
+@compiled
+def _count(x: Any, y: Any, hot: Any, kept: Any, counts: Any) -> Any:
+    """Of the events that are not left out the pixels, and how many each has."""
+    px, py, m = np.empty(len(x), np.int32), np.empty(len(x), np.int32), 0
+    for i in range(len(x)):
+        if (kept is None or kept[i]) and not hot[y[i], x[i]]:
+            if counts[y[i], x[i]] == 0:
+                px[m], py[m] = x[i], y[i]
+                m += 1
+            counts[y[i], x[i]] += 1
+    n = np.empty(m, np.int32)
+    for k in range(m):
+        n[k] = counts[py[k], px[k]]
+        counts[py[k], px[k]] = 0
+    return px[:m], py[:m], n
+
+
+@compiled
+def _add_cells(x: Any, y: Any, hot: Any, kept: Any, A: Any, cell: int, counts: Any) -> None:
+    rows, columns = counts.shape
+    for i in range(len(x)):
+        if (kept is None or kept[i]) and not hot[y[i], x[i]]:
+            row = int(A[1, 0] * x[i] + A[1, 1] * y[i] + A[1, 2]) // cell
+            column = int(A[0, 0] * x[i] + A[0, 1] * y[i] + A[0, 2]) // cell
+            counts[min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)] += 1

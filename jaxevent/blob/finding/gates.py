@@ -1,0 +1,167 @@
+"""Whose the events of a window are: those in targets' gates, and the blobs that these claim."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.blob.finding.detection import CONTACT, touching
+from jaxevent.blob.finding.stream import Part
+from jaxevent.blob.finding.targets import Live
+from jaxevent.kernels import compiled
+from jaxevent.kernels import part as kernel_part
+
+GATE = 3.0  # standard deviations
+CLAIMED, OWNS = 0.3, 0.1  # shares of a blob that is claimed, and of those who own the rest of it
+
+
+class Gates(NamedTuple):
+    """Where the events of some targets are expected at a time, for kernels."""
+
+    p: NDArray[np.float64]  # (n, 2) px
+    v: NDArray[np.float64]  # (n, 2) px/s
+    S: NDArray[np.float64]  # (n, 2, 2) px^2
+    more: NDArray[np.float64]  # (n,) added to an event's distance
+    events: NDArray[np.float64]  # (n,) per window
+    soft: NDArray[np.bool_]  # (n,) whether a target shares events with others
+
+
+class Look:
+    """What targets see of a window about t (s)."""
+
+    def __init__(self, live: Live, part: Part, t: float | int):
+        self.part, self.t = part, t
+        self.p, self.P = live.predict(t)
+        S = live.C * (1 + 2 / live.n)[:, None, None]
+        S = S + (self.P[:, 0] + 0.1)[:, None, None] * np.eye(2)
+        self.soft = _in_contact(self.p, live.C, live.confirmed)
+        more = np.where(live.confirmed, 0.0, 2.0)
+        self.gates = Gates(self.p, live.v, S, more, live.n, self.soft)
+
+    def share_out(self, labels: NDArray, blobs: int) -> NDArray[np.int64]:
+        """Whose each event is; -1: nobody's."""
+        return _share_out(*self.part, self.t, labels, blobs, self.gates)
+
+    def moments(self, owner: NDArray, which: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Number (n,), mean (n, 2) and covariance (n, 2, 2) of residuals of some events."""
+        return _moments(*self.part, self.t, owner, which, self.gates)
+
+
+def _in_contact(p: NDArray, C: NDArray, confirmed: NDArray) -> NDArray[np.bool_]:
+    """Confirmed targets that touch another one: events between them are shared."""
+    if len(p) < 2:
+        return np.zeros(len(p), bool)
+    near = touching(p[:, None], C[:, None], p, C) < CONTACT
+    np.fill_diagonal(near, False)
+    near &= confirmed & confirmed[:, None]
+    return np.asarray(near.any(1))
+
+
+@kernel_part
+def _inverses(S: Any) -> Any:
+    """(n, 4): of S, xx, xy and yy, and the logarithm of its determinant."""
+    out = np.empty((len(S), 4))
+    for k in range(len(S)):
+        a, b, c = S[k, 0, 0], S[k, 0, 1], S[k, 1, 1]
+        determinant = a * c - b * b
+        out[k, 0], out[k, 1], out[k, 2] = c / determinant, -b / determinant, a / determinant
+        out[k, 3] = np.log(determinant)
+    return out
+
+
+@kernel_part
+def _squared(ex: float, ey: float, inverse: Any) -> float:
+    return inverse[0] * ex * ex + 2 * inverse[1] * ex * ey + inverse[2] * ey * ey
+
+
+@compiled
+def _share_out(t: Any, x: Any, y: Any, middle: Any, labels: Any, blobs: int, gates: Any) -> Any:
+    """Whose each event is, -1: nobody's."""
+    targets, inverse, owner = len(gates.p), _inverses(gates.S), np.full(len(t), -1, np.int64)
+    table, counts = np.zeros((blobs, targets), np.int64), np.zeros(blobs, np.int64)
+    own, owned = np.zeros((blobs, targets), np.bool_), np.zeros(blobs, np.bool_)
+    for i in range(len(t)):
+        least, late = np.inf, t[i] - middle
+        for k in range(targets):
+            ex = x[i] - gates.p[k, 0] - gates.v[k, 0] * late
+            ey = y[i] - gates.p[k, 1] - gates.v[k, 1] * late
+            squared = _squared(ex, ey, inverse[k])
+            distance = squared + inverse[k, 3] + gates.more[k]
+            if squared < GATE * GATE and distance < least:
+                least, owner[i] = distance, k
+        if labels[i] > 0:
+            counts[labels[i] - 1] += 1
+            if owner[i] >= 0:
+                table[labels[i] - 1, owner[i]] += 1
+    # The rest of a blob goes with its owners: targets may grow at once or pass their gates.
+    for k in range(blobs):
+        claimed, most = 0, 0
+        for j in range(targets):
+            claimed += table[k, j]
+            most = max(most, table[k, j])
+        if claimed >= CLAIMED * counts[k]:
+            for j in range(targets):
+                own[k, j] = table[k, j] >= min(OWNS * counts[k], most) and table[k, j] > 0
+                owned[k] |= own[k, j]
+    for i in range(len(t)):
+        blob = labels[i] - 1
+        if blob < 0 or not owned[blob] or (owner[i] >= 0 and own[blob, owner[i]]):
+            continue
+        least, late = np.inf, t[i] - middle
+        for k in range(targets):
+            if own[blob, k]:
+                ex = x[i] - gates.p[k, 0] - gates.v[k, 0] * late
+                ey = y[i] - gates.p[k, 1] - gates.v[k, 1] * late
+                distance = _squared(ex, ey, inverse[k]) + inverse[k, 3] + gates.more[k]
+                if distance < least:
+                    least, owner[i] = distance, k
+    return owner
+
+
+@compiled
+def _moments(t: Any, x: Any, y: Any, middle: Any, owner: Any, which: Any, gates: Any) -> Any:
+    """Number, mean and covariance of residuals; targets in contact share events in both gates."""
+    targets, inverse = len(gates.p), _inverses(gates.S)
+    soft = np.flatnonzero(gates.soft)
+    n, z, C = np.zeros(targets), np.zeros((targets, 2)), np.zeros((targets, 2, 2))
+    share = np.zeros(len(soft))
+    for i in range(len(t)):
+        if not which[i]:
+            continue
+        late, sharing = t[i] - middle, 0
+        for j in range(len(soft)):
+            k = soft[j]
+            ex = x[i] - gates.p[k, 0] - gates.v[k, 0] * late
+            ey = y[i] - gates.p[k, 1] - gates.v[k, 1] * late
+            squared, share[j] = _squared(ex, ey, inverse[k]), 0.0
+            if squared < GATE * GATE:
+                sharing += 1
+                share[j] = np.exp(-0.5 * (squared + inverse[k, 3])) * gates.events[k]
+        if sharing > 1:
+            total = share.sum()
+            for j in range(len(soft)):
+                if share[j] > 0:
+                    _add(n, z, C, soft[j], share[j] / total, x[i], y[i], late, gates)
+        elif owner[i] >= 0:
+            _add(n, z, C, owner[i], 1.0, x[i], y[i], late, gates)
+    for k in range(targets):
+        over = 1 / max(n[k], 1e-9)
+        z[k, 0] *= over
+        z[k, 1] *= over
+        C[k, 0, 0] = C[k, 0, 0] * over - z[k, 0] ** 2 + 1 / 12
+        C[k, 0, 1] = C[k, 1, 0] = C[k, 0, 1] * over - z[k, 0] * z[k, 1]
+        C[k, 1, 1] = C[k, 1, 1] * over - z[k, 1] ** 2 + 1 / 12
+    return n, z, C
+
+
+@kernel_part
+def _add(n: Any, z: Any, C: Any, k: int, w: float, x: Any, y: Any, late: float, gates: Any) -> None:
+    """Add an event's residual to a target's sums."""
+    ex = x - gates.p[k, 0] - gates.v[k, 0] * late
+    ey = y - gates.p[k, 1] - gates.v[k, 1] * late
+    n[k] += w
+    z[k, 0] += w * ex
+    z[k, 1] += w * ey
+    C[k, 0, 0] += w * ex * ex
+    C[k, 0, 1] += w * ex * ey
+    C[k, 1, 1] += w * ey * ey

@@ -1,0 +1,301 @@
+"""What two windows of events predict of the next one's, by blobs at some scale."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.blob.finding.background import Background
+from jaxevent.blob.finding.detection import (
+    CONTACT,
+    Scale,
+    blank_cells,
+    blob_moments,
+    find_blobs,
+    ground_of,
+)
+from jaxevent.blob.finding.stream import Part, Pixels
+from jaxevent.kernels import Blank, compiled
+from jaxevent.kernels import part as kernel_part
+
+_bins = Blank(np.int32)
+SCORED = 2000  # most events of a window that are scored
+WIDTHS, BINS = (3.0, 8.0, 20.0), (2, 4, 8)  # px, of the kernels
+KERNELS = len(WIDTHS)
+ROUNDS = 15  # of expectation and maximisation, for the shares of ellipses and kernels
+SPLIT = 0.2  # of the score is lost where all events are in blobs that touch another one
+LARGE = 3  # events of a blob that may be split
+STRIP = 16  # px
+FAR = 80.0  # squared standard deviations from which an ellipse tells nothing
+
+
+class Scored(NamedTuple):
+    """Events of a window that are scored."""
+
+    x: NDArray[np.int32]
+    y: NDArray[np.int32]
+    background: NDArray[np.float64]  # 1/px^2
+    number: int  # of all events
+
+
+class Told(NamedTuple):
+    """What a scale predicts of the events of a window."""
+
+    density: NDArray[np.float64]  # (scored, 4) 1/px^2, by ellipses and by kernels
+    background: NDArray[np.float64]  # (scored,) 1/px^2
+    number: int  # of all events
+    expected: float  # events of the blobs
+    large: float  # events in blobs of three and more,
+    split: float  # and in those of them that touch another one
+
+
+def choose_scored(
+    part: Part, background: Background, t: float | int, window: float | int
+) -> Scored:
+    """At most `SCORED` events of a window (s), at equal steps."""
+    x, y = part.x, part.y
+    if len(part) > SCORED:
+        some = np.linspace(0, len(part) - 1, SCORED).astype(np.int64)
+        x, y = x[some], y[some]
+    return Scored(x, y, background.at(x, y, t) * window, len(part))
+
+
+def predict(
+    first: Pixels,
+    second: Pixels,
+    scored: Scored,
+    background: Background,
+    scale: Scale,
+    size: tuple[int, int],
+    t: float | int,
+) -> Told:
+    """What two windows tell of the third, which begins at t (s). `size`: rows and columns, px."""
+    ground = ground_of(background, scale, size, t)
+    bins = tuple(
+        _bins(*(n // g + 2 * int(r / g + 0.5) + 1 for n in size))
+        for r, g in zip(WIDTHS, BINS, strict=True)
+    )
+    cells = blank_cells(size, scale.cell)
+    density, *told = _predict(first, second, scored.x, scored.y, ground, cells, bins)
+    return Told(density, scored.background, scored.number, *told)
+
+
+class Score(NamedTuple):
+    """How well a scale predicts: nats per event."""
+
+    raw: float
+    whole: float  # and less what is split
+    parts: NDArray[np.float64]  # (windows,) of which the first is the sum
+
+
+def score(told: list[Told]) -> Score:
+    """Of a scale, from what it tells of some windows."""
+    number = sum(one.number for one in told)
+    ends = np.cumsum([0, *(len(one.background) for one in told)])
+    if not ends[-1]:
+        return Score(0.0, 0.0, np.zeros(len(told)))
+    density = np.concatenate([one.density for one in told])
+    b = np.concatenate([one.background for one in told])
+    weight = np.array([max(1.0, one.number / SCORED) for one in told])
+    expected, large, split = (
+        np.array([getattr(one, name) for one in told]) for name in ("expected", "large", "split")
+    )
+    parts = (_gains(density, b, weight, ends) - expected) / number
+    raw = float(parts.sum())
+    lost = SPLIT * abs(raw) * float(split.sum()) / max(float(large.sum()), 1e-9)
+    return Score(raw, raw - lost, parts)
+
+
+@compiled
+def _gains(density: Any, b: Any, weight: Any, ends: Any) -> Any:
+    """Log likelihood ratios of windows with the likeliest shares of ellipses and kernels."""
+    share, new = np.full(1 + KERNELS, 1 / (1 + KERNELS)), np.zeros(1 + KERNELS)
+    for _ in range(ROUNDS):
+        new[:] = 0
+        for k in range(len(weight)):
+            for i in range(ends[k], ends[k + 1]):
+                total = b[i]
+                for j in range(1 + KERNELS):
+                    total += density[i, j] * share[j]
+                part = weight[k] / total
+                for j in range(1 + KERNELS):
+                    new[j] += part * density[i, j]
+        for j in range(1 + KERNELS):
+            share[j] = share[j] * new[j] + 1e-12
+        total = share.sum()
+        for j in range(1 + KERNELS):
+            share[j] /= total
+    nats = np.zeros(len(weight))
+    for k in range(len(weight)):
+        for i in range(ends[k], ends[k + 1]):
+            total = 0.0
+            for j in range(1 + KERNELS):
+                total += density[i, j] * share[j]
+            nats[k] += weight[k] * np.log(total / b[i] + 1)
+    return nats
+
+
+@compiled
+def _predict(first: Any, second: Any, x: Any, y: Any, ground: Any, cells: Any, bins: Any) -> Any:
+    labels, number = find_blobs(first.x, first.y, first.n, ground, cells)
+    before = blob_moments(first.x, first.y, first.n, labels, number)
+    labels, number = find_blobs(second.x, second.y, second.n, ground, cells)
+    last = blob_moments(second.x, second.y, second.n, labels, number)
+    density = np.zeros((len(x), 1 + KERNELS))
+    expected = large = split = 0.0
+    if len(x) and number:
+        n, C = last[0], last[2]
+        p, S = _extrapolate(before, last)
+        _add_ellipses(density, x, y, n, p, S, cells.shape[0] * ground.cell)
+        px, py, events = _moved(second, labels, p - last[1])
+        for k in range(KERNELS):
+            _add_kernels(density, k + 1, x, y, px, py, events, WIDTHS[k], BINS[k], bins[k])
+        expected = n.sum()
+        large, split = _split(n, last[1], C)
+    return density, expected, large, split
+
+
+@kernel_part
+def _larger(C: Any) -> Any:
+    """The larger eigenvalue."""
+    half, cross = (C[0, 0] - C[1, 1]) / 2, C[0, 1]
+    return (C[0, 0] + C[1, 1]) / 2 + np.sqrt(half * half + cross * cross)
+
+
+@kernel_part
+def _extrapolate(before: Any, last: Any) -> Any:
+    """Where the blobs' next events are expected: means and covariances."""
+    (n0, p0, C0), (n, p1, C1) = before, last
+    p, S = p1.copy(), np.empty_like(C1)
+    for k in range(len(n)):
+        least, nearest = np.inf, -1
+        for j in range(len(n0)):
+            ex, ey = p1[k, 0] - p0[j, 0], p1[k, 1] - p0[j, 1]
+            apart = ex * ex + ey * ey
+            if apart < least:
+                least, nearest = apart, j
+        moves = np.sqrt(least) < 6 * np.sqrt(_larger(C1[k])) + 2
+        for i in range(2):
+            if moves:
+                p[k, i] += p1[k, i] - p0[nearest, i]
+            for j in range(2):
+                S[k, i, j] = C1[k, i, j] * (1 + 4 / n[k]) + (0.1 if i == j else 0.0)
+                if moves:
+                    S[k, i, j] += 2 * (C1[k, i, j] / n[k] + C0[nearest, i, j] / n0[nearest])
+    return p, S
+
+
+@kernel_part
+def _add_ellipses(density: Any, x: Any, y: Any, n: Any, p: Any, S: Any, rows: int) -> None:
+    """Events per px^2 of some Gaussian blobs at pixels, added to the first column.
+
+    Pixels are sorted into strips of rows: a blob looks into those that it reaches.
+    """
+    strips = rows // STRIP + 1
+    first, order = np.zeros(strips + 1, np.int64), np.empty(len(x), np.int64)
+    for j in range(len(x)):
+        first[y[j] // STRIP + 1] += 1
+    first = np.cumsum(first)
+    following = first.copy()
+    for j in range(len(x)):
+        strip = y[j] // STRIP
+        order[following[strip]] = j
+        following[strip] += 1
+    for k in range(len(n)):
+        a, b, c = S[k, 0, 0], S[k, 0, 1], S[k, 1, 1]
+        determinant = a * c - b * b
+        peak = n[k] / (2 * np.pi * np.sqrt(determinant))
+        wide, high = np.sqrt(FAR * a), np.sqrt(FAR * c)
+        low = min(max(int((p[k, 1] - high) / STRIP), 0), strips - 1)
+        top = min(max(int((p[k, 1] + high) / STRIP), 0), strips - 1)
+        for i in range(first[low], first[top + 1]):
+            j = order[i]
+            ex, ey = x[j] - p[k, 0], y[j] - p[k, 1]
+            if abs(ex) < wide and abs(ey) < high:
+                squared = (c * ex * ex - 2 * b * ex * ey + a * ey * ey) / determinant
+                if squared < FAR:
+                    density[j, 0] += peak * np.exp(-0.5 * squared)
+
+
+@kernel_part
+def _moved(pixels: Any, labels: Any, moved: Any) -> Any:
+    """Pixels of blobs, moved as these, and their events."""
+    x, y, n, m = np.empty(len(labels)), np.empty(len(labels)), np.empty(len(labels), np.int32), 0
+    for i in range(len(labels)):
+        k = labels[i] - 1
+        if k >= 0:
+            x[m], y[m] = pixels.x[i] + moved[k, 0], pixels.y[i] + moved[k, 1]
+            n[m] = pixels.n[i]
+            m += 1
+    return x[:m], y[:m], n[:m]
+
+
+@kernel_part
+def _add_kernels(
+    density: Any,
+    at: int,
+    x: Any,
+    y: Any,
+    px: Any,
+    py: Any,
+    events: Any,
+    r: Any,
+    g: Any,
+    counts: Any,
+) -> None:
+    """Kernels of radius r, 3 / (pi r^2) (1 - d^2 / r^2)^2, about places, in column `at`.
+
+    Places are counted in bins of g px, `counts`, and lie in their middles.
+    """
+    (rows, columns), reach = counts.shape, int(r / g + 0.5)
+    for k in range(len(px)):
+        row, column = int(py[k] / g + reach), int(px[k] / g + reach)
+        if 0 <= row < rows and 0 <= column < columns:
+            counts[row, column] += events[k]
+    for j in range(len(x)):
+        row, column = y[j] // g + reach, x[j] // g + reach
+        total = 0.0
+        for a in range(row - reach, row + reach + 1):
+            for b in range(column - reach, column + reach + 1):
+                if counts[a, b] > 0:
+                    dy, dx = (a - reach + 0.5) * g - y[j], (b - reach + 0.5) * g - x[j]
+                    u = 1 - (dx * dx + dy * dy) / (r * r)
+                    if u > 0:
+                        total += counts[a, b] * u * u
+        density[j, at] = 3 / (np.pi * r * r) * total
+    for k in range(len(px)):
+        row, column = int(py[k] / g + reach), int(px[k] / g + reach)
+        if 0 <= row < rows and 0 <= column < columns:
+            counts[row, column] = 0
+
+
+@kernel_part
+def _split(n: Any, p: Any, C: Any) -> Any:
+    """Events in large blobs, and in those that touch another one.
+
+    By ellipses: pieces along an outline touch each other, both of its sides do not.
+    """
+    large, split, reach = 0.0, 0.0, np.empty(len(n))
+    for k in range(len(n)):
+        reach[k] = np.sqrt(_larger(C[k]))
+    touches = np.zeros(len(n), np.bool_)
+    for k in range(len(n)):
+        for j in range(k):
+            if n[k] < LARGE or n[j] < LARGE or (touches[k] and touches[j]):
+                continue
+            ux, uy = p[j, 0] - p[k, 0], p[j, 1] - p[k, 1]
+            apart = np.sqrt(ux * ux + uy * uy)
+            if apart >= CONTACT * (reach[k] + reach[j]):
+                continue
+            along = 0.0
+            for one in (k, j):
+                square = C[one, 0, 0] * ux * ux + 2 * C[one, 0, 1] * ux * uy
+                along += np.sqrt(square + C[one, 1, 1] * uy * uy)
+            if apart * apart < CONTACT * along:
+                touches[k] = touches[j] = True
+    for k in range(len(n)):
+        if n[k] >= LARGE:
+            large += n[k]
+            if touches[k]:
+                split += n[k]
+    return large, split

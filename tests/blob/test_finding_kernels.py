@@ -1,0 +1,231 @@
+"""Compiled loops of `jaxevent.blob.finding` beside slow programs that say the same."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from jaxevent.blob.finding.background import (
+    CELL,
+    FINE,
+    SLICES,
+    Background,
+    evidence,
+    measure_dispersion,
+)
+from jaxevent.blob.finding.detection import FALSE_ALARMS, Scale, detect, measure_blobs
+from jaxevent.blob.finding.gates import CLAIMED, GATE, OWNS, Look
+from jaxevent.blob.finding.prediction import WIDTHS, choose_scored, predict, score
+from jaxevent.blob.finding.stream import Part, Pixels, Stream
+from jaxevent.blob.finding.targets import start_targets
+from jaxevent.recording import Events, Recording
+
+SIZE = WIDTH, HEIGHT = 96, 64
+DURATION = 0.5
+
+
+@pytest.fixture(scope="module")
+def stream():
+    """Noise and three spots, two of which go."""
+    rng = np.random.default_rng(5)
+    t = np.sort(rng.integers(0, 500_000, 6000))
+    x, y = rng.integers(0, WIDTH, 6000), rng.integers(0, HEIGHT, 6000)
+    for k, (x0, y0, v) in enumerate([(20, 20, 60), (50, 40, 40), (70, 20, 0)]):
+        of = rng.random(6000) < 0.2
+        x[of] = np.clip(x0 + v * t[of] * 1e-6 + rng.normal(0, 1.5 + k, of.sum()), 0, WIDTH - 1)
+        y[of] = np.clip(y0 + rng.normal(0, 2, of.sum()), 0, HEIGHT - 1)
+    events = Events(t, x.astype(np.uint16), y.astype(np.uint16), np.zeros(6000, bool))
+    return Stream(Recording("spots", WIDTH, HEIGHT, events), 0, 500_000)
+
+
+@pytest.fixture(scope="module")
+def background():
+    rng = np.random.default_rng(6)
+    coarse = HEIGHT // CELL, WIDTH // CELL
+    return Background(
+        rng.uniform(0.2, 0.6, (HEIGHT // FINE, WIDTH // FINE)),
+        rng.random((SLICES, *coarse)) < 0.8,
+        rng.random(coarse) < 0.5,
+        rng.uniform(1, 1.3, SLICES),
+        DURATION,
+    )
+
+
+def test_pixels_are_those_of_the_events(stream):
+    part, pixels = stream.window(0.1, 0.3), stream.pixels(0.1, 0.3)
+    places, counts = np.unique(part.y * WIDTH + part.x, return_counts=True)
+    order = np.argsort(pixels.y * WIDTH + pixels.x)
+    np.testing.assert_array_equal((pixels.y * WIDTH + pixels.x)[order], places)
+    np.testing.assert_array_equal(pixels.n[order], counts)
+
+
+@pytest.mark.parametrize("g", [2, 4])
+def test_blobs_are_neighbouring_cells_with_more_events_than_background(stream, background, g):
+    scale = Scale(0.02, g, np.full((HEIGHT // CELL, WIDTH // CELL), 1.3))
+    part = stream.window(0.1, 0.12)
+    counts = np.zeros((HEIGHT // g, WIDTH // g))
+    np.add.at(counts, (part.y // g, part.x // g), 1)
+    around = ndimage.convolve(counts, np.ones((3, 3)), mode="constant")
+    y, x = np.mgrid[: HEIGHT // g, : WIDTH // g] * g + g // 2
+    mu = background.at(x, y, 0.11) * 0.02 * 9 * g * g
+    enough = np.log(counts.size * DURATION / 0.02 / FALSE_ALARMS)
+    hit = (counts > 0) & (evidence(around, mu, 1.3) > enough)
+    labels = np.zeros(hit.shape, np.int32)
+    ndimage.label(hit, np.ones((3, 3)), labels)
+    number = int(labels.max())
+    assert number > 1
+    told, blobs = detect(part, background, scale, (HEIGHT, WIDTH), 0.11)
+    assert blobs == number
+    blob_of = labels[part.y // g, part.x // g]
+    pairs = {(0, 0), *((int(told[i]), int(blob_of[i])) for i in np.flatnonzero(blob_of))}
+    assert len(pairs) == number + 1 and ((told > 0) == (blob_of > 0)).all()
+    to = np.array([blob for _, blob in sorted(pairs)])
+    measured = measure_blobs(part, told, blobs)
+    for k in range(number):
+        xy = np.stack([part.x, part.y])[:, told == k + 1]
+        assert measured.n[k] == xy.shape[1]
+        np.testing.assert_allclose(measured.p[k], xy.mean(1))
+        np.testing.assert_allclose(measured.C[k], np.cov(xy, ddof=0) + np.eye(2) / 12, atol=1e-12)
+    # Pixels with counts say the same as events.
+    pixels = stream.pixels(0.1, 0.12)
+    told, _ = detect(pixels, background, scale, (HEIGHT, WIDTH), 0.11)
+    np.testing.assert_array_equal(to[told], labels[pixels.y // g, pixels.x // g])
+    for one, other in zip(measure_blobs(pixels, told, blobs), measured, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-12)
+
+
+def test_what_is_predicted_is_the_sum_over_blobs_and_kernels(stream, background):
+    scale, w, t = Scale(0.04, 4, np.ones((HEIGHT // CELL, WIDTH // CELL))), 0.04, 0.2
+    first, second = stream.pixels(t - 2 * w, t - w), stream.pixels(t - w, t)
+    part = stream.window(t, t + w)
+    scored = choose_scored(part, background, t, w)
+    told = predict(first, second, scored, background, scale, (HEIGHT, WIDTH), t)
+    before = measure_blobs(first, *detect(first, background, scale, (HEIGHT, WIDTH), t))
+    labels, number = detect(second, background, scale, (HEIGHT, WIDTH), t)
+    last = measure_blobs(second, labels, number)
+    assert number > 2 and told.expected == last.n.sum()
+    ellipses, kernels, moved = np.zeros(len(part)), np.zeros((len(part), 3)), []
+    for n, p, C in zip(*last, strict=True):
+        k = np.argmin(np.hypot(*(before.p - p).T))
+        known = np.hypot(*(before.p[k] - p)) < 6 * np.sqrt(np.linalg.eigvalsh(C)[1]) + 2
+        moved.append((p - before.p[k]) * known)
+        S = C * (1 + 4 / n) + 0.1 * np.eye(2)
+        S = S + 2 * (C / n + before.C[k] / before.n[k]) * known
+        e = np.stack([part.x, part.y], 1) - (p + moved[-1])
+        squared = np.einsum("ni,ij,nj->n", e, np.linalg.inv(S), e)
+        ellipses += n * np.exp(-squared / 2) / (2 * np.pi * np.sqrt(np.linalg.det(S)))
+    np.testing.assert_allclose(told.density[:, 0], ellipses, rtol=1e-9, atol=1e-15)
+    for j, (r, g) in enumerate(zip(WIDTHS, (2, 4, 8), strict=True)):
+        for i in np.flatnonzero(labels):
+            x, y = np.array([second.x[i], second.y[i]]) + moved[labels[i] - 1]
+            x, y = (np.floor(x / g) + 0.5) * g, (np.floor(y / g) + 0.5) * g
+            u = 1 - ((x - part.x) ** 2 + (y - part.y) ** 2) / r**2
+            kernels[:, j] += second.n[i] * np.where(u > 0, u, 0) ** 2 * 3 / (np.pi * r**2)
+    np.testing.assert_allclose(told.density[:, 1:], kernels, rtol=1e-9, atol=1e-12)
+
+
+def test_scores_are_the_likelihood_of_the_best_shares(stream, background):
+    scale = Scale(0.04, 4, np.ones((HEIGHT // CELL, WIDTH // CELL)))
+    told = []
+    for t in (0.2, 0.3):
+        first, second = stream.pixels(t - 0.08, t - 0.04), stream.pixels(t - 0.04, t)
+        scored = choose_scored(stream.window(t, t + 0.04), background, t, 0.04)
+        told.append(predict(first, second, scored, background, scale, (HEIGHT, WIDTH), t))
+    density = np.concatenate([one.density for one in told])
+    b = np.concatenate([one.background for one in told])
+    share = np.full(4, 0.25)
+    for _ in range(15):
+        share = share * ((1 / (density @ share + b)) @ density)
+        share /= share.sum()
+    nats = np.log(density @ share / b + 1).sum() - sum(one.expected for one in told)
+    result = score(told)
+    assert result.raw == pytest.approx(nats / len(b)) and result.whole <= result.raw
+    assert result.parts.sum() == pytest.approx(result.raw) and len(result.parts) == 2
+
+
+def test_dispersion_is_variance_over_mean(stream, background):
+    told = measure_dispersion(stream, background, 0.01)
+    number = 50
+    middles = (np.arange(number) + np.arange(number) * (0.5 * (5**0.5 - 1)) % 1) / number * DURATION
+    own, fullest = (
+        np.ones((HEIGHT // CELL, WIDTH // CELL)),
+        np.zeros((HEIGHT // CELL, WIDTH // CELL)),
+    )
+    full = own < 0
+    for i, j in np.ndindex(*own.shape):
+        rows = []
+        for t in middles:
+            k = int(background.slice(t))
+            part = stream.window(max(t - 0.005, 0), t + 0.005)
+            n = ((part.y // CELL == i) & (part.x // CELL == j)).sum()
+            if background.calm[k, i, j]:
+                rows.append((n, background.activity[k]))
+        n, a = np.array(rows).T
+        mu = n.sum() / a.sum() * a
+        full[i, j] = mu.sum() >= 5
+        own[i, j] = ((n - mu) ** 2).sum() / mu.sum() if full[i, j] else 1
+        fullest[i, j] = evidence(n, mu, 1).max() / np.log(max(len(n), 10))
+    usual = max(1.0, float(np.median(own[full])))
+    bright = background.bright & full
+    assert full.mean() > 0.5 and bright.any()
+    expected = np.where(bright, np.maximum(np.maximum(own, fullest), usual), usual)
+    np.testing.assert_allclose(told, expected)
+
+
+def test_events_are_shared_out_among_gates_and_blobs():
+    rng = np.random.default_rng(7)
+    number, blobs, targets = 400, 5, 4
+    part = Part(
+        np.sort(rng.uniform(0, 0.01, number)),
+        rng.integers(10, 60, number).astype(np.int32),
+        rng.integers(10, 40, number).astype(np.int32),
+    )
+    labels = rng.integers(0, blobs + 1, number).astype(np.int32)
+    p = np.array([[20.0, 20], [24, 21], [45, 30], [55, 15]])
+    v = rng.normal(0, 300, (targets, 2))
+    C = np.stack([np.array([[9.0, s], [s, 5.0]]) for s in (0, 2, -3, 1)])
+    n, P = np.array([30.0, 20, 5, 40]), rng.uniform(0, 1, (targets, 3))
+    confirmed = np.array([True, True, False, True])
+    live = start_targets(np.arange(targets), 0.005, p, C, n, 0.01)
+    live.v, live.P, live.confirmed = v, P, confirmed
+    seen = Look(live, part, 0.005)
+    assert seen.soft.tolist() == [True, True, False, False]
+
+    e = np.stack([part.x, part.y], 1) - p[:, None] - v[:, None] * (part.t - 0.005)[:, None]
+    S = C * (1 + 2 / n)[:, None, None] + (P[:, 0] + 0.1)[:, None, None] * np.eye(2)
+    squared = np.einsum("kni,kij,knj->kn", e, np.linalg.inv(S), e)
+    inside = squared < GATE**2
+    distance = squared + np.log(np.linalg.det(S))[:, None] + np.where(confirmed, 0, 2)[:, None]
+    near = np.where(inside, distance, np.inf)
+    owner = np.where(inside.any(0), near.argmin(0), -1)
+    expected = owner.copy()
+    for blob in range(1, blobs + 1):
+        share = np.array([((labels == blob) & (owner == k)).sum() for k in range(targets)])
+        share = share / (labels == blob).sum()
+        if share.sum() < CLAIMED:
+            continue
+        own = np.flatnonzero((share >= min(OWNS, share.max())) & (share > 0))
+        for i in np.flatnonzero((labels == blob) & ~np.isin(owner, own)):
+            expected[i] = own[distance[own, i].argmin()]
+    told = seen.share_out(labels, blobs)
+    assert (expected != owner).any()
+    np.testing.assert_array_equal(told, expected)
+
+    which = labels > 1
+    weight = (told == np.arange(targets)[:, None]) * which.astype(float)
+    for i in np.flatnonzero((inside[:2].sum(0) > 1) & which):
+        density = np.exp(-distance[:2, i] / 2) * n[:2]
+        weight[:, i] = [*(density / density.sum()), 0, 0]
+    assert 0 < (weight % 1 > 0).sum()
+    number, z, D = seen.moments(told, which)
+    np.testing.assert_allclose(number, weight.sum(1))
+    for k in range(targets):
+        np.testing.assert_allclose(z[k], np.average(e[k], axis=0, weights=weight[k]))
+        C = np.cov(e[k].T, aweights=weight[k], ddof=0)
+        np.testing.assert_allclose(D[k], C + np.eye(2) / 12, rtol=1e-9)
+
+
+def test_windows_before_the_start_hold_nothing(stream):
+    late = Stream(stream.recording, 100_000, 500_000)
+    assert len(late.window(-0.05, 0.0)) == 0 and len(late.pixels(-0.05, 0.0)) == 0
+    assert len(late.window(-0.05, 0.05)) == len(late.window(0.0, 0.05))
+    assert isinstance(late.pixels(0, 0.1), Pixels)
