@@ -13,10 +13,10 @@ from jaxevent.blob.finding.background import (
     measure_dispersion,
 )
 from jaxevent.blob.finding.detection import FALSE_ALARMS, Scale, detect, measure_blobs
-from jaxevent.blob.finding.gates import CLAIMED, GATE, OWNS, Look
+from jaxevent.blob.finding.gates import CLAIMED, OWNS, Look
 from jaxevent.blob.finding.prediction import WIDTHS, choose_scored, predict, score
 from jaxevent.blob.finding.stream import Part, Pixels, Stream
-from jaxevent.blob.finding.targets import start_targets
+from jaxevent.blob.finding.targets import GATE, start_targets
 from jaxevent.recording import Events, Recording
 
 SIZE = WIDTH, HEIGHT = 96, 64
@@ -186,7 +186,7 @@ def test_events_are_shared_out_among_gates_and_blobs():
     n, P = np.array([30.0, 20, 5, 40]), rng.uniform(0, 1, (targets, 3))
     confirmed = np.array([True, True, False, True])
     live = start_targets(np.arange(targets), 0.005, p, C, n, 0.01)
-    live.v, live.P, live.confirmed = v, P, confirmed
+    live = live._replace(v=v, P=P, confirmed=confirmed)
     seen = Look(live, part, 0.005)
     assert seen.soft.tolist() == [True, True, False, False]
 

@@ -7,6 +7,7 @@ flicker are, cells are smaller, and how its counts disperse is measured for each
 """
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -88,7 +89,8 @@ class Background:
 
     def field(self, t: float | int, over: int = FINE) -> Field:
         """The same of all pixels at one time, for kernels."""
-        return Field(self._rates(over), FINE, float(self.activity[self.slice(t)]), self.placing(t))
+        now = min(max(int(t / self.duration * SLICES), 0), SLICES - 1)
+        return Field(self._rates(over), FINE, float(self.activity[now]), self.placing(t))
 
     def field_of(self, values: NDArray[np.float64], cell: int, t: float | int) -> Field:
         """Other values of the same places, in cells of so many px."""
@@ -109,6 +111,11 @@ class Background:
             return UNMOVED
         (x, a, b), (y, c, d) = self.place(*np.array([[0.0, 1, 0], [0, 0, 1]]), t)
         return np.array([[a - x, b - x, x], [c - y, d - y, y]])
+
+    @functools.cached_property
+    def least(self) -> float:
+        """1/(px s), where the background is darkest."""
+        return float(self.rate.min())
 
     @property
     def mean(self) -> float:

@@ -25,8 +25,12 @@ class Scale(NamedTuple):
 
     def dispersion_at(self, x: Any, y: Any) -> Any:
         """That of counts in 3x3 of the scale's cells, in which flicker adds up."""
-        usual = self.dispersion.min()
-        return usual + (look_up(self.dispersion, CELL, x, y) - usual) * self.flicker
+        return self.usual + (look_up(self.dispersion, CELL, x, y) - self.usual) * self.flicker
+
+    @property
+    def usual(self) -> float:
+        """The least dispersion."""
+        return float(self.dispersion.min())
 
     @property
     def flicker(self) -> float:
@@ -62,10 +66,10 @@ def ground_of(
     g = scale.cell
     usual = scale.window * 9 * g * g
     tests = -(-size[0] // g) * -(-size[1] // g) * background.duration / scale.window
-    rates, least = background.field(t, 3 * g), float(scale.dispersion.min())
+    rates, least = background.field(t, 3 * g), scale.usual
     return Ground(
         rates, background.field_of(scale.dispersion, CELL, t), g, float(usual), scale.flicker,
-        least, float(background.rate.min() * rates.factor * usual),
+        least, float(background.least * rates.factor * usual),
         float(np.log(tests / FALSE_ALARMS)),
     )  # fmt: skip
 

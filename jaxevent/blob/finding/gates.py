@@ -7,11 +7,10 @@ from numpy.typing import NDArray
 
 from jaxevent.blob.finding.detection import CONTACT, touching
 from jaxevent.blob.finding.stream import Part
-from jaxevent.blob.finding.targets import Live
+from jaxevent.blob.finding.targets import GATE, Live
 from jaxevent.kernels import compiled
 from jaxevent.kernels import part as kernel_part
 
-GATE = 3.0  # standard deviations
 CLAIMED, OWNS = 0.3, 0.1  # shares of a blob that is claimed, and of those who own the rest of it
 
 

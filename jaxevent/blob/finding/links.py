@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob.finding.agility import fit_agility
-from jaxevent.blob.finding.background import Background, evidence
+from jaxevent.blob.finding.background import CELL, Background
 from jaxevent.blob.finding.detection import (
     CONTACT,
     FALSE_ALARMS,
@@ -21,20 +21,17 @@ from jaxevent.blob.finding.detection import (
     measure_blobs,
     touching,
 )
-from jaxevent.blob.finding.gates import GATE, Look
+from jaxevent.blob.finding.gates import Look
 from jaxevent.blob.finding.parts import unite
-from jaxevent.blob.finding.paths import STILL, Path
+from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.stream import Part, Stream
-from jaxevent.blob.finding.targets import JITTER, larger, start_targets
+from jaxevent.blob.finding.targets import HOLD, Expected, larger, start_targets, update
 from jaxevent.progress import bar
 
 BORN, FILL = 4, 0.5  # windows, and share of its windows, in which a confirmed target was seen
-# Windows that silent targets are held: confirmed ones (and twice those seen), others; and confirmed
-# ones before a scene that moves, where what is silent is hidden and does not stand still.
-HOLD, HOLD_NEW, HOLD_MOVING = 24, 2, 4
-SEEN, SEEN_NEW = 1e-3, 1e-5  # false alarms of a look where a target is known to be
-FAINT = 0.02  # of its own rate: a target with fewer events is silent
-GAIN = 0.2  # of size and rate
+# Windows that silent targets are held: those that are not confirmed, and confirmed ones before a
+# scene that moves, where what is silent is hidden and does not stand still.
+HOLD_NEW, HOLD_MOVING = 2, 4
 YOUNG = 3  # windows: what is in contact then may be a part, what comes in contact later is not
 PARTS = 5  # windows of common motion in contact that make two targets one
 LONGISH, APART = 3.0, 0.25  # aspect of a target, and share of its events in the smaller of two
@@ -109,85 +106,43 @@ class Links:
         labels, blobs = detect(part, self.background, self.scale, self.size, t)
         owner = np.full(len(part), -1)
         if len(self.live.id):
-            seen = Look(self.live, part, t)
-            owner = seen.share_out(labels, blobs)
-            self._update(seen, owner, labels > 0)
+            look = Look(self.live, part, t)
+            owner = look.share_out(labels, blobs)
+            self._update(look, owner, labels > 0)
             self._part(part, owner, labels, blobs)
             self._join_parts(t)
             self._end(self._over())
         self._begin_targets(part, t, owner, labels, blobs)
 
-    def _update(self, seen: Look, owner: NDArray, in_blob: NDArray) -> None:
+    def _update(self, look: Look, owner: NDArray, in_blob: NDArray) -> None:
         """All targets after a window's events."""
-        live, t = self.live, seen.t
-        n, z, D = seen.moments(owner, in_blob)
-        # One place to look at, no search: fewer events tell. They move the target, not its size.
-        weak = n < 2
-        if weak.any():
-            spread = np.linalg.det(live.C + (seen.P[:, 0] + 0.1)[:, None, None] * np.eye(2))
-            all_n, all_z, all_D = seen.moments(owner, np.ones(len(owner), bool))
-            told = evidence(all_n, self._expected(seen.p, t, spread), self._dispersion(seen.p, t))
-            asked = -np.log(np.where(live.confirmed, SEEN, SEEN_NEW))
-            there = weak & (all_n >= 2) & (told >= asked)
-            n = np.where(weak, np.where(there, all_n, 0), n)
-            z = np.where(there[:, None], all_z, z)
-            D = np.where(there[:, None, None], all_D, D)
-        live.top = np.where(n >= 2, np.maximum(0.99 * live.top, n), live.top)
-        heard = (n >= 2) & (n >= FAINT * live.top)
-        live.miss = np.where(heard, 0, live.miss + 1)
-        still = live.miss == STILL
-        # If it does go on, then no faster than before, or by its size in the time that it is held.
-        fast = (live.v**2).sum(1) + larger(live.C) / (HOLD * self.scale.window) ** 2
-        live.P[still, 2] = np.minimum(live.P[:, 2], fast)[still]
-        live.v[still], live.P[still, 1] = 0, 0
-
-        square = larger(D)
-        R = square / 2 / np.maximum(n, 1) + square * JITTER**2 + 1e-3
-        total = seen.P[:, 0] + R
-        free = heard & ~seen.soft
-        nis = np.clip((z**2).sum(1) / 2 / total, 0, 30)
-        live.nis = np.where(free, live.nis + 0.15 * (nis - live.nis), live.nis)
-        K = seen.P[:, :2] / total[:, None]
-        p = seen.p + K[:, :1] * z
-        P = np.stack(
-            [(1 - K[:, 0]) * seen.P[:, 0], (1 - K[:, 0]) * seen.P[:, 1],
-             seen.P[:, 2] - K[:, 1] * seen.P[:, 1]], 1,
+        live, t = self.live, look.t
+        found = anywhere = look.moments(owner, in_blob)
+        if (found[0] < 2).any():
+            anywhere = look.moments(owner, np.ones(len(owner), bool))
+        background, scale = self.background, self.scale
+        seen = update(
+            live,
+            Expected(
+                t, scale.window, look.p, look.P, look.soft, background.field(t, 3 * scale.cell),
+                background.field_of(scale.dispersion, CELL, t), scale.usual, scale.flicker,
+            ),
+            found,
+            anywhere,
         )  # fmt: skip
-        live.path += np.where(heard, np.hypot(*(p - live.p).T), 0)
-        live.p = np.where(heard[:, None], p, live.p)
-        live.v = np.where(heard[:, None], live.v + K[:, 1:] * z, live.v)
-        live.P = np.where(heard[:, None], P, live.P)
-        live.t = np.where(heard, t, live.t)
-        newer = 1 / (live.hits + 1)
-        a = np.maximum(GAIN * np.minimum(1, n / live.n), newer)
-        sized = free & ~weak
-        live.C = np.where(sized[:, None, None], live.C + a[:, None, None] * (D - live.C), live.C)
-        a = np.maximum(GAIN, newer)
-        live.n = np.where(heard, live.n + a * (n - live.n), live.n)
-        live.hits = live.hits + heard
-        mu = self._expected(live.p, t, np.linalg.det(live.C))
-        told = evidence(n, mu, self._dispersion(live.p, t))
-        live.nats = live.nats + np.where(heard, told, 0)
-        self._confirm(heard, t)
-        some = live.keep(heard)
-        m, R = (seen.p + z)[heard], (square / 2 / np.maximum(n, 1))[heard]
-        self.rows.append(_Row(t, some.id, some.p, some.v, some.C, n[heard], m, R))
-
-    def _expected(self, p: NDArray, t: float | int, determinant: NDArray) -> NDArray[np.float64]:
-        """Events of the background in gates."""
-        rate = self.background.at(p[:, 0], p[:, 1], t, 3 * self.scale.cell)
-        area = np.pi * GATE**2 * np.sqrt(np.maximum(determinant, 0))
-        return np.maximum(rate * area * self.scale.window, 1e-3)
-
-    def _dispersion(self, p: NDArray, t: float | int) -> NDArray[np.float64]:
-        return self.scale.dispersion_at(*self.background.place(p[:, 0], p[:, 1], t))
+        self._confirm(seen.heard, t)
+        some, now = live.keep(seen.heard), seen.heard
+        m = (look.p + seen.z)[now]
+        self.rows.append(_Row(t, some.id, some.p, some.v, some.C, seen.n[now], m, seen.R[now]))
 
     def _confirm(self, heard: NDArray, t: float | int) -> None:
         live = self.live
+        if live.confirmed.all():
+            return
         age = np.rint((t - live.born) / self.scale.window) + 1
         apart = ~np.isin(live.id, [newer for newer, _ in self.contacts])
         enough = (live.hits >= BORN) & (live.hits >= FILL * age) & (live.nats > self.enough)
-        live.confirmed = live.confirmed | (heard & enough & apart)
+        live.confirmed[heard & enough & apart] = True
 
     def _part(self, part: Part, owner: NDArray, labels: NDArray, blobs: int) -> None:
         """Leave a target the larger of two blobs that move apart: the other is another one.
@@ -214,6 +169,9 @@ class Links:
 
     def _join_parts(self, t: float | int) -> None:
         """Make one of two targets that touch and move together."""
+        if len(self.live.id) < 2:
+            self.contacts = {}
+            return
         live, w = self.live, self.scale.window
         size = live.size
         reach = size[:, None] + size
@@ -271,6 +229,8 @@ class Links:
         return live.part | outside | (live.miss > hold)
 
     def _end(self, which: NDArray) -> None:
+        if not which.any():
+            return
         over = self.live.keep(which)
         self.confirmed |= set(over.id[over.confirmed].tolist())
         self.live = self.live.keep(~which)
@@ -283,6 +243,9 @@ class Links:
             return
         free = owner < 0
         counts = np.bincount(labels, minlength=blobs + 1)
+        of_nobody = np.bincount(labels[free], minlength=blobs + 1)[1:]
+        if not ((of_nobody >= 3) & (of_nobody >= FREE * counts[1:])).any():
+            return
         found = measure_blobs(Part(part.t[free], part.x[free], part.y[free]), labels[free], blobs)
         new = (found.n >= 3) & (found.n >= FREE * counts[1:])
         number = int(new.sum())

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.kernels import compiled
+from jaxevent.kernels import part as kernel_part
 from jaxevent.recording import Events
 
 STILL = 2  # windows of silence after which a target stands still
@@ -105,10 +106,15 @@ def _candidates(t: Any, x: Any, y: Any, joined: Any, limit: float | int) -> Any:
         if i0 == i1:
             continue
         row = max(first, first + np.searchsorted(joined.t[first : last + 1], t[i0], "right") - 1)
+        looked, box = -1, (0.0, 0.0, 0.0, 0.0)
         for i in range(i0, i1):
             while row < last and joined.t[row + 1] <= t[i]:
                 row += 1
             following = min(row + 1, last)
+            if row != looked:
+                looked, box = row, _box(joined, row, following, limit)
+            if x[i] < box[0] or x[i] > box[1] or y[i] < box[2] or y[i] > box[3]:
+                continue
             span = joined.t[following] - joined.t[row]
             part = min(max((t[i] - joined.t[row]) / span, 0.0), 1.0) if span > 0 else 0.0
             if span > w + w // 2 and min(part, 1 - part) * span > w / 2:
@@ -122,3 +128,17 @@ def _candidates(t: Any, x: Any, y: Any, joined: Any, limit: float | int) -> Any:
             if c * ex * ex - 2 * b * ex * ey + a * ey * ey <= limit * (a * c - b * b):
                 whose[i] = k if whose[i] == -1 else -2
     return whose
+
+
+@kernel_part
+def _box(joined: Any, row: int, following: int, limit: Any) -> Any:
+    """Least and greatest x and y (px) of what is near a path between two of its rows."""
+    p, S = joined.p, joined.S
+    wide = np.sqrt(limit * max(S[row, 0], S[following, 0]))
+    high = np.sqrt(limit * max(S[row, 2], S[following, 2]))
+    return (
+        min(p[row, 0], p[following, 0]) - wide,
+        max(p[row, 0], p[following, 0]) + wide,
+        min(p[row, 1], p[following, 1]) - high,
+        max(p[row, 1], p[following, 1]) + high,
+    )

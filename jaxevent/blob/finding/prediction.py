@@ -29,6 +29,20 @@ STRIP = 16  # px
 FAR = 80.0  # squared standard deviations from which an ellipse tells nothing
 
 
+def _weights(r: float, g: int) -> NDArray[np.float64]:
+    """Of a kernel, 3 / (pi r^2) (1 - d^2 / r^2)^2: (g, g, bins, bins) 1/px^2.
+
+    Of bins around a pixel that is in row v and column u of its own bin, by v and u.
+    """
+    reach = int(r / g + 0.5)
+    apart = (np.arange(-reach, reach + 1) + 0.5) * g - np.arange(g)[:, None]
+    squared = apart[:, None, :, None] ** 2 + apart[None, :, None, :] ** 2
+    return 3 / (np.pi * r**2) * np.maximum(1 - squared / r**2, 0) ** 2
+
+
+_TABLES = tuple(_weights(r, g) for r, g in zip(WIDTHS, BINS, strict=True))
+
+
 class Scored(NamedTuple):
     """Events of a window that are scored."""
 
@@ -72,11 +86,11 @@ def predict(
     """What two windows tell of the third, which begins at t (s). `size`: rows and columns, px."""
     ground = ground_of(background, scale, size, t)
     bins = tuple(
-        _bins(*(n // g + 2 * int(r / g + 0.5) + 1 for n in size))
-        for r, g in zip(WIDTHS, BINS, strict=True)
+        _bins(*(n // g + table.shape[-1] for n in size))
+        for table, g in zip(_TABLES, BINS, strict=True)
     )
     cells = blank_cells(size, scale.cell)
-    density, *told = _predict(first, second, scored.x, scored.y, ground, cells, bins)
+    density, *told = _predict(first, second, scored.x, scored.y, ground, cells, bins, _TABLES)
     return Told(density, scored.background, scored.number, *told)
 
 
@@ -136,7 +150,9 @@ def _gains(density: Any, b: Any, weight: Any, ends: Any) -> Any:
 
 
 @compiled
-def _predict(first: Any, second: Any, x: Any, y: Any, ground: Any, cells: Any, bins: Any) -> Any:
+def _predict(
+    first: Any, second: Any, x: Any, y: Any, ground: Any, cells: Any, bins: Any, tables: Any
+) -> Any:
     labels, number = find_blobs(first.x, first.y, first.n, ground, cells)
     before = blob_moments(first.x, first.y, first.n, labels, number)
     labels, number = find_blobs(second.x, second.y, second.n, ground, cells)
@@ -149,7 +165,7 @@ def _predict(first: Any, second: Any, x: Any, y: Any, ground: Any, cells: Any, b
         _add_ellipses(density, x, y, n, p, S, cells.shape[0] * ground.cell)
         px, py, events = _moved(second, labels, p - last[1])
         for k in range(KERNELS):
-            _add_kernels(density, k + 1, x, y, px, py, events, WIDTHS[k], BINS[k], bins[k])
+            _add_kernels(density[:, k + 1], x, y, px, py, events, tables[k], bins[k])
         expected = n.sum()
         large, split = _split(n, last[1], C)
     return density, expected, large, split
@@ -232,37 +248,21 @@ def _moved(pixels: Any, labels: Any, moved: Any) -> Any:
 
 @kernel_part
 def _add_kernels(
-    density: Any,
-    at: int,
-    x: Any,
-    y: Any,
-    px: Any,
-    py: Any,
-    events: Any,
-    r: Any,
-    g: Any,
-    counts: Any,
+    out: Any, x: Any, y: Any, px: Any, py: Any, events: Any, table: Any, counts: Any
 ) -> None:
-    """Kernels of radius r, 3 / (pi r^2) (1 - d^2 / r^2)^2, about places, in column `at`.
-
-    Places are counted in bins of g px, `counts`, and lie in their middles.
-    """
-    (rows, columns), reach = counts.shape, int(r / g + 0.5)
+    """Kernels about places, summed at pixels: of bins, `counts`, in whose middles places lie."""
+    (rows, columns), g, reach = counts.shape, len(table), table.shape[2] // 2
     for k in range(len(px)):
         row, column = int(py[k] / g + reach), int(px[k] / g + reach)
         if 0 <= row < rows and 0 <= column < columns:
             counts[row, column] += events[k]
     for j in range(len(x)):
-        row, column = y[j] // g + reach, x[j] // g + reach
-        total = 0.0
-        for a in range(row - reach, row + reach + 1):
-            for b in range(column - reach, column + reach + 1):
-                if counts[a, b] > 0:
-                    dy, dx = (a - reach + 0.5) * g - y[j], (b - reach + 0.5) * g - x[j]
-                    u = 1 - (dx * dx + dy * dy) / (r * r)
-                    if u > 0:
-                        total += counts[a, b] * u * u
-        density[j, at] = 3 / (np.pi * r * r) * total
+        row, column, total = y[j] // g, x[j] // g, 0.0
+        weights = table[y[j] - row * g, x[j] - column * g]
+        for a in range(2 * reach + 1):
+            for b in range(2 * reach + 1):
+                total += weights[a, b] * counts[row + a, column + b]
+        out[j] = total
     for k in range(len(px)):
         row, column = int(py[k] / g + reach), int(px[k] / g + reach)
         if 0 <= row < rows and 0 <= column < columns:

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from jaxevent.blob.finding.background import Background, evidence, measure_background
 from jaxevent.blob.finding.detection import CONTACT, Scale, touching
 from jaxevent.blob.finding.found import Found, Pass
-from jaxevent.blob.finding.gates import GATE
-from jaxevent.blob.finding.links import FAINT, HOLD, SEEN, Links
+from jaxevent.blob.finding.links import Links
 from jaxevent.blob.finding.moving import find_moving_background, goes_own_way
 from jaxevent.blob.finding.parts import join_parts
 from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.scale import Choice, choose_scale
 from jaxevent.blob.finding.stream import Stream
+from jaxevent.blob.finding.targets import FAINT, GATE, HOLD, SEEN
 from jaxevent.blob.seeds import span_of
 from jaxevent.progress import stage
 from jaxevent.recording import Recording
