@@ -8,6 +8,7 @@ flicker are, cells are smaller, and how its counts disperse is measured for each
 
 import dataclasses
 import functools
+import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -107,10 +108,7 @@ class Background:
 
     def placing(self, t: float | int) -> NDArray[np.float64]:
         """`place` at one time as a map (2, 3)."""
-        if self.scene is None:
-            return UNMOVED
-        (x, a, b), (y, c, d) = self.place(*np.array([[0.0, 1, 0], [0, 0, 1]]), t)
-        return np.array([[a - x, b - x, x], [c - y, d - y, y]])
+        return UNMOVED if self.scene is None else placing(self.scene, self.corner, t)
 
     @functools.cached_property
     def least(self) -> float:
@@ -134,6 +132,13 @@ class Background:
             return x, y
         x, y = self.scene.in_scene(x, y, t)
         return x - self.corner[0], y - self.corner[1]
+
+
+def placing(scene: SceneMotion, corner: tuple[int, int], t: float | int) -> NDArray[np.float64]:
+    """The map (2, 3) from px of the sensor at a time (s) to those of a scene from a corner."""
+    x, y = scene.in_scene(np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), t)
+    first = [x[0] - corner[0], y[0] - corner[1]]
+    return np.stack([[x[1] - x[0], y[1] - y[0]], [x[2] - x[0], y[2] - y[0]], first], 1)
 
 
 def look_up(values: NDArray, cell: int, x: NDArray | float | int, y: NDArray | float | int) -> Any:
@@ -244,8 +249,11 @@ def measure_dispersion(
     slices = background.slice(middles)
     N = np.zeros((number, rows, columns), np.int32)
     for k, middle in enumerate(middles):
-        begin, end = middle - window / 2, middle + window / 2
-        stream.add_cells(begin, end, background.placing(middle), CELL, N[k])
+        times = np.array([middle - window / 2, middle + window / 2])
+        if background.scene is not None:
+            times = background.scene.steps(*times)
+        for t, end in itertools.pairwise(times.tolist()):
+            stream.add_cells(t, end, background.placing((t + end) / 2), CELL, N[k])
     calm, activity = background.calm[slices], background.activity[slices]
     mean, squares, expected, fullest, seen = _moments(N, calm, activity, background.bright)
     full = expected >= FULL

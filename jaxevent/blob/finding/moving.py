@@ -6,12 +6,13 @@ scene.
 """
 
 import dataclasses
+import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from jaxevent.blob.finding.background import CELL, FINE, FULL, SLICES, Background, pooled
+from jaxevent.blob.finding.background import CELL, FINE, FULL, SLICES, Background, placing, pooled
 from jaxevent.blob.finding.detection import detect
 from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.scale import STRETCHES, Choice
@@ -28,7 +29,7 @@ SCENE = 0.3  # share of the bright that is edges
 TOLD = 0.1  # of the stretches may be told worse by a map that moves than by one at rest
 MOVED = 2.0  # px
 OWN_WAY = 2.0  # sizes: deviation, along any axis, of a target's own way from its mean
-STEADY = 0.5  # sizes by which a target may leave its velocity's way in a window
+STEADY = 0.25  # sizes by which a target may leave its velocity's way in a window
 STEP = 0.01  # s before and after, between which the scene's motion at a target is told
 
 
@@ -107,14 +108,10 @@ def goes_own_way(path: Path, scene: SceneMotion, start: int) -> bool:
     window, size = path.window * 1e-6, float(np.median(path.size[:, 0]))
     if path.agility * window**3 / 3 > (STEADY * size) ** 2:
         return False
-    t = (path.t - start) * 1e-6
+    t = np.asarray((path.t - start) * 1e-6, np.float64)
     if len(t) < 2:
         return False
-    now = np.clip(t[:, None] + [-STEP, STEP], scene.t[0], scene.t[-1])
-    x, y = scene.in_scene(path.p[:, 0], path.p[:, 1], t)
-    x, y = scene.on_sensor(x[:, None], y[:, None], now)
-    flow = np.stack([x[:, 1] - x[:, 0], y[:, 1] - y[:, 0]], 1)
-    flow /= np.maximum(now[:, 1] - now[:, 0], 1e-9)[:, None]
+    flow = _flow(path, scene, t)
     along = flow / np.maximum(np.hypot(*flow.T), 1e-9)[:, None]
     moved = np.diff(path.p, axis=0)
     with_scene = (moved * along[1:]).sum(1)
@@ -122,6 +119,15 @@ def goes_own_way(path: Path, scene: SceneMotion, start: int) -> bool:
     way = np.cov(np.concatenate([[[0, 0]], np.cumsum(own, 0)]).T)
     ratio = np.linalg.solve(np.median(path.C, 0) + FINE**2 * np.eye(2), way)
     return bool(np.linalg.eigvals(ratio).real.max() > OWN_WAY**2)
+
+
+def _flow(path: Path, scene: SceneMotion, t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Velocities (rows, 2) px/s of the scene where a path is."""
+    now = np.clip(t[:, None] + [-STEP, STEP], scene.t[0], scene.t[-1])
+    x, y = scene.in_scene(path.p[:, 0], path.p[:, 1], t)
+    x, y = scene.on_sensor(x[:, None], y[:, None], now)
+    flow = np.stack([x[:, 1] - x[:, 0], y[:, 1] - y[:, 0]], 1)
+    return flow / np.maximum(now[:, 1] - now[:, 0], 1e-9)[:, None]
 
 
 def measure_moving_background(stream: Stream, scene: SceneMotion) -> Background:
@@ -142,12 +148,10 @@ def measure_moving_background(stream: Stream, scene: SceneMotion) -> Background:
     seen = np.moveaxis((x >= 0) & (x < size[0]) & (y >= 0) & (y < size[1]), 2, 0)
     by = CELL // FINE
     cells = np.zeros((SLICES, rows * by, columns * by), np.int32)
-    for part in stream.batches():
-        slices = np.minimum(part.t / stream.duration * SLICES, SLICES - 1).astype(np.int64)
-        x, y = scene.in_scene(part.x, part.y, part.t)
-        column = np.clip((x - low[0]) // FINE, 0, columns * by - 1).astype(np.int64)
-        row = np.clip((y - low[1]) // FINE, 0, rows * by - 1).astype(np.int64)
-        np.add.at(cells, (slices, row, column), 1)
+    for k, now in enumerate(cells):
+        times = scene.steps(*(np.array([k, k + 1]) / SLICES * stream.duration))
+        for t, end in itertools.pairwise(times.tolist()):
+            stream.add_cells(t, end, placing(scene, corner, (t + end) / 2), FINE, now)
 
     N = np.where(seen, pooled(cells, by), np.inf)
     rank = np.ceil(CALM * seen.sum(0)).astype(int) - 1

@@ -18,6 +18,7 @@ from jaxevent.kernels import part as kernel_part
 
 REFERENCE = np.array([[60.0, 60], [180, 60], [60, 180], [180, 180]])  # px
 STEPS = 128  # motions of a recording, at most
+LITTLE = 0.5  # px
 WIDE = 240  # bins of a pixel and more, so that no more of them lie side by side
 ODD = 1.5  # of the usual difference: pixels that differ so much have half the weight
 NEWEST = 0.07  # share of the newest window in what was seen
@@ -60,6 +61,11 @@ class SceneMotion:
         x, y, over = x - e, y - f, a * d - b * c
         return (d * x - b * y) / over, (a * y - c * x) / over
 
+    def steps(self, begin: float | int, end: float | int) -> NDArray[np.float64]:
+        """Times (s) between two, `begin` and `end` too, between which the scene moves little."""
+        number = 1 + int(self.speed * (end - begin) / LITTLE)
+        return np.linspace(begin, end, number + 1)
+
     def on_sensor(self, x: Any, y: Any, t: Any) -> tuple[Any, Any]:
         """Where on the sensor places of the scene are at times (s)."""
         (a, b, e), (c, d, f) = np.moveaxis(self.at(np.asarray(t, float)), (-2, -1), (0, 1))
@@ -85,17 +91,8 @@ def measure_scene_motion(stream: Stream, window: float | int) -> SceneMotion:
         maps.append(np.concatenate([step[:, :2] @ maps[-1][:, :2],
             step[:, :2] @ maps[-1][:, 2:] + step[:, 2:]], 1))  # fmt: skip
         new = max(NEWEST, 1 / (number + 1))
-        before = _carry(seen, motion)
-        seen = np.where(np.isfinite(before), (1 - new) * before + new * image, image)
+        seen = _carry(seen, motion, image, new)
     return SceneMotion(begins + window / 2, np.array(maps))
-
-
-def _carry(image: NDArray, motion: NDArray) -> NDArray[np.float64]:
-    """An image after a motion; NaN where it was not seen before."""
-    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
-    moved = motion @ _fields(image.shape)
-    at = [y - moved[..., 1], x - moved[..., 0]]
-    return ndimage.map_coordinates(image, at, order=1, cval=np.nan)
 
 
 def _image(part: Part, stream: Stream, bins: int) -> NDArray[np.float64]:
@@ -103,19 +100,6 @@ def _image(part: Part, stream: Stream, bins: int) -> NDArray[np.float64]:
     rows, columns = -(-stream.height // bins), -(-stream.width // bins)
     place = part.y // bins * columns + part.x // bins
     return np.sqrt(np.bincount(place, minlength=rows * columns).reshape(rows, columns))
-
-
-def _fields(shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """(rows, columns, 3, 2): a turn about the middle, and shifts right and down.
-
-    A unit of turn moves what is a quarter of the sides' sum away by one.
-    """
-    y, x = np.mgrid[: shape[0], : shape[1]].astype(float)
-    quarter = sum(shape) / 4
-    x, y = (x - (shape[1] - 1) / 2) / quarter, (y - (shape[0] - 1) / 2) / quarter
-    one, none = np.ones(shape), np.zeros(shape)
-    fields = [(-y, x), (one, none), (none, one)]
-    return np.stack([np.stack(field, 2) for field in fields], 2)
 
 
 def _px(motion: NDArray, shape: tuple[int, ...], bins: int) -> NDArray[np.float64]:
@@ -137,7 +121,7 @@ def _shift(one: NDArray, other: NDArray) -> NDArray[np.float64]:
 
 
 def _align(one: NDArray, other: NDArray, motion: NDArray) -> NDArray[np.float64]:
-    """The motion (3,), in bins of `_fields`, that takes one image to the other."""
+    """The motion (3,), in bins as `_normal_equations` has it, that takes one image to the other."""
     for blur in BLURS:
         a, b = (ndimage.gaussian_filter(image, blur, mode="constant") for image in (one, other))
         for _ in range(ROUNDS):
@@ -151,14 +135,34 @@ def _align(one: NDArray, other: NDArray, motion: NDArray) -> NDArray[np.float64]
 
 
 @compiled
+def _carry(image: Any, motion: Any, now: Any, new: Any) -> Any:
+    """An image after a motion, with a share of what is seen now, or that where it was not seen."""
+    (rows, columns), out = image.shape, np.empty(image.shape)
+    quarter = (rows + columns) / 4
+    for row in range(rows):
+        y = (row - (rows - 1) / 2) / quarter
+        for column in range(columns):
+            x = (column - (columns - 1) / 2) / quarter
+            dx, dy = motion[1] - motion[0] * y, motion[2] + motion[0] * x
+            before = _value(image, row - dy, column - dx)
+            if before == before:
+                out[row, column] = (1 - new) * before + new * now[row, column]
+            else:
+                out[row, column] = now[row, column]
+    return out
+
+
+@compiled
 def _normal_equations(a: Any, b: Any, motion: Any, odd: float | int) -> Any:
     """Of Gauss and Newton: J^T W J and J^T W e of two images, each moved half the way.
 
-    Bins that differ by `odd` times the usual have half the weight.
+    Motions are a turn about the middle, one unit of which moves what is a quarter of the sides' sum
+    away by one bin, and shifts right and down. Bins that differ by `odd` times the usual have half
+    the weight.
     """
     rows, columns = a.shape
     quarter = (rows + columns) / 4
-    e, mean, known = np.zeros(a.shape), np.zeros(a.shape), np.zeros(a.shape, np.bool_)
+    e, mean = np.empty(a.shape), np.zeros(a.shape)
     total, number = 0.0, 0
     for row in range(rows):
         y = (row - (rows - 1) / 2) / quarter
@@ -167,31 +171,33 @@ def _normal_equations(a: Any, b: Any, motion: Any, odd: float | int) -> Any:
             half_x, half_y = (motion[1] - motion[0] * y) / 2, (motion[2] + motion[0] * x) / 2
             before = _value(a, row - half_y, column - half_x)
             after = _value(b, row + half_y, column + half_x)
-            if before == before and after == after:
-                known[row, column] = True
-                e[row, column] = after - before
+            difference = after - before
+            e[row, column] = difference  # NaN where one was not seen
+            if difference == difference:
                 mean[row, column] = (after + before) / 2
-                total += (after - before) ** 2
+                total += difference * difference
                 number += 1
     scale = 1 / (odd * (np.sqrt(total / max(number, 1)) + 1e-12))
-    H, slope, s = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    tt = tx = ty = xx = xy = yy = st = sx = sy = 0.0
     for row in range(rows):
         y = (row - (rows - 1) / 2) / quarter
         above, below = max(row - 1, 0), min(row + 1, rows - 1)
         for column in range(columns):
-            if not known[row, column]:
+            difference = e[row, column]
+            if not difference == difference:
                 continue
             x = (column - (columns - 1) / 2) / quarter
             left, right = max(column - 1, 0), min(column + 1, columns - 1)
-            s[1] = (mean[row, right] - mean[row, left]) / (right - left)
-            s[2] = (mean[below, column] - mean[above, column]) / (below - above)
-            s[0] = x * s[2] - y * s[1]
-            weight = 1 / (1 + (e[row, column] * scale) ** 2)
-            for i in range(3):
-                slope[i] += weight * s[i] * e[row, column]
-                for j in range(3):
-                    H[i, j] += weight * s[i] * s[j]
-    return H, slope
+            gx = (mean[row, right] - mean[row, left]) / (right - left)
+            gy = (mean[below, column] - mean[above, column]) / (below - above)
+            gt = x * gy - y * gx
+            weight = 1 / (1 + (difference * scale) ** 2)
+            wt, wx, wy = weight * gt, weight * gx, weight * gy
+            st, sx, sy = st + wt * difference, sx + wx * difference, sy + wy * difference
+            tt, tx, ty = tt + wt * gt, tx + wt * gx, ty + wt * gy
+            xx, xy, yy = xx + wx * gx, xy + wx * gy, yy + wy * gy
+    H = np.array([[tt, tx, ty], [tx, xx, xy], [ty, xy, yy]])
+    return H, np.array([st, sx, sy])
 
 
 @kernel_part

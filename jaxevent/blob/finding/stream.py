@@ -1,6 +1,6 @@
 """The events that the search for targets looks at, window by window."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -93,11 +93,6 @@ class Stream:
         for row in range(first, last, BATCH):
             events, kept = self._of_rows(row, min(row + BATCH, last))
             _add_cells(events.x, events.y, self.hot, kept, place, cell, counts)
-
-    def batches(self) -> Iterator[Part]:
-        """All events, one batch after another."""
-        for row in range(self._first, self._last, BATCH):
-            yield self._rows(row, min(row + BATCH, self._last))
 
     def times(self, number: int) -> NDArray[np.float64]:
         """Times (s) of some events that are equally many events apart."""

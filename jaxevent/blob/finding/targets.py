@@ -40,10 +40,10 @@ class Live(NamedTuple):
     part: NDArray[np.bool_]  # of another one
 
     def keep(self, which: NDArray) -> "Live":
-        return Live(*(value[which] for value in self))
+        return Live._make(value[which] for value in self)
 
     def add(self, other: "Live") -> "Live":
-        return Live(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
+        return Live._make(np.concatenate(pair) for pair in zip(self, other, strict=True))
 
     @property
     def size(self) -> NDArray[np.float64]:
