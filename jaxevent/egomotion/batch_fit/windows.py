@@ -69,6 +69,8 @@ class Stage(NamedTuple):
 
 ROUNDS = Stage(1.0, 6), Stage(0.5, 6), Stage(0.2, 10), Stage(0.1, 10)  # after a trial of depths
 FINAL = Stage(0.05, 20, 10), Stage(0.02, 20, 3)
+# Of a path that is about right: all of the above takes 1.6 times as long and ends no nearer.
+FOLLOWING = (Stage(0.5, 6), Stage(0.1, 8)), (Stage(0.05, 10, 10),)
 # Rivals remain whose cost is so many times the least, and so much more (C^2): depths that were just
 # looked for leave up to 0.03 C.
 CLOSE = 1.75, 5e-4
@@ -87,7 +89,7 @@ SKEW = 0.03  # standard deviation of the thresholds' skew by counts, at least
 # Where the thresholds themselves are noisy sigma is never less than that noise: else half of the
 # events are fitted exactly, and the others are outliers, for any motion. Simulated without noise
 # the stage NOISY shows 0.07 C, real sensors 0.13 C and more.
-NOISY, NOISE = 1, 0.1  # the stage, C
+NOISY, NOISE = 0.5, 0.1  # C: the stage's sigma, the noise
 # The share of inliers below which rivals are compared, whatever they cost. Walls seen with uneven
 # thresholds have 0.70, whichever motion; ideal ones 0.97.
 AGREED = 0.8
@@ -404,12 +406,14 @@ class Windows:
         limit = CLOSE[0] * self.cost(*found[0]) + CLOSE[1] if found else 0.0
         return [one for one in found if self.cost(*one) < limit]
 
-    def rounds(self, centre: int, tracks: Tracks, paths: list[Path]) -> list[Rival]:
+    def rounds(
+        self, centre: int, tracks: Tracks, paths: list[Path], stages: tuple[Stage, ...] = ROUNDS
+    ) -> list[Rival]:
         """Paths through the first stages, depths looked for before each of them."""
         prior = self.prior(centre, float(self.params.half_window))
         found: list[Rival] = []
         self.least[centre] = 0.0
-        for number, stage in enumerate(ROUNDS):
+        for stage in stages:
 
             def follow(path: Path, stage: Stage = stage) -> Rival:
                 path = Path(path.O, path.D, depths(path, tracks))
@@ -417,7 +421,7 @@ class Windows:
 
             found = side_by_side(follow, paths)
             paths = [scene.path for scene, _ in found]
-            if number == NOISY and found:
+            if stage.sigma == NOISY and found:
                 noise = min(report.noise for _, report in found)
                 self.least[centre] = noise if noise > NOISE else 0.0
         return found
@@ -426,8 +430,9 @@ class Windows:
         """A path with depths at nodes that is about right, but for the last stage."""
         half = float(self.params.half_window)
         tracks, prior = self.tracks(centre, half, TRIED), self.prior(centre, half)
-        ((scene, report),) = self.rounds(centre, tracks, [warm])
-        return _adjusted(tracks, scene, report, prior, FINAL[:-1], least=self.least[centre])
+        first, second = FOLLOWING
+        ((scene, report),) = self.rounds(centre, tracks, [warm], first)
+        return _adjusted(tracks, scene, report, prior, second, least=self.least[centre])
 
     def fit(self, centre: int, warm: Path | None = None) -> Fit | None:
         """The best of new starts, and of a path with depths at nodes that is about right."""
