@@ -1,11 +1,12 @@
 """Bands of rows: which there are, and how events are divided among them."""
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled
+from jaxevent.kernels import lean
 from jaxevent.reconstruction.fused.timeline import NEVER
 from jaxevent.recording import EventColumns
 
@@ -51,56 +52,66 @@ class BandLayout:
         every band that it lies in or borders on. They are written into `room` if they fit. None:
         the events are not in order or not on the sensor.
         """
-        counts = _count_bands(stored.y, self.edges)
-        if counts[0] < 0:
+        origin, height = origin - stored.offset, int(self.edges[-1])
+        if len(stored.t) and (stored.t[0] < origin - NEVER or stored.t[-1] > origin + NEVER):
             return None
-        first = np.zeros(len(self.edges), np.int64)
-        np.cumsum(counts, out=first[1:])
+        counts = np.zeros(1 << 16, np.int64)
+        _count_rows(stored.y, counts)
+        if counts[height:].any():
+            return None
+        before = np.concatenate([[0], np.cumsum(counts[:height])])
+        low, high = np.maximum(self.edges[:-1] - 1, 0), np.minimum(self.edges[1:] + 1, height)
+        first = np.concatenate([[0], np.cumsum(before[high] - before[low])])
         total = int(first[-1])
         events = room if len(room) >= total else np.empty(total + total // 4, np.int64)
         weights = np.empty(total if len(weight) else 0, weight.dtype)
         good = _divide(
-            stored.t, stored.x, stored.y, stored.p, weight, self.edges, width,
-            origin - stored.offset, stored.previous, first, events, weights,
+            stored.t, stored.x, stored.y, stored.p, weight, self._rows(width), width, origin,
+            stored.previous, first.astype(np.uint64), events, weights,
         )  # fmt: skip
         return (events, weights, first) if good else None
 
+    def _rows(self, width: int) -> "_Rows":
+        bands, height, padded = len(self.edges) - 1, int(self.edges[-1]), width + 2
+        rows = np.arange(height)
+        mine = np.searchsorted(self.edges, rows, "right") - 1
+        above, below = rows == self.edges[mine], rows + 1 == self.edges[mine + 1]
+        beside = np.where(above & (mine > 0), mine - 1, np.where(below, mine + 1, bands))
 
-@compiled
-def _count_bands(y, edges):
-    """How many events each band gets; the first number is -1 for a row outside the image."""
-    bands, height = len(edges) - 1, edges[-1]
-    rows = np.zeros(65536 + 2, np.int64)
+        def place(band: NDArray) -> NDArray[np.int64]:
+            return ((rows - self.edges[np.minimum(band, bands)] + 1) * padded + 1) << 1
+
+        of = (mine.astype(np.uint64), beside.astype(np.uint64))
+        return _Rows(of[0], place(mine), of[1], place(beside))
+
+
+class _Rows(NamedTuple):
+    """Of each row its band and where it begins there, and the same of a band above or below.
+
+    Bands are unsigned, as other places are tried for being negative; one too many is none.
+    """
+
+    mine: NDArray[np.uint64]
+    base: NDArray[np.int64]
+    beside: NDArray[np.uint64]
+    aside: NDArray[np.int64]
+
+
+@lean
+def _count_rows(y, counts):
     for i in range(len(y)):
-        rows[y[i] + 1] += 1
-    counts = np.zeros(bands, np.int64)
-    for band in range(bands):
-        for row in range(edges[band], edges[band + 1] + 2):
-            counts[band] += rows[row]
-    for row in range(height + 1, len(rows)):
-        if rows[row] > 0:
-            counts[0] = -1
-    return counts
+        counts[y[i]] += 1
 
 
-@compiled
-def _divide(t, x, y, p, weight, edges, width, origin, previous, cursor, events, weights):
-    """Write each event to its band and to one that it borders on; whether all are valid."""
-    bands, height, padded = len(edges) - 1, edges[-1], width + 2
-    # Of each row its band and where it begins, and the same of a band above or below. Places are
-    # unsigned, as others are tried for being negative.
-    mine, beside = np.empty(height, np.uint64), np.full(height, bands, np.uint64)
-    base, aside = np.empty(height, np.int64), np.zeros(height, np.int64)
-    for band in range(bands):
-        top, bottom = edges[band], edges[band + 1]
-        for row in range(max(top - 1, 0), min(bottom + 1, height)):
-            place = ((row - top + 1) * padded + 1) << 1
-            if top <= row < bottom:
-                mine[row], base[row] = band, place
-            else:
-                beside[row], aside[row] = band, place
-    at, weighted, bad = cursor.astype(np.uint64), len(weight) > 0, False
-    none, one = np.uint64(bands), np.uint64(1)
+@lean
+def _divide(t, x, y, p, weight, rows, width, origin, previous, at, events, weights):
+    """Write each event to its band and to one that it borders on; whether all are valid.
+
+    `at` are the places where each band's events begin, and one more.
+    """
+    mine, base, beside, aside = rows
+    weighted, bad = len(weight) > 0, False
+    none, one = np.uint64(len(at) - 1), np.uint64(1)
     for i in range(len(t)):
         row, column, up = y[i], np.int64(x[i]), np.int64(p[i])
         bad |= (t[i] < previous) | (column >= width) | (up > 1)
@@ -117,6 +128,4 @@ def _divide(t, x, y, p, weight, edges, width, origin, previous, cursor, events, 
             if weighted:
                 weights[at[band]] = weight[i]
             at[band] += one
-    if len(t) > 0:
-        bad |= (t[0] - origin < -NEVER) | (t[-1] - origin > NEVER)
     return not bad

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled, part
+from jaxevent.kernels import compiled, lean, lean_part, part
 from jaxevent.reconstruction.fused.loop import (
     Bands,
     FrameRows,
@@ -127,7 +127,7 @@ def _blank(stride):
     return Spreading(np.zeros(stride, np.float64), np.zeros(stride, np.float64))
 
 
-@part
+@lean_part
 def _advance(given, i, end, until, spreading):
     """Note events from place i on that are before a time; the place of the first that is not."""
     events, rates, last, rate = given.bands.events, given.rates, spreading.last, spreading.rate
@@ -139,7 +139,7 @@ def _advance(given, i, end, until, spreading):
     return i
 
 
-@part
+@lean_part
 def _come_to(given, band, time, spreading):
     """The same from as early as matters."""
     for z in range(len(spreading.rate)):
@@ -149,7 +149,7 @@ def _come_to(given, band, time, spreading):
     return _advance(given, begin, b, time, spreading)
 
 
-@part
+@lean_part
 def _add_begun(out, on, off, time, spreading, sign):
     """Add (sign 1) or take away (-1) the parts of pixels' next events that have happened."""
     last, rate = spreading.last, spreading.rate
@@ -159,21 +159,20 @@ def _add_begun(out, on, off, time, spreading, sign):
         out[off + z] -= begun if rate[z] < 0 else 0.0
 
 
-@part
-def _count_between(given, band, left, right, cells, what, spreading):
+@lean_part
+def _count_between(given, band, left, right, cells, on, off, spreading):
     """`count_events` with changes spread over time."""
     bands, stride, spread = given.bands, given.places.stride, len(given.rates) > 0
     a, b = bands.first[band], bands.first[band + 1]
-    count_events(bands.events, bands.weights, a, b, left, right, cells, stride, what)
+    count_events(bands.events, bands.weights, a, b, left, right, cells, on, off, stride)
     if spread and right > left:
-        on, off = what[0] * stride, what[1] * stride
         i = _come_to(given, band, left, spreading)
         _add_begun(cells, on, off, left, spreading, -1.0)
         _advance(given, i, b, right, spreading)
         _add_begun(cells, on, off, right, spreading, 1.0)
 
 
-@part
+@lean_part
 def _sum_around(cells, of, to, above, width, rows, stride):
     """Sums over the eight neighbours of a band's own pixels, from one field into another."""
     padded, c, out = width + 2, of * stride, to * stride
@@ -183,9 +182,9 @@ def _sum_around(cells, of, to, above, width, rows, stride):
         cells[out + z] = above[z - 1] + above[z] + above[z + 1] - cells[c + z]
 
 
-@part
-def _look(band, k, given, cells, spreading):
-    """A frame's image, and what events say of its exposure."""
+@lean_part
+def _look(band, k, given, cells, spreading, room):
+    """A frame's image, and what events say of its exposure; `room` is that of `sum_segments`."""
     bands, frames, places = given.bands, given.frames, given.places
     stride, top, bottom = places.stride, bands.edges[band], bands.edges[band + 1]
     a, b = bands.first[band], bands.first[band + 1]
@@ -202,14 +201,14 @@ def _look(band, k, given, cells, spreading):
             cells[z] = 0
     sum_segments(
         bands.events, bands.weights, a, b, left, frames.mid[k], right, given.functions.excess,
-        given.numbers, cells, places.total * stride, stride,
+        given.numbers, cells, places.total, stride, room[0], room[1],
     )  # fmt: skip
     if places.inside >= 0:
-        what = np.full(2, places.inside)
-        _count_between(given, band, edge_of(left), edge_of(right), cells, what, spreading)
+        inside = places.inside * stride
+        _count_between(given, band, edge_of(left), edge_of(right), cells, inside, inside, spreading)
 
 
-@part
+@lean_part
 def _measure_clipped(k, row, given, cells, begin, end):
     """Measure again where a frame is clipped: most pixels are not, and that is dear."""
     places, line, gain = given.places, given.line, np.float64(given.frames.gain[k])
@@ -236,7 +235,9 @@ def filter_frames(begin, end, given, memory, starts, linked):
     bands, line, places, functions = given.bands, given.line, given.places, given.functions
     numbers, stride, counts = given.numbers, places.stride, places.counts
     width, padded = np.int64(bands.width), np.int64(bands.width + 2)
+    on, off = counts[0] * stride, counts[1] * stride
     above, spreading = np.zeros(stride, numbers.dtype), _blank(stride)
+    room = np.zeros((3, stride), numbers.dtype), np.zeros(stride)
     for band in range(begin, end):
         cells, rows = memory[given.slot[band]], bands.edges[band + 1] - bands.edges[band]
         first, last = padded, (rows + 1) * padded
@@ -244,14 +245,15 @@ def filter_frames(begin, end, given, memory, starts, linked):
             functions.start(cells.ctypes, numbers.ctypes, 0, first, last, 0.0, 0.0, 0.0)
         for k in range(len(line.mid)):
             row = np.int64((places.work + k * places.kept) * stride)
-            _look(band, k, given, cells, spreading)
+            _look(band, k, given, cells, spreading, room)
             gain, seconds = np.float64(given.frames.gain[k]), line.seconds[k]
             functions.frame(
                 cells.ctypes, numbers.ctypes, row, first, last, gain, line.exists[k], 0.0
             )
             if places.sided:
                 _measure_clipped(k, row, given, cells, first, last)
-            _count_between(given, band, line.mid[k], line.following[k], cells, counts, spreading)
+            mid, following = line.mid[k], line.following[k]
+            _count_between(given, band, mid, following, cells, on, off, spreading)
             _sum_around(cells, counts[0], counts[2], above, width, rows, stride)
             _sum_around(cells, counts[1], counts[3], above, width, rows, stride)
             functions.move(cells.ctypes, numbers.ctypes, row, first, last, seconds, 0.0, 0.0)
@@ -259,7 +261,7 @@ def filter_frames(begin, end, given, memory, starts, linked):
                 functions.link(cells.ctypes, numbers.ctypes, row, first, last, seconds, 0.0, 0.0)
 
 
-@compiled
+@lean
 def smooth_frames(begin, end, given, memory):
     """Pass backwards; before it is known what frames after the stretch say at the next one."""
     bands, line, places = given.bands, given.line, given.places
@@ -275,7 +277,7 @@ def smooth_frames(begin, end, given, memory):
             )  # fmt: skip
 
 
-@part
+@lean_part
 def _count_since(given, band, f, known, i, now, cells, held, spreading):
     """Count the events from the middle of frame f to a time, both given in us.
 
@@ -306,15 +308,15 @@ def _count_since(given, band, f, known, i, now, cells, held, spreading):
     return i
 
 
-@part
+@lean_part
 def _count_until(given, band, now, cells, spreading):
     """Count the events after a time (us) until the middle of the first frame."""
     counts, stride, mid = given.places.counts, given.places.stride, given.line.mid[0]
     bands = given.bands
     a, b = bands.first[band], bands.first[band + 1]
-    count_events(bands.events, bands.weights, a, b, now + 1, mid, cells, stride, counts)
+    on, off = counts[0] * stride, counts[1] * stride
+    count_events(bands.events, bands.weights, a, b, now + 1, mid, cells, on, off, stride)
     if len(given.rates) > 0 and mid > now:
-        on, off = counts[0] * stride, counts[1] * stride
         i = _come_to(given, band, now + 1, spreading)
         _add_begun(cells, on, off, now, spreading, -1.0)
         _advance(given, i, b, mid, spreading)

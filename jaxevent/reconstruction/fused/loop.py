@@ -14,7 +14,14 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled, part
+from jaxevent.kernels import lean, lean_part
+
+# Kinds of steps, and what they are given; fields are places in `cells`.
+MOVE = 0  # to a field, from another
+LOAD = 1  # into a field, which of `FrameRows.tables`, and of which frame
+FILL = 2  # a field, with half of a number
+SUM = 3  # into a column of `Given.totals`, the segments of a frame's exposure
+COUNT = 4  # into two fields, of ON and OFF, events from a time on and until another
 
 # Functions that are passed as arguments are called through their address.
 warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
@@ -63,7 +70,10 @@ class Memory(NamedTuple):
     cells: NDArray  # [bands, fields * STRIDE], real numbers of pixels
     whole: NDArray[np.int64]  # [bands, fields * STRIDE], whole numbers of pixels' states
     last: NDArray[np.float64]  # [bands, STRIDE], us, of the pixels' last events
-    place: NDArray[np.int64]  # [bands, 3]: next event, stretch and frame of the piece
+    place: NDArray[np.int64]  # [bands, 2]: next event and stretch
+    room: NDArray  # [bands, ...], for a row's numbers while images and tables are made
+    bound: NDArray[np.float64]  # [bands, STRIDE], see `sum_segments`
+    counts: NDArray  # [bands, 3, STRIDE], see `sum_segments`
 
 
 class Images(NamedTuple):
@@ -75,22 +85,11 @@ class Images(NamedTuple):
     slopes: NDArray  # [times, pixels, images, lanes]
 
 
-class Places(NamedTuple):
-    """Where the fields of `cells` lie, in strides; -1 where a method needs none."""
+class Steps(NamedTuple):
+    """What bands do at the beginning of each stretch, in order (`entering`)."""
 
-    stride: int
-    exposed: bool  # whether frames have exposures
-    factors: int  # of derivatives of images, for each pixel of a row
-    room: int  # for derivatives of tables
-    on: int
-    off: int
-    before: NDArray[np.int64]  # [2], ON and OFF
-    image: NDArray[np.int64]  # [3, rows]: grey value, intensity, certainty
-    total: NDArray[np.int64]  # [sums, rows]
-    span: NDArray[np.int64]  # [2, rows]
-    head: NDArray[np.int64]
-    tail: NDArray[np.int64]
-    shifted: NDArray[np.int64]  # [:, 2]: to where a field moves, and from, when a frame follows
+    step: NDArray[np.int64]  # [steps, 5]: its kind, and what it is given
+    end: NDArray[np.int64]  # [stretches + 1], of the steps of the stretch before
 
 
 class Given(NamedTuple):
@@ -98,8 +97,10 @@ class Given(NamedTuple):
 
     bands: Bands
     line: Line
+    steps: Steps
     frames: FrameRows
-    places: "Places"
+    totals: NDArray[np.int64]  # [sums, rows], where sums over exposures lie in `cells`, in strides
+    stride: int
     functions: "Functions"
     numbers: NDArray
 
@@ -113,74 +114,37 @@ class Functions(NamedTuple):
     excess: Any
 
 
-@part
-def _enter(band, stretch, now, given, cells, place):
-    """Begin a stretch at a time: the numbers of its frames, the counts so far, its tables."""
-    bands, line, frames, places = given.bands, given.line, given.frames, given.places
-    events, weights, stride = bands.events, bands.weights, places.stride
-    a, b, number = bands.first[band], bands.first[band + 1], frames.number
-    lefts, mids, rights = frames.left, frames.mid, frames.right
-    before, frame, count = place[band, 2], line.frame[stretch], len(lefts) + number
-    base = max(frame - 1, 0)
-    rows = min(count, max(frame, 0) + 2) - base
-    follows = frame == before + 1
-    if follows and frame >= 2:
-        for k in range(len(places.shifted)):
-            copy(cells, places.shifted[k, 0] * stride, places.shifted[k, 1] * stride, stride)
-    fresh = 0 if not follows else 3 if frame == 0 else 2
-    counted = 0 if not follows else 2 if frame == 0 else 1
-    for row in range(fresh, 3):
-        k = base + row - number
-        for kind in range(3):
-            field = places.image[kind, row]
-            if field >= 0 and row < rows:
-                load_image(
-                    frames.images, frames.tables, frames.values, frames.gain[k], kind, k,
-                    bands.width, bands.edges[band], bands.edges[band + 1], cells, field * stride,
-                )  # fmt: skip
-            elif field >= 0 and rows > 0:
-                copy(cells, field * stride, places.image[kind, row - 1] * stride, stride)
-            elif field >= 0:
-                fill(cells, field * stride, stride, 0.5 if kind < 2 else 0.0)
-        if len(places.total) > 0:
-            for total in places.total[:, row]:
-                fill(cells, total * stride, stride, 0.0)
-            if row < rows:
-                sum_segments(
-                    events, weights, a, b, lefts[k], mids[k], rights[k], given.functions.excess,
-                    given.numbers, cells, places.total[:, row] * stride, stride,
-                )  # fmt: skip
-    # Counts of events in eight stretches of time; places in `what` of ON, OFF, left, right.
-    what = np.full((10, 4), -1)
-    for row in range(3):
-        k = base + row - number
-        if row >= fresh and row < rows:
-            left, mid, right = edge_of(lefts[k]), edge_of(mids[k]), edge_of(rights[k])
+@lean_part
+def _take(steps, begin, end, given, band, memory):
+    """Take the steps from begin to end, of a band."""
+    bands, frames, stride, cells = given.bands, given.frames, given.stride, memory.cells[band]
+    events, weights, edges = bands.events, bands.weights, bands.edges
+    a, b = bands.first[band], bands.first[band + 1]
+    for i in range(begin, end):
+        kind, at, of, left, right = (
+            steps[i, 0], steps[i, 1], steps[i, 2], steps[i, 3], steps[i, 4]
+        )  # fmt: skip
+        if kind == MOVE:
+            copy(cells, at, of, stride)
+        elif kind == LOAD:
+            load_image(
+                frames.images, frames.tables, frames.values, frames.gain[left], of, left,
+                bands.width, edges[band], edges[band + 1], cells, at,
+            )  # fmt: skip
+        elif kind == FILL:
+            fill(cells, at, stride, 0.5 * of)
+        elif kind == SUM:
+            sum_segments(
+                events, weights, a, b, frames.left[of], frames.mid[of], frames.right[of],
+                given.functions.excess, given.numbers, cells, given.totals[:, at], stride,
+                memory.counts[band], memory.bound[band],
+            )  # fmt: skip
         else:
-            left = mid = right = np.int64(0)
-        if row >= fresh:
-            _note(what, row, places.head[0, row], places.head[1, row], left, mid)
-            _note(what, 3 + row, places.tail[0, row], places.tail[1, row], mid, right)
-        if counted <= row < 2:
-            left = right = np.int64(0)
-            if row + 1 < rows:  # another frame follows
-                left, right = edge_of(lefts[k]), edge_of(rights[k + 1])
-            _note(what, 6 + row, places.span[0, row], places.span[1, row], left, right)
-    # The piece counts from its exposure's left edge, before the first from the window's start.
-    left = edge_of(lefts[frame - number]) if frame >= 0 else now
-    _note(what, 8, np.int64(places.on), np.int64(places.off), left, now)
-    if frame < 0 and count > 0:
-        _note(
-            what, 9, places.before[0], places.before[1], np.int64(line.opening), edge_of(rights[0])
-        )
-    for k in range(10):
-        if what[k, 0] >= 0:
-            count_events(events, weights, a, b, what[k, 2], what[k, 3], cells, stride, what[k])
-    place[band, 2] = frame
+            count_events(events, weights, a, b, left, right, cells, at, of, stride)
 
 
 # Compilers take several numbers at once where no place can be negative: in parts from 0 on.
-@part
+@lean_part
 def copy(cells, to, of, count):
     """Copy some numbers from one place to another."""
     out, given = cells[to : to + count], cells[of : of + count]
@@ -188,7 +152,7 @@ def copy(cells, to, of, count):
         out[z] = given[z]
 
 
-@part
+@lean_part
 def fill(cells, at, count, value):
     """Set some numbers to one value."""
     out = cells[at : at + count]
@@ -196,18 +160,13 @@ def fill(cells, at, count, value):
         out[z] = value
 
 
-@part
+@lean_part
 def edge_of(time):
     """Events earlier than this whole number of us are before the time."""
     return np.int64(np.ceil(time))
 
 
-@part
-def _note(what, row, on, off, left, right):
-    what[row, 0], what[row, 1], what[row, 2], what[row, 3] = on, off, left, right
-
-
-@part
+@lean_part
 def load_image(images, tables, values, gain, kind, k, width, top, bottom, cells, at):
     """A frame's grey values, intensities or certainties, into a field of `cells`."""
     is_plain = kind != 1 or gain == 1  # divisions take longest
@@ -227,7 +186,7 @@ def load_image(images, tables, values, gain, kind, k, width, top, bottom, cells,
                 out[column] /= gain
 
 
-@part
+@lean_part
 def find(events, begin, end, time):
     """The first of a band's events, from begin to end, that is not before a time."""
     while begin < end:
@@ -239,10 +198,10 @@ def find(events, begin, end, time):
     return begin
 
 
-@part
-def count_events(events, weights, begin, end, left, right, cells, stride, what):
-    """Count the events of every pixel with left <= t < right into the fields what[:2]."""
-    on, off, weighted = what[0] * stride, what[1] * stride, len(weights) > 0
+@lean_part
+def count_events(events, weights, begin, end, left, right, cells, on, off, stride):
+    """Count the ON and OFF events of every pixel with left <= t < right into two fields."""
+    weighted = len(weights) > 0
     fill(cells, on, stride, 0.0)
     fill(cells, off, stride, 0.0)
     for i in range(find(events, begin, end, left), end):
@@ -253,18 +212,33 @@ def count_events(events, weights, begin, end, left, right, cells, stride, what):
         cells[z] += weights[i] if weighted else 1
 
 
-@part
+@lean_part
 def sum_segments(
-    events, weights, begin, end, left, mid, right, excess, numbers, cells, totals, stride
+    events,
+    weights,
+    begin,
+    end,
+    left,
+    mid,
+    right,
+    excess,
+    numbers,
+    cells,
+    totals,
+    stride,
+    counts,
+    bound,
 ):
-    """Add up what the segments of constant brightness of an exposure say, from `totals` on."""
+    """Add up what the segments of constant brightness of an exposure say, into fields `totals`.
+
+    These are in strides. `counts` [3, stride] and `bound` [stride] are room.
+    """
     length = right - left
     a, b = find(events, begin, end, edge_of(left)), find(events, begin, end, edge_of(right))
     middle = find(events, begin, end, edge_of(mid))
     if length <= 0 or a == b:
         return
-    counts, bound = np.empty((2, stride), cells.dtype), np.empty(stride, np.float64)
-    added = np.empty(len(totals), cells.dtype)
+    added = counts[2]
     for half in range(2):  # backwards from the middle to the left edge, then forwards
         for z in range(stride):
             counts[0, z] = counts[1, z] = 0
@@ -276,7 +250,7 @@ def sum_segments(
                 share = abs(now - bound[z]) / length
                 excess(share, 0.0, counts[0, z], counts[1, z], numbers.ctypes, added.ctypes)
                 for k in range(len(totals)):
-                    cells[totals[k] + z] += added[k]
+                    cells[totals[k] * stride + z] += added[k]
             bound[z] = now
             one = np.float64(weights[i]) if len(weights) else 1.0
             counts[0 if events[i] & 1 else 1, z] += one if half else -one
@@ -286,41 +260,38 @@ def sum_segments(
                 share = abs(outer - bound[z]) / length
                 excess(share, edge, counts[0, z], counts[1, z], numbers.ctypes, added.ctypes)
                 for k in range(len(totals)):
-                    cells[totals[k] + z] += added[k]
+                    cells[totals[k] * stride + z] += added[k]
 
 
-@compiled
+@lean
 def run(begin, end, given, memory, enter, times, until, images):
     """Pass over the events before `until` (us) of some bands, and make images at `times` (us).
 
     Before that the bands enter a window at the time `enter[1]`, in the stretch `enter[0]`, unless
     this is -1.
     """
-    bands, line, functions, numbers = given.bands, given.line, given.functions, given.numbers
-    events, starts, place, width = bands.events, line.start, memory.place, np.int64(bands.width)
-    weighted, padded, pixels = np.int64(len(bands.weights) > 0), width + 2, images.mean.shape[1]
+    bands, line, functions, steps = given.bands, given.line, given.functions, given.steps.step
+    first, edges, starts, ends = bands.first, bands.edges, line.start, given.steps.end
+    width, weighted = np.int64(bands.width), np.int64(len(bands.weights) > 0)
+    padded, pixels, places = width + 2, images.mean.shape[1], memory.place
     size = np.int64(images.slopes.shape[2] * images.slopes.shape[3])
-    spare = max(given.places.room, (given.places.factors + 1) * width)
-    room = np.empty(spare, images.mean.dtype)
+    numbers, events, weights = given.numbers.ctypes, bands.events.ctypes, bands.weights.ctypes
+    mean, variance, valid = images.mean.ctypes, images.variance.ctypes, images.valid.ctypes
+    slopes, uniform = images.slopes.ctypes, line.uniform.ctypes
     for band in range(begin, end):
-        cells, whole, last = memory.cells[band], memory.whole[band], memory.last[band]
-        rows, i, s, row = (
-            bands.edges[band + 1] - bands.edges[band],
-            place[band, 0],
-            place[band, 1],
-            0,
-        )
-        entering, now = enter[0] >= 0, np.int64(enter[1])
+        place, rows, row = places[band], edges[band + 1] - edges[band], 0
+        last_own, finish = (rows + 1) * padded, first[band + 1]
+        cells, whole = memory.cells[band].ctypes, memory.whole[band].ctypes
+        last, room = memory.last[band].ctypes, memory.room[band].ctypes
+        i, s, entering = place[0], place[1], enter[0] >= 0
         if entering:
-            i, s = find(events, bands.first[band], bands.first[band + 1], now), np.int64(enter[0])
-            place[band, 2] = -9  # no frame is known
+            i, s = find(bands.events, first[band], finish, np.int64(enter[1])), np.int64(enter[0])
         while True:
             if entering:
-                if line.frame[s] != place[band, 2]:
-                    _enter(band, s, now, given, cells, place)
+                _take(steps, ends[s], ends[s + 1], given, band, memory)
                 functions.tables(
-                    line.variant[s], cells.ctypes, padded, (rows + 1) * padded, numbers.ctypes,
-                    line.uniform.ctypes, s * line.uniform.shape[1], room.ctypes,
+                    line.variant[s], cells, padded, last_own, numbers, uniform,
+                    s * line.uniform.shape[1], room,
                 )  # fmt: skip
                 entering = False
             stop = np.int64(until)
@@ -328,24 +299,23 @@ def run(begin, end, given, memory, enter, times, until, images):
                 stop = starts[s + 1]
             reading = row < len(times) and times[row] < stop
             till = times[row] + 1 if reading else stop
+            opening, rate = line.begin[s], line.rate[s]
+            mid, blend_rate = line.mid[s], line.blend_rate[s]
             i = functions.events(
-                cells.ctypes, whole.ctypes, last.ctypes, events.ctypes, bands.weights.ctypes,
-                weighted, i, bands.first[band + 1], till, padded, (rows + 1) * padded, padded,
-                line.begin[s], line.rate[s], line.mid[s], line.blend_rate[s], numbers.ctypes,
+                cells, whole, last, events, weights, weighted, i, finish, till, padded, last_own,
+                padded, opening, rate, mid, blend_rate, numbers,
             )  # fmt: skip
             if reading:
                 t = np.float64(times[row])
                 functions.images(
-                    cells.ctypes, whole.ctypes, last.ctypes, rows, width, padded, t,
-                    (t - line.begin[s]) * line.rate[s], (t - line.mid[s]) * line.blend_rate[s],
-                    numbers.ctypes, images.mean.ctypes, images.variance.ctypes, images.valid.ctypes,
-                    images.slopes.ctypes, room.ctypes, size,
-                    row * pixels + bands.edges[band] * width,
+                    cells, whole, last, rows, width, padded, t, (t - opening) * rate,
+                    (t - mid) * blend_rate, numbers, mean, variance, valid, slopes, room, size,
+                    row * pixels + edges[band] * width,
                 )  # fmt: skip
                 row += 1
             elif s + 1 < len(starts) and starts[s + 1] < until:
                 s += 1
-                entering, now = True, starts[s]
+                entering = True
             else:
                 break
-        place[band, 0], place[band, 1] = i, s
+        place[0], place[1] = i, s

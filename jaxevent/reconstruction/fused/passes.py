@@ -12,8 +12,18 @@ from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.reconstruction.fused.bands import BandLayout
+from jaxevent.reconstruction.fused.entering import steps_of
 from jaxevent.reconstruction.fused.kernel import Kernel, kernel_of, program_of
-from jaxevent.reconstruction.fused.loop import Bands, FrameRows, Given, Images, Line, Memory, run
+from jaxevent.reconstruction.fused.loop import (
+    Bands,
+    FrameRows,
+    Given,
+    Images,
+    Line,
+    Memory,
+    Steps,
+    run,
+)
 from jaxevent.reconstruction.fused.pixel import Directions
 from jaxevent.reconstruction.fused.timeline import NEVER, make_line
 from jaxevent.reconstruction.memory import aligned
@@ -198,12 +208,17 @@ class Passes:
     def __init__(self, kernel: Kernel, layout: BandLayout, dtype: np.dtype):
         fields, bands = kernel.source.fields, len(layout.edges) - 1
         self.kernel, self.layout, self.dtype = kernel, layout, dtype
+        places, stride = fields.places, layout.stride
         self._memory = Memory(
             aligned((bands, fields.size), dtype),
-            np.zeros((bands, max(len(fields.whole), 1) * layout.stride), np.int64),
-            np.zeros((bands, layout.stride)),
-            np.zeros((bands, 3), np.int64),
+            np.zeros((bands, max(len(fields.whole), 1) * stride), np.int64),
+            np.zeros((bands, stride)),
+            np.zeros((bands, 2), np.int64),
+            np.empty((bands, max(places.room, (places.factors + 1) * stride)), dtype),
+            np.empty((bands, stride)),
+            np.empty((bands, 3, stride), dtype),
         )
+        self._steps = Steps(np.zeros((0, 5), np.int64), np.zeros(1, np.int64))
 
     def run(
         self,
@@ -215,9 +230,12 @@ class Passes:
     ) -> None:
         """Pass over the window's events before a time (us since the recording's start)."""
         kernel = self.kernel
+        places = kernel.source.fields.places
+        if enter[0] >= 0:
+            self._steps = steps_of(places, window.line, window.frames, enter)
         given = Given(
-            window.bands, window.line, window.frames, kernel.source.fields.places,
-            kernel.functions, kernel.numbers,
+            window.bands, window.line, self._steps, window.frames, places.total,
+            self.layout.stride, kernel.functions, kernel.numbers,
         )  # fmt: skip
         if times is None or images is None:
             times, images = np.empty(0, np.int64), self.room(0, 0)
@@ -245,7 +263,7 @@ class Passes:
 
     def state(self) -> Held:
         """A copy of the state, without derivatives."""
-        cells, whole, last, _ = self._memory
+        cells, whole, last = self._memory[:3]
         held = sum(kind.kind == "f" for kind in self.kernel.program.traced.state)
         return Held(cells[:, : held * self.layout.stride].copy(), whole.copy(), last.copy())
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from jaxevent.kernels.expressions import ELEMENTWISE, Level, Node, Untranslatable, needed, value_of
 from jaxevent.kernels.text import Numbers, Place, Writer, import_functions
-from jaxevent.reconstruction.fused.loop import Places
+from jaxevent.reconstruction.fused.entering import Places
 from jaxevent.reconstruction.fused.pixel import ROWS, PixelProgram, pieces
 
 IMAGE_FIELDS = ("grey", "intensity", "certainty")
@@ -88,7 +88,6 @@ class Fields:
         on, off = self.cells["on"], self.cells["off"]
         return Places(
             self.stride,
-            self.exposed,
             self.factors,
             self.changes * BLOCK,
             on,
