@@ -1,9 +1,9 @@
 """A GPU against the CPU's kernels, by the clock: `python experiments/bench.py gpu`.
 
 Images of the filter and the smoother from memory, a loss with 8 gradients, a tracker of 64 targets
-and voting, each by XLA on JAX's default device and by a kernel on all cores of the CPU. The table
-is M events per second, files apart. Without a GPU the default device is the CPU, and the table
-tells what XLA makes of it.
+and voting, each by XLA on JAX's default device and by a kernel on all cores of the CPU; and windows
+prepared there (`reconstruction/on_device.py`) and by loops. The table is M events per second, files
+apart. Without a GPU the default device is the CPU, and the table tells what XLA makes of it.
 """
 
 import functools
@@ -18,6 +18,8 @@ from bench_images import losses, stream
 import jaxevent
 from jaxevent.blob import moment
 from jaxevent.egomotion import voting
+from jaxevent.reconstruction.on_device import DeviceWindows
+from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.simulate import Line, Target, motion_scene, simulate_blobs
 
 REPEAT = 3  # of which the first compiles
@@ -28,6 +30,16 @@ def images(method: Any, recording: Any, compiler: str) -> None:
     times = np.arange(recording.frames.t[0], recording.stop, 10_000)
     for _ in method.estimate(recording, compiler=compiler, progress=False).batches(times):
         pass
+
+
+def prepare(recording: Any, compiler: str) -> None:
+    """Windows of a recording, and images looked up in them."""
+    kind = DeviceWindows if compiler == "xla" else WindowedRecording
+    for window, _ in kind(recording, reuse=True):
+        begin = recording.start if window.start is None else window.start
+        end = recording.stop if window.stop is None else window.stop - 1
+        times = np.linspace(begin, end, 8).astype(np.int64)
+        jax.block_until_ready(window.reader(8)(times))
 
 
 def targets() -> tuple[Any, list[tuple[float, float, float]]]:
@@ -56,6 +68,7 @@ def tasks(events: int) -> dict[str, tuple[int, Callable[[str], object]]]:
         "akf, 100 Hz images": (events, functools.partial(images, jaxevent.akf, recording)),
         "aks, 100 Hz images": (events, functools.partial(images, jaxevent.aks, recording)),
         "akf, loss and 8 gradients": (events, lambda compiler: of_losses[f"{compiler} gradient"]()),
+        "windows prepared": (events, functools.partial(prepare, recording)),
         "moment, 64 targets": (len(many.events), track),
         "voting, rotation": (len(scene.events), vote),
     }

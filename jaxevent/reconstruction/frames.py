@@ -1,6 +1,10 @@
 """Features of the frames in a window, and the event counts that tie them together."""
 
+from typing import Any
+
+import jax
 import numpy as np
+from jaxtyping import Array
 from numpy.typing import NDArray
 
 from jaxevent.kernels import compiled
@@ -10,6 +14,12 @@ from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Segment
 from jaxevent.reconstruction.memory import aligned
 from jaxevent.reconstruction.stream import EdgeCounts, Stream
 from jaxevent.recording import Recording
+
+
+@jax.jit
+def _look_up(tables: Array, levels: Array, rows: Array, gain: Array) -> tuple[Array, Array, Array]:
+    grey, intensity, certainty = tables[:, levels][:, rows]
+    return grey, intensity / gain[:, None], certainty
 
 
 class FrameImages:
@@ -35,6 +45,19 @@ class FrameImages:
         """Grey values, intensities and certainties [3, ...] of images in [0, 1]."""
         made = [evaluated(table, images).astype(self.dtype) for table in self._tables]
         return np.stack(made)
+
+    def read_on_device(self, used: slice, room: int) -> tuple[Any, Any, Any, NDArray]:
+        """The same as `read`, of whole numbers looked up on the device."""
+        frames, n = self.recording.frames, used.stop - used.start
+        if frames is None or n <= 0 or frames.images.dtype.kind not in "iu":
+            return self.read(used, room)
+        pixels = self.recording.width * self.recording.height
+        levels = np.asarray(frames[used].images).reshape(n, pixels)
+        gain = np.ones(room, self.dtype)
+        gain[:n] = self._gain[used]
+        spare = np.minimum(np.arange(room), n - 1)  # rows that repeat the last
+        looked = _look_up(self.tables(), levels, spare, gain[spare])
+        return *looked, gain
 
     def read(self, used: slice, room: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Grey values, intensities, certainties [room, pixels] and gains of a range of frames.
@@ -80,19 +103,12 @@ def make_frame_features(
         span[:, : n - 1] = (counts.right[1:] - counts.base.left[:-1]).swapaxes(0, 1)
         before[:] = counts.right[0] - (counts.base.start if used.start == 0 else 0)
     head = tail = None
-    pieces = room + 1
     if clock.exposed:
-        pieces = 2 * room + 1
         head, tail = (aligned((2, room, pixels), dtype) for _ in range(2))
         head[:, :n] = (counts.mid - counts.base.left).swapaxes(0, 1)
         tail[:, :n] = (counts.right - counts.mid).swapaxes(0, 1)
 
-    def rates_of(times: NDArray, size: int, first: int) -> NDArray:
-        out = np.zeros(size, dtype)
-        rate = 1e6 * rates(times)[: size - first]
-        out[first : first + len(rate)] = rate
-        return out
-
+    weight_rate, blend_rate = piece_rates(clock, used, room, dtype)
     return FrameFeatures(
         grey,
         intensity,
@@ -104,13 +120,24 @@ def make_frame_features(
         head,
         tail,
         segments,
-        rates_of(clock.breaks[clock.first_piece(used.start) :], pieces, 1),
-        rates_of(clock.mid[used], room, 0),
+        weight_rate,
+        blend_rate,
         np.asarray(float(n > 0), dtype),
         rows,
         np.asarray(clock.offset, dtype),
         images.recording.width,
     )
+
+
+def piece_rates(clock: Clock, used: slice, room: int, dtype: np.dtype) -> tuple[NDArray, NDArray]:
+    """How fast weights grow in each piece and blends after each frame of `used`, 1/s."""
+    pieces = (2 if clock.exposed else 1) * room + 1
+    breaks = clock.breaks[clock.first_piece(used.start) :]
+    weight_rate, blend_rate = np.zeros(pieces, dtype), np.zeros(room, dtype)
+    for out, times in ((weight_rate[1:], breaks), (blend_rate, clock.mid[used])):
+        rate = 1e6 * rates(times)[: len(out)]
+        out[: len(rate)] = rate
+    return weight_rate, blend_rate
 
 
 def make_segments(

@@ -88,6 +88,31 @@ class Layout:
         first_tile = np.concatenate([*rounds, np.zeros(1, np.int32)])  # never empty
         return cls(kind, lane, lanes, counts, first_tile, starts, room, ordinary)
 
+    def lane_begins(self) -> list[int]:
+        """Where the lanes of each kind begin among those of all kinds, and where they end."""
+        sizes = [-(-len(self.counts) // width) * width for _, width in SHAPES]
+        return [sum(sizes[:k]) for k in range(len(SHAPES) + 1)]
+
+    def lane_pixels(self) -> NDArray[np.int32]:
+        """The pixels of the lanes of all kinds."""
+        *begins, end = self.lane_begins()
+        # Room at the end, so that as many lanes as the widest tile has can be cut out anywhere.
+        out = np.zeros(end + SHAPES[0][1], np.int32)
+        for begin, mine in zip(begins, self.lanes, strict=True):
+            out[begin : begin + len(mine)] = mine
+        return out
+
+    def tiles(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """The kind and the first lane of every tile; kind 3, with room, of those not used."""
+        kinds, lanes = np.full(self.room, len(SHAPES), np.int32), np.zeros(self.room, np.int32)
+        for k, (ranks, width) in enumerate(SHAPES):
+            busy, first = self.counts[self.lanes[k]], self.round_first[k]
+            for turn in range(-(-int(busy[0]) // ranks) if len(busy) else 0):
+                blocks = np.arange(-(-int((busy > turn * ranks).sum()) // width))
+                tile = self.round_tile[first + turn] + blocks
+                kinds[tile], lanes[tile] = k, self.lane_begins()[k] + blocks * width
+        return kinds, lanes
+
     def slots(self) -> NDArray[np.int32]:
         """The slot of each pixel's last event, -1 if it has none."""
         ranks, width = np.array(SHAPES)[self.kind].T

@@ -1,7 +1,7 @@
 """Reading images from a window: where they lie among its events, pixel by pixel."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,23 @@ from jaxevent.reconstruction.features import ImagePoints, ReadOut
 from jaxevent.reconstruction.layout import SLOTS, SlotMap
 from jaxevent.reconstruction.memory import aligned
 from jaxevent.reconstruction.stream import BaseCounts, DeadTime, Stream, equivalent
+
+
+@runtime_checkable
+class ImageReader(Protocol):
+    """Says where images at sorted times (us) inside a window lie among its events."""
+
+    def __call__(self, times: NDArray[np.int64], growth: bool = False) -> ReadOut: ...
+
+
+@runtime_checkable
+class Basis(Protocol):
+    """What is kept of a window to read images from it."""
+
+    @property
+    def events(self) -> int: ...
+
+    def reader(self, room: int) -> ImageReader: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,6 +45,10 @@ class ReadingBasis:
     rho: float  # us, the dead time
     reach: int  # us, the longest time over which a change is spread
     dtype: np.dtype  # of the results
+
+    def reader(self, room: int) -> "Reader":
+        """Reads images, at most `room` at a time."""
+        return Reader(self, room)
 
 
 class PixelStates(NamedTuple):
@@ -46,6 +67,44 @@ class ImageRows(NamedTuple):
     on: NDArray
     off: NDArray
     since: NDArray
+
+
+class Placed(NamedTuple):
+    """Times of images among the frames of a window, of which the first is 0."""
+
+    piece: NDArray[np.int64]
+    frame: NDArray[np.int64]  # before
+    exposure: NDArray[np.int64]  # whose left edge the piece counts from; -1: the window's start
+    weight: NDArray
+    blend: NDArray
+    elapsed: NDArray
+
+    @classmethod
+    def of(cls, clock: Clock, first_frame: int, times: NDArray[np.int64]) -> "Placed":
+        piece, frame, weight, blend = clock.locate((times - clock.origin).astype(float))
+        return cls(
+            piece - clock.first_piece(first_frame),
+            frame - first_frame,
+            np.maximum(clock.frame(piece) - first_frame, -1),
+            weight,
+            blend,
+            clock.elapsed(times - clock.origin, frame),
+        )
+
+    def points(self, room: int, dtype: np.dtype, on: Any, off: Any) -> ImagePoints:
+        """The points of images with these counts, padded to the room."""
+        weight, blend, elapsed = (
+            padded(v, room, dtype) for v in (self.weight, self.blend, self.elapsed)
+        )
+        piece, frame = (padded(v, room, np.int32) for v in (self.piece, self.frame))
+        return ImagePoints(weight[:, None], blend[:, None], on, off, piece, frame, elapsed)
+
+
+def padded(values: NDArray, room: int, dtype: Any) -> NDArray:
+    """Values with zeros behind them, (room,)."""
+    out = np.zeros(room, dtype)
+    out[: len(values)] = values
+    return out
 
 
 class Reader:
@@ -84,28 +143,14 @@ class Reader:
             self._rewind()
         self._buffers.reverse()
         out = self._buffers[0]
-        piece, frame, weight, blend = clock.locate((times - clock.origin).astype(float))
+        at = Placed.of(clock, basis.first_frame, times)
         self._row = _read(
-            basis.stream, basis.events, self._row, times, clock.frame(piece) - basis.first_frame,
-            basis.counts, basis.slot_map, self._states, DeadTime(basis.rho, growth), basis.reach,
+            basis.stream, basis.events, self._row, times, at.exposure, basis.counts,
+            basis.slot_map, self._states, DeadTime(basis.rho, growth), basis.reach,
             clock.origin, out,
         )  # fmt: skip
         self._time = times[-1] if len(times) else self._time
-
-        def row(values: NDArray, kind: Any, first: int = 0) -> NDArray:
-            padded = np.zeros(self._room, kind)
-            padded[: len(times)] = values - first
-            return padded
-
-        points = ImagePoints(
-            row(weight, basis.dtype)[:, None],
-            row(blend, basis.dtype)[:, None],
-            out.on,
-            out.off,
-            row(piece, np.int32, clock.first_piece(basis.first_frame)),
-            row(frame, np.int32, basis.first_frame),
-            row(clock.elapsed(times - clock.origin, frame), basis.dtype),
-        )
+        points = at.points(self._room, basis.dtype, out.on, out.off)
         return ReadOut(points, out.slot, out.since)
 
 

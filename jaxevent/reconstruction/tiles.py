@@ -144,13 +144,9 @@ def _fill_tiles(
     slots: Slots,
 ) -> NDArray[np.int32]:
     """Write events in the order of lanes to slots; the pixels of all lanes."""
-    pixels = len(layout.counts)
-    # Room at the end, so that as many lanes as the widest tile has can be cut out anywhere.
-    lanes = np.zeros(sum(-(-pixels // w) * w for _, w in SHAPES) + SHAPES[0][1], np.int32)
-    begin = offset = 0
+    begin = 0
     for place, (ranks, width) in enumerate(SHAPES):
-        mine = layout.lanes[place]
-        lanes[offset : offset + len(mine)] = mine
+        mine, offset = layout.lanes[place], layout.lane_begins()[place]
         rounds = layout.round_tile[layout.round_first[place] :]
         lane_first = first[begin : begin + len(mine) + 1]
         kind = TileKind(place, ranks, width, offset, mine, lane_first, rounds)
@@ -160,8 +156,7 @@ def _fill_tiles(
 
         list(pool.map(fill, range(WORKERS)))
         begin += len(mine)
-        offset += -(-pixels // width) * width
-    return lanes
+    return layout.lane_pixels()
 
 
 @compiled

@@ -17,9 +17,10 @@ from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.features import Features, ReadOut, over_pixels, pixel_mesh
-from jaxevent.reconstruction.reading import Reader
+from jaxevent.reconstruction.on_device import windows_of
+from jaxevent.reconstruction.reading import ImageReader
 from jaxevent.reconstruction.stream import StreamState
-from jaxevent.reconstruction.windows import WINDOW_EVENTS, EventWindow, WindowedRecording
+from jaxevent.reconstruction.windows import WINDOW_EVENTS, EventWindow
 from jaxevent.recording import Recording, Times, microseconds
 from jaxevent.shown import Shown
 
@@ -92,7 +93,7 @@ class FilteredWindow(NamedTuple):
     """A window that images can be read from."""
 
     window: EventWindow
-    reader: Reader
+    reader: ImageReader
     trajectory: Any
 
     def contains(self, time: int) -> bool:
@@ -239,9 +240,10 @@ class Video(ImageSequence[P]):
         super().__init__(estimator, recording, params, progress=progress)
         self._devices, self._factors = devices, factors
         self._mesh = pixel_mesh(devices)
-        self._windows = WindowedRecording(
+        self._windows = windows_of(
             recording,
             Timing.of(params),
+            len(devices),
             filtering=estimator.filters,
             events=window_events,
             reuse=True,

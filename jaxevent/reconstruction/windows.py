@@ -27,7 +27,7 @@ from jaxevent.reconstruction.frames import (
 )
 from jaxevent.reconstruction.layout import Layout, SlotMap
 from jaxevent.reconstruction.memory import TileMemory
-from jaxevent.reconstruction.reading import Reader, ReadingBasis
+from jaxevent.reconstruction.reading import Basis, ImageReader, ReadingBasis
 from jaxevent.reconstruction.stream import (
     BaseCounts,
     DeadTime,
@@ -53,16 +53,16 @@ class EventWindow:
     start: int | None
     stop: int | None
     after: StreamState
-    basis: ReadingBasis
+    basis: Basis
 
     @property
     def events(self) -> int:
         """How many events it has."""
         return self.basis.events
 
-    def reader(self, room: int) -> Reader:
+    def reader(self, room: int) -> ImageReader:
         """Reads its images, at most `room` at a time."""
-        return Reader(self.basis, room)
+        return self.basis.reader(room)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -261,11 +261,7 @@ class WindowedRecording:
             segments = make_segments(
                 self.clock, used, self._stream(events.around), weight, counts, self.dtype
             )
-        # Rows of the last frame of the window before, and of the first of the next.
-        onward = used.stop if stop is None else self.clock.used(stop, stop).start
-        n = max(used.stop - used.start, 0)
-        ends = np.maximum([before.frames - 1 - used.start, onward - used.start], 0)
-        rows = np.array([n, *ends], np.int32)
+        rows = self._frame_rows(stop, used, before)
         frames = make_frame_features(
             self._images, self.clock, used, rows, self.frames, counts, segments
         )
@@ -294,6 +290,13 @@ class WindowedRecording:
         )
         features = Features(frames, tiles, make_start(self.clock, self.pixels, self.dtype), slots)
         return EventWindow(start, stop, after, basis), features
+
+    def _frame_rows(self, stop: int | None, used: slice, before: StreamState) -> NDArray[np.int32]:
+        """How many frames; rows of the last one of the window before, and the next's first."""
+        onward = used.stop if stop is None else self.clock.used(stop, stop).start
+        n = max(used.stop - used.start, 0)
+        ends = np.maximum([before.frames - 1 - used.start, onward - used.start], 0)
+        return np.array([n, *ends], np.int32)
 
     def _count(
         self, start: int | None, used: slice, around: Events, before: StreamState
