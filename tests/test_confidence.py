@@ -103,6 +103,7 @@ def test_one_batch_of_a_likelihood_has_the_interval_of_its_information():
     assert told["spread"].low == pytest.approx(s * np.exp(-1.959964 / np.sqrt(2 * n)), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_as_often_as_they_say():
     """Of 100 samples; the interval of a spread is that of large samples, a little narrow."""
 
@@ -123,6 +124,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
 STEPS = Settings(iterations=80, learning_rate=0.1, rounds=1, patience=1000, every=1)
 
 
+@pytest.mark.slow
 def test_what_ran_away_and_what_does_nothing_is_told():
     def loss(params, batch):
         falls = 1 / (1 + params.gain) * (1 + 0.1 * batch)

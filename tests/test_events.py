@@ -134,6 +134,7 @@ def test_fewer_pixels_show_the_same_scene():
     assert rows(events.downsample(recording, 2, 500).events) == kept
 
 
+@pytest.mark.slow
 def test_undistorted_events_lie_where_an_ideal_camera_sees_them():
     recording = recorded()
     camera = recording.camera

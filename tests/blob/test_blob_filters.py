@@ -410,6 +410,7 @@ def test_no_weight_and_no_events(name):
                 np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*TRACKERS, "moving_moments"])
 def test_nothing_breaks_the_numbers(name, float32, optimised):
     """Gaps of 1000 s, equal times and sizes, far outliers, no weight, 10,000 events at a pixel."""

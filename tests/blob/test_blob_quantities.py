@@ -233,6 +233,7 @@ def test_growth_knows_its_error(smooth):
     assert 0.8 < nees[:, 10:].mean() < 1.2
 
 
+@pytest.mark.slow
 def test_growth_allows_for_errors_that_last():
     """Sizes as a Kalman filter of a walk leaves them that measures a constant size."""
     rng = RNG(6)
@@ -264,6 +265,7 @@ def test_growth_allows_for_errors_that_last():
     assert nees(100 * Q_lambda) > 5
 
 
+@pytest.mark.slow
 def test_rows_that_are_not_valid_do_not_matter():
     times = np.linspace(0, 1, 50)
     mean, _ = approach(times)
@@ -517,6 +519,7 @@ def test_small_sensors_are_enlarged_in_a_video(tmp_path):
     assert len(decoded.stdout) == 12 * 720 * 480 * 3
 
 
+@pytest.mark.slow
 def test_plots_are_written(tmp_path):
     pytest.importorskip("matplotlib")
     times, ids, mean, P, valid = tracks(T=12)

@@ -104,6 +104,7 @@ def test_cars_are_found_and_followed(real, data, float32):
     assert row["switches"] == row["strays"] == 0
 
 
+@pytest.mark.slow
 def test_dat_events(real, tmp_path):
     events = np.array([[5, 1279 | 719 << 14 | 1 << 28], [7, 3 | 2 << 14]], "<u4")
     path = tmp_path / "two.dat"

@@ -323,6 +323,7 @@ def test_steps_follow_the_accuracy():
             one.settings(bad)
 
 
+@pytest.mark.slow
 def test_targets_do_not_depend_on_the_clock(crossed):
     recording, _, found = crossed
     events = recording.events[:]

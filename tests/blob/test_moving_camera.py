@@ -53,6 +53,7 @@ def before_noise(targets, seed=0, noise=2e3):
     return simulate_blobs([*targets, far], FRAME, DURATION, noise, seed)
 
 
+@pytest.mark.slow
 def test_the_scene_goes_as_it_was_made_to():
     recording = seen_by_a_moving_camera(before_noise([])[0])
     scene = measure_scene_motion(Stream(recording, 0, 800_000), 0.01)

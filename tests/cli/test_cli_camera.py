@@ -37,6 +37,7 @@ def run(*words: object) -> int:
     return cli.main(["camera", *(str(word) for word in words)])
 
 
+@pytest.mark.slow
 def test_response_merge_and_attach(stack, tmp_path, capsys):
     folder, images, scene = stack
     assert run("response", folder, "--exposures", *SECONDS, "--out", tmp_path / "r.csv") == 0

@@ -188,6 +188,7 @@ def test_results_are_not_written_onto_what_the_configuration_names(command, fold
     assert state(folder) == before
 
 
+@pytest.mark.slow
 def test_what_a_killed_process_left_is_removed(folder):
     code = """
 import os, signal

@@ -320,6 +320,7 @@ def windowed(model, number=150, seed=0, **settings):
     return params, windows.cut(*next(iter(windows))), np.array(motion)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["planar", "rotation"])
 @pytest.mark.parametrize("polarity, measure", [("signed", "mean square"), ("ignored", "variance")])
 def test_the_objective_and_its_gradient(model, polarity, measure):

@@ -116,6 +116,7 @@ def spoilt(folder, how):
     return META
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "match"),
     [

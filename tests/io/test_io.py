@@ -519,6 +519,7 @@ def test_npz_bad(tmp_path, changes, message):
 # HDF5
 
 
+@pytest.mark.slow
 @given(recordings, st.sampled_from([None, "gzip"]), st.integers(0, 2))
 def test_hdf5_round_trip(recording, compression, extras):
     extra = {
@@ -561,6 +562,7 @@ def test_stored_events_are_those_in_memory(recording, compression, data):
                 assert stored.index(int(time) + near) == events.index(int(time) + near)
 
 
+@pytest.mark.slow
 @given(recordings, st.integers(1, 50))
 def test_plain_h5py_reads_the_layout(recording, block):
     """ms_to_idx by its definition, whatever the size of the blocks that were copied."""

@@ -205,6 +205,7 @@ def only(name, beyond="none"):
     return Params(choice=chosen[0], choice_beyond=chosen[1])
 
 
+@pytest.mark.slow
 def test_what_differs_is_hidden():
     rng = np.random.default_rng(3)
     truth = moved((0, 0), (0, 0), [0], 20, 24)[0]
@@ -237,6 +238,7 @@ def test_other_ingredients_can_be_chosen(name):
         np.testing.assert_allclose(fused.L, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_instants_that_fill_up_change_nothing():
     L = moved((3.0, 1.0), (0, 0), np.linspace(-1, 1, 9), 20, 24)
     at = place(9, 2, 1, 5)

@@ -146,6 +146,7 @@ def test_kernel_of_a_users_own_filter():
     assert valid.all()
 
 
+@pytest.mark.slow
 def test_bands_and_cores_do_not_change_a_bit(monkeypatch):
     recording = random_recording(7, 900, 5, size=(11, 9), exposure=0)
     times, params = times_of(recording), params_of(jaxevent.high_pass, **PARAMS)
@@ -214,6 +215,7 @@ def test_float_frames_are_those_of_their_levels():
     np.testing.assert_allclose(one[0], two[0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_which_compiler_serves(float32):
     recording, blend = small(), jaxevent.blend
     assert isinstance(blend.estimate(recording), FusedVideo)

@@ -447,6 +447,7 @@ def test_run_jits_and_maps_over_parameters():
         )
 
 
+@pytest.mark.slow
 def test_step_maps_over_pixels():
     params = jaxevent.akf.Params()
     rng = np.random.default_rng(0)
@@ -608,6 +609,7 @@ def test_likelihood_equals_that_of_measurements_one_by_one(recording, one_sided)
     np.testing.assert_allclose(total, expected, rtol=1e-5 if one_sided else 1e-9)
 
 
+@pytest.mark.slow
 def test_next_recording_of_the_sensor_compiles_nothing():
     params = jaxevent.akf.Params()
 

@@ -103,6 +103,7 @@ def test_what_halves_agree_in_is_the_spread():
     assert thresholds.spread(*halves) == pytest.approx(0.07, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rho", [0.0, 1e-3])
 def test_weighted_events_are_those_of_other_thresholds(rho):
     """One factor for all pixels is the same as common thresholds times it."""

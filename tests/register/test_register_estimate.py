@@ -13,6 +13,7 @@ from jaxevent import cli, register
 from jaxevent.errors import InputError
 
 
+@pytest.mark.slow
 def test_all_is_found_of_a_far_scene(far, tmp_path, capsys):
     pytest.importorskip("cv2")
     _, recording, other, H, offset = far
@@ -81,6 +82,7 @@ def test_what_is_given_is_kept(near):
     np.testing.assert_array_equal(found.homography, H)
 
 
+@pytest.mark.slow
 def test_frames_of_another_scene_are_refused(near):
     _, _, recording, other, rig, _ = near
     noise = np.random.default_rng(0).integers(60, 190, other.frames.images.shape, dtype=np.uint8)

@@ -156,6 +156,7 @@ def test_folders_are_known_by_all_their_files(tmp_path):
     assert len(log(out / "tasks", "finished")) == 2
 
 
+@pytest.mark.slow
 def test_a_bad_recording_does_not_stop_the_others(tmp_path, capsys):
     jaxevent.save(small(), tmp_path / "a.h5")
     (tmp_path / "b<i>.h5").write_bytes(b"not a recording")

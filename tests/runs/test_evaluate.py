@@ -55,6 +55,7 @@ def test_blend_is_scored_as_by_hand(offset):
     assert row["params"].items() >= given.items()
 
 
+@pytest.mark.slow
 def test_hidden_frames_are_never_seen(monkeypatch):
     frames = small().frames
     assert frames is not None
@@ -334,6 +335,7 @@ def test_pixels_without_reference_leave_errors_and_regions():
     assert again["per_frame"]["ssim"] == pytest.approx(row["per_frame"]["ssim"])
 
 
+@pytest.mark.slow
 def test_the_authors_metrics_of_references(folder):
     """Pixels without reference are 0 in both images, and count as right among all pixels."""
     truth = 4 * grey()
@@ -449,6 +451,7 @@ def test_references_that_cannot_be_used(extra, said):
         score(silent, METHODS["blend"], protocol="reference")
 
 
+@pytest.mark.slow
 def test_further_metrics_are_those_of_each_image(folder, monkeypatch):
     seen = []
 
@@ -484,6 +487,7 @@ def test_further_metrics_are_those_of_each_image(folder, monkeypatch):
         score(small(), METHODS["blend"], metrics=["lpip"])
 
 
+@pytest.mark.slow
 def test_results_against_references_show_their_columns(folder):
     jaxevent.save(hdr_recording(), folder / "hdr.h5")
     text = 'protocol = "reference"\n' + ONE.replace("small", "hdr")

@@ -137,6 +137,7 @@ def test_what_a_gap_cannot_be_used_for():
         score(hdr_recording(), METHODS["blend"], protocol="reference", moving=True)
 
 
+@pytest.mark.slow
 def test_evaluations_take_gap_and_moving(tmp_path):
     jaxevent.save(longer(), tmp_path / "small.h5")
     text = 'recordings = ["small.h5"]\ngap = 3\nmoving = true\n[[method]]\nname = "blend"\n'

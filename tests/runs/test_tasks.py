@@ -72,6 +72,7 @@ def test_outcomes_are_in_order_and_finished_tasks_are_kept(place, tmp_path):
     assert json.loads((folder / "key-e.json").read_text())["result"]["name"] == "e"
 
 
+@pytest.mark.slow
 def test_attempts_run_out(place, tmp_path):
     arguments = {"folder": str(tmp_path), "name": "a", "then": "fail", "times": 9}
     (outcome,) = run(errand, [Task("a", arguments)], None, place, retries=3)

@@ -117,6 +117,7 @@ def test_a_motion_and_the_losses_of_a_fit():
     assert points == [[(0, 3.0), (1, 2.0), (2, 1.0)], [(1, 2.5)], [(0, 4.0)], [(0, 5.0)]]
 
 
+@pytest.mark.slow
 def test_notebooks_show_a_table_and_a_picture(monkeypatch):
     video = Video(jaxevent.akf, small(), jaxevent.akf.Params())
     titles = {"small": small(), "akf": video, "2 tracks of small": Tracks(), "vx": motion()}
