@@ -15,6 +15,7 @@ from jaxevent.methods import find
 from jaxevent.reconstruction.colour import chrominance, colour_video, luminance
 from jaxevent.reconstruction.compensated import (
     agreement,
+    course,
     estimator,
     exposures,
     fusion,
@@ -274,6 +275,63 @@ def test_instants():
     first = choose(0)  # nothing before
     assert first.own == first.before - 0 or first.t[first.before] > 0
     assert (first.t >= 0).all()
+
+
+def test_a_clock_that_stops_with_the_scene():
+    # Ten events per ms until 200 ms, none until 300 ms, then five.
+    gone = np.concatenate([np.arange(0, 200_000, 100), np.arange(300_000, 400_000, 200)])
+    apart = 400_000 / len(gone)
+
+    def clock(share):
+        return course.Course(lambda t: int(np.searchsorted(gone, t)), 0, apart, share)
+
+    times = np.array([0, 100_000, 200_000, 250_000, 300_000, 400_000])
+    np.testing.assert_array_equal(course.TIME(times), times)
+    even = clock(1.0)(times) / apart
+    np.testing.assert_allclose(even, [0, 1000, 2000, 2000, 2000, 2500])
+    np.testing.assert_allclose(clock(0.25)(times), 0.75 * times + 0.25 * apart * even)
+    frames = np.arange(0, 440_000, 40_000)
+    choose = instants.Schedule(frames, (0, 400_000), 100.0, clock(0.9))
+    one = choose(262_000)
+    still = np.diff(one.s)[(one.t[:-1] >= 200_000) & (one.t[1:] <= 300_000)]
+    steps = np.diff(one.t)[(one.t[:-1] >= 200_000) & (one.t[1:] <= 300_000)]
+    np.testing.assert_allclose(still * one.unit, 0.1e-6 * steps, rtol=1e-3)
+    np.testing.assert_allclose(one.at(one.t), one.s, atol=1e-6)
+    assert one.pace(1000) * one.unit == pytest.approx(0.1)
+    plain, timed = one.by(course.TIME), instants.Schedule(frames, (0, 400_000), 100.0)(262_000)
+    np.testing.assert_array_equal(plain.s, timed.s)
+    assert plain.unit == timed.unit
+
+
+def test_parts_of_the_image_that_share_a_course():
+    rng = np.random.default_rng(4)
+    pace = np.array([1.0, 2, 3, 2, 1, 0, 0, 0.5])
+    texture = rng.uniform(50, 500, (1, 9, 1))
+    together = rng.poisson(texture * pace, (3, 9, 8)).astype(float)
+    assert course.common_part(together) == course.MOST
+    alone = rng.poisson(texture * rng.permuted(np.tile(pace, (3, 9, 1)), axis=2)).astype(float)
+    assert course.common_part(alone) < 0.1
+    even = rng.poisson(texture * np.ones(8), (3, 9, 8)).astype(float)
+    assert course.common_part(even) < 0.2
+    assert course.common_part(np.zeros((1, 9, 8))) == 0
+
+
+def test_trajectories_on_another_clock():
+    rng = np.random.default_rng(5)
+    p = rng.normal(size=(3, 4, 4)).astype(np.float32)
+    s = np.array([-1, -0.6, -0.3, 0, 0.2, 0.7], np.float32)
+
+    def gone(p, s):
+        return p[..., :2, None] * s + p[..., 2:, None] * s**2
+
+    twice = trajectories.by_clock(p, s, s / 2)
+    np.testing.assert_allclose(gone(twice, s / 2), gone(p, s), atol=1e-5)
+    # A clock that goes ever faster makes parabolas of straight lines.
+    straight = p * np.array([1, 1, 0, 0], np.float32)
+    early = (np.sqrt(1 + 4 * 0.2 * s) - 1) / (2 * 0.2)  # s = early + 0.2 early^2
+    bent = trajectories.by_clock(straight, s, early.astype(np.float32))
+    np.testing.assert_allclose(bent[..., 2:], 0.2 * straight[..., :2], atol=1e-4)
+    np.testing.assert_allclose(bent[..., :2], straight[..., :2], atol=1e-4)
 
 
 SHIFT = (6.0, -4.0)  # px per unit

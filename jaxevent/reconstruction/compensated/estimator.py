@@ -25,6 +25,7 @@ from jaxevent.estimator import Described, Estimate
 from jaxevent.reconstruction.clock import Clock, Timing, time_span
 from jaxevent.reconstruction.compensated import trajectories
 from jaxevent.reconstruction.compensated.agreement import Agreement, Place, agree, shown
+from jaxevent.reconstruction.compensated.course import TIME, course_of
 from jaxevent.reconstruction.compensated.evidence import Evidence
 from jaxevent.reconstruction.compensated.exposures import (
     Shots,
@@ -66,6 +67,7 @@ FADE = 0.35  # of variances from one resolution to the half of it
 APART = 8  # steps of the schedule between anchors
 ANCHORS = 2  # whose motion is remembered
 STEPS = 2  # with which a target's motion is found at half and at full resolution
+CLEARLY = 0.97  # of the misfit by time, where the course tells more than noise
 FASTEST = 2.0  # times as fast as what moves on the whole: what exposures are sampled for
 INFLATE = 3.0  # of the variance of an image that motion is refined with
 
@@ -145,8 +147,13 @@ class Images:
         return L, V, clear
 
 
-def schedule_of(recording: Recording, params: Params, images: Images) -> Schedule:
-    """The schedule for a recording, by the speed of its image."""
+def schedule_of(
+    recording: Recording, params: Params, images: Images, common: bool = True
+) -> Schedule:
+    """The schedule for a recording, by the speed of its image.
+
+    `common`: by a clock that goes as fast as the scene moves, where that has a common course.
+    """
     clock = Clock.of(recording, Timing.of(params))
     # The first whole microsecond at which a frame is the one before.
     frames = np.ceil(clock.mid).astype(np.int64) + clock.origin
@@ -165,7 +172,8 @@ def schedule_of(recording: Recording, params: Params, images: Images) -> Schedul
             f"{recording.name}: with these parameters images at single instants are not finite; "
             "choose some nearer the defaults"
         )
-    return Schedule(frames, (first, last), speed)
+    course = course_of(recording, (first, last), 4 * lag) if common else TIME
+    return Schedule(frames, (first, last), speed, course)
 
 
 class Shutter:
@@ -174,14 +182,14 @@ class Shutter:
     def __init__(self, recording: Recording, params: Params, speed: float):
         clock = Clock.of(recording, Timing.of(params))
         self.mid = np.ceil(clock.mid).astype(np.int64) + clock.origin
-        self._half = (clock.right - clock.left) / 2e6  # s
-        moved = FASTEST * speed * 2 * float(self._half.max(initial=0))
+        self._half = np.rint((clock.right - clock.left) / 2).astype(np.int64)  # us
+        moved = FASTEST * speed * 2e-6 * float(self._half.max(initial=0))
         samples = samples_for(moved) if params.deblur else 1
         wanted = samples > 1 or (float(params.margin) > 0 and params.one_sided)
         self.samples = samples if params.integrate and wanted else None
 
-    def __call__(self, t: int, unit: float) -> Taken:
-        """The frames next to a time (us), on a clock of that unit (s)."""
+    def __call__(self, t: int, instants: Instants) -> Taken:
+        """The frames next to a time (us), that of the target of these instants."""
         after = int(np.searchsorted(self.mid, t, "right"))
         here = int(np.searchsorted(self.mid, t, "left"))
         frame, present = np.array([here - 1, after]), np.array([here > 0, after < len(self.mid)])
@@ -189,11 +197,12 @@ class Shutter:
             far = np.where(present, np.abs(self.mid[frame.clip(0, len(self.mid) - 1)] - t), 1 << 62)
             frame[far.argmax()], present[far.argmax()] = here, True
         frame = frame.clip(0, max(len(self.mid) - 1, 0)).astype(np.int32)
-        s = (self.mid[frame] - t) * 1e-6 / unit
+        mid, half = self.mid[frame], self._half[frame]
+        s = instants.at(mid)
         return Taken(
             frame,
             np.where(present, s, 0).astype(np.float32),
-            (self._half[frame] / unit).astype(np.float32),
+            ((instants.at(mid + half) - instants.at(mid - half)) / 2).astype(np.float32),
             present.astype(np.float32),
         )
 
@@ -264,7 +273,7 @@ class Follower:
         self, recording: Recording, params: Params, images: Images, start: Start | None = None
     ):
         self.params, self.images, self.start = params, images, start
-        self.schedule = schedule_of(recording, params, images)
+        self.schedule = schedule_of(recording, params, images, common=start is None)
         self.shutter = Shutter(recording, params, self.schedule.speed)
         self.steady = Steadiness(recording, self.schedule.frames, float(params.I0))
         self._anchors: collections.OrderedDict[int, tuple[Instants, NDArray[np.float32]]]
@@ -311,8 +320,30 @@ class Follower:
                 h, w = self.images.size
                 return trajectories.Motion(known, 0).at(1, h, w).p
         anchor, p = self._anchor(t)
-        apart = (t - anchor.t[anchor.own]) * 1e-6 / anchor.unit
+        apart = float(anchor.at(np.array([t]))[0])
         return trajectories.advect(p, apart, instants.unit / anchor.unit)
+
+    def _stepped(
+        self, images: NDArray[np.float32], instants: Instants, p: NDArray[np.float32]
+    ) -> tuple[Instants, NDArray[np.float32]]:
+        """A few steps at half resolution, by the clock on which images agree better."""
+
+        def stepped(s: NDArray[np.float32], path: NDArray[np.float32]) -> NDArray[np.float32]:
+            for _ in range(STEPS):
+                path = trajectories.step(images, s, path, *self._settings)
+            return path
+
+        found = stepped(instants.s, p)
+        if not instants.course.share:
+            return instants, found
+        plain = instants.by(TIME)
+        other = stepped(plain.s, trajectories.by_clock(p, instants.s, plain.s))
+        floor, nu, _ = self._settings
+        misfit, by_time = (
+            trajectories.misfit(images, one.s, path, floor, nu)
+            for one, path in ((instants, found), (plain, other))
+        )
+        return (instants, found) if misfit < CLEARLY * by_time else (plain, other)
 
     def __call__(self, t: int) -> Followed:
         """The target at a time (us)."""
@@ -325,8 +356,8 @@ class Follower:
             return Followed(instants, L, V, clear, p, smooth)
         doubted = self._doubted(V, clear)
         pyramid = trajectories.Pyramid(L, doubted, FADE)
-        for _ in range(STEPS):
-            p = trajectories.step(pyramid[1], s, p, *self._settings)
+        instants, p = self._stepped(pyramid[1], instants, p)
+        s = instants.s
         p = trajectories.Motion(p, 1).at(0, *L.shape[1:]).p
         # The target's own image is the smoother's. What is fused so far is a better one to refine
         # with.
@@ -356,7 +387,7 @@ def place_of(instants: Instants, clear: NDArray, room: int) -> Place:
     count = len(instants)
     framed: NDArray = clear.reshape(count, -1).max(1) > 0
     framed[[instants.before, instants.after]] |= instants.before != instants.after
-    order = np.argsort(np.abs(instants.s), kind="stable")
+    order = np.argsort(np.abs(instants.t - instants.t[instants.own]), kind="stable")
     near = np.zeros(count, bool)
     near[[k for k in order if k == instants.own or not framed[k]][:5]] = True
     near[instants.own] = True
@@ -485,7 +516,7 @@ class CompensatedVideo(ImageSequence[Params]):
         """What is fused, held to exposures and clipped pixels."""
         shutter = self.follow.shutter
         assert shutter.samples is not None
-        taken = shutter(t, target.instants.unit)
+        taken = shutter(t, target.instants)
         low, high = int(taken.frame.min()), int(taken.frame.max()) + 1
         grey, intensity, _, gain = self._frames.read(slice(low, high), high - low)
         rows = taken.frame - low
@@ -512,7 +543,7 @@ class CompensatedVideo(ImageSequence[Params]):
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         """As `ImageSequence.carry`, along trajectories."""
         target, fused = self._target(to)
-        s = ((at - to) * 1e-6 / target.instants.unit).astype(np.float32)
+        s = target.instants.at(at).astype(np.float32)
         order = np.argsort(at, kind="stable")
         L, V, clear = (part[np.argsort(order)] for part in self.follow.images(at[order]))
         M = np.asarray(fused.L, np.float32)
@@ -529,7 +560,8 @@ class CompensatedVideo(ImageSequence[Params]):
         """
         size = (self.recording.height, self.recording.width)
         found = [
-            trajectories.velocity(target.p, size) / np.float32(target.instants.unit)
+            trajectories.velocity(target.p, size)
+            * np.float32(target.instants.pace(self.follow.schedule.step))
             for target, _ in self._targets(times, extrapolate)
         ]
         return np.stack(found)
@@ -591,12 +623,12 @@ class MotionCompensated(ImageEstimator[Params]):
         rows, p = np.zeros((len(chosen), room), np.int32), np.zeros(shape, np.float32)
         places, taken = [], []
         steady, doubt = np.ones((2, len(chosen)), np.float32)
-        for n, one in enumerate(chosen):
-            _, _, _, clear, p[n], smooth = follow(int(wanted[n]))
+        for n in range(len(chosen)):
+            one, _, _, clear, p[n], smooth = follow(int(wanted[n]))
             steady[n], doubt[n] = smooth is None, follow.steady.doubt(int(wanted[n]))
             rows[n, : len(one)] = np.searchsorted(every, one.t)
             places.append(place_of(one, clear, room))
-            taken.append(follow.shutter(int(wanted[n]), one.unit))
+            taken.append(follow.shutter(int(wanted[n]), one))
         place, taken = (
             jax.tree.map(lambda *leaves: np.stack(leaves), *parts) for parts in (places, taken)
         )

@@ -6,6 +6,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.reconstruction.compensated.course import TIME, Course
+
 OFFSETS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # in steps, of instants from the target
 STEP = 0.6  # px that what moves does so in a step
 NEAR = 6.0  # px that it may move between the target and a further frame
@@ -18,7 +20,8 @@ ROOM = 4  # numbers of instants are multiples, to compile few shapes
 class Instants:
     """Those of one target: times (us), which is the target and which hold frames.
 
-    `s` are the times relative to the target, -1..1; `unit` (s) is what 1 stands for.
+    `s` are the times relative to the target by the scene's course, -1..1; `unit` (s) is what 1
+    stands for.
     """
 
     t: NDArray[np.int64]
@@ -28,9 +31,35 @@ class Instants:
     s: NDArray[np.float32]
     unit: float
     first: float  # the horizon, in s, at which motion is first sought
+    course: Course
+
+    def at(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Times (us) as those of `s`."""
+        both = self.course(np.append(times, self.t[self.own]))
+        return (both[:-1] - both[-1]) * 1e-6 / self.unit
+
+    def pace(self, over: int) -> float:
+        """How much of s passes per s at the target, within so many us before and after it."""
+        begin, end = self.at(self.t[self.own] + np.array([-over, over]))
+        return float(end - begin) / (2e-6 * over)
+
+    def by(self, course: Course) -> "Instants":
+        """The same on another clock."""
+        s, unit = _relative(course, self.t, self.own)
+        return dataclasses.replace(self, s=s, unit=unit, course=course)
 
     def __len__(self) -> int:
         return len(self.t)
+
+
+def _relative(
+    course: Course, times: NDArray[np.int64], own: int
+) -> tuple[NDArray[np.float32], float]:
+    """Times (us) relative to that of a target, in -1..1, and what 1 stands for in s."""
+    gone = course(times)
+    gone -= gone[own]
+    unit = max(float(np.abs(gone).max()), 1.0)
+    return (gone / unit).astype(np.float32), unit * 1e-6
 
 
 class Schedule:
@@ -39,8 +68,14 @@ class Schedule:
     `speed` (px/s) is that of what moves.
     """
 
-    def __init__(self, frames: NDArray[np.int64], span: tuple[int, int], speed: float):
-        self.frames, self.span = frames, span
+    def __init__(
+        self,
+        frames: NDArray[np.int64],
+        span: tuple[int, int],
+        speed: float,
+        course: Course = TIME,
+    ):
+        self.frames, self.span, self.course = frames, span, course
         gap = float(np.median(np.diff(frames))) if len(frames) > 1 else float(span[1] - span[0])
         self.speed = speed = max(speed, 1e-3)
         self.step = max(round(min(STEP / speed * 1e6, gap / 2)), 200)
@@ -67,18 +102,17 @@ class Schedule:
         chosen.add(t)
         times = np.array(sorted(chosen), np.int64)
         own = int(np.searchsorted(times, t))
-        unit = max(int(np.abs(times - t).max()), 1)
-        s = ((times - t) / unit).astype(np.float32)
+        s, unit = _relative(self.course, times, own)
         at = [
             int(np.searchsorted(times, frames[k]))
             for k in (left - 1, right)
             if 0 <= k < len(frames)
         ]
         before, after = (at[0], at[-1]) if at else (own, own)
-        far = np.sort(np.abs(times - t))
+        far = np.sort(np.abs(s))
         # At least two instants on either side, where there are.
-        horizon = max(NEAREST * step, far[min(4, len(far) - 1)]) / unit
-        return Instants(times, own, before, after, s, unit * 1e-6, float(min(horizon, 1)))
+        horizon = max(NEAREST * step * 1e-6 / unit, float(far[min(4, len(far) - 1)]))
+        return Instants(times, own, before, after, s, unit, float(min(horizon, 1)), self.course)
 
 
 def speed_of(

@@ -500,6 +500,34 @@ def step(
     return out
 
 
+def misfit(
+    images: NDArray[np.float32],
+    s: NDArray[np.float32],
+    p: NDArray[np.float32],
+    floor: float,
+    nu: float,
+) -> float:
+    """How badly packed images (K, h, w, 4) agree along trajectories: robust squares, a mean."""
+    near, (count, h, w, _) = np.exp(-2 * s**2).astype(np.float32), images.shape
+    points, M = np.empty((h, w, count, 4), np.float32), np.empty((h, w), np.float32)
+    over_rows(_fetch, h, images, s, near, p, np.float32(floor), np.float32(nu), points, M)
+    return float(((points[..., 0] - M[..., None]) ** 2 * points[..., 1]).mean())
+
+
+def by_clock(
+    p: NDArray[np.float32], s: NDArray[np.float32], other: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Trajectories on another clock, on which the same instants s (K,) are at other times.
+
+    v and a such that places differ least, squared, most of all near the target.
+    """
+    weight = np.exp(-(s**2) - other**2)[:, None]
+    old, new = (np.stack([one, one**2], 1).astype(float) for one in (s, other))
+    change = np.linalg.lstsq(weight * new, weight * old, rcond=None)[0]
+    paths = p.reshape(*p.shape[:2], 2, 2)
+    return np.einsum("ab,ijbc->ijac", change, paths).reshape(p.shape).astype(np.float32)
+
+
 @compiled
 def _resize(p, out, scale):
     """Nodes at another resolution, bilinear, displacements times `scale`."""
