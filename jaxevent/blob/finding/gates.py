@@ -11,6 +11,7 @@ from jaxevent.blob.finding.targets import GATE, Live
 from jaxevent.kernels import compiled
 from jaxevent.kernels import part as kernel_part
 
+REACH = 1.0  # sizes
 CLAIMED, OWNS = 0.3, 0.1  # shares of a blob that is claimed, and of those who own the rest of it
 
 
@@ -32,7 +33,8 @@ class Look:
         self.part, self.t = part, t
         self.p, self.P = live.predict(t)
         S = live.C * (1 + 2 / live.n)[:, None, None]
-        S = S + (self.P[:, 0] + 0.1)[:, None, None] * np.eye(2)
+        P = np.where(live.confirmed, np.minimum(self.P[:, 0], _reach(live)), self.P[:, 0])
+        S = S + (P + 0.1)[:, None, None] * np.eye(2)
         self.soft = _in_contact(self.p, live.C, live.confirmed)
         more = np.where(live.confirmed, 0.0, 2.0)
         self.gates = Gates(self.p, live.v, S, more, live.n, self.soft)
@@ -44,6 +46,14 @@ class Look:
     def moments(self, owner: NDArray, which: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """Number (n,), mean (n, 2) and covariance (n, 2, 2) of residuals of some events."""
         return _moments(*self.part, self.t, owner, which, self.gates)
+
+
+def _reach(live: Live) -> NDArray[np.float64]:
+    """The most that gates take of the variance of targets' places, (n,) px^2.
+
+    A target that is known leaves its way by about its size in a window: what is farther is another.
+    """
+    return (REACH * live.size) ** 2
 
 
 def _in_contact(p: NDArray, C: NDArray, confirmed: NDArray) -> NDArray[np.bool_]:
