@@ -139,7 +139,7 @@ class Packing:
             seeds, detect = found.seeds(begin, end), False
         detect = seeds is None if detect is None else detect
         self.recording, self.start, self.stop = recording, begin, end
-        self.joined = self.ends = None
+        self.joined = self.ends = self.polarity = None
         self.own: dict[str, Numeric] = {}
         if found is not None and len(found):
             self.joined = join(found.paths)
@@ -148,6 +148,9 @@ class Packing:
                 [end if p.end >= end - p.window else p.end for p in found.paths], np.int64
             )
             self.own |= found.own(params)
+            self.polarity = np.array(
+                [-1 if p.polarity is None else p.polarity for p in found.paths], np.int8
+            )
         self.seeds = read_seeds(recording, seeds, begin, end)
         # Without births and tentative tracks less is to be decided.
         self.period = max(1, round((1 if detect else 10) * 1e6 * float(params.cycle)))
@@ -233,6 +236,9 @@ class Packing:
         if self.joined is not None and len(part):
             owner = candidates(part, self.joined, NEAR)
             kept &= owner != NOBODY
+            assert self.polarity is not None
+            wanted = self.polarity[owner]
+            kept &= (owner < 0) | (wanted < 0) | (wanted == part.p)
         given = _Given(part.t, part.x, part.y, part.p, kept, owner)
         order = _spread(part.t, len(part) if self._as_stored else TIES)
         if not len(order):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from jaxevent.blob import moment
 from jaxevent.blob.finding.background import (
     CELL,
     FINE,
@@ -13,10 +14,14 @@ from jaxevent.blob.finding.background import (
     measure_dispersion,
 )
 from jaxevent.blob.finding.detection import FALSE_ALARMS, Scale, detect, measure_blobs
+from jaxevent.blob.finding.found import Found
 from jaxevent.blob.finding.gates import CLAIMED, OWNS, Look
+from jaxevent.blob.finding.paths import Path as TargetPath
+from jaxevent.blob.finding.polarity import prefer_sharper
 from jaxevent.blob.finding.prediction import WIDTHS, choose_scored, predict, score
 from jaxevent.blob.finding.stream import Part, Pixels, Stream
 from jaxevent.blob.finding.targets import GATE, start_targets
+from jaxevent.blob.prepare import Packing
 from jaxevent.recording import Events, Recording
 
 SIZE = WIDTH, HEIGHT = 96, 64
@@ -229,3 +234,35 @@ def test_windows_before_the_start_hold_nothing(stream):
     assert len(late.window(-0.05, 0.0)) == 0 and len(late.pixels(-0.05, 0.0)) == 0
     assert len(late.window(-0.05, 0.05)) == len(late.window(0.0, 0.05))
     assert isinstance(late.pixels(0, 0.1), Pixels)
+
+
+def lagging(tail):
+    """A light that goes right, whose OFF events come so many px behind it, and its mean's path."""
+    rng = np.random.default_rng(8)
+    t = np.sort(rng.integers(0, 1_000_000, 3000))
+    on = rng.random(3000) < 0.6
+    x = 20 + 40e-6 * t + rng.normal(0, 1.5, 3000) - np.where(on, 0, rng.exponential(tail, 3000))
+    y = 30 + rng.normal(0, 1.5, 3000)
+    x, y = (np.rint(np.clip(part, 0, 90)).astype(np.uint16) for part in (x, y))
+    recording = Recording("light", WIDTH, HEIGHT, Events(t, x, y, on))
+    middle = np.arange(25_000, 1_000_000, 50_000)
+    p = np.stack([20 + 40e-6 * middle - 0.4 * tail, np.full(20, 30.0)], 1)
+    C = np.broadcast_to(np.diag([2.5 + 0.7 * tail**2, 2.5]), (20, 2, 2))
+    path = TargetPath(middle, p, np.zeros((20, 2)), C, np.full(20, 150.0), 50_000, 1.0)
+    return recording, path
+
+
+def test_where_events_of_one_polarity_lag_the_other_tells_the_place():
+    cold = np.zeros((HEIGHT, WIDTH), bool)
+    recording, path = lagging(tail=8.0)
+    (told,) = prefer_sharper([path], recording, cold)
+    assert told.polarity == 1
+    np.testing.assert_allclose(told.p[:, 0], 20 + 40e-6 * path.t, atol=0.8)
+    np.testing.assert_allclose(told.C[0], np.diag([1.5**2 + 1 / 6] * 2), atol=0.4)
+    found = Found((told,), (), 0, 0.0, recording)
+    kept = Packing(recording, moment.Params(), found=found).whole()
+    assert (kept.polarity[kept.valid] > 0).all() and kept.valid.sum() > 1500
+    # No events of hot pixels, and no change where both are alike.
+    assert prefer_sharper([path], recording, ~cold)[0] is path
+    recording, path = lagging(tail=0.5)
+    assert prefer_sharper([path], recording, cold)[0] is path

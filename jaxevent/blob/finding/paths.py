@@ -27,6 +27,7 @@ class Path:
         n: (rows,) events in the window, smoothed.
         window: us.
         agility: px^2/s^3, noise of its velocity.
+        polarity: Of its events, 1 ON and 0 OFF; None: both. See `prefer_sharper`.
     """
 
     t: NDArray[np.int64]
@@ -36,6 +37,7 @@ class Path:
     n: NDArray[np.float64]
     window: int
     agility: float
+    polarity: int | None = None
 
     @property
     def begin(self) -> int:

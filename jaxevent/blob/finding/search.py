@@ -17,6 +17,7 @@ from jaxevent.blob.finding.links import Links
 from jaxevent.blob.finding.moving import find_moving_background, goes_own_way
 from jaxevent.blob.finding.parts import join_parts
 from jaxevent.blob.finding.paths import Path
+from jaxevent.blob.finding.polarity import prefer_sharper
 from jaxevent.blob.finding.scale import Choice, choose_scale
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.blob.finding.targets import FAINT, GATE, HOLD, SEEN
@@ -71,6 +72,7 @@ def find(
     found, passes = _search(stream, background, choice, progress)
     rate = background.mean * stream.width * stream.height
     moves = background.scene is not None
+    found = prefer_sharper(found, recording, stream.hot)
     found.sort(key=lambda path: (path.begin, path.p[0].tolist()))
     return Found(tuple(found), tuple(passes), int(stream.hot.sum()), rate, recording, moves)
 

@@ -1,0 +1,94 @@
+"""Targets whose events of one polarity lag: where these are is told by the other's.
+
+A dim light makes ON events at its edge, and OFF events for long after it has gone on. Their mean
+lies in the tail, behind the light.
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.blob.finding.agility import fit_agility
+from jaxevent.blob.finding.paths import Path, candidates, join
+from jaxevent.blob.finding.stream import BATCH
+from jaxevent.blob.finding.targets import GATE
+from jaxevent.kernels import compiled
+from jaxevent.recording import Recording
+
+LAGS = 1.8  # times the larger standard deviation of the sharper polarity's events
+SHARE = 0.2  # of the events are of the sharper polarity, at least
+FEWEST = 4  # windows in which it is seen, and
+FEW = 2  # events in each
+
+
+def prefer_sharper(paths: list[Path], recording: Recording, hot: NDArray[np.bool_]) -> list[Path]:
+    """Paths of the sharper polarity's events, where the other's lag; the others as they are.
+
+    `hot` (rows, columns) are pixels that are left out.
+    """
+    if not paths:
+        return paths
+    joined, events = join(paths), recording.events
+    sums = np.zeros((len(joined.t), 2, 6))
+    first = events.index(min(path.begin for path in paths))
+    last = events.index(max(path.end for path in paths))
+    for row in range(first, last, BATCH):
+        part = events[row : min(row + BATCH, last)]
+        _add(part.t, part.x, part.y, part.p, candidates(part, joined, GATE), joined, hot, sums)
+    ends = zip(joined.first[:-1], joined.first[1:], strict=True)
+    return [_sharper(path, sums[a:b]) for path, (a, b) in zip(paths, ends, strict=True)]
+
+
+def _sharper(path: Path, sums: NDArray[np.float64]) -> Path:
+    """A path, or that of its sharper events, by sums of its windows' residuals."""
+    n, S = sums[..., 0], sums[..., 1:]
+    mean = S[..., :2] / np.maximum(n, 1)[..., None]
+    spread = np.empty((2, 2, 2))
+    for i, (a, b) in enumerate([(0, 0), (0, 1), (1, 1)]):
+        within = (S[..., 2 + i] - n * mean[..., a] * mean[..., b]) * (n > 1)
+        spread[:, a, b] = spread[:, b, a] = within.sum(0) / np.maximum((n - (n > 0)).sum(0), 1)
+    spread += np.eye(2) / 12
+    size = np.sqrt(np.linalg.eigvalsh(spread)[:, 1])
+    sharp = int(size[1] <= size[0])
+    enough = (n[:, sharp] >= FEW).sum() >= FEWEST and n[:, sharp].sum() >= SHARE * n.sum()
+    if not enough or (n[:, 1 - sharp] > 1).sum() < FEWEST or size[1 - sharp] < LAGS * size[sharp]:
+        return path
+    seen = n[:, sharp] >= FEW
+    t = path.t * 1e-6
+    m = (path.p + mean[:, sharp])[seen]
+    p = np.stack([np.interp(t, t[seen], m[:, i]) for i in range(2)], 1)
+    R = size[sharp] ** 2 / 2 / n[seen, sharp]
+    agility = fit_agility(t[seen], m, R, size[sharp] ** 2 / (path.window * 1e-6) ** 3)
+    C = np.broadcast_to(spread[sharp], path.C.shape)
+    share = n[:, sharp].sum() / n.sum()
+    return dataclasses.replace(path, p=p, C=C, n=share * path.n, agility=agility, polarity=sharp)
+
+
+@compiled
+def _add(t: Any, x: Any, y: Any, p: Any, whose: Any, joined: Any, hot: Any, sums: Any) -> None:
+    """Add events' residuals to the sums of their paths' windows, by polarity."""
+    rows = joined.first[:-1].copy()
+    for i in range(len(t)):
+        k = whose[i]
+        if k < 0 or hot[y[i], x[i]]:
+            continue
+        last, half = joined.first[k + 1] - 1, joined.window[k] / 2
+        while rows[k] < last and joined.t[rows[k]] + half <= t[i]:
+            rows[k] += 1
+        row = rows[k]
+        if abs(t[i] - joined.t[row]) > half:
+            continue
+        before, after = max(row - 1, joined.first[k]), min(row + 1, last)
+        span = max(joined.t[after] - joined.t[before], 1)
+        late = (t[i] - joined.t[row]) / span
+        ex = x[i] - joined.p[row, 0] - late * (joined.p[after, 0] - joined.p[before, 0])
+        ey = y[i] - joined.p[row, 1] - late * (joined.p[after, 1] - joined.p[before, 1])
+        to = sums[row, np.int64(p[i])]
+        to[0] += 1
+        to[1] += ex
+        to[2] += ey
+        to[3] += ex * ex
+        to[4] += ex * ey
+        to[5] += ey * ey
