@@ -118,9 +118,9 @@ class Motion(Shown):
 
         One velocity of the whole image is no better than by how much its parts differ, as those at
         several depths do; and where they differ from a rotation translation may have made all of
-        it. See `choice.layers`. Of other models it is the same.
+        it. See `layers`. Of other models it is the same.
         """
-        from jaxevent.egomotion.choice import layers
+        from jaxevent.egomotion.layers import layers
 
         found = layers(recording, self.model)
         if found is None or not found.several:

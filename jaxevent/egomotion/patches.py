@@ -52,6 +52,7 @@ class Look(NamedTuple):
     image, per event, of ways that are `ways` (2, n) px in the window's length (s), in x and y.
     """
 
+    middle: int  # us
     length: float
     xi: NDArray[np.float64]  # (patches, 2) px, of their middles, from the principal point
     count: NDArray[np.int64]  # (patches,)
@@ -153,7 +154,7 @@ def look(
         share = np.bincount(which[halves == k], minlength=len(taken))
         energy[k] /= np.maximum(share, 1)[:, None, None]
     centre = corner + (np.stack([taken % columns, taken // columns], 1) + 0.5) * PATCH
-    return Look(length, centre, count[taken], energy, ways)
+    return Look(middle, length, centre, count[taken], energy, ways)
 
 
 @compiled

@@ -5,9 +5,11 @@ import pytest
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import contrast, find_model, truth, twists, voting
-from jaxevent.egomotion.choice import choose, layers, standard
+from jaxevent.egomotion.choice import choose, decide
 from jaxevent.egomotion.geometry import A, B
+from jaxevent.egomotion.layers import layers
 from jaxevent.egomotion.motion import Calibration, Motion
+from jaxevent.egomotion.patch_fits import standard
 from jaxevent.egomotion.patches import usual_speed
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Imu, Poses, Recording
@@ -109,6 +111,24 @@ def test_models_are_told_apart():
     assert same is turn and not line
     wider, line = turn.with_layers(sliding)  # translation may have made all of it
     assert wider.covariance[0, 1, 1] == pytest.approx(1 + 4 * 1.01) and "rotation" in line
+
+
+@pytest.mark.parametrize(
+    ("patches", "windows", "model", "sure"),
+    [
+        ((0.0, 0.0, 0.0), [-3.0, -1.0], "rotation", True),
+        ((0.0, 0.0, 0.0), [1.0, 1.0], "rotation", False),  # 1.4 together
+        ((0.0, 0.0, 0.0), [2.5, 2.5], "general", True),  # 3.5
+        ((0.0, 0.0, 0.0), [], "rotation", False),
+        ((0.0, 5.0, 5.0), None, "general", True),  # longer windows are not asked
+        ((-4.0, 2.0, 5.0), None, "planar", True),
+    ],
+)
+def test_the_simplest_model_that_is_not_beaten_is_chosen(patches, windows, model, sure):
+    pairs = ("rotation", "planar"), ("general", "planar"), ("general", "rotation")
+    found = decide(dict(zip(pairs, patches, strict=True)), lambda: windows)
+    assert found.model.name == model
+    assert ("not sure" in found.lines[-1]) is not sure
 
 
 def test_a_heading_that_nothing_tells_is_said():
