@@ -24,13 +24,13 @@ from jaxevent.show.track_tables import check_tracks
 
 _BEHIND = 1_000_000  # most events behind the paths
 _ELLIPSES = 6  # along a path
-_TELLS, _OFTEN = (
-    3.0,
-    0.2,
-)  # standard deviations from 0 of a growth, and share of its times, to be told
+_TELLS, _OFTEN = 3.0, 0.2  # standard deviations of a growth from 0, and share of its times
+_CHANGED, _ALIKE = 1.2, 0.5  # ratio of sizes of what grows, least of the axes' changes over most
+_PARTS = 8  # of a life, whose median sizes are compared
+_CURVES = 6  # most tracks in the panels over time
 _SIZE, _TTC, _RANGE = "lambda (px)", "1 / TTC (1/s)", "range (m)"
 _FAINT = 0.2  # of bands
-_LEGEND = 16  # most tracks that a legend lists
+_LEGEND = 16  # most lines that a legend lists
 _PAIRS = ("-", "--", ":", "-.")  # lines of pairs
 
 
@@ -52,12 +52,13 @@ def write_track_plot(
 ) -> None:
     """Draw where tracks went and, over time, their size, with bands of two standard deviations.
 
-    Paths are drawn over the events, coloured by time, with ellipses of two standard deviations at
-    intervals. 1 / TTC is that of each track's growth (`quantities.growth`, smoothed, with Q and
-    Q_lambda), where it differs from 0, and, of `pairs` of ids, that of the two blobs. Range
-    is drawn where `extent` (m) and `focal` (px) are given. Time counts from the recording's start.
-    The suffix of `path` chooses the format (PNG, PDF, SVG). Raises `InputError` without the extra
-    "plot", for unknown ids and suffixes and for arrays that do not fit.
+    Over time are the six tracks that are seen longest, and those of pairs. Paths are drawn over the
+    events, coloured by time, with ellipses of two standard deviations at intervals. 1 / TTC is that
+    of a track's growth (`quantities.growth`, smoothed, with Q and Q_lambda), if it differs from 0
+    and both axes grow alike, as those of what comes nearer do; and, of `pairs` of ids, that of the
+    two blobs. Range is drawn where `extent` (m) and `focal` (px) are given. Time counts from the
+    recording's start. The suffix of `path` chooses the format (PNG, PDF, SVG). Raises `InputError`
+    without the extra "plot", for unknown ids and suffixes and for arrays that do not fit.
     """
     require("matplotlib", "plot")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -73,7 +74,9 @@ def write_track_plot(
     filled = np.where(valid[..., None], mean, 1.0)
     filled_P = np.where(valid[..., None, None], covariance, np.eye(8))
     m, P = jnp.asarray(filled), jnp.asarray(filled_P)
+    shown = _longest(valid, [known.index(one) for pair in pairs for one in pair])
     grown, spread, grows = _growths(t, m, P, valid, Q, Q_lambda)
+    grows &= _scales(filled[..., 4:6], valid) & shown
 
     names = [_SIZE] + [_TTC] * bool(grows.any() or len(pairs)) + [_RANGE] * (extent is not None)
     high = 7.0 * min(recording.height / recording.width, 1.2)
@@ -91,8 +94,8 @@ def write_track_plot(
     ranges = None
     if extent is not None and focal is not None:
         ranges = jax.jit(size_range)(m, P, extent, focal, size_factor)
-    for i, one in enumerate(known):
-        seen, label = valid[:, i], f"{one}"
+    for i in np.flatnonzero(shown).tolist():
+        one, seen, label = known[i], valid[:, i], f"{known[i]}"
         line: dict[str, Any] = {
             "color": "#{:02x}{:02x}{:02x}".format(*track_colour(one, dark=True))
         }
@@ -108,9 +111,33 @@ def write_track_plot(
         value, variance = jax.jit(inverse_ttc)(m[:, a], P[:, a], m[:, b], P[:, b])
         line = {"color": "black", "ls": ls, "label": f"{pair[0]} and {pair[1]}"}
         bands.add(_TTC, value, variance, valid[:, a] & valid[:, b], **line)
-    bands.finish(legend=0 < len(known) <= _LEGEND)
+    bands.finish(shown)
     with complete(Path(path)) as temporary:
         figure.savefig(temporary, format=suffix, dpi=150)
+
+
+def _longest(valid: NDArray[np.bool_], also: Sequence[int]) -> NDArray[np.bool_]:
+    """Which tracks are seen at the most times; and some others."""
+    shown = np.zeros(valid.shape[1], bool)
+    shown[np.argsort(-valid.sum(0), kind="stable")[:_CURVES]] = True
+    shown[list(also)] = True
+    return shown
+
+
+def _scales(sizes: NDArray, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Of which tracks (T, N) both sizes (T, N, 2) change alike: they come nearer or go away.
+
+    What turns, or comes into sight, changes one of them.
+    """
+    told = np.zeros(valid.shape[1], bool)
+    for i, seen in enumerate(valid.T):
+        parts = np.array_split(np.log(sizes[seen, i]), _PARTS)
+        if len(parts[-1]):
+            medians = np.array([np.median(part, axis=0) for part in parts])
+            mean = medians.sum(1)
+            change = medians[mean.argmax()] - medians[mean.argmin()]
+            told[i] = change.max() > np.log(_CHANGED) and change.min() > _ALIKE * change.max()
+    return told
 
 
 def _growths(
@@ -153,7 +180,9 @@ class _Bands:
             clear = np.isfinite(value) & (deviation <= 3 * np.nanmedian(deviation[seen]))
             self.bounds += [float(np.nanmin(low[clear])), float(np.nanmax(high[clear]))]
 
-    def finish(self, legend: bool) -> None:
+    def finish(self, shown: NDArray[np.bool_]) -> None:
+        legend = 0 < shown.sum() <= _LEGEND
+        some = "" if shown.all() else f" of {shown.sum()} tracks"
         for name, axis in self.axes.items():
             axis.set_ylabel(name)
             axis.spines[["top", "right"]].set_visible(False)
@@ -161,7 +190,7 @@ class _Bands:
                 axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
         if self.bounds:
             self.axes[_TTC].set_ylim(min(self.bounds), max(self.bounds) + 1e-9)
-        title = "lambda1 solid, lambda2 dashed; bands: 2 standard deviations"
+        title = f"lambda1 solid, lambda2 dashed{some}; bands: 2 standard deviations"
         self.axes[_SIZE].set_title(title, fontsize=9)
         list(self.axes.values())[-1].set_xlabel("t (s) from the recording's start")
 

@@ -12,6 +12,7 @@ from jaxevent import blob, simulate
 from jaxevent.blob import quantities
 from jaxevent.errors import InputError
 from jaxevent.show import track_pictures as pictures
+from jaxevent.show import track_plots
 from jaxevent.show.track_plots import write_track_plot
 from jaxevent.show.track_tables import COLUMNS, write_tracks
 from jaxevent.simulate.blobs import CARS, blob_scene
@@ -534,3 +535,25 @@ def test_plots_are_written(tmp_path):
     assert (
         sizes[0][0] == sizes[1][0] and sizes[0][1] - sizes[1][1] == 2 * 330
     )  # panels of 2.2 inches
+
+
+def test_what_comes_nearer_grows_along_both_axes():
+    t = np.linspace(0, 1, 50)
+    both, one, little = np.exp(0.5 * t), np.exp(-0.7 * t), np.exp(0.1 * t)
+    sizes = np.stack([
+        np.stack([5 * both, 3 * both], 1),
+        np.stack([5 / both, 3 / both], 1),
+        np.stack([5 * one, np.full(50, 3.0)], 1),
+        np.stack([5 * little, 3 * little], 1),
+        np.stack([5 * both, 3 / both], 1),
+    ], 1)  # fmt: skip
+    valid = np.ones((50, 6), bool)
+    valid[:, 5] = False
+    sizes = np.concatenate([sizes, np.ones((50, 1, 2))], 1)
+    assert track_plots._scales(sizes, valid).tolist() == [True, True, False, False, False, False]
+
+
+def test_panels_hold_the_tracks_that_are_seen_longest():
+    valid = np.arange(10)[:, None] >= np.arange(8)
+    shown = track_plots._longest(valid, [7])
+    assert shown.tolist() == [True] * 6 + [False, True]

@@ -29,7 +29,7 @@ SCENE = 0.3  # share of the bright that is edges
 TOLD = 0.1  # of the stretches may be told worse by a map that moves than by one at rest
 MOVED = 2.0  # px
 OWN_WAY = 2.0  # sizes: deviation, along any axis, of a target's own way from its mean
-STEADY = 0.25  # sizes by which a target may leave its velocity's way in a window
+STEADY = 0.2  # sizes by which a target may leave its velocity's way in a window
 STEP = 0.01  # s before and after, between which the scene's motion at a target is told
 
 
