@@ -26,6 +26,7 @@ _BEHIND = 1_000_000  # most events behind the paths
 _ELLIPSES = 6  # along a path
 _TELLS, _OFTEN = 3.0, 0.2  # standard deviations of a growth from 0, and share of its times
 _CHANGED, _ALIKE = 1.2, 0.5  # ratio of sizes of what grows, least of the axes' changes over most
+_ONE_WAY = 0.5  # of all changes is one of growth or of shrinking
 _PARTS = 8  # of a life, whose median sizes are compared
 _CURVES = 6  # most tracks in the panels over time
 _SIZE, _TTC, _RANGE = "lambda (px)", "1 / TTC (1/s)", "range (m)"
@@ -78,7 +79,8 @@ def write_track_plot(
     grown, spread, grows = _growths(t, m, P, valid, Q, Q_lambda)
     grows &= _scales(filled[..., 4:6], valid) & shown
 
-    names = [_SIZE] + [_TTC] * bool(grows.any() or len(pairs)) + [_RANGE] * (extent is not None)
+    asked = [_TTC] * bool(grows.any() or len(pairs)) + [_RANGE] * (extent is not None)
+    names = [_SIZE, *asked] if valid.any() else []
     high = 7.0 * min(recording.height / recording.width, 1.2)
     figure = Figure(figsize=(8, high + 2.2 * len(names)), layout="constrained")
     suffix = Path(path).suffix.lstrip(".").lower()
@@ -94,7 +96,7 @@ def write_track_plot(
     ranges = None
     if extent is not None and focal is not None:
         ranges = jax.jit(size_range)(m, P, extent, focal, size_factor)
-    for i in np.flatnonzero(shown).tolist():
+    for i in np.flatnonzero(shown & valid.any(0)).tolist():
         one, seen, label = known[i], valid[:, i], f"{known[i]}"
         line: dict[str, Any] = {
             "color": "#{:02x}{:02x}{:02x}".format(*track_colour(one, dark=True))
@@ -106,7 +108,7 @@ def write_track_plot(
         if ranges is not None:
             value, variance = ranges
             bands.add(_RANGE, value[:, i], variance[:, i], seen, **line, label=label)
-    for pair, ls in zip(pairs, itertools.cycle(_PAIRS)):
+    for pair, ls in zip(pairs if names else (), itertools.cycle(_PAIRS)):
         a, b = (known.index(one) for one in pair)
         value, variance = jax.jit(inverse_ttc)(m[:, a], P[:, a], m[:, b], P[:, b])
         line = {"color": "black", "ls": ls, "label": f"{pair[0]} and {pair[1]}"}
@@ -127,7 +129,7 @@ def _longest(valid: NDArray[np.bool_], also: Sequence[int]) -> NDArray[np.bool_]
 def _scales(sizes: NDArray, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Of which tracks (T, N) both sizes (T, N, 2) change alike: they come nearer or go away.
 
-    What turns, or comes into sight, changes one of them.
+    What turns, or comes into sight, changes one of them; what flickers grows and shrinks by turns.
     """
     told = np.zeros(valid.shape[1], bool)
     for i, seen in enumerate(valid.T):
@@ -136,7 +138,8 @@ def _scales(sizes: NDArray, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
             medians = np.array([np.median(part, axis=0) for part in parts])
             mean = medians.sum(1)
             change = medians[mean.argmax()] - medians[mean.argmin()]
-            told[i] = change.max() > np.log(_CHANGED) and change.min() > _ALIKE * change.max()
+            alike = change.min() > _ALIKE * change.max() > _ALIKE * np.log(_CHANGED)
+            told[i] = alike and np.ptp(mean) > _ONE_WAY * abs(np.diff(mean)).sum()
     return told
 
 
@@ -164,10 +167,8 @@ class _Bands:
     def __init__(self, axes: Mapping[str, Any], seconds: NDArray[np.float64]):
         self.axes, self.seconds = axes, seconds
         self.bounds: list[float] = []
-        first = axes[_SIZE]
-        for axis in axes.values():
-            if axis is not first:
-                axis.sharex(first)
+        for axis in list(axes.values())[1:]:
+            axis.sharex(axes[_SIZE])
 
     def add(self, name: str, value: Any, variance: Any, seen: NDArray, color: str, **line: Any):
         deviation = np.sqrt(np.maximum(np.asarray(variance, np.float64), 0))
@@ -183,6 +184,8 @@ class _Bands:
     def finish(self, shown: NDArray[np.bool_]) -> None:
         legend = 0 < shown.sum() <= _LEGEND
         some = "" if shown.all() else f" of {shown.sum()} tracks"
+        if not self.axes:
+            return
         for name, axis in self.axes.items():
             axis.set_ylabel(name)
             axis.spines[["top", "right"]].set_visible(False)

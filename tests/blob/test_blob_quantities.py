@@ -526,15 +526,14 @@ def test_plots_are_written(tmp_path):
     times, ids, mean, P, valid = tracks(T=12)
     given = still(), times, ids, mean, P
     write_track_plot(tmp_path / "both.png", *given, valid, pairs=[(3, 17)], extent=0.2, focal=500.0)
-    # None is valid, and neither time to contact nor range is asked for.
+    # None is valid: there is nothing to be shown over time.
     write_track_plot(tmp_path / "none.png", *given, np.zeros_like(valid))
     sizes = []
     for name in ("both.png", "none.png"):
         with Image.open(tmp_path / name) as image:
             sizes.append(image.size)
-    assert (
-        sizes[0][0] == sizes[1][0] and sizes[0][1] - sizes[1][1] == 2 * 330
-    )  # panels of 2.2 inches
+    panels = 3 * 330  # of 2.2 inches
+    assert sizes[0][0] == sizes[1][0] and sizes[0][1] - sizes[1][1] == panels
 
 
 def test_what_comes_nearer_grows_along_both_axes():
@@ -551,6 +550,8 @@ def test_what_comes_nearer_grows_along_both_axes():
     valid[:, 5] = False
     sizes = np.concatenate([sizes, np.ones((50, 1, 2))], 1)
     assert track_plots._scales(sizes, valid).tolist() == [True, True, False, False, False, False]
+    flickers = np.exp(0.3 * np.sin(20 * t))[:, None, None] * np.ones((1, 1, 2))
+    assert not track_plots._scales(flickers, valid[:, :1]).any()
 
 
 def test_panels_hold_the_tracks_that_are_seen_longest():
