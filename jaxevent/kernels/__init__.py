@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from jaxevent.kernels import kept
 
-# numba makes two functions more of each: for Python, and for those that call it by its address.
-_CALLED_BY_PYTHON: dict[str, Any] = {"nogil": True, "no_cfunc_wrapper": True}
-_CALLED_INSIDE: dict[str, Any] = {**_CALLED_BY_PYTHON, "no_cpython_wrapper": True}
+# numba makes two functions more of each. The one for those that call it by its address is left out;
+# without the one for Python a call from there would end the process.
+_USUAL: dict[str, Any] = {"nogil": True, "no_cfunc_wrapper": True}
 # Counting references to arrays is two thirds of a function that takes many of them.
 _LEAN: dict[str, Any] = {"_nrt": False}
 # Sums in any order, so that several are taken at once.
@@ -25,32 +25,32 @@ _LOOSE: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reas
 
 def compiled(function: Callable) -> Any:
     """Compile with numba, without the argument checks that tests wrap around functions."""
-    return kept.compiled(inspect.unwrap(function), **_CALLED_BY_PYTHON)
+    return kept.compiled(inspect.unwrap(function), **_USUAL)
 
 
 def part(function: Callable) -> Any:
     """The same for what compiled functions alone call: they are kept, with it inside."""
-    return numba.njit(error_model="numpy", **_CALLED_INSIDE)(inspect.unwrap(function))
+    return numba.njit(error_model="numpy", **_USUAL)(inspect.unwrap(function))
 
 
 def lean(function: Callable) -> Any:
     """Compile as `compiled` does, in less time, what makes no arrays of its own."""
-    return kept.compiled(inspect.unwrap(function), **_CALLED_BY_PYTHON, **_LEAN)
+    return kept.compiled(inspect.unwrap(function), **_USUAL, **_LEAN)
 
 
 def lean_part(function: Callable) -> Any:
     """The same for what such functions alone call."""
-    return numba.njit(error_model="numpy", **_CALLED_INSIDE, **_LEAN)(inspect.unwrap(function))
+    return numba.njit(error_model="numpy", **_USUAL, **_LEAN)(inspect.unwrap(function))
 
 
 def fast(function: Callable) -> Any:
     """Compile as `compiled` does, sums in whatever order is fastest: the same one every time."""
-    return kept.compiled(inspect.unwrap(function), **_CALLED_BY_PYTHON, **_LOOSE)
+    return kept.compiled(inspect.unwrap(function), **_USUAL, **_LOOSE)
 
 
 def fast_part(function: Callable) -> Any:
     """The same for what such functions alone call."""
-    return numba.njit(**_CALLED_INSIDE, **_LOOSE)(inspect.unwrap(function))
+    return numba.njit(**_USUAL, **_LOOSE)(inspect.unwrap(function))
 
 
 class Blank:
