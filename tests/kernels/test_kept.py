@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numba.core import types
 
+from jaxevent import kernels
 from jaxevent.kernels import kept, modules
 
 
@@ -178,3 +179,13 @@ def test_a_module_of_text_is_made_again_from_damaged_files(tmp_path, monkeypatch
     assert modules.module_of(text).third.ctypes(6) == 2.25
     assert path.read_bytes() == content[0]
     assert modules.module_of(text).third.cache_hits == 1
+
+
+def _double(x):
+    return 2 * x
+
+
+def test_what_is_compiled_may_be_called_from_python():
+    """Parts too: without numba's wrapper the process ends."""
+    for make in (kernels.compiled, kernels.part, kernels.lean, kernels.lean_part, kernels.fast):
+        assert make(_double)(1.5) == 3
