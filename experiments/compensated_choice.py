@@ -234,6 +234,7 @@ def compared(targets: Iterator[tuple]) -> Iterator[dict[str, Any]]:
             "signs": np.asarray(told.signs),
             "usual": np.asarray(told.usual),
             "beyond": np.asarray(told.beyond),
+            "rest": np.asarray(told.rest),
             "truth": truth.astype(np.float32),
             "I0": float(video.params.I0),
             "hdr": hdr,
@@ -357,6 +358,7 @@ def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:
             jnp.zeros((2, 1, 1)),
             jnp.asarray(r["usual"]),
             jnp.asarray(r["beyond"]),
+            jnp.asarray(r["rest"]),
         )
         fused = decide(params, told)
         line = []

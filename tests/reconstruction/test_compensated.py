@@ -239,6 +239,20 @@ def test_other_ingredients_can_be_chosen(name):
         np.testing.assert_allclose(fused.L, expected, atol=1e-5)
 
 
+def test_a_scene_at_rest_is_as_its_last_frame():
+    L = np.repeat(moved((0, 0), (0, 0), [0], 20, 24), 9, 0)
+    L[3] += 0.3  # the frame; after it nothing happens but at one pixel
+    L[6:, 10, 12] += 0.5
+    params, at = only("none", beyond="smoothed"), place(9, 8, 3, 3)
+    found = [
+        np.asarray(fuse(params, L, np.full_like(L, 0.01), still(L), at._replace(rest=rest)).L)
+        for rest in (np.float32(0), np.float32(1))
+    ]
+    np.testing.assert_allclose(found[0], L[8], atol=1e-5)
+    np.testing.assert_allclose(found[1][:, :6], L[3, :, :6], atol=1e-3)
+    np.testing.assert_allclose(found[1][9:12, 11:14], L[8, 9:12, 11:14], atol=1e-2)
+
+
 @pytest.mark.slow
 def test_instants_that_fill_up_change_nothing():
     L = moved((3.0, 1.0), (0, 0), np.linspace(-1, 1, 9), 20, 24)
@@ -298,6 +312,14 @@ def test_a_clock_that_stops_with_the_scene():
     np.testing.assert_allclose(still * one.unit, 0.1e-6 * steps, rtol=1e-3)
     np.testing.assert_allclose(one.at(one.t), one.s, atol=1e-6)
     assert one.pace(1000) * one.unit == pytest.approx(0.1)
+    # At rest after the last frame and before the first; not between two, nor while things move.
+    early, late = frames[:7], frames[7:]
+    assert (
+        one.rest == 0
+        and instants.Schedule(late, (0, 400_000), 100.0, clock(0.0))(262_000).rest > 0.9
+    )
+    assert instants.Schedule(early, (0, 400_000), 100.0, clock(0.9))(262_000).rest > 0.9
+    assert instants.Schedule(early, (0, 400_000), 100.0, clock(0.9))(390_000).rest < 0.05
     plain, timed = one.by(course.TIME), instants.Schedule(frames, (0, 400_000), 100.0)(262_000)
     np.testing.assert_array_equal(plain.s, timed.s)
     assert plain.unit == timed.unit

@@ -29,6 +29,7 @@ class Place(NamedTuple):
     own: Numeric  # (), the target's
     before: Numeric  # (), that of the frame before
     after: Numeric
+    rest: Numeric = np.float32(0)  # (), `Instants.rest`
 
 
 class Agreement(NamedTuple):

@@ -41,6 +41,12 @@ class Course:
         counts = np.array([self.index(t) for t in times.tolist()], float)
         return (1 - self.share) * past + self.share * self.apart * counts
 
+    def rate(self, begin: int, end: int) -> float:
+        """Events between two times (us), as part of what comes in as long on the mean."""
+        if not (self.apart and end > begin):
+            return 1.0
+        return (self.index(end) - self.index(begin)) * self.apart / (end - begin)
+
 
 TIME = Course(lambda _: 0, 0, 0.0, 0.0)
 

@@ -397,6 +397,7 @@ def place_of(instants: Instants, clear: NDArray, room: int) -> Place:
         filled(framed.astype(np.float32), room),
         filled(near.astype(np.float32), room),
         *(np.asarray(k, np.int32) for k in (instants.own, instants.before, instants.after)),
+        rest=np.float32(instants.rest),
     )
 
 

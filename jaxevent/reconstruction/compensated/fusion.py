@@ -43,6 +43,7 @@ class Views(NamedTuple):
     inside_after: Float[Numeric, "h w"]
     weight: Numeric  # (), of the frame after in the blend of the two
     beyond: Numeric  # (), 1 where frames are on one side of the target alone, else 0
+    rest: Numeric  # (), `Instants.rest`
 
 
 def views(L: Numeric, V: Numeric, along: Along, place: Place) -> Views:
@@ -54,7 +55,7 @@ def views(L: Numeric, V: Numeric, along: Along, place: Place) -> Views:
     after = along.inside[b] * (1 - beyond * (place.s[a] <= 0))
     other = L[jnp.where(a == b, place.own, b)]
     images = (L[a], other, along.L[a], along.L[b], before, after)
-    return Views(L[place.own], V[place.own], *images, weight_after(place), beyond)
+    return Views(L[place.own], V[place.own], *images, weight_after(place), beyond, place.rest)
 
 
 def weight_after(place: Place) -> Numeric:
@@ -82,6 +83,7 @@ class Comparison(Described):
     visible: Float[Array, "2 h w"]  # as in `Fused`
     usual: Float[Array, "h w"]  # the variance of single images along trajectories
     beyond: Float[Array, ""]  # as in `Views`
+    rest: Float[Array, ""]
 
 
 SOURCES = ("before", "after", "events", *OTHERS)
@@ -119,7 +121,8 @@ def compare(told: Agreement, seen: Views) -> Comparison:
     X = jnp.stack([*X, jnp.ones_like(M)])
     visible = told.seen * jnp.stack([seen.inside_before, seen.inside_after])
     ingredients = jnp.stack([M, smoothed, blend])
-    return Comparison(ingredients, X, told.parts, visible, told.usual, jnp.asarray(seen.beyond))
+    sides = (jnp.asarray(seen.beyond), jnp.asarray(seen.rest, jnp.float32))
+    return Comparison(ingredients, X, told.parts, visible, told.usual, *sides)
 
 
 def decide(params: Params, comparison: Comparison) -> Fused:
@@ -132,6 +135,9 @@ def decide(params: Params, comparison: Comparison) -> Fused:
     weights = jnp.where(beyond, params.choice_beyond, params.choice)
     choice = jnp.tensordot(weights.reshape(len(OTHERS), -1), X, 1)
     q = jax.nn.softmax(jnp.concatenate([jnp.zeros_like(choice[:1]), choice]), axis=0)
+    # Where neither the scene nor a pixel's surroundings changed, it is as the frame shows it.
+    still = comparison.rest * TINY / jnp.exp(X[SIGNS.index("activity")])
+    q = (1 - still) * q + still * jnp.array([0.0, 0, 1])[:, None, None]
     P = jnp.exp(jnp.tensordot(jnp.where(beyond, params.doubt_beyond, params.doubt), X, 1))
     # Where frames are clipped all instants rest on the same events; more of them tell no more.
     P = jnp.maximum(P, params.common * comparison.usual)

@@ -13,6 +13,7 @@ STEP = 0.6  # px that what moves does so in a step
 NEAR = 6.0  # px that it may move between the target and a further frame
 FRAMES = (2, 8)  # on either side: at least, at most
 NEAREST = 2.2  # steps: the horizon at which motion is first sought
+RESTING = 0.1  # of the mean rate of events, below which a scene is at rest
 ROOM = 4  # numbers of instants are multiples, to compile few shapes
 
 
@@ -32,6 +33,9 @@ class Instants:
     unit: float
     first: float  # the horizon, in s, at which motion is first sought
     course: Course
+    # How far the scene is at rest between the target and frames that are on one side of it alone,
+    # 0..1; 0 where they are on both.
+    rest: float = 0.0
 
     def at(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
         """Times (us) as those of `s`."""
@@ -112,7 +116,12 @@ class Schedule:
         far = np.sort(np.abs(s))
         # At least two instants on either side, where there are.
         horizon = max(NEAREST * step * 1e-6 / unit, float(far[min(4, len(far) - 1)]))
-        return Instants(times, own, before, after, s, unit, float(min(horizon, 1)), self.course)
+        rest = 0.0
+        if len(at) == 1 and left == right:
+            rate = self.course.rate(*sorted((int(times[at[0]]), t)))
+            rest = 1 / (1 + (rate / RESTING) ** 2)
+        horizon = float(min(horizon, 1))
+        return Instants(times, own, before, after, s, unit, horizon, self.course, rest)
 
 
 def speed_of(
