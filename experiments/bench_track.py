@@ -1,23 +1,38 @@
 """What `jaxevent track` spends its time on: finding, following, reading, tables and the video.
 
-    python experiments/bench_track.py --data DIR [--only NAME ...]
+    python experiments/bench_track.py --data DIR [--only NAME ...] [--find]
 
-CPU seconds of this process and of ffmpeg, of the second of two runs in one process, so without
-compilation; the video's time is what a folder with it takes more than one without. Makes no file.
+With `--find` the parts of finding alone. CPU seconds of this process and of ffmpeg, of the second
+of two runs in one process, so without compilation; the video's time is what a folder with it takes
+more than one without. Makes no file.
 """
 
 import argparse
+import contextlib
 import resource
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from jaxevent.blob import find, moment
+from jaxevent.blob.finding import search
+from jaxevent.blob.finding.stream import Stream
 from jaxevent.io import load
 from jaxevent.show.tracks import Output
 
+PARTS = {  # of finding: where they are
+    "background": (search, "measure_background"),
+    "scale": (search, "choose_scale"),
+    "camera": (search, "find_moving_background"),
+    "links": (search.Links, "follow"),
+    "beginnings": (search, "_look_back"),
+    "parts": (search, "join_parts"),
+    "taken away": (Stream, "without"),
+    "polarity": (search, "prefer_sharper"),
+}
 NAMES = ("spinning_dot.npz", "davis346_street.npz", "atis.es")
 
 
@@ -48,19 +63,44 @@ def parts_of(path: Path, folder: Path) -> list[float]:
     return [found_in, followed_in, table - followed_in, video - followed_in, events]
 
 
+def parts_of_finding(path: Path) -> list[float]:
+    """CPU seconds of all, of each of `PARTS`, and M events/s."""
+    recording, spent = load(path, in_memory=False), dict.fromkeys(PARTS, 0.0)
+
+    def watched(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **options: Any) -> Any:
+            seconds, told = timed(lambda: function(*args, **options))
+            spent[name] += seconds
+            return told
+
+        return call
+
+    with contextlib.ExitStack() as stack:
+        for name, (place, function) in PARTS.items():
+            call = watched(name, getattr(place, function))
+            stack.enter_context(mock.patch.object(place, function, call))
+        seconds, _ = timed(lambda: find(recording, progress=False))
+    return [seconds, *spent.values(), len(recording.events) / seconds * 1e-6]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--only", nargs="+", default=NAMES)
+    parser.add_argument("--find", action="store_true")
     args = parser.parse_args()
-    print("| recording | find s | follow s | table s | video s | find and follow, M events/s |")
-    print("|---|" + "---:|" * 5)
+    columns = ["find s", "follow s", "table s", "video s", "find and follow, M events/s"]
+    if args.find:
+        columns = ["find s", *PARTS, "M events/s"]
+    print(f"| recording | {' | '.join(columns)} |")
+    print("|---|" + "---:|" * len(columns))
     for name in args.only:
         with tempfile.TemporaryDirectory() as folder:
             for _ in range(2):
-                told = parts_of(args.data / name, Path(folder))
+                path = args.data / name
+                told = parts_of_finding(path) if args.find else parts_of(path, Path(folder))
         print(f"| {name} | " + " | ".join(f"{one:.2f}" for one in told) + " |", flush=True)
 
 

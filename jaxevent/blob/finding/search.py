@@ -82,7 +82,6 @@ def _search(
 ) -> tuple[list[Path], list[Pass]]:
     """Paths and passes against a background; the choice is that of the first pass."""
     found: list[Path] = []
-    near: list[Path] = []
     passes: list[Pass] = []
     worth = WORTH if background.scene is None else WORTH_MOVING
     for number in range(PASSES):
@@ -98,18 +97,16 @@ def _search(
             passes.append(Pass(choice, 0))
             break
         with stage(f"find, pass {number + 1}: beginnings", progress):
-            rest = stream.without([*near, *confirmed], GATE)
+            rest = stream.without(confirmed, GATE)
             whole = [_look_back(path, rest, background, choice.scale) for path in confirmed]
-        whole = join_parts(whole)
-        near += whole
+        near = whole = join_parts(whole)
         if background.scene is not None:
             whole = [one for one in whole if goes_own_way(one, background.scene, stream.start)]
         new = _stitch([one for one in whole if _lasting(one)], (stream.width, stream.height))
         new = [one for one in new if not _left_over(one, found)]
         passes.append(Pass(choice, len(new)))
         found += new
-        near += new
-        stream = stream.without(near, 2 * GATE)
+        stream = stream.without([*near, *new], 2 * GATE)
     return found, passes
 
 
