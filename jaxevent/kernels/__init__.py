@@ -39,8 +39,20 @@ def lean(function: Callable) -> Any:
 
 
 def lean_part(function: Callable) -> Any:
-    """The same for what such functions alone call."""
-    return numba.njit(error_model="numpy", **_USUAL, **_LEAN)(inspect.unwrap(function))
+    """The same for what such functions alone call; raises `TypeError` where Python does."""
+    # The function for Python takes as long again to compile as one of many arrays.
+    alone = {**_USUAL, **_LEAN, "no_cpython_wrapper": True}
+    made: Any = numba.njit(error_model="numpy", **alone)(inspect.unwrap(function))
+    made._insert, made._compile_for_args = _ignore, _refuse
+    return made
+
+
+def _ignore(*_: Any) -> None:
+    """Do not note for Python what was compiled: it would call nothing, and the process end."""
+
+
+def _refuse(*_: Any, **named: Any) -> None:
+    raise TypeError("this is for compiled functions to call, not for Python")
 
 
 def fast(function: Callable) -> Any:

@@ -186,6 +186,16 @@ def _double(x):
 
 
 def test_what_is_compiled_may_be_called_from_python():
-    """Parts too: without numba's wrapper the process ends."""
-    for make in (kernels.compiled, kernels.part, kernels.lean, kernels.lean_part, kernels.fast):
+    """Parts too: without numba's wrapper the process ends. Lean ones, which have none, refuse."""
+    for make in (kernels.compiled, kernels.part, kernels.lean, kernels.fast):
         assert make(_double)(1.5) == 3
+    inside = kernels.lean_part(_double)
+
+    @kernels.lean
+    def outside(x):
+        return inside(x)
+
+    assert outside(1.5) == 3
+    for x in (1.5, 1):
+        with pytest.raises(TypeError, match="not for Python"):
+            inside(x)
