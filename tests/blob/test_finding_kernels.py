@@ -20,7 +20,7 @@ from jaxevent.blob.finding.paths import Path as TargetPath
 from jaxevent.blob.finding.polarity import prefer_sharper
 from jaxevent.blob.finding.prediction import WIDTHS, choose_scored, predict, score
 from jaxevent.blob.finding.stream import Part, Pixels, Stream
-from jaxevent.blob.finding.targets import GATE, start_targets
+from jaxevent.blob.finding.targets import GATE, Expected, start_targets, update
 from jaxevent.blob.prepare import Packing
 from jaxevent.recording import Events, Recording
 
@@ -266,3 +266,51 @@ def test_where_events_of_one_polarity_lag_the_other_tells_the_place():
     assert prefer_sharper([path], recording, ~cold)[0] is path
     recording, path = lagging(tail=0.5)
     assert prefer_sharper([path], recording, cold)[0] is path
+
+
+def one_target(P):
+    """A known target at (40, 30) that is seen anew in a window about 10 ms."""
+    live = start_targets(
+        np.arange(1), 0.0, np.array([[40.0, 30.0]]), 4 * np.eye(2)[None], np.array([20.0]), 0.01
+    )
+    return live._replace(
+        P=np.array([[P, 0.0, 0.0]]), q=np.zeros(1), confirmed=np.ones(1, bool), hits=np.full(1, 9)
+    )
+
+
+def test_gates_of_known_targets_end_at_their_size_beyond_it():
+    x = np.array([42, 47, 49, 70], np.int32)
+    part = Part(np.full(4, 0.01), x, np.full(4, 30, np.int32))
+    owners = [
+        Look(one_target(P), part, 0.01).share_out(np.zeros(4, np.int32), 0).tolist()
+        for P in (0.0, 1e4)
+    ]
+    # Of 3 standard deviations of 4.4 px^2, and of 4.4 + 4.
+    assert owners == [[0, -1, -1, -1], [0, 0, -1, -1]]
+
+
+def test_a_target_is_updated_as_by_a_kalman_filter(background):
+    live, t = one_target(3.0), 0.01
+    p, P = live.predict(t)
+    n, z, D = np.array([16.0]), np.array([[1.5, -0.5]]), np.array([[[6.0, 1.0], [1.0, 3.0]]])
+    dispersion = background.field_of(np.ones((HEIGHT // CELL, WIDTH // CELL)), CELL, t)
+    expected = Expected(
+        t, 0.01, p, P, np.zeros(1, bool), background.field(t, 8), dispersion, 1.0, 1.0
+    )
+    seen = update(live, expected, (n, z, D), (n, z, D))
+    assert seen.heard.all() and seen.n[0] == 16
+    square = np.linalg.eigvalsh(D[0])[1]
+    K = P[0, :2] / (P[0, 0] + square / 32 + 0.05**2 * square + 1e-3)
+    np.testing.assert_allclose(live.p, p + K[0] * z)
+    np.testing.assert_allclose(live.P[0, :2], (1 - K[0]) * P[0, :2])
+    np.testing.assert_allclose(live.C[0], 4 * np.eye(2) + 0.2 * 0.8 * (D[0] - 4 * np.eye(2)))
+    mu = background.at(*live.p[0], t) * 0.01 * np.pi * 9 * np.sqrt(np.linalg.det(live.C[0]))
+    assert live.nats[0] == pytest.approx(float(evidence(16, mu, 1.0)))
+    # Two windows of silence: it stands still where it was.
+    live.v[:] = 50.0
+    none = np.zeros(1), np.zeros((1, 2)), np.zeros((1, 2, 2))
+    before = live.p.copy()
+    for miss in (1, 2):
+        assert not update(live, expected, none, none).heard.any() and live.miss[0] == miss
+    np.testing.assert_array_equal(live.p, before)
+    assert (live.v == 0).all()

@@ -73,8 +73,8 @@ def start_targets(
     # An error of 0.3 sizes after one window.
     q = 0.3**2 * (square + 0.5) * 3 / window**3
     return Live(
-        ids, zero + t, p, np.zeros((number, 2)), P, C, n, n, q, zero + 1, zero + t, none + 1, none,
-        zero, zero, np.zeros(number, bool), np.zeros(number, bool),
+        ids, zero + t, p, np.zeros((number, 2)), P, C, n, n.copy(), q, zero + 1, zero + t,
+        none + 1, none, zero, zero.copy(), np.zeros(number, bool), np.zeros(number, bool),
     )  # fmt: skip
 
 
