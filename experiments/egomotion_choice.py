@@ -94,9 +94,10 @@ def main() -> None:
     for name, right, recording, camera in recordings(arguments.data) if arguments.data else ():
         add(name, right, recording, camera)
     table = pd.DataFrame(rows)
-    for (name, right), part in table.groupby(["scene", "right"], sort=False):
+    for scene, part in table.groupby("scene", sort=False):
+        right = part["right"].iloc[0]
         count = ", ".join(f"{n} {k}" for k, n in part["chosen"].value_counts().items())
-        print(f"| {name} | {right} | {count} |")
+        print(f"| {scene} | {right} | {count} |")
     print(f"{platform.machine()}, Python {platform.python_version()}")
 
 
