@@ -119,6 +119,7 @@ def test_events_of_one_time_are_replayed(waiting):
     assert one.hits[-1, 0] == len(t) and (one.state.x[n - 1] == one.state.x[n + waiting - 1]).all()
 
 
+@pytest.mark.slow
 def test_the_nearest_target_alone_may_take_an_event():
     seeds = [(10.0, 10.0, 4.0), (40.0, 10.0, 4.0)]
     xi = [[10, 10], [10, 30], [22, 10], [41, 10], [31, 10]]

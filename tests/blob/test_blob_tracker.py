@@ -346,6 +346,7 @@ def test_single_precision(pair, float32):
     np.testing.assert_allclose(states.mean[..., :2], exact.mean[..., :2], atol=0.02)
 
 
+@pytest.mark.slow
 def test_prefilter():
     rng = np.random.default_rng(6)
     rec = together(noise(rng, 20_000, 0.05), cloud(rng, line(60, 60), (3, 3), 20_000, (0, 0.05)))

@@ -148,6 +148,7 @@ def test_pieces_of_an_edge_are_one_while_each_is_seen():
     assert len(join_parts(round_ones)) == 3  # as far apart, but no edges
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [0, 1, 99])
 def test_recordings_of_few_events_have_no_targets(count):
     t = np.arange(count, dtype=np.int64)
@@ -224,6 +225,7 @@ def test_background_is_that_without_the_targets():
     assert rate.max() < 4 * true  # the target alone makes 20 times as many where it passes
 
 
+@pytest.mark.slow
 def test_candidates_are_those_of_a_slow_loop():
     rng = np.random.default_rng(1)
     paths = []

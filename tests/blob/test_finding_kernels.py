@@ -63,6 +63,7 @@ def test_pixels_are_those_of_the_events(stream):
     np.testing.assert_array_equal(pixels.n[order], counts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("g", [2, 4])
 def test_blobs_are_neighbouring_cells_with_more_events_than_background(stream, background, g):
     scale = Scale(0.02, g, np.full((HEIGHT // CELL, WIDTH // CELL), 1.3))
@@ -98,6 +99,7 @@ def test_blobs_are_neighbouring_cells_with_more_events_than_background(stream, b
         np.testing.assert_allclose(one, other, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_what_is_predicted_is_the_sum_over_blobs_and_kernels(stream, background):
     scale, w, t = Scale(0.04, 4, np.ones((HEIGHT // CELL, WIDTH // CELL))), 0.04, 0.2
     first, second = stream.pixels(t - 2 * w, t - w), stream.pixels(t - w, t)
@@ -147,6 +149,7 @@ def test_scores_are_the_likelihood_of_the_best_shares(stream, background):
     assert result.parts.sum() == pytest.approx(result.raw) and len(result.parts) == 2
 
 
+@pytest.mark.slow
 def test_dispersion_is_variance_over_mean(stream, background):
     told = measure_dispersion(stream, background, 0.01)
     number = 50
@@ -176,6 +179,7 @@ def test_dispersion_is_variance_over_mean(stream, background):
     np.testing.assert_allclose(told, expected)
 
 
+@pytest.mark.slow
 def test_events_are_shared_out_among_gates_and_blobs():
     rng = np.random.default_rng(7)
     number, blobs, targets = 400, 5, 4
@@ -289,6 +293,7 @@ def test_gates_of_known_targets_end_at_their_size_beyond_it():
     assert owners == [[0, -1, -1, -1], [0, 0, -1, -1]]
 
 
+@pytest.mark.slow
 def test_a_target_is_updated_as_by_a_kalman_filter(background):
     live, t = one_target(3.0), 0.01
     p, P = live.predict(t)

@@ -324,6 +324,7 @@ def test_missing_extras_are_named(module, extra, name, folder, capsys, monkeypat
     assert not (folder / name).exists()
 
 
+@pytest.mark.slow
 def test_without_extras_the_tables_are_written(folder, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setitem(sys.modules, "matplotlib", None)

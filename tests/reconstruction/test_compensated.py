@@ -55,6 +55,7 @@ def moved(v, a, s, height=40, width=56):
     return np.stack([level(y - dy, x - dx) for dx, dy in shifts]).astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "v, a", [((6.0, -3.0), (0.0, 0.0)), ((-9.0, 4.0), (2.5, -1.5)), ((0.0, 0.0), (0.0, 0.0))]
 )
@@ -74,6 +75,7 @@ def test_motion_is_found_from_nothing(v, a):
     np.testing.assert_allclose(flow[12:-12, 12:-12].mean((0, 1)), v, atol=0.15)
 
 
+@pytest.mark.slow
 def test_motion_of_half_the_image_alone():
     s = np.array([-1, -0.5, 0, 0.5, 1], np.float32)
     still, moving = moved((0, 0), (0, 0), s), moved((3.0, 0), (0, 0), s)

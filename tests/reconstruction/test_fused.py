@@ -164,6 +164,7 @@ def test_bands_and_cores_do_not_change_a_bit(monkeypatch):
     np.testing.assert_array_equal(images(), whole)
 
 
+@pytest.mark.slow
 def test_stored_events_are_checked_while_they_are_divided(tmp_path):
     recording = random_recording(7, 900, 5, size=(11, 9), exposure=0)
     times, params = times_of(recording), params_of(jaxevent.high_pass, **PARAMS)

@@ -109,8 +109,8 @@ def times_of(recording):
     return np.sort(recording.start + rng.integers(-3, span + span // 3, 7))
 
 
-# They compile most; `cf` goes through the same scan, and `edi` looks at frames as they do.
-SLOW = {"akf", "aks", "cf-augmented", "augmented", "high-pass", "cf"}
+# They compile most; `blend` and `last-frame` look at frames as they do.
+SLOW = {"akf", "aks", "cf-augmented", "augmented", "high-pass", "cf", "edi"}
 METHODS = [
     pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW))
     for name in names("reconstruction")
@@ -317,6 +317,7 @@ def test_without_events_the_filter_tends_to_the_augmented_frame():
     assert (variance < 1 / (0.09 * 7e7 * elapsed)).all()  # P < R / elapsed, I + I0 >= 1
 
 
+@pytest.mark.slow
 def test_without_belief_in_frames_the_filter_integrates_events():
     recording = random_recording(3, 80, 3)
     params = jaxevent.akf.Params(kappa=1e-12, c_on=0.2, c_off=0.15)
