@@ -130,6 +130,7 @@ def test_what_is_predicted_is_the_sum_over_blobs_and_kernels(stream, background)
     np.testing.assert_allclose(told.density[:, 1:], kernels, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_scores_are_the_likelihood_of_the_best_shares(stream, background):
     scale = Scale(0.04, 4, np.ones((HEIGHT // CELL, WIDTH // CELL)))
     told = []

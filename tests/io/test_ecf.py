@@ -107,6 +107,7 @@ events = st.integers(1, 400).flatmap(
 )
 
 
+@pytest.mark.slow
 @given(events, st.integers(0, 2), st.integers(0, 1 << 40))
 def test_what_was_encoded_is_decoded(steps, kind, start):
     records = np.zeros(len(steps[0]), ecf.RECORD)

@@ -100,6 +100,7 @@ def test_motion_of_a_later_target():
     np.testing.assert_allclose(later[..., 2], 0.5 * 1.5**2, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_equations_are_solved():
     rng = np.random.default_rng(1)
     rows, columns = 3, 4

@@ -187,6 +187,7 @@ def test_stored_events_are_checked_while_they_are_divided(tmp_path):
             images(jaxevent.load(wrong, in_memory=False))
 
 
+@pytest.mark.slow
 def test_images_that_are_held_are_not_written_over(monkeypatch):
     monkeypatch.setattr(room, "IMAGE_PIXELS", 2 * 11 * 9)  # two images at once
     recording = random_recording(7, 900, 5, size=(11, 9), exposure=0)
