@@ -97,7 +97,7 @@ def make_frame_features(
 ) -> FrameFeatures:
     """Features of the frames `used`, with room for `room`; `rows` are those of the features."""
     dtype, n, pixels = images.dtype, len(counts.mid), counts.base.start.shape[1]
-    grey, intensity, certainty, gain = images.read(used, room)
+    looked = images.read(used, room)
     span, before = aligned((2, room, pixels), dtype), np.zeros((2, pixels), dtype)
     if n:
         span[:, : n - 1] = (counts.right[1:] - counts.base.left[:-1]).swapaxes(0, 1)
@@ -108,28 +108,29 @@ def make_frame_features(
         head[:, :n] = (counts.mid - counts.base.left).swapaxes(0, 1)
         tail[:, :n] = (counts.right - counts.mid).swapaxes(0, 1)
 
-    weight_rate, blend_rate = piece_rates(clock, used, room, dtype)
+    return gathered(images, clock, used, rows, looked, (span, before, head, tail), segments)
+
+
+def gathered(
+    images: FrameImages,
+    clock: Clock,
+    used: slice,
+    rows: NDArray[np.int32],
+    looked: tuple[Any, Any, Any, NDArray],
+    between: tuple[Any, Any, Any, Any],
+    segments: Segments | None,
+) -> FrameFeatures:
+    """The features, of frames as `FrameImages.read` gives them and events between their edges."""
+    grey, intensity, certainty, gain = looked
+    present = np.asarray(float(used.stop > used.start), images.dtype)
+    rates_of = _piece_rates(clock, used, len(gain), images.dtype)
     return FrameFeatures(
-        grey,
-        intensity,
-        certainty,
-        images.response(),
-        gain,
-        span,
-        before,
-        head,
-        tail,
-        segments,
-        weight_rate,
-        blend_rate,
-        np.asarray(float(n > 0), dtype),
-        rows,
-        np.asarray(clock.offset, dtype),
-        images.recording.width,
-    )
+        grey, intensity, certainty, images.response(), gain, *between, segments, *rates_of,
+        present, rows, np.asarray(clock.offset, images.dtype), images.recording.width,
+    )  # fmt: skip
 
 
-def piece_rates(clock: Clock, used: slice, room: int, dtype: np.dtype) -> tuple[NDArray, NDArray]:
+def _piece_rates(clock: Clock, used: slice, room: int, dtype: np.dtype) -> tuple[NDArray, NDArray]:
     """How fast weights grow in each piece and blends after each frame of `used`, 1/s."""
     pieces = (2 if clock.exposed else 1) * room + 1
     breaks = clock.breaks[clock.first_piece(used.start) :]

@@ -105,12 +105,13 @@ class Layout:
     def tiles(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """The kind and the first lane of every tile; kind 3, with room, of those not used."""
         kinds, lanes = np.full(self.room, len(SHAPES), np.int32), np.zeros(self.room, np.int32)
+        begins = self.lane_begins()
         for k, (ranks, width) in enumerate(SHAPES):
             busy, first = self.counts[self.lanes[k]], self.round_first[k]
             for turn in range(-(-int(busy[0]) // ranks) if len(busy) else 0):
                 blocks = np.arange(-(-int((busy > turn * ranks).sum()) // width))
                 tile = self.round_tile[first + turn] + blocks
-                kinds[tile], lanes[tile] = k, self.lane_begins()[k] + blocks * width
+                kinds[tile], lanes[tile] = k, begins[k] + blocks * width
         return kinds, lanes
 
     def slots(self) -> NDArray[np.int32]:

@@ -28,12 +28,11 @@ from jaxevent.reconstruction.features import (
     ReadOut,
     Tiles,
 )
-from jaxevent.reconstruction.frames import make_segments, make_start, piece_rates
+from jaxevent.reconstruction.frames import gathered, make_segments, make_start
 from jaxevent.reconstruction.layout import SHAPES, SLOTS, Layout
 from jaxevent.reconstruction.reading import Placed, padded
 from jaxevent.reconstruction.stream import BaseCounts, EdgeCounts, StreamState, note_latest
 from jaxevent.reconstruction.windows import EventWindow, WindowedRecording, WindowEvents
-from jaxevent.recording import Recording
 
 FARTHEST = 1 << 30  # us from a window's first event that times may lie: sums fit in 32 bits
 NEVER = np.iinfo(np.int32).max
@@ -396,26 +395,18 @@ class DeviceWindows(WindowedRecording):
             segments = make_segments(
                 clock, used, self._stream(events.around), weight, edges, self.dtype
             )
-        grey, intensity, certainty, gain = images.read_on_device(used, self.frames)
-        pieces, blends = piece_rates(clock, used, self.frames, self.dtype)
+        looked = images.read_on_device(used, self.frames)
+        between = (span, first, head, tail)
         rows = self._frame_rows(stop, used, before)
-        return FrameFeatures(
-            grey, intensity, certainty, images.response(), gain, span, first, head, tail, segments,
-            pieces, blends, np.asarray(float(n > 0), self.dtype), rows,
-            np.asarray(clock.offset, self.dtype), self.recording.width,
-        )  # fmt: skip
+        return gathered(images, clock, used, rows, looked, between, segments)
 
     def _after(self, events: WindowEvents, before: StreamState, used: slice) -> StreamState:
         after = before.copy()
         after.frames = max(used.stop, 1)
         note_latest(self._stream(events.own), after.last)
-        shape = self.recording.height + 2, self.recording.width + 2
-        padded = np.full(shape, np.iinfo(np.int64).min)
-        padded[1:-1, 1:-1] = after.last.reshape(shape[0] - 2, shape[1] - 2)
-        latest = padded.copy()
-        for axis in (0, 1):  # what rolls over the border falls on it, where nothing is read
-            latest = np.maximum.reduce([np.roll(latest, k, axis) for k in (-1, 0, 1)])
-        after.near = latest.ravel()
+        image = after.last.reshape(self.recording.height, self.recording.width)
+        around = np.lib.stride_tricks.sliding_window_view(np.pad(image, 1, "edge"), (3, 3))
+        after.near = np.pad(around.max((2, 3)), 1).ravel()
         return after
 
 
@@ -439,9 +430,3 @@ def _between(
     before = jnp.where(n > 0, right[0] - (start if first else 0), 0).astype(dtype)
     inside = (rows(mid - left, n), rows(right - mid, n)) if exposed else None
     return span, before, inside
-
-
-def windows_of(recording: Recording, timing: Timing, devices: int, **options: Any) -> Any:
-    """A recording in windows: prepared on a GPU where images are made on one, else on the host."""
-    on_device = jax.default_backend() != "cpu" and devices < 2 and DeviceWindows.serves(timing)
-    return (DeviceWindows if on_device else WindowedRecording)(recording, timing, **options)

@@ -17,10 +17,9 @@ from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.features import Features, ReadOut, over_pixels, pixel_mesh
-from jaxevent.reconstruction.on_device import windows_of
 from jaxevent.reconstruction.reading import ImageReader
 from jaxevent.reconstruction.stream import StreamState
-from jaxevent.reconstruction.windows import WINDOW_EVENTS, EventWindow
+from jaxevent.reconstruction.windows import WINDOW_EVENTS, EventWindow, WindowedRecording
 from jaxevent.recording import Recording, Times, microseconds
 from jaxevent.shown import Shown
 
@@ -213,6 +212,18 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
                 shown.update(len(batch))
 
 
+def _windows_of(
+    recording: Recording, timing: Timing, devices: int, **options: Any
+) -> WindowedRecording:
+    """A recording in windows: prepared on a GPU where images are made on one, else on the host."""
+    if jax.default_backend() != "cpu" and devices < 2:
+        from jaxevent.reconstruction.on_device import DeviceWindows  # others need not load it
+
+        if DeviceWindows.serves(timing):
+            return DeviceWindows(recording, timing, **options)
+    return WindowedRecording(recording, timing, **options)
+
+
 class Video(ImageSequence[P]):
     """Images of a reconstruction: `image, variance, valid = video(times)`.
 
@@ -240,7 +251,7 @@ class Video(ImageSequence[P]):
         super().__init__(estimator, recording, params, progress=progress)
         self._devices, self._factors = devices, factors
         self._mesh = pixel_mesh(devices)
-        self._windows = windows_of(
+        self._windows = _windows_of(
             recording,
             Timing.of(params),
             len(devices),

@@ -11,6 +11,7 @@ import jaxevent
 from jaxevent.reconstruction import on_device
 from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.on_device import DeviceWindows
+from jaxevent.reconstruction.video import _windows_of
 from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import Events
 
@@ -107,5 +108,5 @@ def test_what_32_bits_cannot_tell_is_prepared_on_the_host(monkeypatch):
     assert not DeviceWindows.serves(Timing(rho_ref=1e-4))
     assert not DeviceWindows.serves(Timing(spread=0.01))
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert isinstance(on_device.windows_of(late, Timing(), 0), DeviceWindows)
-    assert type(on_device.windows_of(late, Timing(), 2)) is WindowedRecording
+    assert isinstance(_windows_of(late, Timing(), 0), DeviceWindows)
+    assert type(_windows_of(late, Timing(), 2)) is WindowedRecording

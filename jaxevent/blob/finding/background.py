@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from jaxevent.blob.finding.scene import SceneMotion
-from jaxevent.blob.finding.stream import Stream
+from jaxevent.blob.finding.stream import Stream, cell_at
 from jaxevent.events.filters import busiest_neighbour
 from jaxevent.kernels import compiled
 from jaxevent.kernels import part as kernel_part
@@ -44,11 +44,8 @@ class Field(NamedTuple):
 @kernel_part
 def value_at(field: Any, x: Any, y: Any) -> Any:
     """As `look_up`."""
-    (rows, columns), A = field.values.shape, field.place
-    row = int(A[1, 0] * x + A[1, 1] * y + A[1, 2]) // field.cell
-    column = int(A[0, 0] * x + A[0, 1] * y + A[0, 2]) // field.cell
-    row, column = min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)
-    return field.values[row, column] * field.factor
+    place = cell_at(field.place, x, y, field.cell, field.values.shape)
+    return field.values[place] * field.factor
 
 
 @dataclasses.dataclass(frozen=True)

@@ -79,6 +79,15 @@ def _inverses(S: Any) -> Any:
 
 
 @kernel_part
+def _residual(gates: Any, k: int, x: Any, y: Any, late: float) -> tuple[float, float]:
+    """How far an event lies from where a target then is, in px."""
+    return (
+        x - gates.p[k, 0] - gates.v[k, 0] * late,
+        y - gates.p[k, 1] - gates.v[k, 1] * late,
+    )
+
+
+@kernel_part
 def _squared(ex: float, ey: float, inverse: Any) -> float:
     return inverse[0] * ex * ex + 2 * inverse[1] * ex * ey + inverse[2] * ey * ey
 
@@ -92,8 +101,7 @@ def _share_out(t: Any, x: Any, y: Any, middle: Any, labels: Any, blobs: int, gat
     for i in range(len(t)):
         least, late = np.inf, t[i] - middle
         for k in range(targets):
-            ex = x[i] - gates.p[k, 0] - gates.v[k, 0] * late
-            ey = y[i] - gates.p[k, 1] - gates.v[k, 1] * late
+            ex, ey = _residual(gates, k, x[i], y[i], late)
             squared = _squared(ex, ey, inverse[k])
             distance = squared + inverse[k, 3] + gates.more[k]
             if squared < GATE * GATE and distance < least:
@@ -119,8 +127,7 @@ def _share_out(t: Any, x: Any, y: Any, middle: Any, labels: Any, blobs: int, gat
         least, late = np.inf, t[i] - middle
         for k in range(targets):
             if own[blob, k]:
-                ex = x[i] - gates.p[k, 0] - gates.v[k, 0] * late
-                ey = y[i] - gates.p[k, 1] - gates.v[k, 1] * late
+                ex, ey = _residual(gates, k, x[i], y[i], late)
                 distance = _squared(ex, ey, inverse[k]) + inverse[k, 3] + gates.more[k]
                 if distance < least:
                     least, owner[i] = distance, k
@@ -140,8 +147,7 @@ def _moments(t: Any, x: Any, y: Any, middle: Any, owner: Any, which: Any, gates:
         late, sharing = t[i] - middle, 0
         for j in range(len(soft)):
             k = soft[j]
-            ex = x[i] - gates.p[k, 0] - gates.v[k, 0] * late
-            ey = y[i] - gates.p[k, 1] - gates.v[k, 1] * late
+            ex, ey = _residual(gates, k, x[i], y[i], late)
             squared, share[j] = _squared(ex, ey, inverse[k]), 0.0
             if squared < GATE * GATE:
                 sharing += 1
@@ -166,8 +172,7 @@ def _moments(t: Any, x: Any, y: Any, middle: Any, owner: Any, which: Any, gates:
 @kernel_part
 def _add(n: Any, z: Any, C: Any, k: int, w: float, x: Any, y: Any, late: float, gates: Any) -> None:
     """Add an event's residual to a target's sums."""
-    ex = x - gates.p[k, 0] - gates.v[k, 0] * late
-    ey = y - gates.p[k, 1] - gates.v[k, 1] * late
+    ex, ey = _residual(gates, k, x, y, late)
     n[k] += w
     z[k, 0] += w * ex
     z[k, 1] += w * ey

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from jaxevent.blob.finding.paths import NOBODY, Path, candidates, join
 from jaxevent.kernels import Blank, compiled
+from jaxevent.kernels import part as kernel_part
 from jaxevent.recording import Events, Recording
 
 _counts = Blank(np.int32)
@@ -146,11 +147,16 @@ def _count(x: Any, y: Any, hot: Any, kept: Any, counts: Any) -> Any:
     return px[:m], py[:m], n
 
 
+@kernel_part
+def cell_at(A: Any, x: Any, y: Any, cell: int, shape: Any) -> tuple[int, int]:
+    """The cell (row, column) of the px to which a map (2, 3) takes a pixel, or the nearest one."""
+    row = int(A[1, 0] * x + A[1, 1] * y + A[1, 2]) // cell
+    column = int(A[0, 0] * x + A[0, 1] * y + A[0, 2]) // cell
+    return min(max(row, 0), shape[0] - 1), min(max(column, 0), shape[1] - 1)
+
+
 @compiled
 def _add_cells(x: Any, y: Any, hot: Any, kept: Any, A: Any, cell: int, counts: Any) -> None:
-    rows, columns = counts.shape
     for i in range(len(x)):
         if (kept is None or kept[i]) and not hot[y[i], x[i]]:
-            row = int(A[1, 0] * x[i] + A[1, 1] * y[i] + A[1, 2]) // cell
-            column = int(A[0, 0] * x[i] + A[0, 1] * y[i] + A[0, 2]) // cell
-            counts[min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)] += 1
+            counts[cell_at(A, x[i], y[i], cell, counts.shape)] += 1

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.kernels import compiled, over_rows, part
+from jaxevent.reconstruction.compensated.instants import Instants
 from jaxevent.reconstruction.compensated.parameters import Params
 from jaxevent.reconstruction.compensated.warping import Along
 from jaxevent.reconstruction.features import Numeric
@@ -30,6 +31,31 @@ class Place(NamedTuple):
     before: Numeric  # (), that of the frame before
     after: Numeric
     rest: Numeric = np.float32(0)  # (), `Instants.rest`
+
+
+def place_of(instants: Instants, clear: NDArray, room: int) -> Place:
+    """A target's instants for `fuse`, filled up to a number of `room`."""
+    count = len(instants)
+    framed: NDArray = clear.reshape(count, -1).max(1) > 0
+    framed[[instants.before, instants.after]] |= instants.before != instants.after
+    order = np.argsort(np.abs(instants.t - instants.t[instants.own]), kind="stable")
+    near = np.zeros(count, bool)
+    near[[k for k in order if k == instants.own or not framed[k]][:5]] = True
+    near[instants.own] = True
+    return Place(
+        _filled(instants.s, room, 1),
+        _filled(np.ones(count, np.float32), room),
+        _filled(framed.astype(np.float32), room),
+        _filled(near.astype(np.float32), room),
+        *(np.asarray(k, np.int32) for k in (instants.own, instants.before, instants.after)),
+        rest=np.float32(instants.rest),
+    )
+
+
+def _filled(values: NDArray, room: int, rest: float | int = 0) -> NDArray:
+    """Values (K, ...) of instants, filled up to the number `room`."""
+    more = np.full((room - len(values), *values.shape[1:]), rest, values.dtype)
+    return np.concatenate([values, more]) if len(more) else values
 
 
 class Agreement(NamedTuple):

@@ -24,7 +24,7 @@ from jaxevent.errors import InputError
 from jaxevent.estimator import Described, Estimate
 from jaxevent.reconstruction.clock import Clock, Timing, time_span
 from jaxevent.reconstruction.compensated import trajectories
-from jaxevent.reconstruction.compensated.agreement import Agreement, Place, agree, shown
+from jaxevent.reconstruction.compensated.agreement import Agreement, Place, agree, place_of, shown
 from jaxevent.reconstruction.compensated.course import TIME, course_of
 from jaxevent.reconstruction.compensated.evidence import Evidence
 from jaxevent.reconstruction.compensated.exposures import (
@@ -371,34 +371,9 @@ class Follower:
         return Followed(instants, L, V, clear, p, smooth)
 
 
-def filled(values: NDArray, room: int, rest: float | int = 0) -> NDArray:
-    """Values (K, ...) of instants, filled up to the number `room`."""
-    more = np.full((room - len(values), *values.shape[1:]), rest, values.dtype)
-    return np.concatenate([values, more]) if len(more) else values
-
-
 def room_for(number: int) -> int:
     """The number up to which instants are filled."""
     return -(-number // ROOM) * ROOM
-
-
-def place_of(instants: Instants, clear: NDArray, room: int) -> Place:
-    """A target's instants for `fuse`, filled up to a number of `room`."""
-    count = len(instants)
-    framed: NDArray = clear.reshape(count, -1).max(1) > 0
-    framed[[instants.before, instants.after]] |= instants.before != instants.after
-    order = np.argsort(np.abs(instants.t - instants.t[instants.own]), kind="stable")
-    near = np.zeros(count, bool)
-    near[[k for k in order if k == instants.own or not framed[k]][:5]] = True
-    near[instants.own] = True
-    return Place(
-        filled(instants.s, room, 1),
-        filled(np.ones(count, np.float32), room),
-        filled(framed.astype(np.float32), room),
-        filled(near.astype(np.float32), room),
-        *(np.asarray(k, np.int32) for k in (instants.own, instants.before, instants.after)),
-        rest=np.float32(instants.rest),
-    )
 
 
 @jax.jit

@@ -480,9 +480,7 @@ def step(
     near = np.exp(-2 * (s / reach) ** 2).astype(np.float32)
     N, b = np.empty((*shape, 10), np.float32), np.empty((*shape, 4), np.float32)
     edge = np.empty(shape, np.float32)
-    count, h, w, _ = images.shape
-    points, M = np.empty((h, w, count, 4), np.float32), np.empty((h, w), np.float32)
-    over_rows(_fetch, h, images, s, near, p, np.float32(floor), np.float32(nu), points, M)
+    points, M = _fetched(images, s, near, p, floor, nu)
     over_rows(_linearise, shape[0], points, s, M, N, b, edge)
     blurred_N, blurred_b = np.empty_like(N), np.empty_like(b)
     _soften(N, blurred_N)
@@ -500,6 +498,21 @@ def step(
     return out
 
 
+def _fetched(
+    images: NDArray[np.float32],
+    s: NDArray[np.float32],
+    near: NDArray[np.float32],
+    p: NDArray[np.float32],
+    floor: float,
+    nu: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What `_fetch` writes: of every pixel its instants' points, and their mean."""
+    count, h, w, _ = images.shape
+    points, M = np.empty((h, w, count, 4), np.float32), np.empty((h, w), np.float32)
+    over_rows(_fetch, h, images, s, near, p, np.float32(floor), np.float32(nu), points, M)
+    return points, M
+
+
 def misfit(
     images: NDArray[np.float32],
     s: NDArray[np.float32],
@@ -508,9 +521,7 @@ def misfit(
     nu: float,
 ) -> float:
     """How badly packed images (K, h, w, 4) agree along trajectories: robust squares, a mean."""
-    near, (count, h, w, _) = np.exp(-2 * s**2).astype(np.float32), images.shape
-    points, M = np.empty((h, w, count, 4), np.float32), np.empty((h, w), np.float32)
-    over_rows(_fetch, h, images, s, near, p, np.float32(floor), np.float32(nu), points, M)
+    points, M = _fetched(images, s, np.exp(-2 * s**2).astype(np.float32), p, floor, nu)
     return float(((points[..., 0] - M[..., None]) ** 2 * points[..., 1]).mean())
 
 
