@@ -385,7 +385,7 @@ class Parameters(_Module):
 
 
 def _elementwise(name: str, values: Array) -> Array:
-    """A function of numbers; by NumPy where they are known, as XLA compiles each shape for 60 ms."""
+    """A function of numbers, by NumPy where they are known: XLA compiles 60 ms for each shape."""
     if isinstance(values, Tracer):
         return getattr(jnp, name)(values)
     with np.errstate(divide="ignore"):  # the logarithm of 0

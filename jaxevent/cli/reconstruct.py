@@ -18,6 +18,7 @@ def add(commands: Any) -> None:
         "linear intensity and its variance; .mp4 is a video; without suffix it is a folder of PNG "
         "images with images.txt. Recordings are read and images written a part at a time, so that "
         "memory does not grow with their length (.npz, .mat and folders of text are read whole).",
+        "slider_depth.zip --out slider.mp4",
         "slider_depth.zip --method akf --rate 200 --out slider.mp4",
         "slider_depth.zip --method akf --at frames --params mine.toml --out slider.h5",
         "bike.h5 --method akf --colour --tone log --out bike",
@@ -27,9 +28,9 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--method",
         metavar="NAME",
-        required=True,
         help="mc, akf, aks, cf, cf-augmented, high-pass, edi, augmented, flow, blend, last-frame, "
-        "or package.module:object of your own",
+        "or package.module:object of your own; default: mc, the best, or aks where mc would take "
+        "over ten minutes, or high-pass where there are no frames",
     )
     when = one.add_mutually_exclusive_group()
     when.add_argument("--rate", metavar="HZ", type=float, help="images per second, evenly spaced")
@@ -76,9 +77,26 @@ def add(commands: Any) -> None:
     arguments.add_stream(one)
 
 
+_MC = 7e-6  # s of a core that `mc` takes for a pixel of an image: 0.3 for 240x180
+_PATIENCE = 600.0  # s
+
+
+def _usual(has_frames: bool, pixels: int) -> str:
+    """The method where none is named, for images of so many pixels in all; says why it is that."""
+    seconds = _MC * pixels
+    if not has_frames:
+        method, why = "high-pass", "there are no frames, so images show changes alone"
+    elif seconds > _PATIENCE:
+        method, why = "aks", f"mc, the best, would take {seconds / 60:.0f} minutes of a core"
+    else:
+        method, why = "mc", "the best where there are frames"
+    print(f"method {method}: {why}; choose another with --method")
+    return method
+
+
 def run(
     path: Path,
-    method: str,
+    method: str | None,
     rate: float | int | None,
     at: str | None,
     times: Path | None,
@@ -100,7 +118,9 @@ def run(
     write = writer(out)
     if tone is not None and write is write_hdf5:
         raise InputError(f"{out}: --tone is for images to look at; HDF5 holds linear intensity")
-    estimator = find(method, "reconstruction")
+    if method is None and params is not None:
+        raise InputError(f"{params}: parameters are of one method; name it with --method")
+    estimator = find(method or "mc", "reconstruction")
     values = estimator.Params() if params is None else estimator.Params.load(params, method)
     asked = None if times is None else read_times(times)
     recording = load(path, size, in_memory=False, progress=show_progress(), stream=stream)
@@ -113,6 +133,10 @@ def run(
     elif asked is None:
         asked = evenly(recording, 100.0 if rate is None else rate, start)
     asked = within(asked, start, stop, str(path))
+    if method is None:
+        pixels = len(asked) * recording.width * recording.height
+        estimator = find(_usual(recording.frames is not None, pixels), "reconstruction")
+        values = estimator.Params()
     clock = time.perf_counter()
     video = estimator.estimate(recording, values, progress=show_progress())
     colours = None

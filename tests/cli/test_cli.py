@@ -20,6 +20,7 @@ from PIL import Image
 
 import jaxevent
 from jaxevent import cli
+from jaxevent.cli import reconstruct
 from jaxevent.methods import names
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.show import describe, export
@@ -166,6 +167,8 @@ def test_bad_ways_to_reconstruct(folder, capsys):
     fails(capsys, ["reconstruct", path, *blend, "--tone", "log"], out, "--tone")
     for name in ("mine.toml", "broken.toml", "other.toml", "none.toml"):
         fails(capsys, ["reconstruct", path, *blend, "--params", folder / name], folder / name)
+    mine = folder / "other.toml"
+    fails(capsys, ["reconstruct", path, "--params", mine, "--out", out], mine, "--method")
     fails(capsys, ["reconstruct", path, "--method", "akff", "--out", out], "'akf'")
     for name in ("out.h5", "out.mp4", "out"):
         argv = ["reconstruct", path, *blend[:2], "--colour", "--out", folder / name]
@@ -276,6 +279,7 @@ def test_a_signal_is_not_lost_in_a_callback(number, tmp_path):
 import gc, os, signal, sys, time
 import jaxevent.io
 from jaxevent import cli
+from jaxevent.cli import reconstruct
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def callback(phase, about, first=[1]):
@@ -308,6 +312,7 @@ def test_a_signal_waits_for_an_import_and_outlives_who_drops_it(number, tmp_path
 import signal, sys, time
 import jaxevent.io
 from jaxevent import cli
+from jaxevent.cli import reconstruct
 signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.path.insert(0, {str(tmp_path)!r})
 
@@ -496,6 +501,26 @@ def test_reconstruct_to_hdf5(folder, capsys):
     np.testing.assert_array_equal(contents[0]["t"], STAMPS + 2_500)
     np.testing.assert_array_equal(contents[0]["image"], image.astype(np.float32))
     np.testing.assert_array_equal(contents[0]["variance"], variance.astype(np.float32))
+
+
+def test_the_usual_method(folder, capsys, monkeypatch):
+    assert reconstruct._usual(True, 2000 * 240 * 180) == "aks"  # ten minutes of a core
+    assert reconstruct._usual(True, 1900 * 240 * 180) == "mc"
+    capsys.readouterr()
+    bare = folder / "bare.h5"
+    jaxevent.save(small(frames=None), bare)
+    for patience, path, method in ((1e-9, "small.h5", "aks"), (1e9, bare, "high-pass")):
+        monkeypatch.setattr("jaxevent.cli.reconstruct._PATIENCE", patience)
+        for name, more in (("usual.h5", []), ("named.h5", ["--method", method])):
+            argv = ["reconstruct", folder / path, "--rate", 100, "--out", folder / name, *more]
+            assert cli.main([*map(str, argv), "--force"]) == 0
+            assert capsys.readouterr().out.startswith(f"method {method}: ") == (not more)
+        assert described(folder / "usual.h5")["method"] == method
+        images = []
+        for name in ("usual.h5", "named.h5"):
+            with h5py.File(folder / name) as file:
+                images.append(np.asarray(file["image"]).tobytes())
+        assert images[0] == images[1]
 
 
 def test_reconstruct_some_times(folder, capsys):
