@@ -58,11 +58,12 @@ def add(commands: Any) -> None:
     )
     one.add_argument(
         "--tone",
-        choices=["linear", "log", "percentile", "clahe"],
+        choices=["linear", "log", "percentile", "clahe", "changes"],
         help="how intensity becomes grey in PNG and MP4: linear (default), from the frames' black "
         "to their white, so that images are as bright as frames and what is brighter is cut off; "
         "log, the logarithm of 99 %% of the intensities, for high dynamic range; percentile, their "
-        "intensity; clahe, log with contrast evened out. All images have the same limits",
+        "intensity; clahe, log with contrast evened out; changes (default where there are no "
+        "frames), grey where nothing changed. All images have the same limits",
     )
     one.add_argument(
         "--colour",
@@ -144,7 +145,8 @@ def run(
         from jaxevent.reconstruction.colour import colour_video
 
         colours = colour_video(video, recording)
-    how = write(video, asked, out, tone or "linear", name, colours)
+    tone = tone or ("changes" if recording.frames is None else "linear")
+    how = write(video, asked, out, tone, name, colours)
     seconds = time.perf_counter() - clock
     print(
         f"{out}: {len(asked):,} images{how}, {seconds:.2f} s, "

@@ -19,12 +19,15 @@ from jaxevent.errors import InputError, require
 from jaxevent.io.output import complete
 from jaxevent.metrics import MEANINGS, checked
 
-Tone = Literal["linear", "log", "percentile", "clahe"]
+Tone = Literal["linear", "log", "percentile", "clahe", "changes"]
 Kind = Literal["image", "error", "uncertainty"]
 
 # The logarithm shows at most this many halvings below the brightest value (96 dB): pixels that are
 # dark up to rounding, say 1e-9, would otherwise take most of the grey scale.
 OCTAVES = 16
+UNCHANGED = (
+    0.01  # of ln(1 + I): less, a tenth of a threshold, tells nothing of how large changes are
+)
 
 
 def display_limits(images: ArrayLike, how: str = "linear") -> tuple[float, float]:
@@ -32,12 +35,18 @@ def display_limits(images: ArrayLike, how: str = "linear") -> tuple[float, float
 
     "linear" has the limits 0 and 1, whatever the images. The other tones leave out the darkest and
     the brightest 0.5 % of the values as outliers; "log" and "clahe" look at positive values only.
+    "changes" leaves out the largest 5 % of those that differ from 0, and is even about it.
     Pass the result to `tone_map` for each frame of a video, so that its brightness does not pump.
     Raises `InputError` for an unknown tone and for images that are not floats or hold NaN.
     """
     images, logarithmic = _bounded(images), _is_logarithmic(how)
     if how == "linear":
         return 0.0, 1.0
+    if how == "changes":
+        size = np.abs(_change(images.astype(np.float64)))
+        size = size[size > UNCHANGED]
+        most = float(np.percentile(size, 95)) if len(size) else 1.0
+        return math.expm1(-most), math.expm1(most)
     values = images[images > 0] if logarithmic else images.ravel()
     if not len(values):
         return (2.0**-OCTAVES, 1.0) if logarithmic else (0.0, 1.0)
@@ -55,6 +64,7 @@ def tone_map(
 
     "linear" and "percentile" scale intensity, "log" its base-2 logarithm, from `limits` (black,
     white; by default `display_limits` of these images) to 0..255 and clip what lies outside.
+    "changes" scales ln(1 + I), for images from events alone, whose intensity 0 is no change: grey.
     "clahe" equalises the histogram of the result of "log" in tiles of 1/8 of the image with limited
     contrast, each image by itself. Raises `InputError` for an unknown tone, for images that are not
     floats or hold NaN and for limits that are out of order or, with a logarithm, not positive.
@@ -69,6 +79,8 @@ def tone_map(
     shown = np.clip(images, low, high)
     if logarithmic:
         shown, low, high = np.log2(shown), math.log2(low), math.log2(high)
+    elif how == "changes":
+        shown, low, high = _change(shown), *_change(np.array([low, high])).tolist()
     shown = np.clip((shown - low) / (high - low), 0, 1)
     if how == "clahe":
         shown = _equalised(shown)
@@ -81,6 +93,10 @@ def _bounded(images: ArrayLike) -> NDArray[np.floating]:
     if images.dtype.kind == "f":
         images = images.clip(-1e30, 1e30)
     return checked(images, "images")
+
+
+def _change(images: NDArray[np.floating]) -> NDArray[np.floating]:
+    return np.log1p(np.maximum(images, 2.0**-OCTAVES - 1))
 
 
 def _is_logarithmic(how: str) -> bool:

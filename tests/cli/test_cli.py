@@ -612,6 +612,17 @@ def test_reconstruct_to_video(rate, fps, factor, folder, capsys):
     assert np.abs(images - shown).mean() < 3
 
 
+def test_without_frames_images_show_changes(folder, capsys):
+    recording = small(frames=None)
+    jaxevent.save(recording, folder / "bare.h5")
+    assert cli.main(f"reconstruct {folder}/bare.h5 --rate 300 --out {folder}/a".split()) == 0
+    assert "frames," not in capsys.readouterr().out.partition("\n")[2]
+    times = export.evenly(recording, 300)
+    images = jaxevent.high_pass.estimate(recording)(times).mean
+    shown = [np.asarray(Image.open(p)) for p in sorted((folder / "a").glob("*.png"))]
+    np.testing.assert_array_equal(np.stack(shown), tone_map(images, "changes"))
+
+
 def test_reconstruct_in_colour(folder):
     """Two colours side by side, far from black and white, on frames of their own brightness."""
     ramp = 60 + 2 * np.arange(WIDTH) + 3 * np.arange(6)[:, None, None]

@@ -24,7 +24,7 @@ from jaxevent.show.report import (
 
 pytestmark = pytest.mark.slow
 
-TONES = ["linear", "log", "percentile", "clahe"]
+TONES = ["linear", "log", "percentile", "clahe", "changes"]
 RAMP = np.linspace(-0.2, 1.3, 40 * 60).reshape(40, 60)
 
 
@@ -56,7 +56,18 @@ def test_log_limits_ignore_what_is_dark_up_to_rounding():
     np.testing.assert_array_equal(tone_map(images[None], "log"), 255 * (images[None] > 0.5))
 
 
-@pytest.mark.parametrize("how", ["linear", "log", "percentile"])
+def test_changes_are_even_about_grey():
+    levels = np.array([-0.4, -0.2, 0.0, 0.0, 0.2, 0.4])  # ln(1 + I)
+    images = np.expm1(np.repeat(levels, 200).reshape(24, 50))
+    low, high = display_limits(images, "changes")
+    np.testing.assert_allclose(np.log1p([low, high]), [-0.4, 0.4])
+    shown = tone_map(images, "changes").ravel()[::200].astype(int)
+    np.testing.assert_allclose(shown, [0, 63.75, 127.5, 127.5, 191.25, 255], atol=0.5)
+    sparse = np.where(np.arange(10_000) % 1000 < 2, images[-1, -1], 0).reshape(100, 100)
+    np.testing.assert_allclose(display_limits(sparse, "changes"), [low, high])  # not of what rests
+
+
+@pytest.mark.parametrize("how", ["linear", "log", "percentile", "changes"])
 @given(seed=st.integers(0, 2**32 - 1), scale=st.floats(1e-3, 1e3))
 def test_brighter_is_never_shown_darker(how, seed, scale):
     values = scale * np.random.default_rng(seed).normal(size=(8, 9)) ** 3
@@ -83,7 +94,7 @@ def test_common_limits_show_a_frame_alike_alone_and_in_a_video(how):
 def test_constant_images_can_be_shown(how, value):
     shown = tone_map(np.full((16, 20), value, np.float32), how)
     assert np.ptp(shown) == 0
-    if how == "percentile" or (how != "linear" and value > 0):
+    if how == "percentile" or (how in ("log", "clahe") and value > 0):
         assert shown[0, 0] in (127, 128)
 
 
@@ -275,7 +286,7 @@ def test_every_number_that_is_shown_is_explained():
     assert {*FIGURES, "lost", "startup"} < MEANINGS.keys()
 
 
-@pytest.mark.parametrize("how", ["linear", "log", "percentile", "clahe"])
+@pytest.mark.parametrize("how", TONES)
 def test_pixels_without_bound_are_white_and_change_no_limit(how):
     """A hot pixel's events add up until exp(L) overflows."""
     image = np.linspace(0.1, 0.9, 400, dtype=np.float32).reshape(20, 20)
