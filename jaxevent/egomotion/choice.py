@@ -73,7 +73,10 @@ def choose(recording: Recording, camera: PinholeCamera | None = None) -> Choice:
             "model of its motion"
         )
     if camera is None:
-        line = "planar motion, since there is no calibration, which the others need"
+        line = (
+            "planar motion, since there is no calibration, which the others need; --focal PX "
+            "stands for one"
+        )
         return Choice(Planar, (line,), {})
     _, f = coordinates(recording.width, recording.height, camera)
     sharp: dict[str, list[NDArray]] = {"planar": [], "rotation": [], "general": []}

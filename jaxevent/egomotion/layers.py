@@ -13,15 +13,17 @@ from jaxevent.egomotion.patches import usual_speed
 from jaxevent.recording import Recording
 
 Z = 3.0  # from which parts of the image move differently
-FACTORS = np.geomspace(0.3, 3.0, 25)  # of the usual speed, by patches
+# Of the usual speed, by patches; of a roll half of them go back.
+FACTORS = np.concatenate([-np.geomspace(3.0, 0.3, 25), np.geomspace(0.3, 3.0, 25)])
 
 
 @dataclasses.dataclass(frozen=True)
 class Layers:
     """How differently parts of the image move, along the usual direction.
 
-    `spread` is the standard deviation of their speeds, in shares of the usual one, `z` how sure it
-    is that they differ, and `slow` and `fast` (px/s) bound the middle four fifths of them.
+    `spread` is the standard deviation of their velocities along it, in shares of the usual one, `z`
+    how sure it is that they differ, and `slow` and `fast` (px/s) bound the middle four fifths of
+    their speeds.
     """
 
     spread: float
@@ -64,12 +66,12 @@ def layers(
         telling = train.max(0) - train[-1] + train.max(0) - np.median(train, 0) > np.log(1.3)
         factor = np.append(FACTORS, 1.0)[pick][telling]
         factors.append(factor)
-        speeds.append(factor * np.hypot(*ways[telling].T) / one.length)
+        speeds.append(np.abs(factor) * np.hypot(*ways[telling].T) / one.length)
     if not factors or not len(np.concatenate(factors)):
         return None
     factor, speed_of = np.concatenate(factors), np.concatenate(speeds)
     low, high = np.percentile(factor, [16, 84])
     slow, fast = np.percentile(speed_of, [10, 90])
-    usual = float(np.median(factor))
+    usual = float(np.median(np.abs(factor)))
     spread = float((high - low) / 2 / max(usual, 1e-9))
     return Layers(spread, standard(np.concatenate(differ)), float(slow), float(fast))

@@ -93,7 +93,8 @@ def test_models_are_told_apart():
     assert turns.model.name == "rotation" and slides.model.name == "general"
     assert turns.z["rotation", "planar"] > 3 and "better than" in " ".join(turns.lines)
     assert "not sure" in turns.lines[-1] and "not sure" not in " ".join(slides.lines)
-    flat, several = layers(plane), layers(sliding)
+    flat, several, rolling = layers(plane), layers(sliding), layers(turning)
+    assert rolling is not None and rolling.several and rolling.spread > 0.5  # both ways
     assert flat is None or not flat.several
     assert several is not None and several.several and 0.2 < several.spread < 0.9
     assert several.slow < 50 and several.fast > 75  # 45 and 90 px/s
