@@ -6,12 +6,27 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.estimator import Estimate
 from jaxevent.recording import Recording, Times, check_times, microseconds
 from jaxevent.shown import Shown
 
 ACROSS = 0.1  # of the spread of speeds at several depths, that of the velocity across them
+# Of a motion, what a lens that was calibrated leaves: of a rotation, that f is off by 0.5 %, the
+# centre by 1 px, k1 by 0.01 and k2 by 0.02 (tests/egomotion/test_egomotion_patches.py).
+LENS = 0.01
+UNDECIDED = 1.0  # rad, standard deviation of a direction that is not told
+
+
+def decided(model: str | type[Model], covariance: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Whether components are told, (times, d): those of a direction are not where it is any."""
+    told = np.ones(covariance.shape[:2], bool)
+    for part in find_model(model).parts:
+        if part.direction:
+            spread = np.trace(covariance[:, part.rows, part.rows], axis1=1, axis2=2)
+            told[:, part.rows] = ~(spread > UNDECIDED**2)[:, None]
+    return told
 
 
 class Calibration(NamedTuple):
@@ -20,13 +35,20 @@ class Calibration(NamedTuple):
     factor C + share^2 |m|^2 + speed^2 m m' + change^2 (d d' + b b'),
 
     d the change of the motion within what an estimate sees and b by how much it bends there.
-    Chosen on simulated scenes: `experiments/egomotion_sigmas.py`.
+    Chosen on simulated scenes: `experiments/egomotion_sigmas.py`. `behind` adds what a real lens
+    makes.
     """
 
     factor: float = 1.0
     share: float = 0.0
     speed: float = 0.0  # likewise, of motions that are told too slow or too fast
     change: float = 0.0
+
+    def behind(self, camera: PinholeCamera | None) -> "Calibration":
+        """The same, with what a camera's calibration leaves, if its lens distorts."""
+        if camera is None or not any(camera.distortion):
+            return self
+        return self._replace(share=float(np.hypot(self.share, LENS)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,8 +65,9 @@ class Motion(Shown):
     event tells it; `lag` (s) by which what was seen is older than `t`; `contrast`, how much better
     the motion explains the events than chance would, about 1 where it does not; `evidence`, the
     log-likelihood of the events since the estimate before. The last two are NaN where an estimator
-    has none. `cloud` (n, particles, d), where it was asked for, is some of a filter's particles:
-    the likelier a motion, the more of them are near it. `recording` is the name of the recording
+    has none. `agreement` (n,), where an estimator tells it, is the share of the events that the
+    motion explains. `cloud` (n, particles, d), where it was asked for, is some of a filter's
+    particles: the likelier a motion, the more of them are near it. `recording` is the name of the recording
     and `span` (us) from when to when it lasts; without a span, all times may be asked for.
     """
 
@@ -57,6 +80,7 @@ class Motion(Shown):
     contrast: NDArray[np.floating]
     evidence: NDArray[np.floating]
     cloud: NDArray[np.floating] | None = None
+    agreement: NDArray[np.floating] | None = None
     recording: str = "the recording"
     span: tuple[int, int] | None = None
 
@@ -83,9 +107,15 @@ class Motion(Shown):
         return cls.of(model, np.zeros(0, np.int64), np.zeros((0, n)), np.zeros((0, n, n)))
 
     def calibrated(
-        self, by: Calibration, length: float | int | NDArray[np.floating] = 0.0
+        self,
+        by: Calibration,
+        length: float | int | NDArray[np.floating] = 0.0,
+        alone: NDArray[np.floating] | None = None,
     ) -> "Motion":
-        """The same with the covariance that its errors have; an estimate sees `length` seconds."""
+        """The same with the covariance that its errors have; an estimate sees `length` seconds.
+
+        Estimates beside each other tell how the motion changes; of one `alone` (d,) may tell it.
+        """
         if not len(self):
             return self
         mean = np.nan_to_num(self.mean)
@@ -105,6 +135,8 @@ class Motion(Shown):
                 change[:, i], bend[:, i] = late - early, late + early - 2 * now
                 if inner.any():
                     bend[:, i] = np.interp(self.t, self.t[inner], bend[inner, i])
+        elif alone is not None:
+            change[:] = alone
         covariance = by.factor * self.covariance
         for d in (change, bend):
             covariance = covariance + by.change**2 * d[:, :, None] * d[:, None, :]
@@ -143,6 +175,30 @@ class Motion(Shown):
         if len(recording.events) or recording.frames:
             span = recording.start, recording.stop
         return dataclasses.replace(self, recording=recording.name, span=span)
+
+    def reaching(self, first: int, last: int, rate: NDArray[np.floating] | None = None) -> "Motion":
+        """The same, with estimates at `first` and `last` (us), before and after all others.
+
+        They are what is told at these times: the motion held, with a covariance that grows by how
+        much it usually changes, `rate` (d, d) per us^2 or as the estimates tell. None is added next
+        to one that is lost.
+        """
+        if not len(self):
+            return self
+        rate = self._change() if rate is None else rate
+        early = bool(self.valid[0] and first < self.t[0])
+        late = bool(self.valid[-1] and last > self.t[-1])
+        rows = np.r_[[0] * early, : len(self), [len(self) - 1] * late].astype(int)
+        arrays = {
+            field.name: value[rows]
+            for field in dataclasses.fields(self)
+            if isinstance(value := getattr(self, field.name), np.ndarray)
+        }
+        for row, at, added in ((0, first, early), (-1, last, late)):
+            if added:
+                arrays["covariance"][row] += float(at - arrays["t"][row]) ** 2 * rate
+                arrays["t"][row] = at
+        return dataclasses.replace(self, **arrays)
 
     def _change(self) -> NDArray[np.float64]:
         """The mean square (d, d) of changes from an estimate to the next, per us^2."""

@@ -409,9 +409,29 @@ def test_windows_of_a_number_of_events(straight):
     recording, truth = straight
     params = contrast.Params.of({**SMALL.values(), "window": "events"})
     motion = contrast.estimate(recording, params)
-    assert len(motion) == (len(recording.events) - 4000) // 2000 + 1
+    # And the ends of the first and the last.
+    assert len(motion) == (len(recording.events) - 4000) // 2000 + 1 + 2
     off = np.linalg.norm(motion.mean - truth, axis=1) / np.linalg.norm(truth)
     assert (off < 0.05).all()
+
+
+@pytest.mark.slow
+def test_a_lone_window_tells_how_the_motion_changes():
+    """The motion's mean, its change as a part of the error, and how far it may be at the ends."""
+    speeds = iter(np.linspace(100, 200, 200))
+
+    def faster(at):
+        return np.tile([next(speeds), 0.0], (len(at), 1))
+
+    recording = moved(faster, 0.06, 800)
+    params = contrast.Params.of({**SMALL.values(), "duration": 1.0})
+    motion = contrast.estimate(recording, params)
+    assert list(motion.t) == pytest.approx([recording.start, 30_000, recording.stop], abs=500)
+    true = np.array([[100, 0], [137.5, 0], [175, 0]])
+    z = (motion.mean - true) / np.sqrt(np.diagonal(motion.covariance, axis1=1, axis2=2))
+    assert motion.valid.all() and (np.abs(z) < 3).all()
+    sigma = np.sqrt(motion.covariance[:, 0, 0])
+    assert 0.7 * 37.5 < sigma[0] < 1.3 * 37.5 and 0.06 * 75 < sigma[1] < 0.2 * 75
 
 
 @pytest.mark.slow

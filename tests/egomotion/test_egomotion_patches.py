@@ -1,19 +1,23 @@
 """How fast patches move, which model explains them, and what errors are made of."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import contrast, find_model, truth, twists, voting
+from jaxevent.egomotion.candidates import coordinates
 from jaxevent.egomotion.choice import choose, decide
-from jaxevent.egomotion.geometry import A, B
+from jaxevent.egomotion.geometry import A, B, rotation_basis
 from jaxevent.egomotion.layers import layers
-from jaxevent.egomotion.motion import Calibration, Motion
+from jaxevent.egomotion.motion import LENS, Calibration, Motion
 from jaxevent.egomotion.patch_fits import standard
 from jaxevent.egomotion.patches import usual_speed
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Imu, Poses, Recording
 from jaxevent.show.motion import Written
+from jaxevent.show.motion_pictures import motion_figure
 
 WIDTH, HEIGHT, F = 120, 96, 100.0
 CAMERA = PinholeCamera(F, F, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
@@ -139,7 +143,14 @@ def test_a_heading_that_nothing_tells_is_said():
         covariance[:, [0, 1], [0, 1]] = sigma2
         motion = Motion.of("general", t, mean, covariance)
         lines = Written([], t, motion(t), motion, None, None, None).summary()
-        assert ("not observable" in " ".join(lines)) == said
+        assert lines[0].startswith("2 estimates, found")
+        assert ("not observable" in " ".join(lines)) == ("not told" in lines[2]) == said
+        # Nor is a heading drawn that is not told, or a panel without anything.
+        figure = motion_figure(dataclasses.replace(motion, agreement=np.array([0.5, 0.9])), t)
+        drawn = {axis.get_ylabel(): axis.lines[0].get_ydata() for axis in figure.axes}
+        assert len(drawn) == 7 and np.isfinite(drawn["wx (rad/s)"]).all()
+        assert np.isnan(drawn["tx"]).all() == said
+        np.testing.assert_allclose(drawn["events explained"], [0.5, 0.9])
 
 
 def test_standard():
@@ -166,6 +177,55 @@ def test_what_errors_are_made_of():
     np.testing.assert_allclose(told.covariance[1] - np.eye(2), [[1.0, 0.5], [0.5, 0.25]])
     lost = Motion.of("planar", t, mean, np.full((3, 2, 2), np.nan))
     assert not lost(t).valid.any()  # without a sigma
+
+
+def test_a_lone_estimate_and_what_it_reaches():
+    t, mean = np.array([100_000]), np.array([[3.0, 0]])
+    motion = Motion.of("planar", t, mean, np.eye(2)[None])
+    assert (motion.calibrated(Calibration(change=0.5), 0.2).covariance == np.eye(2)).all()
+    told = motion.calibrated(Calibration(change=0.5), 0.2, np.array([0.0, 4.0]))
+    np.testing.assert_allclose(told.covariance[0], np.diag([1, 1 + 0.25 * 16]))
+    rate = np.diag([0, 4.0**2]) / 2e5**2
+    whole = told.reaching(0, 200_000, rate).within(moving(lambda x: x, 0.2))
+    assert list(whole.t) == [0, 100_000, 200_000] and whole.valid.all()
+    np.testing.assert_allclose(whole.mean, np.tile(mean, (3, 1)))
+    # In half a window it changes by half as much.
+    np.testing.assert_allclose(whole.covariance[:, 1, 1], [9, 5, 9])
+    assert whole(np.arange(5000, 195_000, 1000)).valid.all()
+    lost = Motion.of("planar", t, mean, np.eye(2)[None], np.array([False]))
+    assert len(lost.reaching(0, 200_000)) == 1
+
+
+def test_what_the_calibration_of_a_lens_leaves():
+    """Rotations from the flow that they make, if the calibration is off as far as usual.
+
+    Of a DAVIS240C's lens; every fourth pixel is enough.
+    """
+    lens = np.array([199, 199, 132, 110, -0.37, 0.15]) / [4, 4, 4, 4, 1, 1]
+    usual = np.array([1, 1, 1, 1, 0.01, 0.02]) / [4, 4, 4, 4, 1, 1]
+    axes = np.random.default_rng(0).normal(size=(3, 50))
+    axes /= np.linalg.norm(axes, axis=0)
+
+    def camera(values):
+        fx, fy, cx, cy, k1, k2 = values.tolist()
+        return PinholeCamera(fx, fy, cx, cy, (k1, k2, 0.0, 0.0, 0.0))
+
+    def places(values):
+        xi, f = coordinates(60, 45, camera(values))
+        slope = np.stack([np.gradient(xi, axis=axis) for axis in (1, 0)], -1)
+        return slope.reshape(-1, 2, 2), rotation_basis(xi.reshape(-1, 2), f)
+
+    slope, flow = places(lens)
+    seen = np.linalg.solve(slope, flow @ axes)
+    square = 0.0
+    for off in np.diag(usual):
+        slope, flow = places(lens + off)
+        found = np.linalg.lstsq(flow.reshape(-1, 3), (slope @ seen).reshape(-1, 50))[0]
+        square += np.square(found - axes).mean()
+    assert LENS / 1.3 < np.sqrt(square) < 1.3 * LENS
+    ideal = Calibration(share=0.02)
+    assert ideal.behind(None) == ideal.behind(CAMERA) == ideal
+    assert ideal.behind(camera(lens)).share == pytest.approx(np.hypot(0.02, LENS))
 
 
 def test_a_gyro_in_other_axes_and_with_a_bias():

@@ -61,7 +61,7 @@ PROBE = 0.5  # px at the window's end, between which and the maximum the curvatu
 ENOUGH = 1e-3  # 1/px; a smaller slope, in shares of the objective, ends the ascent
 WAY, WAYS = 10.0, (5.0, 60.0)  # px in a window: at best, and with which the default is kept
 SHORTEST, LONGEST = 0.002, 2.0  # s
-CALIBRATION = Calibration(factor=0.5, change=0.09)
+CALIBRATION = Calibration(change=0.09)
 SPREAD = 2.0  # px^2; the inverse curvature, in the same unit, that an ascent begins with
 
 Numeric = Array | np.ndarray
@@ -391,6 +391,23 @@ class Windows:
             self.model, self.shape, self.offset, self.box,
         )  # fmt: skip
 
+    def change(
+        self, t: int, start: int, stop: int, motion: NDArray[np.floating]
+    ) -> NDArray[np.float64]:
+        """By how much the motion changes in a window, by its halves; 0 where one is lost."""
+        quarter = self.half(t, start, stop) / 2
+        told = [
+            refine(
+                self.params,
+                self.cut(t + round(1e6 * side * quarter), start, stop, quarter),
+                motion,
+            )
+            for side in (-1, 1)
+        ]
+        if min(half.contrast for half in told) < float(self.params.contrast):
+            return np.zeros(len(motion))
+        return 2 * (told[1].motion - told[0].motion)
+
     def search(self, t: int, start: int, stop: int) -> NDArray[np.float64]:
         """The motion of a window of which nothing is known.
 
@@ -447,17 +464,20 @@ def solve(params: Params, given: Given) -> Motion:
 
     `contrast` is the objective in units of what it is after the events' times have been shuffled,
     by the seed. Where that is too small, or events are too few, it is lost: the motion before is
-    held, and the next window is searched anew. For the covariance see `covariance`.
+    held, and the next window is searched anew. For the covariance see `covariance`. The first and
+    the last estimate are held to their windows' ends.
     """
     windows = Windows(given.recording, params, given.model, given.camera, given.seed)
     if not len(windows):
         return Motion.nothing(given.model)
     motion, t, fits, contrasts, spans = None, [], [], [], []
+    rows: list[tuple[int, int, int]] = []
     for middle, start, stop in bar(
         windows, desc="sharpen windows", unit="window", progress=given.progress
     ):
         t.append(middle)
         spans.append(windows.span(start, stop))
+        rows.append((middle, start, stop))
         if stop - start < params.fewest:
             motion = None
             fits.append(None)
@@ -473,7 +493,14 @@ def solve(params: Params, given: Given) -> Motion:
         fits.append(fit)
         contrasts.append(told.contrast)
     found = held(given.model, np.array(t), fits, np.array(contrasts))
-    return found.calibrated(CALIBRATION, np.array(spans))
+    alone = rate = None
+    if found.valid.sum() == 1:
+        k = int(found.valid.argmax())
+        alone = windows.change(*rows[k], found.mean[k])
+        rate = np.outer(alone, alone) / max(1e6 * spans[k], 1) ** 2
+    found = found.calibrated(CALIBRATION.behind(given.camera), np.array(spans), alone)
+    halves = (round(1e6 * windows.half(*rows[k])) for k in (0, -1))
+    return found.reaching(t[0] - next(halves), t[-1] + next(halves), rate)
 
 
 def lengths(params: Params, speed: Speed) -> dict[str, float]:

@@ -145,7 +145,7 @@ def solve(params: Params, given: Given) -> Motion:
         lags.append(flows.age[valid].mean() if len(valid) else 0.0)
     motion = held(given.model, begins + window // 2, fits)
     return dataclasses.replace(motion, lag=np.array(lags)).calibrated(
-        CALIBRATION, float(params.window)
+        CALIBRATION.behind(camera), float(params.window)
     )
 
 

@@ -243,7 +243,7 @@ class Voting(MotionEstimator[Params]):
             whole("evidence"),
             whole("cloud") if cloud else None,
         ).within(recording)
-        by = PLANAR if kind.uniform else OTHERS
+        by = (PLANAR if kind.uniform else OTHERS).behind(camera or recording.camera)
         return (smoothed(motion, params) if smooth else motion).calibrated(by, 2 * motion.lag)
 
     def _kernel(
