@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from jaxevent.egomotion import flow as event_flow
 from jaxevent.egomotion.comparison import Comparison, compare
 from jaxevent.egomotion.models import Model, find_model
-from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.motion import Motion, decided
 from jaxevent.egomotion.truth import Known, known
 from jaxevent.egomotion.twists import constant_between, from_poses, nearest_axes
 from jaxevent.errors import InputError, MissingExtra, require
@@ -76,7 +76,8 @@ def write_motion(
     method: str | None = None,
     params: Parameters | None = None,
 ) -> None:
-    """Write the estimates as HDF5: t (us), mean, covariance, lost, lag (s), contrast, evidence.
+    """Write the estimates as HDF5: t (us), mean, covariance, lost, lag (s), contrast, evidence, and
+    what else the motion has.
 
     The attributes are recording, model, components, units, what `about` holds, of numbers and
     texts, and what `jaxevent.io.description` lists.
@@ -84,6 +85,7 @@ def write_motion(
     units = {
         "t": CLOCK, "mean": "units", "covariance": "units[i] units[j]", "lost": "1", "lag": "s",
         "contrast": "1", "evidence": "1, of a natural logarithm", "cloud": "units",
+        "agreement": "1",
     }  # fmt: skip
     with complete_hdf5(Path(path), method, params) as (file, _):
         file.attrs["format"] = "jaxevent motion"
@@ -143,9 +145,6 @@ def fitted_velocity(recording: Recording, motion: Motion, span: float | int = 0.
     mean, _, valid = motion(twists.t, extrapolate=True)
     mean = np.where(valid[:, None], mean, np.nan)
     return Known(model, twists.t, model.at_one_depth(twists, f, mean))
-
-
-UNDECIDED = 1.0  # rad, standard deviation of a direction that is not told
 
 
 class Truth(NamedTuple):
@@ -331,11 +330,15 @@ class Written:
             lines += ["", f"pictures are left out: {self.left_out}"]
         return lines
 
+    def _count(self) -> str:
+        number = len(self.motion)
+        return f"{number:,} estimate{'s' * (number != 1)}"
+
     def _found(self) -> list[str]:
         lost = ~self.told.valid
         first = np.flatnonzero(~lost)
         if not len(first):
-            lines = [f"{len(self.motion):,} estimates: the motion was never found"]
+            lines = [f"{self._count()}: the motion was never found"]
             return [
                 *lines,
                 "another --model or --method, or --params of other windows, may find it",
@@ -343,19 +346,19 @@ class Written:
         since = (self.times[first[0]] - self.times[0]) * 1e-6
         later = lost[first[0] :].mean()
         lines = [
-            f"{len(self.motion):,} estimates, found after {since:.3f} s, then lost "
-            f"{100 * later:.2f} % of the time"
+            f"{self._count()}, found after {since:.3f} s, then lost {100 * later:.2f} % of the time"
         ]
         mean = self.told.mean[first]
         sigma = np.sqrt(np.diagonal(self.told.covariance[first], axis1=1, axis2=2).clip(0))
         cells = [["", "mean", "least", "most", "sigma", ""]]
         model = self.motion.model
+        told = decided(model, self.told.covariance[first])
         for i, (name, unit) in enumerate(zip(model.components, model.units, strict=True)):
-            column = mean[:, i]
-            numbers = (column.mean(), column.min(), column.max(), np.median(sigma[:, i]))
-            cells.append(
-                [name, *(f"{number:.4g}" for number in numbers), "" if unit == "1" else unit]
-            )
+            column = mean[told[:, i], i]
+            numbers = (column.mean(), column.min(), column.max()) if len(column) else ()
+            said = [f"{number:.4g}" for number in numbers] or ["not told", "", ""]
+            usual = f"{np.median(sigma[:, i]):.4g}"
+            cells.append([name, *said, usual, "" if unit == "1" else unit])
         widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
         lines += [
             "  ".join(cell.rjust(w) for cell, w in zip(line, widths, strict=True)).rstrip()
@@ -366,8 +369,7 @@ class Written:
         )
         for part in model.parts:
             if part.direction:
-                blocks = self.told.covariance[first, part.rows, part.rows]
-                unknown = np.trace(blocks, axis1=1, axis2=2) > UNDECIDED**2
+                unknown = ~told[:, part.rows].all(1)
                 if unknown.any():
                     lines.append(
                         f"translation is not observable {100 * unknown.mean():.0f} % of the time: "

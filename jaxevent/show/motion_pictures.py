@@ -17,7 +17,7 @@ from jaxevent.egomotion import flow as event_flow
 from jaxevent.egomotion.candidates import coordinates
 from jaxevent.egomotion.flow import Flow
 from jaxevent.egomotion.models import Model, Numeric
-from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.motion import Motion, decided
 from jaxevent.egomotion.scores import axis_error, endpoint_error
 from jaxevent.egomotion.truth import Known
 from jaxevent.egomotion.warped import blur, contrast, splat
@@ -51,7 +51,8 @@ def motion_figure(
     """The components over times (us), against the truth and with errors where known.
 
     Bands are two standard deviations, grey spans those in which the motion is lost, dots some of
-    the particles, where the motion has a `cloud` (estimates, particles, components).
+    the particles, where the motion has a `cloud` (estimates, particles, components). Where a
+    direction is not told there is neither line nor band.
     """
     figure = new_figure()
     if len(times) > _PLOTTED:
@@ -59,7 +60,7 @@ def motion_figure(
     told = motion(times, centred=centred)
     model, seconds = motion.model, times * 1e-6
     judged = _judged(model, times, told, truth)
-    trust = np.where(told.valid, 1.0, np.nan)
+    trust = np.where(told.valid[:, None] & decided(model, told.covariance), 1.0, np.nan)
     extra = judged or _contrasts(motion, times)
     sizes = [len(model.components[part.rows]) for part in model.parts]
     rows, columns = max(sizes), len(sizes)  # a column for each part
@@ -74,7 +75,7 @@ def motion_figure(
     for i, name in enumerate(model.components):
         row, column, part = order[i]
         axis = grid[row, column]
-        value = told.mean[:, i] * trust
+        value = told.mean[:, i] * trust[:, i]
         _cloud(axis, motion, i, centred)
         low, high = value - 2 * sigma[:, i], value + 2 * sigma[:, i]
         axis.fill_between(seconds, low, high, color=_ESTIMATE, alpha=0.25, lw=0)
@@ -90,6 +91,7 @@ def motion_figure(
         axis.set_ylabel(name if unit == "1" else f"{name} ({unit})")
         if part.direction:
             axis.set_ylim(-1.08, 1.08)
+            _untold(axis, seconds, told.valid & np.isnan(value))
         elif any(map(len, seen)):
             # A component that hardly changes is not enlarged until its noise fills the axis.
             low, high = np.concatenate(seen).min(), np.concatenate(seen).max()
@@ -102,14 +104,19 @@ def motion_figure(
         good = series[np.isfinite(series)]
         if len(good):
             axis.set_ylim(0, 1.15 * max(np.percentile(good, 99), 1e-9))
-    for axis in grid.ravel():
+    empty = range(len(extra), columns) if extra else ()
+    for column in empty:
+        grid[-1, column].remove()
+    for column in range(columns):
+        axis = grid[-2 if column in empty else -1, column]
+        axis.tick_params(labelbottom=True)
+        axis.set_xlabel("t (s)")
+    for axis in figure.axes:
         _shade(axis, seconds, ~told.valid)
         if not told.valid.any():
             axis.text(0.5, 0.5, "never found", transform=axis.transAxes, ha="center", va="center")
         axis.spines[["top", "right"]].set_visible(False)
         axis.set_xlim(seconds[0], max(seconds[-1], seconds[0] + 1e-6))
-    for axis in grid[-1]:
-        axis.set_xlabel("t (s)")
     grid[0, 0].legend(
         fontsize=8, frameon=False, ncols=4, loc="lower left", bbox_to_anchor=(0, 1), borderpad=0.2
     )
@@ -147,10 +154,11 @@ def _judged(
 
 
 def _contrasts(motion: Motion, times: NDArray[np.int64]) -> list[tuple[str, NDArray[np.float64]]]:
-    """Without a truth: how much better than chance the motion explains the events."""
-    if not np.isfinite(motion.contrast).any():
-        return []
-    return [("contrast", np.interp(times, motion.t, motion.contrast))]
+    """Without a truth: how well the motion explains the events."""
+    for label, values in (("contrast", motion.contrast), ("events explained", motion.agreement)):
+        if values is not None and np.isfinite(values).any():
+            return [(label, np.interp(times, motion.t, values))]
+    return []
 
 
 def _cloud(axis: Any, motion: Motion, component: int, centred: bool) -> None:
@@ -168,6 +176,17 @@ def _cloud(axis: Any, motion: Motion, component: int, centred: bool) -> None:
         zorder=0, rasterized=True,
     )  # fmt: skip
     axis.plot([], [], ".", color=_CLOUD, label="particles")
+
+
+def _untold(axis: Any, seconds: NDArray, untold: NDArray[np.bool_]) -> None:
+    """Say where a direction is not told."""
+    edges = np.flatnonzero(np.diff(np.r_[False, untold, False].astype(int)))
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        last = seconds[min(end, len(seconds) - 1)]
+        axis.axvspan(seconds[begin], last, fc="none", ec=_LOST, hatch="///", lw=0)
+    if untold.any():
+        place = float(seconds[untold].mean())
+        axis.text(place, 0, "not told", ha="center", va="center", backgroundcolor="white")
 
 
 def _shade(axis: Any, seconds: NDArray, lost: NDArray[np.bool_]) -> None:
@@ -318,9 +337,12 @@ def plot_warped(
         f"{len(events):,} events of {span:.0f} ms at {part.reference * 1e-6:.3f} s", fontsize=10
     )
     gain = sharp[1] / sharp[0] if sharp[0] > 0 else math.nan
-    titles = (f"as they fell: contrast {sharp[0]:.3g}", f"warped: {sharp[1]:.3g}, {gain:.2f} times")
+    titles = (
+        f"as they fell: contrast {sharp[0]:.3g}",
+        f"moved back along the motion: {sharp[1]:.3g}, {gain:.2f} times as much",
+    )
     if not motion(part.reference, extrapolate=True).valid[0]:
-        titles = (titles[0], "not warped: the motion is not found here")
+        titles = (titles[0], "not moved: the motion is not found here")
     for axis, image, title in zip(figure.subplots(1, 2), images, titles, strict=True):
         axis.imshow(image, cmap="gray", vmin=-limit, vmax=limit, interpolation="nearest")
         axis.set_title(title, fontsize=10)

@@ -1,5 +1,6 @@
 """A recording's windows one beside another, each from where the one before goes on."""
 
+import dataclasses
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 
@@ -126,7 +127,7 @@ def _blended(
     end = 2 * half // 3
     t = np.arange(max(centres[0] - end, first), min(centres[-1] + end, last) + 1, max(step // 5, 1))
     heading, Omega = np.zeros((len(t), 3)), np.zeros((len(t), 3))
-    covariance, total, contrast = np.zeros((len(t), 6, 6)), np.zeros(len(t)), np.zeros(len(t))
+    covariance, total, agreement = np.zeros((len(t), 6, 6)), np.zeros(len(t)), np.zeros(len(t))
     reach = min(end, step)
     apart = _disagreements(centres, fits, half)
     for centre, fit, off in zip(centres, fits, apart, strict=True):
@@ -139,14 +140,15 @@ def _blended(
         heading[near] += weight[:, None] * T
         Omega[near] += weight[:, None] * turn
         covariance[near] += weight[:, None, None] * (fit.covariance + off)
-        contrast[near] += weight * fit.agreement
+        agreement[near] += weight * fit.agreement
         total[near] += weight
     lost = total < 1e-6
     safe = np.where(lost, 1, total)
     size = np.linalg.norm(heading, axis=1, keepdims=True)
     heading = np.where(size > 0, heading / np.where(size > 0, size, 1), np.array([0.0, 0, 1]))
     mean = np.concatenate([heading, Omega / safe[:, None]], 1)
-    return Motion.of(General, t, mean, covariance / safe[:, None, None], ~lost, contrast / safe)
+    told = Motion.of(General, t, mean, covariance / safe[:, None, None], ~lost)
+    return dataclasses.replace(told, agreement=agreement / safe)
 
 
 def _disagreements(
