@@ -23,13 +23,14 @@ class Layers:
 
     `spread` is the standard deviation of their velocities along it, in shares of the usual one, `z`
     how sure it is that they differ, and `slow` and `fast` (px/s) bound the middle four fifths of
-    their speeds.
+    their speeds. `both` tells that some go the usual way and some back.
     """
 
     spread: float
     z: float
     slow: float
     fast: float
+    both: bool
 
     @property
     def several(self) -> bool:
@@ -74,4 +75,4 @@ def layers(
     slow, fast = np.percentile(speed_of, [10, 90])
     usual = float(np.median(np.abs(factor)))
     spread = float((high - low) / 2 / max(usual, 1e-9))
-    return Layers(spread, standard(np.concatenate(differ)), float(slow), float(fast))
+    return Layers(spread, standard(np.concatenate(differ)), float(slow), float(fast), bool(low < 0))

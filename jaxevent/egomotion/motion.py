@@ -163,9 +163,12 @@ class Motion(Shown):
         along = spread**2 * mean[:, :, None] * mean[:, None, :]
         across = (spread * ACROSS) ** 2 * size2 * np.eye(mean.shape[1])
         how = "as one" if self.model.uniform else "as a rotation makes it"
+        cause, other = "at several depths", "general"
+        if self.model.uniform and found.both:
+            cause, other = "both ways if the camera rolls", "rotation"
         line = (
             f"the image does not move {how}: parts of it at {found.slow:.0f} to {found.fast:.0f} "
-            "px/s, as at several depths; sigmas count that, and --model general may explain it"
+            f"px/s, as {cause}; sigmas count that, and --model {other} may explain it"
         )
         return dataclasses.replace(self, covariance=self.covariance + along + across), line
 

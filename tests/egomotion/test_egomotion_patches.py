@@ -98,9 +98,11 @@ def test_models_are_told_apart():
     assert turns.z["rotation", "planar"] > 3 and "better than" in " ".join(turns.lines)
     assert "not sure" in turns.lines[-1] and "not sure" not in " ".join(slides.lines)
     flat, several, rolling = layers(plane), layers(sliding), layers(turning)
-    assert rolling is not None and rolling.several and rolling.spread > 0.5  # both ways
+    assert rolling is not None and rolling.several and rolling.spread > 0.5 and rolling.both
     assert flat is None or not flat.several
-    assert several is not None and several.several and 0.2 < several.spread < 0.9
+    assert (
+        several is not None and several.several and not several.both and 0.2 < several.spread < 0.9
+    )
     assert several.slow < 50 and several.fast > 75  # 45 and 90 px/s
     bare = moving(lambda x: np.tile(one, (len(x), 1)), 0.6, camera=None)
     assert choose(bare).model.name == "planar"
