@@ -446,6 +446,24 @@ def test_windows_that_disagree_are_less_sure():
     assert not np.any(far)  # they share no events
 
 
+def test_the_end_of_a_path_is_less_sure():
+    """Where no other window tells the motion, and by how far it is from that at the middle."""
+    path = Path.constant(np.array([0.0, 0, 1]), np.array([0, 0, 0.5]), np.zeros(1))
+    path.O[1, 2] = -2.0  # rad/s^2
+    fits, half = [a_fit(path, 1.0)._replace(covariance=np.eye(6) * 1e-4)] * 3, 150_000
+    told = sequence._blended(np.arange(3) * 100_000, [*fits], half, 100_000, -half, 2 * half)
+    middle = np.abs(told.t - 100_000) < 100_000
+    apart = told.covariance[middle, 5, 5] - 1e-4  # of the windows, which a ramp does not join
+    lone = sequence._blended(np.zeros(1, int), fits[:1], half, 100_000, -half, half)
+    assert list(lone.t[[0, -1]]) == [-100_000, 100_000]
+    grown = 1e-4 + (sequence.BENT * 2.0 * lone.t * 1e-6) ** 2
+    np.testing.assert_allclose(lone.covariance[:, 5, 5], grown)
+    np.testing.assert_allclose(lone.covariance[:, :5, :5], np.tile(np.eye(5) * 1e-4, (11, 1, 1)))
+    np.testing.assert_allclose(apart, (2.0 * 0.1) ** 2)
+    first = told.covariance[told.t == -100_000, 5, 5]
+    assert first > (sequence.BENT * 0.2) ** 2
+
+
 def windows_that(monkeypatch, fit, follow):
     """Windows whose fits are given, by centre and path; what was asked for, in order."""
     asked = []
