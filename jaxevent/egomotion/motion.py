@@ -150,10 +150,17 @@ class Motion(Shown):
 
         One velocity of the whole image is no better than by how much its parts differ, as those at
         several depths do; and where they differ from a rotation translation may have made all of
-        it. See `layers`. Of other models it is the same.
+        it. See `layers`. Where the camera stands still and things move (`still`), nothing tells its
+        motion but theirs.
         """
         from jaxevent.egomotion.layers import layers
+        from jaxevent.egomotion.still import stands_still
 
+        if self.valid.any() and stands_still(recording):
+            return self._of_things(), (
+                "the camera seems to stand still while things move: edges that the frames show make "
+                "no events; sigmas count that, and jaxevent track follows things"
+            )
         found = layers(recording, self.model)
         if found is None or not found.several:
             return self, ""
@@ -171,6 +178,16 @@ class Motion(Shown):
             f"px/s, as {cause}; sigmas count that, and --model {other} may explain it"
         )
         return dataclasses.replace(self, covariance=self.covariance + along + across), line
+
+    def _of_things(self) -> "Motion":
+        """The same, whose covariance counts that it may be no motion of the camera at all."""
+        covariance, mean = self.covariance.copy(), np.nan_to_num(self.mean)
+        for part in self.model.parts:
+            m = mean[:, part.rows]
+            own = m[:, :, None] * m[:, None, :]
+            own = own + (ACROSS**2 * (m**2).sum(1))[:, None, None] * np.eye(m.shape[1])
+            covariance[:, part.rows, part.rows] += np.eye(3) if part.direction else own
+        return dataclasses.replace(self, covariance=covariance)
 
     def within(self, recording: Recording) -> "Motion":
         """The same, of that recording."""

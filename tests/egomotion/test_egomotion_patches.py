@@ -11,11 +11,12 @@ from jaxevent.egomotion.candidates import coordinates
 from jaxevent.egomotion.choice import choose, decide
 from jaxevent.egomotion.geometry import A, B, rotation_basis
 from jaxevent.egomotion.layers import layers
-from jaxevent.egomotion.motion import LENS, Calibration, Motion
+from jaxevent.egomotion.motion import LENS, Calibration, Motion, decided
 from jaxevent.egomotion.patch_fits import standard
 from jaxevent.egomotion.patches import usual_speed
+from jaxevent.egomotion.still import edges_with_events
 from jaxevent.errors import InputError
-from jaxevent.recording import Events, Imu, Poses, Recording
+from jaxevent.recording import Events, Frames, Imu, Poses, Recording
 from jaxevent.show.motion import Written
 from jaxevent.show.motion_pictures import motion_figure
 
@@ -153,6 +154,33 @@ def test_a_heading_that_nothing_tells_is_said():
         assert len(drawn) == 7 and np.isfinite(drawn["wx (rad/s)"]).all()
         assert np.isnan(drawn["tx"]).all() == said
         np.testing.assert_allclose(drawn["events explained"], [0.5, 0.9])
+
+
+def test_a_camera_that_stands_still_while_things_move():
+    """Edges of frames on that side of the image where events are, or on the other."""
+    recording = moving(lambda x: np.tile([70.0, 20.0], (len(x), 1)), 0.6)
+    e = recording.events
+    right = e.x >= WIDTH // 2
+    events = Events(e.t[right], e.x[right], e.y[right], e.p[right])
+    t = np.arange(100_000, 600_000, 100_000)
+    light = np.random.default_rng(0).uniform(0.2, 1, (HEIGHT // 8, WIDTH // 8)).repeat(8, 0)
+    image, shares = np.full((HEIGHT, WIDTH), 0.5, np.float32), []
+    mean, covariance = np.tile([70.0, 20.0], (2, 1)), np.tile(np.eye(2), (2, 1, 1))
+    motion = Motion.of("planar", np.array([100_000, 500_000]), mean, covariance)
+    for columns in (slice(0, 56), slice(64, WIDTH)):
+        image[:], image[:, columns] = 0.5, light.repeat(8, 1)[:, columns]
+        frames = Frames(t, np.tile(image, (len(t), 1, 1)), np.zeros(len(t), np.int64))
+        shown = dataclasses.replace(recording, events=events, frames=frames)
+        shares.append(edges_with_events(shown))
+        told, line = motion.with_layers(shown)
+        still = "stand still" in line
+        assert still == (told.covariance[0, 0, 0] > 70**2) == (columns.start == 0)
+    assert shares[0] < 0.1 and shares[1] > 0.5
+    assert edges_with_events(recording) is None
+    heading = np.tile([0.0, 0, 1, 0.1, 0, 0], (2, 1))
+    general = Motion.of("general", motion.t, heading, np.zeros((2, 6, 6)))
+    unsure = general._of_things().covariance
+    assert not decided("general", unsure)[:, :3].any() and unsure[0, 3, 3] > 0.1**2
 
 
 def test_standard():
