@@ -26,7 +26,8 @@ _BEHIND = 1_000_000  # most events behind the paths
 _ELLIPSES = 6  # along a path
 _TELLS, _OFTEN = 3.0, 0.2  # standard deviations of a growth from 0, and share of its times
 _CHANGED, _ALIKE = 1.2, 0.5  # ratio of sizes of what grows, least of the axes' changes over most
-_ONE_WAY = 0.5  # of all changes is one of growth or of shrinking
+_ONE_WAY = 0.8  # of all changes is one of growth or of shrinking
+_RESOLVED = 2.0  # px, the least size along the shorter axis: smaller spots are as large as pixels
 _PARTS = 8  # of a life, whose median sizes are compared
 _CURVES = 6  # most tracks in the panels over time
 _SIZE, _TTC, _RANGE = "lambda (px)", "1 / TTC (1/s)", "range (m)"
@@ -50,16 +51,18 @@ def write_track_plot(
     size_factor: float | int = SIZE_FACTORS["ring"],
     Q: float | int = 0.01,
     Q_lambda: float | int | None = None,
+    total: int | None = None,
 ) -> None:
     """Draw where tracks went and, over time, their size, with bands of two standard deviations.
 
     Over time are the six tracks that are seen longest, and those of pairs. Paths are drawn over the
     events, coloured by time, with ellipses of two standard deviations at intervals. 1 / TTC is that
     of a track's growth (`quantities.growth`, smoothed, with Q and Q_lambda), if it differs from 0
-    and both axes grow alike, as those of what comes nearer do; and, of `pairs` of ids, that of the
-    two blobs. Range is drawn where `extent` (m) and `focal` (px) are given. Time counts from the
-    recording's start. The suffix of `path` chooses the format (PNG, PDF, SVG). Raises `InputError`
-    without the extra "plot", for unknown ids and suffixes and for arrays that do not fit.
+    and both axes, larger than pixels, grow alike and one way, as those of what comes nearer do;
+    and, of `pairs` of ids, that of the two blobs. Range is drawn where `extent` (m) and `focal`
+    (px) are given. Time counts from the recording's start. `total` is of how many tracks these are
+    a part. The suffix of `path` chooses the format (PNG, PDF, SVG). Raises `InputError` without the
+    extra "plot", for unknown ids and suffixes and for arrays that do not fit.
     """
     require("matplotlib", "plot")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -72,12 +75,16 @@ def write_track_plot(
             raise InputError(f"{path}: the pair {pair} is not two of the tracks {known}")
     if (extent is None) != (focal is None):
         raise InputError(f"{path}: range needs both the extent (m) and the focal length (px)")
+    paths = t, known, mean, valid
+    shown = _longest(valid, [known.index(one) for pair in pairs for one in pair])
+    known, mean, covariance, valid = (
+        number[shown].tolist(), mean[:, shown], covariance[:, shown], valid[:, shown],
+    )  # fmt: skip
     filled = np.where(valid[..., None], mean, 1.0)
     filled_P = np.where(valid[..., None, None], covariance, np.eye(8))
     m, P = jnp.asarray(filled), jnp.asarray(filled_P)
-    shown = _longest(valid, [known.index(one) for pair in pairs for one in pair])
     grown, spread, grows = _growths(t, m, P, valid, Q, Q_lambda)
-    grows &= _scales(filled[..., 4:6], valid) & shown
+    grows &= _scales(filled[..., 4:6], valid)
 
     asked = [_TTC] * bool(grows.any() or len(pairs)) + [_RANGE] * (extent is not None)
     names = [_SIZE, *asked] if valid.any() else []
@@ -91,12 +98,12 @@ def write_track_plot(
         )
     grid = figure.add_gridspec(1 + len(names), 1, height_ratios=[high, *([2.2] * len(names))])
     seconds = (t - recording.start) * 1e-6
-    draw_paths(figure.add_subplot(grid[0]), recording, t, known, mean, valid)
+    draw_paths(figure.add_subplot(grid[0]), recording, *paths, total=total)
     bands = _Bands({name: figure.add_subplot(grid[k + 1]) for k, name in enumerate(names)}, seconds)
     ranges = None
     if extent is not None and focal is not None:
         ranges = jax.jit(size_range)(m, P, extent, focal, size_factor)
-    for i in np.flatnonzero(shown & valid.any(0)).tolist():
+    for i in np.flatnonzero(valid.any(0)).tolist():
         one, seen, label = known[i], valid[:, i], f"{known[i]}"
         line: dict[str, Any] = {
             "color": "#{:02x}{:02x}{:02x}".format(*track_colour(one, dark=True))
@@ -113,7 +120,7 @@ def write_track_plot(
         value, variance = jax.jit(inverse_ttc)(m[:, a], P[:, a], m[:, b], P[:, b])
         line = {"color": "black", "ls": ls, "label": f"{pair[0]} and {pair[1]}"}
         bands.add(_TTC, value, variance, valid[:, a] & valid[:, b], **line)
-    bands.finish(shown)
+    bands.finish(len(known), len(number) if total is None else total)
     with complete(Path(path)) as temporary:
         figure.savefig(temporary, format=suffix, dpi=150)
 
@@ -129,13 +136,16 @@ def _longest(valid: NDArray[np.bool_], also: Sequence[int]) -> NDArray[np.bool_]
 def _scales(sizes: NDArray, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Of which tracks (T, N) both sizes (T, N, 2) change alike: they come nearer or go away.
 
-    What turns, or comes into sight, changes one of them; what flickers grows and shrinks by turns.
+    What turns, or comes into sight, changes one of them; what flickers, or takes events of others
+    for a while, grows and shrinks by turns; and what is as small as pixels has their size.
     """
     told = np.zeros(valid.shape[1], bool)
     for i, seen in enumerate(valid.T):
         parts = np.array_split(np.log(sizes[seen, i]), _PARTS)
         if len(parts[-1]):
             medians = np.array([np.median(part, axis=0) for part in parts])
+            if np.median(medians.min(1)) < np.log(_RESOLVED):
+                continue
             mean = medians.sum(1)
             change = medians[mean.argmax()] - medians[mean.argmin()]
             alike = change.min() > _ALIKE * change.max() > _ALIKE * np.log(_CHANGED)
@@ -181,9 +191,9 @@ class _Bands:
             clear = np.isfinite(value) & (deviation <= 3 * np.nanmedian(deviation[seen]))
             self.bounds += [float(np.nanmin(low[clear])), float(np.nanmax(high[clear]))]
 
-    def finish(self, shown: NDArray[np.bool_]) -> None:
-        legend = 0 < shown.sum() <= _LEGEND
-        some = "" if shown.all() else f" of {shown.sum()} tracks"
+    def finish(self, shown: int, total: int) -> None:
+        legend = 0 < shown <= _LEGEND
+        some = "" if shown == total else f" of the {shown} tracks seen longest"
         if not self.axes:
             return
         for name, axis in self.axes.items():
@@ -205,12 +215,13 @@ def draw_paths(
     known: Sequence[int],
     mean: NDArray,
     valid: NDArray[np.bool_],
+    total: int | None = None,
 ) -> None:
     """Draw paths in the image plane over the number of events of each pixel; time is colour.
 
     `mean` (T, N, 8) and `valid` (T, N) at sorted times (us) of the tracks `known`. Ellipses of two
     standard deviations stand at intervals, a track's number where it ends. Behind are the events of
-    that time, at most a million in its middle.
+    that time, at most a million in its middle. `total` is of how many tracks these are a part.
     """
     from matplotlib.collections import LineCollection
 
@@ -243,4 +254,8 @@ def draw_paths(
         axis.figure.colorbar(lines, ax=axis, fraction=0.03, pad=0.01, label="t (s)")
     axis.set(xlim=(-0.5, recording.width - 0.5), ylim=(recording.height - 0.5, -0.5))
     axis.set(xlabel="x (px)", ylabel="y (px)")
-    axis.set_title("paths, ellipses of 2 standard deviations, numbers where they end", fontsize=9)
+    some = ""
+    if total is not None and total > len(known):
+        some = f" of the {len(known)} of {total} tracks seen longest"
+    title = f"paths{some}, ellipses of 2 standard deviations, numbers where they end"
+    axis.set_title(title, fontsize=9)

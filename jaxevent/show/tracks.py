@@ -28,7 +28,7 @@ from jaxevent.show.track_tables import QUANTITIES, no_rows, quantity_writer, tra
 
 _PLOTS = (".png", ".pdf", ".svg")
 _EXTRAS = {".mp4": ("imageio_ffmpeg", "video")} | {kind: ("matplotlib", "plot") for kind in _PLOTS}
-_COARSE, _PLOTTED = 4096, 16  # most times of the plot and of quantities, most tracks plotted
+_COARSE, _PLOTTED = 4096, 64  # most times of the plot and of quantities, most tracks plotted
 _FPS, _PICTURES = 30.0, 150  # of a video: most pictures per second, and least in all
 _STRETCH = 2_000_000  # events of which rows are written at a time
 
@@ -47,7 +47,7 @@ class Output:
     is in the gate of a track, of its likeliest one. Behind the video are "events" or the
     "high-pass" reconstruction; it plays at 30 pictures per second, slower than real time if that
     would be less than 5 s. quantities.csv and the plot have at most 4096 times, evenly spaced; the
-    plot shows the 16 longest tracks. Memory does not grow with the recording's length.
+    plot shows the 64 longest tracks. Memory does not grow with the recording's length.
 
     quantities.csv has the columns t (s), id, other, inverse_ttc (1/s), range (m) and their standard
     deviations; where `other` is empty, inverse_ttc is that of the growth of one blob, see
@@ -214,7 +214,7 @@ class Output:
             write_track_plot(
                 places[kind], tracks.recording, coarse, tracks.id[chosen], *rows.dense(chosen),
                 pairs=self.pairs, extent=self.extent, focal=self.focal, size_factor=self._factor(),
-                Q_lambda=float(tracks.params.Q_lambda),
+                Q_lambda=float(tracks.params.Q_lambda), total=len(tracks),
             )  # fmt: skip
         slow = min(often, _FPS) / often if ".mp4" in places else None
         return Written(tracks, rows, [path.name for path in places.values()], slow, [])
@@ -294,8 +294,11 @@ class Written:
     left_out: list[str]
 
     def summary(self, most: int = 20) -> list[str]:
-        """Lines of a table of the longest tracks: times in s, median speed and size in px."""
-        tracks = self.tracks
+        """Lines of a table of the longest tracks: times in s, median speed and size in px.
+
+        Times are from the recording's start, as in the plot.
+        """
+        tracks, zero = self.tracks, self.tracks.recording.start
         order = sorted(np.argsort(tracks.birth - tracks.death, kind="stable")[:most].tolist())
         cells = [["id", "birth s", "death s", "ended", "px/s", "lambda1, lambda2 px"]]
         for i in order:
@@ -304,7 +307,7 @@ class Written:
             if len(mean):
                 median = np.median(np.c_[np.hypot(mean[:, 2], mean[:, 3]), mean[:, 4:6]], axis=0)
                 speed, size = f"{median[0]:.4g}", f"{median[1]:.3g}, {median[2]:.3g}"
-            birth, death = (f"{at[i] * 1e-6:.4f}" for at in (tracks.birth, tracks.death))
+            birth, death = (f"{(at[i] - zero) * 1e-6:.4f}" for at in (tracks.birth, tracks.death))
             cells.append([str(tracks.id[i]), birth, death, tracks.ended[i], speed, size])
         widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
         lines = [
@@ -316,6 +319,9 @@ class Written:
         lines += ["", f"ended: {'; '.join(f'{one}, {ENDED[one]}' for one in reasons)}"] * bool(
             order
         )
+        if order and abs(zero) >= 1000:
+            at = f"{zero * 1e-6:.4f} s on its clock, which tables tell"
+            lines.append(f"birth, death: from the recording's start, {at}")
         lines += [
             "px/s, lambda1, lambda2: medians over time of the speed and of the standard deviations "
             "of a blob's events along its axes"

@@ -550,8 +550,11 @@ def test_what_comes_nearer_grows_along_both_axes():
     valid[:, 5] = False
     sizes = np.concatenate([sizes, np.ones((50, 1, 2))], 1)
     assert track_plots._scales(sizes, valid).tolist() == [True, True, False, False, False, False]
-    flickers = np.exp(0.3 * np.sin(20 * t))[:, None, None] * np.ones((1, 1, 2))
-    assert not track_plots._scales(flickers, valid[:, :1]).any()
+    flickers = np.exp(0.3 * np.sin(20 * t))[:, None, None] * 5 * np.ones((1, 1, 2))
+    swells = np.exp(np.clip(4 - 20 * abs(t - 0.5), 0, 1))[:, None, None] * 5 * np.ones((1, 1, 2))
+    tiny = sizes[:, :2] / 3
+    for one in (flickers, swells, tiny):
+        assert not track_plots._scales(one, valid[:, : one.shape[1]]).any()
 
 
 def test_panels_hold_the_tracks_that_are_seen_longest():

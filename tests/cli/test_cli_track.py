@@ -225,6 +225,22 @@ def test_one_file_of_each_kind(folder, capsys):
 
 
 @pytest.mark.slow
+def test_the_summary_counts_from_the_recordings_start(tmp_path):
+    events = two().events[:]
+    later = Recording(
+        "later", WIDTH, HEIGHT, Events(events.t + 7_000_000, events.x, events.y, events.p)
+    )
+    params = constant_velocity.Params(**tomllib.loads(SETTINGS))
+    told = []
+    for k, recording in enumerate((two(), later)):
+        tracks = constant_velocity.estimate(recording, params, seeds=SEEDS)
+        told.append(written.Output(tmp_path / f"{k}.csv").write(tracks).summary())
+    (note,) = [line for line in told[1] if line not in told[0]]
+    assert note.startswith("birth, death: from the recording's start, 7.00")
+    assert [line for line in told[1] if line != note] == told[0] and len(told[0]) > 3
+
+
+@pytest.mark.slow
 def test_nothing_found_is_an_empty_table(tmp_path, capsys):
     t = np.arange(0, 60_000, 3_000)
     x, y = (37 * np.arange(20)) % WIDTH, (23 * np.arange(20)) % HEIGHT
