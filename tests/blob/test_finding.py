@@ -15,6 +15,7 @@ from jaxevent.blob.finding.found import Found, most_events
 from jaxevent.blob.finding.parts import join_parts
 from jaxevent.blob.finding.paths import ANYBODY, NOBODY, candidates, join
 from jaxevent.blob.finding.paths import Path as TargetPath
+from jaxevent.blob.finding.search import _settled
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.errors import InputError
 from jaxevent.io import load
@@ -123,6 +124,15 @@ def test_paths_in_contact_all_their_lives_are_one():
     np.testing.assert_allclose(
         both.C, np.broadcast_to(np.diag([9.0, 9 + float(spread)]), both.C.shape)
     )
+
+
+def test_beginnings_from_which_a_target_leaps_are_left_out():
+    t = np.arange(0, 30_000, 1000)
+    x = 20 + 5e-3 * t
+    path = _path(t, x, 30.0, 3.0, 30)
+    assert _settled(path) is path
+    leaping = _path(t, np.where(np.arange(30) == 2, x + 25, x), 30.0, 3.0, 30)
+    np.testing.assert_array_equal(_settled(leaping).t, t[3:])
 
 
 def test_pieces_of_an_edge_are_one_while_each_is_seen():

@@ -20,7 +20,7 @@ from jaxevent.blob.finding.paths import Path as TargetPath
 from jaxevent.blob.finding.polarity import prefer_sharper
 from jaxevent.blob.finding.prediction import WIDTHS, choose_scored, predict, score
 from jaxevent.blob.finding.stream import Part, Pixels, Stream
-from jaxevent.blob.finding.targets import GATE, Expected, start_targets, update
+from jaxevent.blob.finding.targets import GATE, KNOWN, Expected, start_targets, update
 from jaxevent.blob.prepare import Packing
 from jaxevent.recording import Events, Recording
 
@@ -214,7 +214,8 @@ def test_events_are_shared_out_among_gates_and_blobs():
         if share.sum() < CLAIMED:
             continue
         own = np.flatnonzero((share >= min(OWNS, share.max())) & (share > 0))
-        for i in np.flatnonzero((labels == blob) & ~np.isin(owner, own)):
+        kept = (owner >= 0) & confirmed[owner]
+        for i in np.flatnonzero((labels == blob) & ~np.isin(owner, own) & ~kept):
             expected[i] = own[distance[own, i].argmin()]
     told = seen.share_out(labels, blobs)
     assert (expected != owner).any()
@@ -294,6 +295,19 @@ def test_gates_of_known_targets_end_at_their_size_beyond_it():
     assert owners == [[0, -1, -1, -1], [0, 0, -1, -1]]
 
 
+@pytest.mark.parametrize(("known", "owners"), [(True, {1}), (False, {0})])
+def test_faint_targets_that_are_known_keep_their_events_in_a_blob_with_a_large_one(known, owners):
+    two = start_targets(
+        np.arange(2), 0.0, np.array([[30.0, 30], [60, 30]]), 9 * np.ones((2, 1, 1)) * np.eye(2),
+        np.array([95.0, 5]), 0.01,
+    )  # fmt: skip
+    live = two._replace(confirmed=np.array([True, known]), P=np.zeros((2, 3)))
+    x = np.r_[np.full(95, 32), np.full(5, 58)].astype(np.int32)
+    part = Part(np.full(100, 0.01), x, np.full(100, 31, np.int32))
+    owner = Look(live, part, 0.01).share_out(np.ones(100, np.int32), 1)
+    assert set(owner[:95].tolist()) == {0} and set(owner[95:].tolist()) == owners
+
+
 @pytest.mark.slow
 def test_a_target_is_updated_as_by_a_kalman_filter(background):
     live, t = one_target(3.0), 0.01
@@ -305,7 +319,8 @@ def test_a_target_is_updated_as_by_a_kalman_filter(background):
     )
     seen = update(live, expected, (n, z, D), (n, z, D))
     assert seen.heard.all() and seen.n[0] == 16
-    square = np.linalg.eigvalsh(D[0])[1]
+    square = (16 * np.linalg.eigvalsh(D[0])[1] + KNOWN * 4) / (16 + KNOWN)
+    assert seen.R[0] == pytest.approx(square / 32)
     K = P[0, :2] / (P[0, 0] + square / 32 + 0.05**2 * square + 1e-3)
     np.testing.assert_allclose(live.p, p + K[0] * z)
     np.testing.assert_allclose(live.P[0, :2], (1 - K[0]) * P[0, :2])
@@ -320,3 +335,22 @@ def test_a_target_is_updated_as_by_a_kalman_filter(background):
         assert not update(live, expected, none, none).heard.any() and live.miss[0] == miss
     np.testing.assert_array_equal(live.p, before)
     assert (live.v == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("n", "away", "hits", "heard"),
+    [(3, 2.0, 9, True), (3, 5.0, 9, False), (3, 5.0, 2, True), (16, 5.0, 9, True), (16, 9.0, 9, False)],
+)  # fmt: skip
+def test_a_known_target_does_not_leap_to_few_events(background, n, away, hits, heard):
+    # Of size 2, with 20 events per window: 3 of them are at most 4.0 px from where it is expected,
+    # Of size 2, with 20 events per window: 3 of them are at most 4.0 px from where it is expected,
+    # most of them at most 6.7.
+    live, t = one_target(0.25)._replace(hits=np.full(1, hits)), 0.01
+    p, P = live.predict(t)
+    dispersion = background.field_of(np.ones((HEIGHT // CELL, WIDTH // CELL)), CELL, t)
+    expected = Expected(
+        t, 0.01, p, P, np.zeros(1, bool), background.field(t, 8), dispersion, 1.0, 1.0
+    )
+    told = np.array([float(n)]), np.array([[away, 0.0]]), 0.1 * np.eye(2)[None]
+    assert update(live, expected, told, told).heard[0] == heard
+    assert (live.p[0, 0] > 40.5) == heard

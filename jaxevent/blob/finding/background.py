@@ -19,7 +19,7 @@ from jaxevent.blob.finding.scene import SceneMotion
 from jaxevent.blob.finding.stream import Stream, cell_at
 from jaxevent.events.filters import busiest_neighbour
 from jaxevent.kernels import compiled
-from jaxevent.kernels import part as kernel_part
+from jaxevent.kernels import lean_part
 
 SLICES = 64  # of the recording's time
 CELL, FINE = 16, 4  # px; fine cells where the background is bright:
@@ -41,7 +41,7 @@ class Field(NamedTuple):
     place: NDArray[np.float64]  # (2, 3), from pixels to px in the cells
 
 
-@kernel_part
+@lean_part
 def value_at(field: Any, x: Any, y: Any) -> Any:
     """As `look_up`."""
     place = cell_at(field.place, x, y, field.cell, field.values.shape)
@@ -158,7 +158,7 @@ def evidence(
     return np.where(n > mu, told, 0) / dispersion
 
 
-@kernel_part
+@lean_part
 def nats(n: float | int, mu: float | int) -> float:
     """`evidence` for kernels, of a dispersion of 1."""
     return n * np.log(n / mu) - n + mu if n > mu else 0.0

@@ -7,11 +7,10 @@ from numpy.typing import NDArray
 
 from jaxevent.blob.finding.detection import CONTACT, touching
 from jaxevent.blob.finding.stream import Part
-from jaxevent.blob.finding.targets import GATE, Live
+from jaxevent.blob.finding.targets import GATE, REACH, Live
 from jaxevent.kernels import compiled
 from jaxevent.kernels import part as kernel_part
 
-REACH = 1.0  # sizes
 CLAIMED, OWNS = 0.3, 0.1  # shares of a blob that is claimed, and of those who own the rest of it
 
 
@@ -121,8 +120,10 @@ def _share_out(t: Any, x: Any, y: Any, middle: Any, labels: Any, blobs: int, gat
                 own[k, j] = table[k, j] >= min(OWNS * counts[k], most) and table[k, j] > 0
                 owned[k] |= own[k, j]
     for i in range(len(t)):
-        blob = labels[i] - 1
-        if blob < 0 or not owned[blob] or (owner[i] >= 0 and own[blob, owner[i]]):
+        blob, k = labels[i] - 1, owner[i]
+        if blob < 0 or not owned[blob]:
+            continue
+        if k >= 0 and (own[blob, k] or gates.more[k] == 0):
             continue
         least, late = np.inf, t[i] - middle
         for k in range(targets):

@@ -20,7 +20,7 @@ from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.polarity import prefer_sharper
 from jaxevent.blob.finding.scale import Choice, choose_scale
 from jaxevent.blob.finding.stream import Stream
-from jaxevent.blob.finding.targets import FAINT, GATE, HOLD, SEEN
+from jaxevent.blob.finding.targets import FAINT, GATE, HOLD, REACH, SEEN
 from jaxevent.blob.seeds import span_of
 from jaxevent.progress import stage
 from jaxevent.recording import Recording
@@ -35,6 +35,7 @@ JOINS = 1.5  # ellipses' distances, as `touching`, of a target's end and its new
 PAUSE = 4 * HOLD  # windows between them at most; or, at rest,
 LAST = 8  # windows that tell how fast it went
 REST = 2.0  # times the life of the shorter of both
+LEAP = 2 * GATE * REACH  # sizes: what is farther from its way is not the target
 EDGE = 2.0  # sizes from the sensor's edge, where others come and go
 SAME = 0.5  # share of a target's life near one of an earlier pass that makes it a part of that
 
@@ -98,7 +99,8 @@ def _search(
             break
         with stage(f"find, pass {number + 1}: beginnings", progress):
             rest = stream.without(confirmed, GATE)
-            whole = [_look_back(path, rest, background, choice.scale) for path in confirmed]
+            settled = [_settled(path) for path in confirmed]
+            whole = [_look_back(path, rest, background, choice.scale) for path in settled]
         near = whole = join_parts(whole)
         if background.scene is not None:
             whole = [one for one in whole if goes_own_way(one, background.scene, stream.start)]
@@ -115,6 +117,25 @@ def _lasting(path: Path) -> bool:
     windows = (path.t[-1] - path.t[0]) / path.window + 1
     size = np.median(np.trace(path.C, axis1=1, axis2=2))
     return bool(size > 2 * ONE_PIXEL**2 and len(path.t) >= FILL * windows)
+
+
+def _settled(path: Path) -> Path:
+    """The path from where it leaps no more: a new target may be where it is not yet known.
+
+    What comes after tells where each row was expected.
+    """
+    for k in range(min(LAST, len(path.t) - 2))[::-1]:
+        later = slice(k + 1, k + 1 + LAST)
+        before = path.p[k + 1] - _speed(path, later) * (path.t[k + 1] - path.t[k]) * 1e-6
+        if np.hypot(*(path.p[k] - before)) > LEAP * np.median(path.size[later, 0]):
+            return _rows(path, slice(k + 1, None))
+    return path
+
+
+def _rows(path: Path, which: slice | NDArray) -> Path:
+    """Some rows of a path."""
+    cut = {name: getattr(path, name)[which] for name in ("t", "p", "v", "C", "n")}
+    return dataclasses.replace(path, **cut)
 
 
 def _look_back(path: Path, rest: Stream, background: Background, scale: Scale) -> Path:
@@ -146,6 +167,9 @@ def _look_back(path: Path, rest: Stream, background: Background, scale: Scale) -
             silent += 1
             continue
         z = e[near].mean(0)
+        if z @ z > (GATE * REACH) ** 2 * np.linalg.eigvalsh(C)[1]:
+            silent += 1
+            continue
         p, v, silent = p + 0.5 * z, v - 0.15 * z / w / (1 + silent), 0
         rows.append((t, p, v, n))
     if not rows:
@@ -204,8 +228,7 @@ def _later(one: Path, other: Path) -> Path:
     rest = other.t > one.t[-1]
     if rest.mean() < FILL:
         return other
-    cut = {name: getattr(other, name)[rest] for name in ("t", "p", "v", "C", "n")}
-    return dataclasses.replace(other, **cut)
+    return _rows(other, rest)
 
 
 def _speed(path: Path, rows: slice) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from jaxevent.blob.finding.paths import NOBODY, Path, candidates, join
 from jaxevent.kernels import Blank, compiled
-from jaxevent.kernels import part as kernel_part
+from jaxevent.kernels import lean_part
 from jaxevent.recording import Events, Recording
 
 _counts = Blank(np.int32)
@@ -147,7 +147,7 @@ def _count(x: Any, y: Any, hot: Any, kept: Any, counts: Any) -> Any:
     return px[:m], py[:m], n
 
 
-@kernel_part
+@lean_part
 def cell_at(A: Any, x: Any, y: Any, cell: int, shape: Any) -> tuple[int, int]:
     """The cell (row, column) of the px to which a map (2, 3) takes a pixel, or the nearest one."""
     row = int(A[1, 0] * x + A[1, 1] * y + A[1, 2]) // cell

@@ -7,14 +7,18 @@ from numpy.typing import NDArray
 
 from jaxevent.blob.finding.background import Field, nats, value_at
 from jaxevent.blob.finding.paths import STILL
-from jaxevent.kernels import compiled
-from jaxevent.kernels import part as kernel_part
+from jaxevent.kernels import lean, lean_part
 
 GATE = 3.0  # standard deviations
 HOLD = 24  # windows that confirmed targets are held that are silent
 SEEN, SEEN_NEW = 1e-3, 1e-5  # false alarms of a look where a target is known to be
 FAINT = 0.02  # of its own rate: a target with fewer events is silent
 GAIN = 0.2  # of size and rate
+KNOWN = 8.0  # events that the size told before counts for: by chance two or three lie together
+REACH = 1.0  # sizes: by how much a known target leaves its way in a window; others are farther
+MOST = 0.5  # of its events
+ASIDE = 0.5  # sizes: how far few events of a part of it lie from its middle
+TOLD = 3  # windows that tell how a target moves
 JITTER = 0.05  # of the size: error of a window's mean, for events of an edge are not independent
 
 
@@ -113,10 +117,15 @@ def update(live: Live, expected: Expected, found: Any, anywhere: Any) -> Seen:
     `found` are number, mean and covariance of a target's events in blobs, `anywhere` those of all
     of its events: at one place to look at fewer tell. They move the target, not its size.
     """
-    return Seen(*_update(live, expected, found, anywhere))
+    number = len(live.n)
+    seen = Seen(
+        np.zeros(number, bool), np.zeros(number), np.zeros((number, 2)), np.zeros(number)
+    )  # fmt: skip
+    _update(live, expected, found, anywhere, seen)
+    return seen
 
 
-@kernel_part
+@lean_part
 def _background(expected: Any, x: float, y: float, determinant: float) -> Any:
     """Events of the background in a gate, and their dispersion."""
     area = np.pi * GATE * GATE * np.sqrt(max(determinant, 0.0))
@@ -125,12 +134,10 @@ def _background(expected: Any, x: float, y: float, determinant: float) -> Any:
     return max(mu, 1e-3), expected.least + F * expected.more
 
 
-@compiled
-def _update(live: Any, expected: Any, found: Any, anywhere: Any) -> Any:
-    number = len(live.n)
-    heard, events = np.zeros(number, np.bool_), np.zeros(number)
-    means, errors = np.zeros((number, 2)), np.zeros(number)
-    for k in range(number):
+@lean
+def _update(live: Any, expected: Any, found: Any, anywhere: Any, seen: Any) -> None:
+    heard, events, means, errors = seen
+    for k in range(len(live.n)):
         (n, z, D), some = (found[0][k], found[1][k], found[2][k]), True
         C, before = live.C[k], expected.P[k]
         if n < 2:
@@ -144,17 +151,34 @@ def _update(live: Any, expected: Any, found: Any, anywhere: Any) -> Any:
                 n, z, D = all_n, anywhere[1][k], anywhere[2][k]
         if n >= 2:
             live.top[k] = max(0.99 * live.top[k], n)
-        heard[k], events[k] = n >= 2 and n >= FAINT * live.top[k], n
-        square = _larger(D)
+        square = (n * _larger(D) + KNOWN * _larger(C)) / (n + KNOWN)
         means[k, 0], means[k, 1], errors[k] = z[0], z[1], square / 2 / max(n, 1.0)
+        heard[k] = (
+            n >= 2 and n >= FAINT * live.top[k] and _is_it(live, k, n, z, before[0] + errors[k])
+        )
+        events[k] = n
         if heard[k]:
             _hear(live, expected, k, n, z, D, square, some)
         else:
             _miss(live, expected, k)
-    return heard, events, means, errors
 
 
-@kernel_part
+@lean_part
+def _is_it(live: Any, k: int, n: float, z: Any, variance: float) -> bool:
+    """Whether n events whose mean is z from where a target was expected may be it.
+
+    A known target is not where few events are that its motion does not lead to, but for parts of
+    it that are seen by turns. Where most of them are it may have turned, but goes no farther than
+    `REACH` allows.
+    """
+    square = (REACH * REACH) * _larger(live.C[k])
+    if n >= MOST * live.n[k]:
+        variance = max(variance, square)
+    most = GATE * GATE * min(variance + ASIDE * ASIDE * square, 2 * square)
+    return live.hits[k] < TOLD or z[0] * z[0] + z[1] * z[1] <= most
+
+
+@lean_part
 def _miss(live: Any, expected: Any, k: int) -> None:
     """A window of silence: what stands still then goes on, if at all, no faster than before."""
     live.miss[k] += 1
@@ -166,7 +190,7 @@ def _miss(live: Any, expected: Any, k: int) -> None:
         live.v[k, 0] = live.v[k, 1] = live.P[k, 1] = 0
 
 
-@kernel_part
+@lean_part
 def _hear(live: Any, expected: Any, k: int, n: float, z: Any, D: Any, square: float, some: bool):
     """A target with n events at z from where it was expected; `some` of them are in blobs."""
     P, free = expected.P[k], not expected.soft[k]
@@ -197,7 +221,7 @@ def _hear(live: Any, expected: Any, k: int, n: float, z: Any, D: Any, square: fl
     live.nats[k] += nats(n, mu) / F
 
 
-@kernel_part
+@lean_part
 def _larger(C: Any) -> Any:
     """As `larger`, of one."""
     half, cross = (C[0, 0] - C[1, 1]) / 2, C[0, 1]
