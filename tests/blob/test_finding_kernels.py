@@ -339,8 +339,14 @@ def test_a_target_is_updated_as_by_a_kalman_filter(background):
 
 @pytest.mark.parametrize(
     ("n", "away", "hits", "heard"),
-    [(3, 2.0, 9, True), (3, 5.0, 9, False), (3, 5.0, 2, True), (16, 5.0, 9, True), (16, 9.0, 9, False)],
-)  # fmt: skip
+    [
+        (3, 2.0, 9, True),
+        (3, 5.0, 9, False),
+        (3, 5.0, 2, True),
+        (16, 5.0, 9, True),
+        (16, 9.0, 9, False),
+    ],
+)
 def test_a_known_target_does_not_leap_to_few_events(background, n, away, hits, heard):
     # Of size 2, with 20 events per window: 3 of them are at most 4.0 px from where it is expected,
     # Of size 2, with 20 events per window: 3 of them are at most 4.0 px from where it is expected,

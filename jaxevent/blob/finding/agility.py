@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled
+from jaxevent.kernels import lean
 
 GRID = 10.0 ** np.arange(-7, 2.01, 0.25)  # of the larger size^2 / window^3
 FAR = 16.0  # squared standardised innovations count no more than this
@@ -25,7 +25,7 @@ def fit_agility(t: NDArray, m: NDArray, R: NDArray, unit: float | int) -> float:
     return float(GRID[np.argmax(scores)] * unit)
 
 
-@compiled
+@lean
 def _log_likelihood(t: Any, m: Any, R: Any, q: float | int) -> float:
     total = 0.0
     for axis in range(2):

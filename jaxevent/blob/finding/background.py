@@ -18,8 +18,7 @@ from scipy import ndimage
 from jaxevent.blob.finding.scene import SceneMotion
 from jaxevent.blob.finding.stream import Stream, cell_at
 from jaxevent.events.filters import busiest_neighbour
-from jaxevent.kernels import compiled
-from jaxevent.kernels import lean_part
+from jaxevent.kernels import lean, lean_part
 
 SLICES = 64  # of the recording's time
 CELL, FINE = 16, 4  # px; fine cells where the background is bright:
@@ -252,7 +251,9 @@ def measure_dispersion(
         for t, end in itertools.pairwise(times.tolist()):
             stream.add_cells(t, end, background.placing((t + end) / 2), CELL, N[k])
     calm, activity = background.calm[slices], background.activity[slices]
-    mean, squares, expected, fullest, seen = _moments(N, calm, activity, background.bright)
+    sums = np.zeros((6, rows, columns))
+    _moments(N, calm, activity, background.bright, sums)
+    _, squares, expected, fullest, seen, _ = sums
     full = expected >= FULL
     own = np.where(full, squares / np.maximum(expected, FULL), 1.0)
     usual = max(1.0, float(np.median(own[full]))) if full.mean() >= 0.5 else 1.0
@@ -261,15 +262,17 @@ def measure_dispersion(
     return np.where(background.bright & full, np.maximum(own, usual), usual)
 
 
-@compiled
-def _moments(N: Any, calm: Any, activity: Any, bright: Any) -> Any:
+@lean
+def _moments(N: Any, calm: Any, activity: Any, bright: Any, sums: Any) -> None:
     """Of calm counts (windows, rows, columns) of each cell: mean, squares about it, expected sum.
 
-    And the nats of the fullest window, where it is bright, and how many windows are calm.
+    And the nats of the fullest window, where it is bright, how many windows are calm, and the sum
+    of their activities: `sums`, which are 0 before.
     """
     windows, rows, columns = N.shape
-    mean, squares, expected = np.zeros((3, rows, columns))
-    usual, fullest, seen = np.zeros((3, rows, columns))
+    mean, squares, expected, fullest, seen, usual = (
+        sums[0], sums[1], sums[2], sums[3], sums[4], sums[5],
+    )  # fmt: skip
     for k in range(windows):
         for i in range(rows):
             for j in range(columns):
@@ -277,7 +280,9 @@ def _moments(N: Any, calm: Any, activity: Any, bright: Any) -> Any:
                     mean[i, j] += N[k, i, j]
                     usual[i, j] += activity[k]
                     seen[i, j] += 1
-    mean /= np.maximum(usual, 1)
+    for i in range(rows):
+        for j in range(columns):
+            mean[i, j] /= max(usual[i, j], 1.0)
     for k in range(windows):
         for i in range(rows):
             for j in range(columns):
@@ -287,4 +292,3 @@ def _moments(N: Any, calm: Any, activity: Any, bright: Any) -> Any:
                     expected[i, j] += mu
                     if bright[i, j] and N[k, i, j] > mu:
                         fullest[i, j] = max(fullest[i, j], nats(N[k, i, j], mu))
-    return mean, squares, expected, fullest, seen

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from jaxevent.blob.finding.background import CELL, Background, Field, look_up, nats, value_at
 from jaxevent.blob.finding.stream import Part, Pixels
-from jaxevent.kernels import Blank, compiled
-from jaxevent.kernels import part as kernel_part
+from jaxevent.kernels import Blank, lean, lean_part
 
 _cells = Blank(np.int32)
 FALSE_ALARMS = 0.1  # per recording
@@ -20,7 +19,7 @@ class Scale(NamedTuple):
     """How finely events are looked at."""
 
     window: float | int  # s
-    cell: int  # px
+    cell: int  # px, a power of 2
     dispersion: NDArray[np.float64]  # of the background's counts in such windows, in 16 px cells
 
     def dispersion_at(self, x: Any, y: Any) -> Any:
@@ -45,13 +44,34 @@ class Blobs(NamedTuple):
     p: NDArray[np.float64]  # (blobs, 2) px
     C: NDArray[np.float64]  # (blobs, 2, 2) px^2
 
+    @classmethod
+    def of(cls, number: int) -> "Blobs":
+        """Room for so many."""
+        return cls(np.empty(number), np.empty((number, 2)), np.empty((number, 2, 2)))
+
+
+class Room(NamedTuple):
+    """Where kernels look for blobs of so many pixels; int64 but for `labels`."""
+
+    place: NDArray[np.int64]  # the cell of each pixel
+    filled: NDArray[np.int64]  # cells that are not empty,
+    hit: NDArray[np.int64]  # those with more events than background,
+    waiting: NDArray[np.int64]  # and those of a blob that are still to be looked at
+    labels: NDArray[np.int32]  # the blob of each pixel, from 1 on; 0: none
+
+    @classmethod
+    def of(cls, pixels: int) -> "Room":
+        place, filled, hit, waiting = np.empty((4, pixels), np.int64)
+        return cls(place, filled, hit, waiting, np.empty(pixels, np.int32))
+
 
 class Ground(NamedTuple):
     """What tells blobs from background in a window, for kernels."""
 
     rates: Field
     dispersion: Field
-    cell: int
+    bits: int  # the cell is 2^bits px
+    wide: int  # cells of a row, with the border
     usual: float | int  # s px^2, of 3x3 cells
     more: float | int  # times the dispersion of 3x3 cells exceeds that of 16 px more than the least
     least: float | int  # dispersion
@@ -68,7 +88,8 @@ def ground_of(
     tests = -(-size[0] // g) * -(-size[1] // g) * background.duration / scale.window
     rates, least = background.field(t, 3 * g), scale.usual
     return Ground(
-        rates, background.field_of(scale.dispersion, CELL, t), g, float(usual), scale.flicker,
+        rates, background.field_of(scale.dispersion, CELL, t), g.bit_length() - 1,
+        -(-size[1] // g) + 2, float(usual), scale.flicker,
         least, float(background.least * rates.factor * usual),
         float(np.log(tests / FALSE_ALARMS)),
     )  # fmt: skip
@@ -83,78 +104,79 @@ def detect(
     events than background would give to one in 10 recordings. Blobs come in the order of their
     cells' first events. `size`: rows and columns, px.
     """
-    ground = ground_of(background, scale, size, t)
-    return _detect(part.x, part.y, _events_of(part), ground, blank_cells(size, scale.cell))
+    ground, room = ground_of(background, scale, size, t), Room.of(len(part))
+    cells = blank_cells(size, scale.cell)
+    number = _detect(part.x, part.y, _events_of(part), ground, cells, room)
+    return room.labels, number
 
 
 def blank_cells(size: tuple[int, int], cell: int) -> NDArray[np.int32]:
-    """Cells of a sensor and a border of one cell around them, to be counted in."""
-    return _cells(*(-(-n // cell) + 2 for n in size))
+    """Cells of a sensor and a border of one cell around them, to be counted in, row by row."""
+    rows, columns = (-(-n // cell) + 2 for n in size)
+    return _cells(rows * columns)
 
 
 # Windows hold far fewer events than there are cells: only those that are not empty are touched, and
 # made 0 again.
 
 
-@compiled
-def _detect(x: Any, y: Any, number: Any, ground: Any, cells: Any) -> Any:
-    return find_blobs(x, y, number, ground, cells)
+@lean
+def _detect(x: Any, y: Any, number: Any, ground: Any, cells: Any, room: Any) -> int:
+    return find_blobs(x, y, number, ground, cells, room)
 
 
-@kernel_part
-def find_blobs(x: Any, y: Any, number: Any, ground: Any, cells: Any) -> Any:
-    """`detect`, of pixels with so many events each. `cells` are 0, and are again."""
-    place, filled = _count(x, y, number, ground.cell, cells)
-    hit = _significant(filled, ground, cells)
-    for cell in filled:
-        cells.ravel()[cell] = 0
-    return _label(place, hit, cells)
+@lean_part
+def find_blobs(x: Any, y: Any, number: Any, ground: Any, cells: Any, room: Any) -> int:
+    """How many blobs there are of pixels with so many events each, as `detect`.
+
+    `cells` are 0, and are again; the pixels' blobs are in `room.labels`.
+    """
+    filled = _count(x, y, number, ground, cells, room)
+    hits = _significant(filled, ground, cells, room)
+    for i in range(filled):
+        cells[room.filled[i]] = 0
+    return _label(len(x), hits, ground.wide, cells, room)
 
 
-@kernel_part
-def _count(x: Any, y: Any, number: Any, cell: int, cells: Any) -> Any:
-    """The cell of each pixel, and all that are not empty."""
-    n, (rows, wide), place = cells.ravel(), cells.shape, np.empty(len(x), np.int64)
-    across, down = np.empty(wide * cell, np.int32), np.empty(rows * cell, np.int32)
-    for table in (across, down):
-        for i in range(len(table)):
-            table[i] = i // cell + 1
-    filled, count = np.empty(len(x), np.int64), 0
+@lean_part
+def _count(x: Any, y: Any, number: Any, ground: Any, cells: Any, room: Any) -> int:
+    """The cell of each pixel, and all that are not empty: their number."""
+    n, wide, bits, count = cells, ground.wide, ground.bits, 0
     for i in range(len(x)):
-        at = np.int64(down[y[i]]) * wide + across[x[i]]
-        place[i] = at
+        at = ((np.int64(y[i]) >> bits) + 1) * wide + (np.int64(x[i]) >> bits) + 1
+        room.place[i] = at
         if n[at] == 0:
-            filled[count] = at
+            room.filled[count] = at
             count += 1
         n[at] += number[i]
-    return place, filled[:count]
+    return count
 
 
-@kernel_part
-def _significant(filled: Any, ground: Any, cells: Any) -> Any:
-    """Cells that are not empty whose 3x3 hold more events than background gives."""
-    n, wide, g = cells.ravel(), cells.shape[1], ground.cell
+@lean_part
+def _significant(filled: int, ground: Any, cells: Any, room: Any) -> int:
+    """Cells that are not empty whose 3x3 hold more events than background gives: their number."""
+    n, wide, g = cells, ground.wide, 1 << ground.bits
     # Fewer events are no evidence even where the background is darkest.
     few = 1
     while few < MOST_FEW and nats(few, ground.darkest) <= ground.enough * ground.least:
         few += 1
-    many, count = np.empty(len(filled), np.int64), 0
-    for cell in filled:
-        if _sum_around(n, cell, wide) >= few:
-            many[count] = cell
-            count += 1
-    some, count = many[:count], 0
-    for cell in some:
+    many, some, count = room.hit, 0, 0
+    for i in range(filled):
+        if _sum_around(n, room.filled[i], wide) >= few:
+            many[some] = room.filled[i]
+            some += 1
+    for i in range(some):
+        cell = many[i]
         x, y = (cell % wide - 1) * g + g // 2, (cell // wide - 1) * g + g // 2
         mu = value_at(ground.rates, x, y) * ground.usual
         F = ground.least + (value_at(ground.dispersion, x, y) - ground.least) * ground.more
         if nats(_sum_around(n, cell, wide), mu) > ground.enough * F:
             many[count] = cell
             count += 1
-    return many[:count]
+    return count
 
 
-@kernel_part
+@lean_part
 def _sum_around(n: Any, cell: int, wide: int) -> Any:
     total = 0
     for row in (cell - wide, cell, cell + wide):
@@ -162,14 +184,15 @@ def _sum_around(n: Any, cell: int, wide: int) -> Any:
     return total
 
 
-@kernel_part
-def _label(place: Any, hit: Any, cells: Any) -> Any:
+@lean_part
+def _label(events: int, hits: int, wide: int, labels: Any, room: Any) -> int:
     """The blob of each event, and how many there are: neighbours, also across corners."""
-    labels, wide, waiting = cells.ravel(), cells.shape[1], np.empty(len(hit), np.int64)
-    for cell in hit:
-        labels[cell] = -1
+    waiting = room.waiting
+    for i in range(hits):
+        labels[room.hit[i]] = -1
     number = 0
-    for cell in hit:
+    for i in range(hits):
+        cell = room.hit[i]
         if labels[cell] > 0:
             continue
         number += 1
@@ -184,34 +207,36 @@ def _label(place: Any, hit: Any, cells: Any) -> Any:
                         labels[near] = number
                         waiting[count] = near
                         count += 1
-    of_event = np.zeros(len(place), np.int32)
-    if number:
-        for i in range(len(place)):
-            of_event[i] = labels[place[i]]
-    for cell in hit:
-        labels[cell] = 0
-    return of_event, number
+    for i in range(events):
+        room.labels[i] = labels[room.place[i]]
+    for i in range(hits):
+        labels[room.hit[i]] = 0
+    return number
 
 
 def measure_blobs(part: Part | Pixels, labels: NDArray[np.int32], number: int) -> Blobs:
     """Moments of all blobs. A pixel's own extent is added to the covariance."""
-    return Blobs(*_measure(part.x, part.y, _events_of(part), labels, number))
+    blobs = Blobs.of(number)
+    _measure(part.x, part.y, _events_of(part), labels, number, blobs)
+    return blobs
 
 
 def _events_of(part: Part | Pixels) -> NDArray[np.int32]:
     return part.n if isinstance(part, Pixels) else np.ones(len(part), np.int32)
 
 
-@compiled
-def _measure(x: Any, y: Any, events: Any, labels: Any, number: int) -> Any:
-    return blob_moments(x, y, events, labels, number)
+@lean
+def _measure(x: Any, y: Any, events: Any, labels: Any, number: int, blobs: Any) -> None:
+    blob_moments(x, y, events, labels, number, blobs)
 
 
-@kernel_part
-def blob_moments(x: Any, y: Any, events: Any, labels: Any, number: int) -> Any:
-    """`measure_blobs`, of pixels with so many events each."""
-    n, p, C = np.zeros(number), np.zeros((number, 2)), np.zeros((number, 2, 2))
-    for i in range(len(labels)):
+@lean_part
+def blob_moments(x: Any, y: Any, events: Any, labels: Any, number: int, blobs: Any) -> None:
+    """The first `number` of `blobs`, of pixels with so many events each, as `measure_blobs`."""
+    n, p, C = blobs
+    for k in range(number):
+        n[k] = p[k, 0] = p[k, 1] = C[k, 0, 0] = C[k, 0, 1] = C[k, 1, 1] = 0.0
+    for i in range(len(x)):
         k = labels[i] - 1
         if k >= 0:
             n[k] += events[i]
@@ -220,7 +245,7 @@ def blob_moments(x: Any, y: Any, events: Any, labels: Any, number: int) -> Any:
     for k in range(number):
         p[k, 0] /= max(n[k], 1.0)
         p[k, 1] /= max(n[k], 1.0)
-    for i in range(len(labels)):
+    for i in range(len(x)):
         k = labels[i] - 1
         if k >= 0:
             ex, ey = x[i] - p[k, 0], y[i] - p[k, 1]
@@ -232,7 +257,6 @@ def blob_moments(x: Any, y: Any, events: Any, labels: Any, number: int) -> Any:
         C[k, 0, 0] = C[k, 0, 0] * over + 1 / 12
         C[k, 0, 1] = C[k, 1, 0] = C[k, 0, 1] * over
         C[k, 1, 1] = C[k, 1, 1] * over + 1 / 12
-    return n, p, C
 
 
 def touching(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> Any:

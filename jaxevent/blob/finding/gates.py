@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from jaxevent.blob.finding.detection import CONTACT, touching
 from jaxevent.blob.finding.stream import Part
 from jaxevent.blob.finding.targets import GATE, REACH, Live
-from jaxevent.kernels import compiled
-from jaxevent.kernels import part as kernel_part
+from jaxevent.kernels import lean, lean_part
 
 CLAIMED, OWNS = 0.3, 0.1  # shares of a blob that is claimed, and of those who own the rest of it
 
@@ -19,7 +18,7 @@ class Gates(NamedTuple):
 
     p: NDArray[np.float64]  # (n, 2) px
     v: NDArray[np.float64]  # (n, 2) px/s
-    S: NDArray[np.float64]  # (n, 2, 2) px^2
+    inverse: NDArray[np.float64]  # (n, 4): of their covariance xx, xy, yy; log determinant
     more: NDArray[np.float64]  # (n,) added to an event's distance
     events: NDArray[np.float64]  # (n,) per window
     soft: NDArray[np.bool_]  # (n,) whether a target shares events with others
@@ -36,15 +35,25 @@ class Look:
         S = S + (P + 0.1)[:, None, None] * np.eye(2)
         self.soft = _in_contact(self.p, live.C, live.confirmed)
         more = np.where(live.confirmed, 0.0, 2.0)
-        self.gates = Gates(self.p, live.v, S, more, live.n, self.soft)
+        self.gates = Gates(self.p, live.v, _inverses(S), more, live.n, self.soft)
 
     def share_out(self, labels: NDArray, blobs: int) -> NDArray[np.int64]:
         """Whose each event is; -1: nobody's."""
-        return _share_out(*self.part, self.t, labels, blobs, self.gates)
+        targets = len(self.p)
+        shares = _Shares(
+            np.full(len(self.part), -1), np.zeros((blobs, targets), np.int64),
+            np.zeros(blobs, np.int64), np.zeros((blobs, targets), bool), np.zeros(blobs, bool),
+        )  # fmt: skip
+        _share_out(*self.part, self.t, labels, self.gates, shares)
+        return shares.owner
 
     def moments(self, owner: NDArray, which: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """Number (n,), mean (n, 2) and covariance (n, 2, 2) of residuals of some events."""
-        return _moments(*self.part, self.t, owner, which, self.gates)
+        targets, soft = len(self.p), np.flatnonzero(self.soft)
+        told = np.zeros(targets), np.zeros((targets, 2)), np.zeros((targets, 2, 2))
+        share = np.zeros(len(soft))
+        _moments(*self.part, self.t, owner, which, self.gates, soft, share, told)
+        return told
 
 
 def _reach(live: Live) -> NDArray[np.float64]:
@@ -65,19 +74,25 @@ def _in_contact(p: NDArray, C: NDArray, confirmed: NDArray) -> NDArray[np.bool_]
     return np.asarray(near.any(1))
 
 
-@kernel_part
-def _inverses(S: Any) -> Any:
-    """(n, 4): of S, xx, xy and yy, and the logarithm of its determinant."""
-    out = np.empty((len(S), 4))
-    for k in range(len(S)):
-        a, b, c = S[k, 0, 0], S[k, 0, 1], S[k, 1, 1]
-        determinant = a * c - b * b
-        out[k, 0], out[k, 1], out[k, 2] = c / determinant, -b / determinant, a / determinant
-        out[k, 3] = np.log(determinant)
-    return out
+def _inverses(S: NDArray) -> NDArray[np.float64]:
+    """(n, 4): of the inverses of S, xx, xy and yy, and the logarithms of S's determinants."""
+    a, b, c = S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]
+    determinant = a * c - b * b
+    parts = c / determinant, -b / determinant, a / determinant, np.log(determinant)
+    return np.stack(parts, 1)
 
 
-@kernel_part
+class _Shares(NamedTuple):
+    """What `_share_out` fills."""
+
+    owner: NDArray[np.int64]  # whose each event is, -1: nobody's
+    table: NDArray[np.int64]  # (blobs, targets) events of a blob in a target's gate,
+    counts: NDArray[np.int64]  # (blobs,) and all of it
+    own: NDArray[np.bool_]  # (blobs, targets) who owns the rest of a blob,
+    owned: NDArray[np.bool_]  # (blobs,) and whether it is owned
+
+
+@lean_part
 def _residual(gates: Any, k: int, x: Any, y: Any, late: float) -> tuple[float, float]:
     """How far an event lies from where a target then is, in px."""
     return (
@@ -86,17 +101,16 @@ def _residual(gates: Any, k: int, x: Any, y: Any, late: float) -> tuple[float, f
     )
 
 
-@kernel_part
+@lean_part
 def _squared(ex: float, ey: float, inverse: Any) -> float:
     return inverse[0] * ex * ex + 2 * inverse[1] * ex * ey + inverse[2] * ey * ey
 
 
-@compiled
-def _share_out(t: Any, x: Any, y: Any, middle: Any, labels: Any, blobs: int, gates: Any) -> Any:
-    """Whose each event is, -1: nobody's."""
-    targets, inverse, owner = len(gates.p), _inverses(gates.S), np.full(len(t), -1, np.int64)
-    table, counts = np.zeros((blobs, targets), np.int64), np.zeros(blobs, np.int64)
-    own, owned = np.zeros((blobs, targets), np.bool_), np.zeros(blobs, np.bool_)
+@lean
+def _share_out(t: Any, x: Any, y: Any, middle: Any, labels: Any, gates: Any, shares: Any) -> None:
+    """Whose each event is."""
+    owner, table, counts, own, owned = shares
+    targets, inverse = len(gates.p), gates.inverse
     for i in range(len(t)):
         least, late = np.inf, t[i] - middle
         for k in range(targets):
@@ -110,7 +124,7 @@ def _share_out(t: Any, x: Any, y: Any, middle: Any, labels: Any, blobs: int, gat
             if owner[i] >= 0:
                 table[labels[i] - 1, owner[i]] += 1
     # The rest of a blob goes with its owners: targets may grow at once or pass their gates.
-    for k in range(blobs):
+    for k in range(len(counts)):
         claimed, most = 0, 0
         for j in range(targets):
             claimed += table[k, j]
@@ -132,16 +146,15 @@ def _share_out(t: Any, x: Any, y: Any, middle: Any, labels: Any, blobs: int, gat
                 distance = _squared(ex, ey, inverse[k]) + inverse[k, 3] + gates.more[k]
                 if distance < least:
                     least, owner[i] = distance, k
-    return owner
 
 
-@compiled
-def _moments(t: Any, x: Any, y: Any, middle: Any, owner: Any, which: Any, gates: Any) -> Any:
+@lean
+def _moments(
+    t: Any, x: Any, y: Any, middle: Any, owner: Any, which: Any, gates: Any, soft: Any,
+    share: Any, told: Any,
+) -> None:  # fmt: skip
     """Number, mean and covariance of residuals; targets in contact share events in both gates."""
-    targets, inverse = len(gates.p), _inverses(gates.S)
-    soft = np.flatnonzero(gates.soft)
-    n, z, C = np.zeros(targets), np.zeros((targets, 2)), np.zeros((targets, 2, 2))
-    share = np.zeros(len(soft))
+    (n, z, C), inverse = told, gates.inverse
     for i in range(len(t)):
         if not which[i]:
             continue
@@ -154,23 +167,24 @@ def _moments(t: Any, x: Any, y: Any, middle: Any, owner: Any, which: Any, gates:
                 sharing += 1
                 share[j] = np.exp(-0.5 * (squared + inverse[k, 3])) * gates.events[k]
         if sharing > 1:
-            total = share.sum()
+            total = 0.0
+            for j in range(len(soft)):
+                total += share[j]
             for j in range(len(soft)):
                 if share[j] > 0:
                     _add(n, z, C, soft[j], share[j] / total, x[i], y[i], late, gates)
         elif owner[i] >= 0:
             _add(n, z, C, owner[i], 1.0, x[i], y[i], late, gates)
-    for k in range(targets):
+    for k in range(len(n)):
         over = 1 / max(n[k], 1e-9)
         z[k, 0] *= over
         z[k, 1] *= over
         C[k, 0, 0] = C[k, 0, 0] * over - z[k, 0] ** 2 + 1 / 12
         C[k, 0, 1] = C[k, 1, 0] = C[k, 0, 1] * over - z[k, 0] * z[k, 1]
         C[k, 1, 1] = C[k, 1, 1] * over - z[k, 1] ** 2 + 1 / 12
-    return n, z, C
 
 
-@kernel_part
+@lean_part
 def _add(n: Any, z: Any, C: Any, k: int, w: float, x: Any, y: Any, late: float, gates: Any) -> None:
     """Add an event's residual to a target's sums."""
     ex, ey = _residual(gates, k, x, y, late)

@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled
-from jaxevent.kernels import part as kernel_part
+from jaxevent.kernels import lean, lean_part
 from jaxevent.recording import Events
 
 STILL = 2  # windows of silence after which a target stands still
@@ -95,21 +94,21 @@ def candidates(events: Events, joined: Joined, sigmas: float | int) -> NDArray[n
 
     Of a path are events within `sigmas` standard deviations while it is seen.
     """
-    return _candidates(events.t, events.x, events.y, joined, float(sigmas) ** 2)
+    t, whose, half = events.t, np.full(len(events), NOBODY, np.int32), joined.window // 2
+    begins, ends = joined.t[joined.first[:-1]] - half, joined.t[joined.first[1:] - 1] + half
+    rows = np.stack([np.searchsorted(t, begins), np.searchsorted(t, ends)])
+    _candidates(t, events.x, events.y, joined, rows, float(sigmas) ** 2, whose)
+    return whose
 
 
-@compiled
-def _candidates(t: Any, x: Any, y: Any, joined: Any, limit: float | int) -> Any:
-    whose = np.full(len(t), -1, np.int32)
+@lean
+def _candidates(
+    t: Any, x: Any, y: Any, joined: Any, rows: Any, limit: float | int, whose: Any
+) -> None:
     for k in range(len(joined.window)):
-        first, last, w = joined.first[k], joined.first[k + 1] - 1, joined.window[k]
-        begin, end = joined.t[first] - w // 2, joined.t[last] + w // 2
-        i0, i1 = np.searchsorted(t, begin), np.searchsorted(t, end)
-        if i0 == i1:
-            continue
-        row = max(first, first + np.searchsorted(joined.t[first : last + 1], t[i0], "right") - 1)
+        row, last, w = joined.first[k], joined.first[k + 1] - 1, joined.window[k]
         looked, box = -1, (0.0, 0.0, 0.0, 0.0)
-        for i in range(i0, i1):
+        for i in range(rows[0, k], rows[1, k]):
             while row < last and joined.t[row + 1] <= t[i]:
                 row += 1
             following = min(row + 1, last)
@@ -129,10 +128,9 @@ def _candidates(t: Any, x: Any, y: Any, joined: Any, limit: float | int) -> Any:
             ex, ey = x[i] - px, y[i] - py
             if c * ex * ex - 2 * b * ex * ey + a * ey * ey <= limit * (a * c - b * b):
                 whose[i] = k if whose[i] == -1 else -2
-    return whose
 
 
-@kernel_part
+@lean_part
 def _box(joined: Any, row: int, following: int, limit: Any) -> Any:
     """Least and greatest x and y (px) of what is near a path between two of its rows."""
     p, S = joined.p, joined.S

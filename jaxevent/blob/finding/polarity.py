@@ -14,7 +14,7 @@ from jaxevent.blob.finding.agility import fit_agility
 from jaxevent.blob.finding.paths import Path, candidates, join
 from jaxevent.blob.finding.stream import BATCH
 from jaxevent.blob.finding.targets import GATE
-from jaxevent.kernels import compiled
+from jaxevent.kernels import lean
 from jaxevent.recording import Recording
 
 LAGS = 1.8  # times the larger standard deviation of the sharper polarity's events
@@ -36,7 +36,8 @@ def prefer_sharper(paths: list[Path], recording: Recording, hot: NDArray[np.bool
     last = events.index(max(path.end for path in paths))
     for row in range(first, last, BATCH):
         part = events[row : min(row + BATCH, last)]
-        _add(part.t, part.x, part.y, part.p, candidates(part, joined, GATE), joined, hot, sums)
+        near, now = candidates(part, joined, GATE), joined.first[:-1].copy()
+        _add(part.t, part.x, part.y, part.p, near, joined, hot, now, sums)
     ends = zip(joined.first[:-1], joined.first[1:], strict=True)
     return [_sharper(path, sums[a:b]) for path, (a, b) in zip(paths, ends, strict=True)]
 
@@ -66,10 +67,14 @@ def _sharper(path: Path, sums: NDArray[np.float64]) -> Path:
     return dataclasses.replace(path, p=p, C=C, n=share * path.n, agility=agility, polarity=sharp)
 
 
-@compiled
-def _add(t: Any, x: Any, y: Any, p: Any, whose: Any, joined: Any, hot: Any, sums: Any) -> None:
-    """Add events' residuals to the sums of their paths' windows, by polarity."""
-    rows = joined.first[:-1].copy()
+@lean
+def _add(
+    t: Any, x: Any, y: Any, p: Any, whose: Any, joined: Any, hot: Any, rows: Any, sums: Any
+) -> None:
+    """Add events' residuals to the sums of their paths' windows, by polarity.
+
+    `rows` are those at which the search in each path begins.
+    """
     for i in range(len(t)):
         k = whose[i]
         if k < 0 or hot[y[i], x[i]]:
@@ -85,10 +90,10 @@ def _add(t: Any, x: Any, y: Any, p: Any, whose: Any, joined: Any, hot: Any, sums
         late = (t[i] - joined.t[row]) / span
         ex = x[i] - joined.p[row, 0] - late * (joined.p[after, 0] - joined.p[before, 0])
         ey = y[i] - joined.p[row, 1] - late * (joined.p[after, 1] - joined.p[before, 1])
-        to = sums[row, np.int64(p[i])]
-        to[0] += 1
-        to[1] += ex
-        to[2] += ey
-        to[3] += ex * ex
-        to[4] += ex * ey
-        to[5] += ey * ey
+        sign = np.int64(p[i])
+        sums[row, sign, 0] += 1
+        sums[row, sign, 1] += ex
+        sums[row, sign, 2] += ey
+        sums[row, sign, 3] += ex * ex
+        sums[row, sign, 4] += ex * ey
+        sums[row, sign, 5] += ey * ey

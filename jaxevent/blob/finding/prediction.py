@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from jaxevent.blob.finding.background import Background
 from jaxevent.blob.finding.detection import (
     CONTACT,
+    Blobs,
+    Room,
     Scale,
     blank_cells,
     blob_moments,
@@ -15,8 +17,7 @@ from jaxevent.blob.finding.detection import (
     ground_of,
 )
 from jaxevent.blob.finding.stream import Part, Pixels
-from jaxevent.kernels import Blank, compiled
-from jaxevent.kernels import part as kernel_part
+from jaxevent.kernels import Blank, lean, lean_part
 
 _bins = Blank(np.int32)
 SCORED = 2000  # most events of a window that are scored
@@ -90,8 +91,35 @@ def predict(
         for table, g in zip(_TABLES, BINS, strict=True)
     )
     cells = blank_cells(size, scale.cell)
-    density, *told = _predict(first, second, scored.x, scored.y, ground, cells, bins, _TABLES)
-    return Told(density, scored.background, scored.number, *told)
+    density, told = np.zeros((len(scored.x), 1 + KERNELS)), np.zeros(3)
+    strips = size[0] // STRIP + 1
+    space = _Space.of(max(len(first), len(second)), len(scored.x), strips)
+    _predict(first, second, scored.x, scored.y, ground, cells, bins, _TABLES, space, density, told)
+    return Told(density, scored.background, scored.number, *told.tolist())
+
+
+class _Space(NamedTuple):
+    """Where `_predict` keeps what it needs of windows of so many pixels."""
+
+    room: Room
+    before: Blobs
+    last: Blobs
+    p: NDArray[np.float64]  # (pixels, 2) px, where the blobs' next events are expected,
+    S: NDArray[np.float64]  # (pixels, 2, 2) px^2, and how these scatter
+    moved: NDArray[np.float64]  # (2, pixels) px, places of pixels that move with their blobs,
+    events: NDArray[np.int32]  # (pixels,) and their events
+    reach: NDArray[np.float64]  # (pixels,) px, of blobs
+    touches: NDArray[np.bool_]  # (pixels,) whether a blob touches another
+    order: NDArray[np.int64]  # scored pixels, by their strips of rows
+    strips: NDArray[np.int64]  # (2, strips + 1): where each begins, and is filled
+
+    @classmethod
+    def of(cls, pixels: int, scored: int, strips: int) -> "_Space":
+        return cls(
+            Room.of(pixels), Blobs.of(pixels), Blobs.of(pixels), *Blobs.of(pixels)[1:],
+            np.empty((2, pixels)), np.empty(pixels, np.int32), np.empty(pixels),
+            np.empty(pixels, bool), np.empty(scored, np.int64), np.empty((2, strips + 1), np.int64),
+        )  # fmt: skip
 
 
 class Score(NamedTuple):
@@ -114,18 +142,21 @@ def score(told: list[Told]) -> Score:
     expected, large, split = (
         np.array([getattr(one, name) for one in told]) for name in ("expected", "large", "split")
     )
-    parts = (_gains(density, b, weight, ends) - expected) / number
+    gains, share = np.zeros(len(told)), np.full((2, 1 + KERNELS), 1 / (1 + KERNELS))
+    _gains(density, b, weight, ends, share, gains)
+    parts = (gains - expected) / number
     raw = float(parts.sum())
     lost = SPLIT * abs(raw) * float(split.sum()) / max(float(large.sum()), 1e-9)
     return Score(raw, raw - lost, parts)
 
 
-@compiled
-def _gains(density: Any, b: Any, weight: Any, ends: Any) -> Any:
+@lean
+def _gains(density: Any, b: Any, weight: Any, ends: Any, shares: Any, nats: Any) -> None:
     """Log likelihood ratios of windows with the likeliest shares of ellipses and kernels."""
-    share, new = np.full(1 + KERNELS, 1 / (1 + KERNELS)), np.zeros(1 + KERNELS)
+    share, new = shares[0], shares[1]
     for _ in range(ROUNDS):
-        new[:] = 0
+        for j in range(1 + KERNELS):
+            new[j] = 0.0
         for k in range(len(weight)):
             for i in range(ends[k], ends[k + 1]):
                 total = b[i]
@@ -134,90 +165,91 @@ def _gains(density: Any, b: Any, weight: Any, ends: Any) -> Any:
                 part = weight[k] / total
                 for j in range(1 + KERNELS):
                     new[j] += part * density[i, j]
+        total = 0.0
         for j in range(1 + KERNELS):
             share[j] = share[j] * new[j] + 1e-12
-        total = share.sum()
+            total += share[j]
         for j in range(1 + KERNELS):
             share[j] /= total
-    nats = np.zeros(len(weight))
     for k in range(len(weight)):
         for i in range(ends[k], ends[k + 1]):
             total = 0.0
             for j in range(1 + KERNELS):
                 total += density[i, j] * share[j]
             nats[k] += weight[k] * np.log(total / b[i] + 1)
-    return nats
 
 
-@compiled
+@lean
 def _predict(
-    first: Any, second: Any, x: Any, y: Any, ground: Any, cells: Any, bins: Any, tables: Any
-) -> Any:
-    labels, number = find_blobs(first.x, first.y, first.n, ground, cells)
-    before = blob_moments(first.x, first.y, first.n, labels, number)
-    labels, number = find_blobs(second.x, second.y, second.n, ground, cells)
-    last = blob_moments(second.x, second.y, second.n, labels, number)
-    density = np.zeros((len(x), 1 + KERNELS))
-    expected = large = split = 0.0
+    first: Any, second: Any, x: Any, y: Any, ground: Any, cells: Any, bins: Any, tables: Any,
+    space: Any, density: Any, told: Any,
+) -> None:  # fmt: skip
+    labels = space.room.labels
+    earlier = find_blobs(first.x, first.y, first.n, ground, cells, space.room)
+    blob_moments(first.x, first.y, first.n, labels, earlier, space.before)
+    number = find_blobs(second.x, second.y, second.n, ground, cells, space.room)
+    blob_moments(second.x, second.y, second.n, labels, number, space.last)
     if len(x) and number:
-        n, C = last[0], last[2]
-        p, S = _extrapolate(before, last)
-        _add_ellipses(density, x, y, n, p, S, cells.shape[0] * ground.cell)
-        px, py, events = _moved(second, labels, p - last[1])
+        _extrapolate(earlier, number, space)
+        _add_ellipses(density, x, y, number, space)
+        pixels = _move(second, space)
         for k in range(KERNELS):
-            _add_kernels(density[:, k + 1], x, y, px, py, events, tables[k], bins[k])
-        expected = n.sum()
-        large, split = _split(n, last[1], C)
-    return density, expected, large, split
+            _add_kernels(density[:, k + 1], x, y, pixels, space, tables[k], bins[k])
+        for k in range(number):
+            told[0] += space.last.n[k]
+        told[1], told[2] = _split(number, space)
 
 
-@kernel_part
+@lean_part
 def _larger(C: Any) -> Any:
     """The larger eigenvalue."""
     half, cross = (C[0, 0] - C[1, 1]) / 2, C[0, 1]
     return (C[0, 0] + C[1, 1]) / 2 + np.sqrt(half * half + cross * cross)
 
 
-@kernel_part
-def _extrapolate(before: Any, last: Any) -> Any:
+@lean_part
+def _extrapolate(earlier: int, number: int, space: Any) -> None:
     """Where the blobs' next events are expected: means and covariances."""
-    (n0, p0, C0), (n, p1, C1) = before, last
-    p, S = p1.copy(), np.empty_like(C1)
-    for k in range(len(n)):
+    (n0, p0, C0), (n, p1, C1), p, S = space.before, space.last, space.p, space.S
+    for k in range(number):
         least, nearest = np.inf, -1
-        for j in range(len(n0)):
+        for j in range(earlier):
             ex, ey = p1[k, 0] - p0[j, 0], p1[k, 1] - p0[j, 1]
             apart = ex * ex + ey * ey
             if apart < least:
                 least, nearest = apart, j
         moves = np.sqrt(least) < 6 * np.sqrt(_larger(C1[k])) + 2
         for i in range(2):
+            p[k, i] = p1[k, i]
             if moves:
                 p[k, i] += p1[k, i] - p0[nearest, i]
             for j in range(2):
                 S[k, i, j] = C1[k, i, j] * (1 + 4 / n[k]) + (0.1 if i == j else 0.0)
                 if moves:
                     S[k, i, j] += 2 * (C1[k, i, j] / n[k] + C0[nearest, i, j] / n0[nearest])
-    return p, S
 
 
-@kernel_part
-def _add_ellipses(density: Any, x: Any, y: Any, n: Any, p: Any, S: Any, rows: int) -> None:
+@lean_part
+def _add_ellipses(density: Any, x: Any, y: Any, number: int, space: Any) -> None:
     """Events per px^2 of some Gaussian blobs at pixels, added to the first column.
 
     Pixels are sorted into strips of rows: a blob looks into those that it reaches.
     """
-    strips = rows // STRIP + 1
-    first, order = np.zeros(strips + 1, np.int64), np.empty(len(x), np.int64)
+    n, p, S, order = space.last.n, space.p, space.S, space.order
+    first, following = space.strips[0], space.strips[1]
+    strips = len(first) - 1
+    for j in range(strips + 1):
+        first[j] = 0
     for j in range(len(x)):
         first[y[j] // STRIP + 1] += 1
-    first = np.cumsum(first)
-    following = first.copy()
+    for j in range(strips):
+        first[j + 1] += first[j]
+        following[j] = first[j]
     for j in range(len(x)):
         strip = y[j] // STRIP
         order[following[strip]] = j
         following[strip] += 1
-    for k in range(len(n)):
+    for k in range(number):
         a, b, c = S[k, 0, 0], S[k, 0, 1], S[k, 1, 1]
         determinant = a * c - b * b
         peak = n[k] / (2 * np.pi * np.sqrt(determinant))
@@ -233,53 +265,55 @@ def _add_ellipses(density: Any, x: Any, y: Any, n: Any, p: Any, S: Any, rows: in
                     density[j, 0] += peak * np.exp(-0.5 * squared)
 
 
-@kernel_part
-def _moved(pixels: Any, labels: Any, moved: Any) -> Any:
-    """Pixels of blobs, moved as these, and their events."""
-    x, y, n, m = np.empty(len(labels)), np.empty(len(labels)), np.empty(len(labels), np.int32), 0
-    for i in range(len(labels)):
-        k = labels[i] - 1
+@lean_part
+def _move(pixels: Any, space: Any) -> int:
+    """Pixels of blobs, moved as these, and their events: how many they are."""
+    moved, p, last, m = space.moved, space.p, space.last.p, 0
+    for i in range(len(pixels.x)):
+        k = space.room.labels[i] - 1
         if k >= 0:
-            x[m], y[m] = pixels.x[i] + moved[k, 0], pixels.y[i] + moved[k, 1]
-            n[m] = pixels.n[i]
+            moved[0, m] = pixels.x[i] + (p[k, 0] - last[k, 0])
+            moved[1, m] = pixels.y[i] + (p[k, 1] - last[k, 1])
+            space.events[m] = pixels.n[i]
             m += 1
-    return x[:m], y[:m], n[:m]
+    return m
 
 
-@kernel_part
+@lean_part
 def _add_kernels(
-    out: Any, x: Any, y: Any, px: Any, py: Any, events: Any, table: Any, counts: Any
+    out: Any, x: Any, y: Any, pixels: int, space: Any, table: Any, counts: Any
 ) -> None:
     """Kernels about places, summed at pixels: of bins, `counts`, in whose middles places lie."""
     (rows, columns), g, reach = counts.shape, len(table), table.shape[2] // 2
-    for k in range(len(px)):
+    px, py, events = space.moved[0], space.moved[1], space.events
+    for k in range(pixels):
         row, column = int(py[k] / g + reach), int(px[k] / g + reach)
         if 0 <= row < rows and 0 <= column < columns:
             counts[row, column] += events[k]
     for j in range(len(x)):
         row, column, total = y[j] // g, x[j] // g, 0.0
-        weights = table[y[j] - row * g, x[j] - column * g]
+        v, u = y[j] - row * g, x[j] - column * g
         for a in range(2 * reach + 1):
             for b in range(2 * reach + 1):
-                total += weights[a, b] * counts[row + a, column + b]
+                total += table[v, u, a, b] * counts[row + a, column + b]
         out[j] = total
-    for k in range(len(px)):
+    for k in range(pixels):
         row, column = int(py[k] / g + reach), int(px[k] / g + reach)
         if 0 <= row < rows and 0 <= column < columns:
             counts[row, column] = 0
 
 
-@kernel_part
-def _split(n: Any, p: Any, C: Any) -> Any:
+@lean_part
+def _split(number: int, space: Any) -> tuple[float, float]:
     """Events in large blobs, and in those that touch another one.
 
     By ellipses: pieces along an outline touch each other, both of its sides do not.
     """
-    large, split, reach = 0.0, 0.0, np.empty(len(n))
-    for k in range(len(n)):
-        reach[k] = np.sqrt(_larger(C[k]))
-    touches = np.zeros(len(n), np.bool_)
-    for k in range(len(n)):
+    (n, p, C), reach, touches = space.last, space.reach, space.touches
+    large = split = 0.0
+    for k in range(number):
+        reach[k], touches[k] = np.sqrt(_larger(C[k])), False
+    for k in range(number):
         for j in range(k):
             if n[k] < LARGE or n[j] < LARGE or (touches[k] and touches[j]):
                 continue
@@ -293,7 +327,7 @@ def _split(n: Any, p: Any, C: Any) -> Any:
                 along += np.sqrt(square + C[one, 1, 1] * uy * uy)
             if apart * apart < CONTACT * along:
                 touches[k] = touches[j] = True
-    for k in range(len(n)):
+    for k in range(number):
         if n[k] >= LARGE:
             large += n[k]
             if touches[k]:

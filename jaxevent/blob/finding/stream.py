@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob.finding.paths import NOBODY, Path, candidates, join
-from jaxevent.kernels import Blank, compiled
-from jaxevent.kernels import lean_part
+from jaxevent.kernels import Blank, lean, lean_part
 from jaxevent.recording import Events, Recording
 
 _counts = Blank(np.int32)
 BATCH = 1 << 20  # events read at a time
+ALL = np.ones(0, bool)  # all events are kept
 
 
 class Part(NamedTuple):
@@ -81,7 +81,9 @@ class Stream:
         """The pixels of these events, by their first event."""
         events, kept = self._of_rows(*self._span(begin, end))
         counts = _counts(self.height, self.width)
-        return Pixels(*_count(events.x, events.y, self.hot, kept, counts))
+        x, y, n = np.empty((3, len(events)), np.int32)
+        number = _count(events.x, events.y, self.hot, kept, counts, x, y, n)
+        return Pixels(x[:number], y[:number], n[:number])
 
     def add_cells(
         self, begin: float | int, end: float | int, place: NDArray, cell: int, counts: NDArray
@@ -108,43 +110,51 @@ class Stream:
         first, last = (self.recording.events.index(t) for t in us)
         return first, last
 
-    def _of_rows(self, first: int, last: int) -> tuple[Events, NDArray[np.bool_] | None]:
-        """Some events, and which of them are kept; None: all."""
-        kept = None if self._kept is None else self._kept[first - self._first : last - self._first]
+    def _of_rows(self, first: int, last: int) -> tuple[Events, NDArray[np.bool_]]:
+        """Some events, and which of them are kept, or `ALL`."""
+        kept = ALL if self._kept is None else self._kept[first - self._first : last - self._first]
         return self.recording.events[first:last], kept
 
     def _rows(self, first: int, last: int) -> Part:
         events, kept = self._of_rows(first, last)
-        return Part(*_keep(events.t, events.x, events.y, self.start, self.hot, kept))
+        t, (x, y) = np.empty(len(events)), np.empty((2, len(events)), np.int32)
+        number = _keep(events.t, events.x, events.y, self.start, self.hot, kept, t, x, y)
+        return Part(t[:number], x[:number], y[:number])
 
 
-@compiled
-def _keep(t: Any, x: Any, y: Any, start: int, hot: Any, kept: Any) -> Any:
-    """Times (s), x and y of the events that are not left out."""
-    out_t, out_x, out_y = np.empty(len(t)), np.empty(len(t), np.int32), np.empty(len(t), np.int32)
+@lean_part
+def _stays(i: int, x: Any, y: Any, hot: Any, kept: Any) -> bool:
+    """Whether an event is not left out."""
+    return (len(kept) == 0 or kept[i]) and not hot[y[i], x[i]]
+
+
+@lean
+def _keep(
+    t: Any, x: Any, y: Any, start: int, hot: Any, kept: Any, to_t: Any, to_x: Any, to_y: Any
+) -> int:
+    """Times (s), x and y of the events that are not left out: how many they are."""
     n = 0
-    for i in range(len(t)):
-        if (kept is None or kept[i]) and not hot[y[i], x[i]]:
-            out_t[n], out_x[n], out_y[n] = (t[i] - start) * 1e-6, x[i], y[i]
-            n += 1
-    return out_t[:n], out_x[:n], out_y[:n]
-
-
-@compiled
-def _count(x: Any, y: Any, hot: Any, kept: Any, counts: Any) -> Any:
-    """Of the events that are not left out the pixels, and how many each has."""
-    px, py, m = np.empty(len(x), np.int32), np.empty(len(x), np.int32), 0
     for i in range(len(x)):
-        if (kept is None or kept[i]) and not hot[y[i], x[i]]:
+        if _stays(i, x, y, hot, kept):
+            to_t[n], to_x[n], to_y[n] = (t[i] - start) * 1e-6, x[i], y[i]
+            n += 1
+    return n
+
+
+@lean
+def _count(x: Any, y: Any, hot: Any, kept: Any, counts: Any, px: Any, py: Any, n: Any) -> int:
+    """Of the events that are not left out the pixels, and how many each has: their number."""
+    m = 0
+    for i in range(len(x)):
+        if _stays(i, x, y, hot, kept):
             if counts[y[i], x[i]] == 0:
                 px[m], py[m] = x[i], y[i]
                 m += 1
             counts[y[i], x[i]] += 1
-    n = np.empty(m, np.int32)
     for k in range(m):
         n[k] = counts[py[k], px[k]]
         counts[py[k], px[k]] = 0
-    return px[:m], py[:m], n
+    return m
 
 
 @lean_part
@@ -155,8 +165,8 @@ def cell_at(A: Any, x: Any, y: Any, cell: int, shape: Any) -> tuple[int, int]:
     return min(max(row, 0), shape[0] - 1), min(max(column, 0), shape[1] - 1)
 
 
-@compiled
+@lean
 def _add_cells(x: Any, y: Any, hot: Any, kept: Any, A: Any, cell: int, counts: Any) -> None:
     for i in range(len(x)):
-        if (kept is None or kept[i]) and not hot[y[i], x[i]]:
+        if _stays(i, x, y, hot, kept):
             counts[cell_at(A, x[i], y[i], cell, counts.shape)] += 1
