@@ -15,7 +15,7 @@ from jaxevent.blob.finding.found import Found, most_events
 from jaxevent.blob.finding.parts import join_parts
 from jaxevent.blob.finding.paths import ANYBODY, NOBODY, candidates, join
 from jaxevent.blob.finding.paths import Path as TargetPath
-from jaxevent.blob.finding.search import _settled
+from jaxevent.blob.finding.search import _lasting, _settled
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.errors import InputError
 from jaxevent.io import load
@@ -133,6 +133,17 @@ def test_beginnings_from_which_a_target_leaps_are_left_out():
     assert _settled(path) is path
     leaping = _path(t, np.where(np.arange(30) == 2, x + 25, x), 30.0, 3.0, 30)
     np.testing.assert_array_equal(_settled(leaping).t, t[3:])
+
+
+@pytest.mark.parametrize(
+    ("rows", "leaves", "duration", "lasts"),
+    [(15, 0.3, 1, True), (15, 0.5, 1, False), (16, 0.5, 1, True), (15, 0.5, 0.02, True)],
+)
+def test_what_is_seen_shortly_and_goes_no_way_is_left_out(rows, leaves, duration, lasts):
+    path = _path(np.arange(0, 1000 * rows, 1000), 20.0, 30.0, 3.0, 30)
+    # In a window the noise q of the velocity makes a deviation of sqrt(q w^3 / 3).
+    path = dataclasses.replace(path, agility=3 * (leaves * 3.0) ** 2 / 1e-9)
+    assert _lasting(path, duration) == lasts
 
 
 def test_pieces_of_an_edge_are_one_while_each_is_seen():

@@ -30,6 +30,7 @@ WORTH = 0.05  # nats per event from which a pass is worth it
 WORTH_MOVING = 0.1  # and before a scene that moves, whose map is less exact
 FEWEST = 100  # events of a recording that is looked at
 ONE_PIXEL = 0.5  # px: what is smaller is a pixel, no blob
+SHORT, ERRATIC = 16, 0.4  # windows, and sizes by which what is seen in fewer leaves its way in one
 FILL = 0.5  # share of its windows in which a target was seen
 JOINS = 1.5  # ellipses' distances, as `touching`, of a target's end and its new beginning
 PAUSE = 4 * HOLD  # windows between them at most; or, at rest,
@@ -104,7 +105,8 @@ def _search(
         near = whole = join_parts(whole)
         if background.scene is not None:
             whole = [one for one in whole if goes_own_way(one, background.scene, stream.start)]
-        new = _stitch([one for one in whole if _lasting(one)], (stream.width, stream.height))
+        lasting = [one for one in whole if _lasting(one, stream.duration)]
+        new = _stitch(lasting, (stream.width, stream.height))
         new = [one for one in new if not _left_over(one, found)]
         passes.append(Pass(choice, len(new)))
         found += new
@@ -112,11 +114,20 @@ def _search(
     return found, passes
 
 
-def _lasting(path: Path) -> bool:
-    """Whether it is larger than a pixel and was seen in enough of its windows."""
-    windows = (path.t[-1] - path.t[0]) / path.window + 1
+def _lasting(path: Path, duration: float | int) -> bool:
+    """Whether it is larger than a pixel and was seen in enough of its windows.
+
+    What is seen in few of those of the recording, of `duration` s, goes on as it goes: parts of a
+    flicker are here and there.
+    """
+    window, seen = path.window * 1e-6, len(path.t)
     size = np.median(np.trace(path.C, axis1=1, axis2=2))
-    return bool(size > 2 * ONE_PIXEL**2 and len(path.t) >= FILL * windows)
+    leaves = path.agility * window**3 / 3
+    short = seen < min(SHORT, FILL * duration / window)
+    if short and leaves > (ERRATIC * np.median(path.size[:, 0])) ** 2:
+        return False
+    windows = (path.t[-1] - path.t[0]) / path.window + 1
+    return bool(size > 2 * ONE_PIXEL**2 and seen >= FILL * windows)
 
 
 def _settled(path: Path) -> Path:
