@@ -145,6 +145,7 @@ def run(
     span: dict[str, Any] = {"start": start, "stop": stop}
     clock = time.perf_counter()
     options: dict[str, Any] = {"seeds": seeds, "detect": detect, **span}
+    found = None
     if seeds is None and not detect:
         found = find(recording, **span, progress=show_progress())
         print(found.summary())
@@ -166,6 +167,11 @@ def run(
     count = recording.events.index(tracks.stop) - recording.events.index(tracks.start)
     if len(tracks):
         print("\n".join(written.summary()))
+    elif found is not None and found.camera_moves:
+        print(
+            "the camera moves, and no blob was found that goes its own way; jaxevent motion tells "
+            "how the camera moves, --seed X,Y,SIZE says where a blob is"
+        )
     else:
         print("no blob was found; say where one is with --seed X,Y,SIZE, or try --detect")
     if written.left_out:

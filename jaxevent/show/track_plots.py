@@ -29,6 +29,7 @@ _CHANGED, _ALIKE = 1.2, 0.5  # ratio of sizes of what grows, least of the axes' 
 _ONE_WAY = 0.8  # of all changes is one of growth or of shrinking
 _RESOLVED = 2.0  # px, the least size along the shorter axis: smaller spots are as large as pixels
 _PARTS = 8  # of a life, whose median sizes are compared
+_SURE = 2.0  # standard deviations of the change: errors within a part are alike
 _CURVES = 6  # most tracks in the panels over time
 _SIZE, _TTC, _RANGE = "lambda (px)", "1 / TTC (1/s)", "range (m)"
 _FAINT = 0.2  # of bands
@@ -84,7 +85,8 @@ def write_track_plot(
     filled_P = np.where(valid[..., None, None], covariance, np.eye(8))
     m, P = jnp.asarray(filled), jnp.asarray(filled_P)
     grown, spread, grows = _growths(t, m, P, valid, Q, Q_lambda)
-    grows &= _scales(filled[..., 4:6], valid)
+    variances = np.diagonal(filled_P, axis1=2, axis2=3)[..., 4:6]
+    grows &= _scales(filled[..., 4:6], variances, valid)
 
     asked = [_TTC] * bool(grows.any() or len(pairs)) + [_RANGE] * (extent is not None)
     names = [_SIZE, *asked] if valid.any() else []
@@ -133,22 +135,27 @@ def _longest(valid: NDArray[np.bool_], also: Sequence[int]) -> NDArray[np.bool_]
     return shown
 
 
-def _scales(sizes: NDArray, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _scales(sizes: NDArray, variances: NDArray, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Of which tracks (T, N) both sizes (T, N, 2) change alike: they come nearer or go away.
 
     What turns, or comes into sight, changes one of them; what flickers, or takes events of others
-    for a while, grows and shrinks by turns; and what is as small as pixels has their size.
+    for a while, grows and shrinks by turns; and what is as small as pixels has their size. What is
+    seen shortly changes by no more than its errors.
     """
     told = np.zeros(valid.shape[1], bool)
     for i, seen in enumerate(valid.T):
         parts = np.array_split(np.log(sizes[seen, i]), _PARTS)
+        errors = np.array_split((variances[seen, i] / sizes[seen, i] ** 2).sum(1), _PARTS)
         if len(parts[-1]):
             medians = np.array([np.median(part, axis=0) for part in parts])
             if np.median(medians.min(1)) < np.log(_RESOLVED):
                 continue
             mean = medians.sum(1)
-            change = medians[mean.argmax()] - medians[mean.argmin()]
+            most, least = mean.argmax(), mean.argmin()
+            change = medians[most] - medians[least]
+            error = np.sqrt(np.median(errors[most]) + np.median(errors[least]))
             alike = change.min() > _ALIKE * change.max() > _ALIKE * np.log(_CHANGED)
+            alike = alike and change.sum() > _SURE * error
             told[i] = alike and np.ptp(mean) > _ONE_WAY * abs(np.diff(mean)).sum()
     return told
 
@@ -258,4 +265,4 @@ def draw_paths(
     if total is not None and total > len(known):
         some = f" of the {len(known)} of {total} tracks seen longest"
     title = f"paths{some}, ellipses of 2 standard deviations, numbers where they end"
-    axis.set_title(title, fontsize=9)
+    axis.set_title("events; no track" if lines is None else title, fontsize=9)

@@ -549,12 +549,19 @@ def test_what_comes_nearer_grows_along_both_axes():
     valid = np.ones((50, 6), bool)
     valid[:, 5] = False
     sizes = np.concatenate([sizes, np.ones((50, 1, 2))], 1)
-    assert track_plots._scales(sizes, valid).tolist() == [True, True, False, False, False, False]
+    few = np.zeros_like(sizes)
+    told = track_plots._scales(sizes, few, valid)
+    assert told.tolist() == [True, True, False, False, False, False]
     flickers = np.exp(0.3 * np.sin(20 * t))[:, None, None] * 5 * np.ones((1, 1, 2))
     swells = np.exp(np.clip(4 - 20 * abs(t - 0.5), 0, 1))[:, None, None] * 5 * np.ones((1, 1, 2))
     tiny = sizes[:, :2] / 3
     for one in (flickers, swells, tiny):
-        assert not track_plots._scales(one, valid[:, : one.shape[1]]).any()
+        assert not track_plots._scales(one, few[:, : one.shape[1]], valid[:, : one.shape[1]]).any()
+    # From the first to the last eighth both sizes grow by exp(0.44): of errors of 10 % of each at
+    # both ends this is 4.4 standard deviations, of 30 % it is 1.5.
+    for error, clear in ((0.1, True), (0.3, False)):
+        variances = (error * sizes[:, :1]) ** 2
+        assert track_plots._scales(sizes[:, :1], variances, valid[:, :1]) == [clear]
 
 
 def test_panels_hold_the_tracks_that_are_seen_longest():

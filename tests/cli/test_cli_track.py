@@ -15,7 +15,7 @@ from commands import decoded, described, fails
 from PIL import Image
 
 import jaxevent
-from jaxevent import cli
+from jaxevent import blob, cli
 from jaxevent.blob import constant_velocity
 from jaxevent.blob.quantities import inverse_ttc, size_range
 from jaxevent.errors import install_command
@@ -241,7 +241,7 @@ def test_the_summary_counts_from_the_recordings_start(tmp_path):
 
 
 @pytest.mark.slow
-def test_nothing_found_is_an_empty_table(tmp_path, capsys):
+def test_nothing_found_is_an_empty_table(tmp_path, capsys, monkeypatch):
     t = np.arange(0, 60_000, 3_000)
     x, y = (37 * np.arange(20)) % WIDTH, (23 * np.arange(20)) % HEIGHT
     events = Events(t, x.astype(np.uint16), y.astype(np.uint16), x % 2 == 0)
@@ -273,6 +273,10 @@ def test_nothing_found_is_an_empty_table(tmp_path, capsys):
     assert len(images) > 40
     with Image.open(out / "tracks.png") as figure:
         assert figure.width > 800
+    # Where the camera moves it is said.
+    monkeypatch.setattr(blob, "find", lambda one, **_: blob.Found((), (), 0, 1.0, one, True))
+    assert cli.main([*map(str, argv[:-1]), str(tmp_path / "a.csv")]) == 0
+    assert "the camera moves, and no blob was found" in capsys.readouterr().out
 
 
 @pytest.mark.slow
