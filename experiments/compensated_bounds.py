@@ -5,8 +5,9 @@
 Tables:
 
     objects     simulated objects, 25 Hz, halfway between frames, of the seeds that
-                experiments/motion_compensated.py scores: the motion found, the true one, and the
-                true visibility beside it; all errors, and those within 2 px of where surfaces meet
+                experiments/motion_compensated.py scores: the motion found, the true one as means
+                of 2 x 2 pixels, the true one of pixels, and the true visibility beside it; all
+                errors, and those within 2 px of where surfaces meet
     pans        fast pans of HDR scenes: MSE of ln(I + I0) of dark, well-exposed, bright pixels, of
                 the smoother, of `mc` with the motion found and the true one, of the fusion alone,
                 and with the best ingredient at every pixel; which part of the dark error of a pixel
@@ -28,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 import jaxevent
-from jaxevent.reconstruction.compensated import fusion
+from jaxevent.reconstruction.compensated import fusion, trajectories
 from jaxevent.reconstruction.compensated.agreement import agree
 from jaxevent.reconstruction.compensated.estimator import Followed, place_of
 from jaxevent.reconstruction.compensated.warping import Along, warp
@@ -54,6 +55,19 @@ def truly_along(target: Followed, source: Objects, t: int) -> tuple[Along, NDArr
     return Along(*warped), hidden
 
 
+def by_nodes(target: Followed, source: Objects, t: int) -> NDArray[np.float32]:
+    """The paths of pixels where the true motion is the mean of 2 x 2 pixels at each node."""
+    s = target.instants.s.astype(float)
+    moved = np.stack(
+        [source.displacement(t * 1e-6, float(at) * 1e-6)[0] for at in target.instants.t]
+    )
+    count, h, w, _ = moved.shape
+    v, a = np.linalg.lstsq(np.stack([s, s**2], 1), moved.reshape(count, -1), rcond=None)[0]
+    paths = np.concatenate([v.reshape(h, w, 2), a.reshape(h, w, 2)], -1)
+    nodes = paths.reshape(h // 2, 2, w // 2, 2, 4).mean((1, 3)).astype(np.float32)
+    return trajectories.spread(nodes, (h, w))
+
+
 def objects(folder: Path) -> Iterator[str]:
     """The table, line by line."""
     params = mc.Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4)
@@ -68,11 +82,14 @@ def objects(folder: Path) -> Iterator[str]:
             meet[1:] |= seen[1:] != seen[:-1]
             near = np.asarray(distance_transform_edt(~meet)) < EDGE
             target = video.follow(t)
-            instants, L, V, clear, p, _ = target
+            instants, L, V, clear, *_ = target
             place = place_of(instants, clear, len(instants))
             true, hidden = truly_along(target, source, t)
             cases = {
-                "motion found": warp(L, V, np.asarray(clear, np.float32), instants.s, p),
+                "motion found": warp(L, V, np.asarray(clear, np.float32), instants.s, target.paths),
+                "true motion, by nodes": warp(
+                    L, V, np.asarray(clear, np.float32), instants.s, by_nodes(target, source, t)
+                ),
                 "true motion": true,
                 "true motion and visibility": true._replace(inside=true.inside * ~hidden),
             }
@@ -132,11 +149,12 @@ def pans(folder: Path) -> Iterator[str]:
             low, high = recording.extra.get("clip", (0.01, 1.0))
             regions = (truth < low, (truth >= low) & (truth <= high), truth > high)
             target = video.follow(t)
-            instants, L, V, clear, p, _ = target
+            instants, L, V, clear, *_ = target
             place = place_of(instants, clear, len(instants))
             true = truly_panned(target, source, t)
             images = {"smoother": L[instants.own]}
-            ways = {"found": warp(L, V, np.asarray(clear, np.float32), instants.s, p), "true": true}
+            found_along = warp(L, V, np.asarray(clear, np.float32), instants.s, target.paths)
+            ways = {"found": found_along, "true": true}
             for motion, along in ways.items():
                 told = fusion.compare(
                     agree(params, L, along, place), fusion.views(L, V, along, place)

@@ -15,6 +15,7 @@ from jaxevent.methods import find
 from jaxevent.reconstruction.colour import chrominance, colour_video, luminance
 from jaxevent.reconstruction.compensated import (
     agreement,
+    borders,
     course,
     estimator,
     exposures,
@@ -71,8 +72,8 @@ def test_motion_is_found_from_nothing(v, a):
     # The scene's points go by v s + a s^2.
     np.testing.assert_allclose(inner.mean((0, 1)), [*v, *a], atol=0.15)
     assert np.abs(inner - inner.mean((0, 1)))[..., :2].max() < 0.6
-    flow = trajectories.velocity(p, (40, 56))
-    np.testing.assert_allclose(flow[12:-12, 12:-12].mean((0, 1)), v, atol=0.15)
+    paths = trajectories.spread(p, (40, 56))
+    np.testing.assert_allclose(paths[12:-12, 12:-12].mean((0, 1)), [*v, *a], atol=0.15)
 
 
 @pytest.mark.slow
@@ -138,6 +139,31 @@ def test_equations_are_solved():
     np.testing.assert_allclose(d.ravel(), expected, atol=2e-4)
 
 
+def test_pixels_take_the_path_of_their_side():
+    s = np.array([-1, -0.5, 0, 0.5, 1], np.float32)
+    x = np.arange(56)
+    still, moving = moved((0, 0), (0, 0), s), moved((6.0, -3.0), (0, 0), s)
+    images = trajectories.pack(np.where(x < 28, still, moving), np.full_like(still, 1e-3))
+    # Between both motions a ramp, 12 px wide, as nodes leave it.
+    part = np.clip((x - 21.5) / 12, 0, 1)[None, :, None] * np.ones((40, 1, 1))
+    paths = (part * [6.0, -3, 0, 0]).astype(np.float32)
+    whose = borders.choose(images, s, paths, 2e-4, 10.0)
+    chosen = paths.reshape(-1, 4)[whose][4:-4]
+    before = paths[4:-4]
+    truth = np.where(x < 28, 0.0, 6.0)
+    near = (np.abs(x - 27.5) < 8) & (np.abs(x - 27.5) > 1)
+
+    def wrong(paths):
+        return (np.abs(paths[..., 0] - truth)[:, near] > 0.7).mean()
+
+    # What moves has left the image's other half, so that some pixels see it in few instants.
+    assert wrong(before) > 0.5 and wrong(chosen) < 0.25
+    # Where all move alike none is better, and each keeps its own.
+    even = np.broadcast_to(np.float32([6, -3, 0, 0]), paths.shape).copy()
+    own = np.arange(40 * 56).reshape(40, 56)
+    np.testing.assert_array_equal(borders.choose(images, s, even, 2e-4, 10.0), own)
+
+
 @functools.cache
 def warped_case():
     rng = np.random.default_rng(2)
@@ -145,17 +171,17 @@ def warped_case():
     V = rng.uniform(0.01, 0.1, L.shape).astype(np.float32)
     clear = (rng.random(L.shape) < 0.5).astype(np.float32)
     p = rng.uniform(-4, 4, (9, 12, 4)).astype(np.float32)
-    return L, V, clear, np.float32([-1, 0, 1]), p
+    return L, V, clear, np.float32([-1, 0, 1]), trajectories.spread(p, (18, 23))
 
 
 @pytest.mark.slow
 def test_images_along_trajectories():
-    L, V, clear, s, p = warped_case()
-    quick = warping.warp(L, V, clear, s, p)
-    pure = warping.warp_purely(*map(jnp.asarray, (L, V, clear, s, p)))
+    L, V, clear, s, paths = warped_case()
+    quick = warping.warp(L, V, clear, s, paths)
+    pure = warping.warp_purely(*map(jnp.asarray, (L, V, clear, s, paths)))
     for one, other in zip(quick, pure, strict=True):
         np.testing.assert_allclose(one, other, atol=2e-5)
-    Y, X = (np.asarray(v) for v in warping.places(jnp.asarray(p), jnp.asarray(s), *L.shape[1:]))
+    Y, X = (np.asarray(v) for v in warping.places(jnp.asarray(paths), jnp.asarray(s)))
     for k in range(3):
         at = [Y[k], X[k]]
         expected = map_coordinates(V[k], at, order=1, mode="nearest")
@@ -184,8 +210,8 @@ def still(L, V=0.01):
 
 @pytest.mark.slow
 def test_agreement_is_that_of_the_pure_function():
-    L, V, clear, s, p = warped_case()
-    along = warping.warp(L, V, clear, s, p)
+    L, V, clear, s, paths = warped_case()
+    along = warping.warp(L, V, clear, s, paths)
     L[0, 4:9, 5:12] += 1.0  # a thing in front
     # Activity is what changes between frames; where none follows, or is before, up to the target.
     activity = ((3, 1, 0, 2), 0), ((3, 2, 0, 0), L[2] - L[1]), ((3, 0, 2, 2), L[1] - L[0])
@@ -383,20 +409,20 @@ def exposed(half=0.5):
         np.linspace(0, 1, 256, dtype=np.float32),
         np.ones(2, np.float32),
     )
-    p = np.zeros((9, 12, 4), np.float32)
-    p[..., :2] = SHIFT
+    paths = np.zeros((18, 23, 4), np.float32)
+    paths[..., :2] = SHIFT
     I0 = float(Params().I0)
-    return np.log(seen(0) + I0).astype(np.float32), taken, shots, p
+    return np.log(seen(0) + I0).astype(np.float32), taken, shots, paths
 
 
 def held(params, L, P, case, samples):
     """`constrain`, which is `constrain_purely`."""
-    _, taken, shots, p = case
+    _, taken, shots, paths = case
     ones = jnp.ones((7, *L.shape), np.float32)
     fused = fusion.Fused(jnp.asarray(L), jnp.asarray(P), ones[:5], ones[:2])
     rest: tuple = (taken, shots, samples)
-    quick = exposures.constrain(params, fused, p, *rest)
-    pure = exposures.constrain_purely(params, fused, jnp.asarray(p), *rest)
+    quick = exposures.constrain(params, fused, paths, *rest)
+    pure = exposures.constrain_purely(params, fused, jnp.asarray(paths, float), *rest)
     for one, other in ((quick.L, pure.L), (quick.P, pure.P)):
         np.testing.assert_allclose(one, other, rtol=2e-4, atol=2e-4)
     return np.asarray(quick.L), np.asarray(quick.P)
@@ -404,12 +430,12 @@ def held(params, L, P, case, samples):
 
 @pytest.mark.slow
 def test_an_exposure_is_the_mean_along_trajectories():
-    L, taken, shots, p = exposed()
+    L, taken, shots, paths = exposed()
     I0 = float(Params().I0)
-    D = exposures._shifts(taken, jnp.asarray(p), 15, L.shape)
+    D = exposures._shifts(taken, jnp.asarray(paths), 15)
     B, shares = exposures.smeared(jnp.asarray(L), D)
     np.testing.assert_allclose(shares.sum(1), 1, atol=1e-5)
-    Y, X = (np.asarray(v) for v in warping.places(jnp.asarray(p), jnp.asarray(taken.s), 18, 23))
+    Y, X = (np.asarray(v) for v in warping.places(jnp.asarray(paths), jnp.asarray(taken.s)))
     for k in range(2):
         seen = map_coordinates(shots.intensity[k].reshape(18, 23), [Y[k], X[k]], order=3)
         expected = np.log(seen + I0)  # exp L is I + I0, whose mean is that of I, plus I0

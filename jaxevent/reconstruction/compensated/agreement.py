@@ -407,7 +407,8 @@ def _finish(begin, end, L, along, misfits, steep, settings, place, taps, out, ex
             _exceed(along.L[k, y], clear, M, misfit[k], variance[k], settings, excess[y], weight[y])
 
 
-def _blurred(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+def blurred(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    """`blur` of an image (h, w), in loops."""
     taps = taps_of(sigma)
     across, out = np.empty_like(image), np.empty_like(image)
     over_rows(_blur_across, len(image), image, taps, across)
@@ -426,7 +427,7 @@ def agree(params: Params, L: NDArray, along: Along, place: Place) -> Agreement:
     place = place._replace(own=own, before=int(place.before), after=int(place.after))
     misfits = np.empty((count, h, w), np.float32)
     steep, M = np.empty((2, h, w), np.float32)
-    seen_from = _blurred(np.ascontiguousarray(L[own]), 1.0)
+    seen_from = blurred(np.ascontiguousarray(L[own]), 1.0)
     for turn in range(3):
         given = (along, weights, misfits, seen_from, steep, settings, own, turn, taps, M)
         over_rows(_find_mean, h, *given)
@@ -439,5 +440,5 @@ def agree(params: Params, L: NDArray, along: Along, place: Place) -> Agreement:
     out = Agreement(*told, parts, seen, usual)
     excess, weight = np.empty((2, h, w), np.float32)
     over_rows(_finish, h, L, along, misfits, steep, settings, place, taps, out, excess, weight)
-    scatter = np.maximum(_blurred(excess, SCATTER) / _blurred(weight, SCATTER), 0)
+    scatter = np.maximum(blurred(excess, SCATTER) / blurred(weight, SCATTER), 0)
     return out._replace(scatter=scatter)

@@ -23,7 +23,7 @@ from scipy.ndimage import map_coordinates
 from jaxevent.errors import InputError
 from jaxevent.estimator import Described, Estimate
 from jaxevent.reconstruction.clock import Clock, Timing, time_span
-from jaxevent.reconstruction.compensated import trajectories
+from jaxevent.reconstruction.compensated import borders, trajectories
 from jaxevent.reconstruction.compensated.agreement import Agreement, Place, agree, place_of, shown
 from jaxevent.reconstruction.compensated.course import TIME, course_of
 from jaxevent.reconstruction.compensated.evidence import Evidence
@@ -53,7 +53,13 @@ from jaxevent.reconstruction.compensated.steadiness import (
     smooth_part,
 )
 from jaxevent.reconstruction.compensated.thresholds import learn
-from jaxevent.reconstruction.compensated.warping import places, sample, warp, warp_purely
+from jaxevent.reconstruction.compensated.warping import (
+    places,
+    sample,
+    spread_purely,
+    warp,
+    warp_purely,
+)
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.features import Features, Numeric, ReadOut
 from jaxevent.reconstruction.frames import FrameImages
@@ -81,6 +87,7 @@ class Targets(Described):
     rows: Int[Numeric, "times k"]  # of each target's instants
     place: Place  # each (times, k) or (times,)
     p: Float[Numeric, "times rows columns 4"]  # trajectories
+    whose: Int[Numeric, "times h w"]  # the pixel whose trajectory each one takes
     taken: Taken  # each (times, n)
     steady: Float[Numeric, " times"]  # 1 where frames keep their brightness, else 0
     doubt: Float[Numeric, " times"]  # `Steadiness.doubt`
@@ -89,7 +96,9 @@ class Targets(Described):
 
     def images(self, rows: NDArray) -> "Targets":
         """Those of its images, in that order."""
-        each = (self.rows, self.place, self.p, self.taken, self.steady, self.doubt)
+        each = (
+            self.rows, self.place, self.p, self.whose, self.taken, self.steady, self.doubt,
+        )  # fmt: skip
         chosen = jax.tree.map(lambda leaf: leaf[rows], each)
         return Targets(self.instants, *chosen, samples=self.samples)
 
@@ -214,8 +223,15 @@ class Followed(NamedTuple):
     L: NDArray[np.float32]  # (K, h, w)
     V: NDArray[np.float32]
     clear: NDArray[np.float32]
-    p: NDArray[np.float32]  # (rows, columns, 4), px at s = 1
+    p: NDArray[np.float32]  # (rows, columns, 4), px at s = 1, of nodes
+    whose: NDArray[np.int32] | None = None  # (h, w), as `borders.choose`; None: each its own
     smooth: NDArray[np.float32] | None = None  # (K, h, w), taken away from L; None: nothing is
+
+    @property
+    def paths(self) -> NDArray[np.float32]:
+        """Those of all pixels, (h, w, 4)."""
+        paths = trajectories.spread(self.p, self.L.shape[1:])
+        return paths if self.whose is None else paths.reshape(-1, 4)[self.whose]
 
 
 @runtime_checkable
@@ -353,7 +369,7 @@ class Follower:
         L, V, clear, smooth = self._images(instants)
         if self.start is not None and not self.start.refine:
             p = trajectories.Motion(p, 1).at(0, *L.shape[1:]).p
-            return Followed(instants, L, V, clear, p, smooth)
+            return Followed(instants, L, V, clear, p, smooth=smooth)
         doubted = self._doubted(V, clear)
         pyramid = trajectories.Pyramid(L, doubted, FADE)
         instants, p = self._stepped(pyramid[1], instants, p)
@@ -368,7 +384,8 @@ class Follower:
         packed = trajectories.pack(better, doubted)
         for _ in range(STEPS):
             p = trajectories.step(packed, s, p, *self._settings)
-        return Followed(instants, L, V, clear, p, smooth)
+        whose = borders.choose(packed, s, trajectories.spread(p, L.shape[1:]), *self._settings[:2])
+        return Followed(instants, L, V, clear, p, whose, smooth)
 
 
 def room_for(number: int) -> int:
@@ -383,8 +400,8 @@ def _decide(params: Params, told: Agreement, seen: Views) -> Fused:
 
 def look(params: Params, target: Followed) -> tuple[Agreement, Views]:
     """What `fusion.compare` looks at, of a target's images along trajectories."""
-    instants, L, V, clear, p, _ = target
-    along = warp(L, V, np.asarray(clear, np.float32), instants.s, p)
+    instants, L, V, clear, *_ = target
+    along = warp(L, V, np.asarray(clear, np.float32), instants.s, target.paths)
     place = place_of(instants, clear, len(instants))
     return agree(params, L, along, place), views(L, V, along, place)
 
@@ -420,9 +437,9 @@ def follower_of(
 
 
 @jax.jit
-def _carry(images: Array, s: Array, p: Array) -> Array:
+def _carry(images: Array, s: Array, paths: Array) -> Array:
     """Images (n, h, w, channels) at s (n,) along trajectories."""
-    Y, X = places(p, s, *images.shape[1:3])
+    Y, X = places(paths, s)
     return jax.vmap(lambda one: sample(one, Y, X), -1, -1)(images)
 
 
@@ -497,7 +514,7 @@ class CompensatedVideo(ImageSequence[Params]):
         grey, intensity, _, gain = self._frames.read(slice(low, high), high - low)
         rows = taken.frame - low
         shots = Shots(grey[rows], intensity[rows], self._response, gain[rows])
-        return constrain(self.params, fused, target.p, taken, shots, shutter.samples)
+        return constrain(self.params, fused, target.paths, taken, shots, shutter.samples)
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         for n, t in enumerate(times.tolist()):
@@ -525,8 +542,8 @@ class CompensatedVideo(ImageSequence[Params]):
         M = np.asarray(fused.L, np.float32)
         if target.smooth is not None:
             L, M = L - smooth_part(L), M - smooth_part(M)
-        along = warp(L, V, clear, s, target.p)
-        seen = _carry(np.asarray(images, np.float32), s, target.p)
+        along = warp(L, V, clear, s, target.paths)
+        seen = _carry(np.asarray(images, np.float32), s, target.paths)
         return np.asarray(seen), np.asarray(_shown(self.params, M, along))
 
     def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.float32]:
@@ -534,10 +551,8 @@ class CompensatedVideo(ImageSequence[Params]):
 
         Times are as those of images.
         """
-        size = (self.recording.height, self.recording.width)
         found = [
-            trajectories.velocity(target.p, size)
-            * np.float32(target.instants.pace(self.follow.schedule.step))
+            target.paths[..., :2] * np.float32(target.instants.pace(self.follow.schedule.step))
             for target, _ in self._targets(times, extrapolate)
         ]
         return np.stack(found)
@@ -599,16 +614,21 @@ class MotionCompensated(ImageEstimator[Params]):
         rows, p = np.zeros((len(chosen), room), np.int32), np.zeros(shape, np.float32)
         places, taken = [], []
         steady, doubt = np.ones((2, len(chosen)), np.float32)
+        size = (recording.height, recording.width)
+        own = np.arange(recording.height * recording.width, dtype=np.int32).reshape(size)
+        whose = np.repeat(own[None], len(chosen), 0)
         for n in range(len(chosen)):
-            one, _, _, clear, p[n], smooth = follow(int(wanted[n]))
-            steady[n], doubt[n] = smooth is None, follow.steady.doubt(int(wanted[n]))
+            target = follow(int(wanted[n]))
+            one, clear, p[n] = target.instants, target.clear, target.p
+            whose[n] = own if target.whose is None else target.whose
+            steady[n], doubt[n] = target.smooth is None, follow.steady.doubt(int(wanted[n]))
             rows[n, : len(one)] = np.searchsorted(every, one.t)
             places.append(place_of(one, clear, room))
             taken.append(follow.shutter(int(wanted[n]), one))
         place, taken = (
             jax.tree.map(lambda *leaves: np.stack(leaves), *parts) for parts in (places, taken)
         )
-        each = (rows, place, p, taken, steady, doubt)
+        each = (rows, place, p, whose, taken, steady, doubt)
         targets = Targets(instants, *each, samples=follow.shutter.samples)
         return features, jax.device_put(targets)
 
@@ -625,23 +645,24 @@ class MotionCompensated(ImageEstimator[Params]):
 
         @jax.checkpoint
         def one(target: tuple) -> tuple[Array, Array]:
-            rows, place, p, taken, steady, doubt = target
+            rows, place, p, whose, taken, steady, doubt = target
             smooth = (1 - steady) * smooth_part(L[rows])
             images = (L[rows] - smooth, V[rows], clear[rows])
             if self.through_motion:
                 p = self._moved(params, images, place, p)
-            along = warp_purely(*images, place.s, p)
+            paths = spread_purely(p, *whose.shape).reshape(-1, 4)[whose]
+            along = warp_purely(*images, place.s, paths)
             fused = fuse(params, images[0], images[1], along, place)
             if out.samples is not None:
                 at = taken.frame
                 seen = (frames.grey[at], frames.intensity[at], frames.response, frames.gain[at])
                 # Frames of another brightness hold nothing.
                 taken = taken._replace(present=taken.present * steady)
-                fused = constrain_purely(params, fused, p, taken, Shots(*seen), out.samples)
+                fused = constrain_purely(params, fused, paths, taken, Shots(*seen), out.samples)
             base, variance = smooth_at_target(smooth, place, weight_after(place), doubt)
             return fused.L + base, fused.P + variance
 
-        each = (out.rows, out.place, out.p, out.taken, out.steady, out.doubt)
+        each = (out.rows, out.place, out.p, out.whose, out.taken, out.steady, out.doubt)
         found, P = jax.lax.map(one, each)
         image = (jnp.exp(found) - params.I0).reshape(len(found), -1)
         P = P.reshape(image.shape)

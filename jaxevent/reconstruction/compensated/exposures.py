@@ -158,12 +158,12 @@ def _quickly_returned(error: NDArray, shares: NDArray, D: NDArray) -> NDArray:
     return out
 
 
-def _shifts(taken: Taken, p: Array, samples: int, size: tuple[int, int]) -> Array:
+def _shifts(taken: Taken, paths: Array, samples: int) -> Array:
     """D (n, samples, h, w, 2)."""
     s, half = jnp.asarray(taken.s), jnp.asarray(taken.half)
     at = s[:, None] + half[:, None] * ((jnp.arange(samples) + 0.5) / samples * 2 - 1)
-    whole = displaced(p, at.reshape(-1), *size).reshape(*at.shape, *size, 2)
-    return whole - displaced(p, s, *size)[:, None]
+    whole = displaced(paths, at.reshape(-1)).reshape(*at.shape, *paths.shape[:2], 2)
+    return whole - displaced(paths, s)[:, None]
 
 
 def _discord(D: Array) -> Array:
@@ -183,11 +183,11 @@ def _discord(D: Array) -> Array:
 
 
 def _look(
-    params: Params, taken: Taken, shots: Shots, p: Array, D: Array, B: Array, fused: Fused
+    params: Params, taken: Taken, shots: Shots, paths: Array, D: Array, B: Array, fused: Fused
 ) -> _Seen:
     """What shots tell; B is what they would show of the image."""
     _, h, w = B.shape
-    Y, X = places(p, jnp.asarray(taken.s), h, w)
+    Y, X = places(paths, jnp.asarray(taken.s))
     light = jnp.asarray(shots.intensity) + params.I0
     own = jnp.asarray(taken.s)[:, None, None] == 0
     inside = within(Y, X, h, w) * jnp.asarray(taken.present)[:, None, None]
@@ -230,22 +230,21 @@ def _lost(seen: _Seen, image: Array, B: Array) -> Array:
 
 
 def constrain_purely(
-    params: Params, fused: Fused, p: Array, taken: Taken, shots: Shots, samples: int
+    params: Params, fused: Fused, paths: Array, taken: Taken, shots: Shots, samples: int
 ) -> Fused:
     """An image held to what frames integrated and to clipped pixels; differentiable.
 
     Args:
         params: Its `smear` says which part of what an exposure smears is in doubt.
         fused: The image.
-        p: Trajectories (rows, columns, 4).
+        paths: Of all pixels, (h, w, 4).
         taken: When the frames were taken.
         shots: The frames.
         samples: Of each exposure.
     """
-    h, w = fused.L.shape
-    D = _shifts(taken, p, samples, (h, w))
+    D = _shifts(taken, paths, samples)
     L, P = fused.L.astype(D.dtype), fused.P.astype(D.dtype)
-    seen = _look(params, taken, shots, p, D, smeared(L, D)[0], fused)
+    seen = _look(params, taken, shots, paths, D, smeared(L, D)[0], fused)
 
     def step(image: Array, _: None) -> tuple[Array, None]:
         B, shares = smeared(image, D)
@@ -262,19 +261,18 @@ def _single(values: Any) -> NDArray[np.float32]:
     return np.asarray(values, np.float32)
 
 
-_shifts_now = jax.jit(_shifts, static_argnums=(2, 3))
+_shifts_now = jax.jit(_shifts, static_argnums=2)
 _look_now, _weigh_now, _lost_now = jax.jit(_look), jax.jit(_weigh), jax.jit(_lost)
 
 
 def constrain(
-    params: Params, fused: Fused, p: Any, taken: Taken, shots: Shots, samples: int
+    params: Params, fused: Fused, paths: Any, taken: Taken, shots: Shots, samples: int
 ) -> Fused:
     """The same as `constrain_purely`, in loops."""
     L, P = _single(fused.L), _single(fused.P)
-    h, w = L.shape
-    D = _single(_shifts_now(taken, p, samples, (h, w)))
+    D = _single(_shifts_now(taken, paths, samples))
     B, _ = _quickly_smeared(L, D)
-    seen, image = _look_now(params, taken, shots, p, D, B, fused), L
+    seen, image = _look_now(params, taken, shots, paths, D, B, fused), L
     for _ in range(STEPS):
         B, shares = _quickly_smeared(image, D)
         pull, information = map(_single, _weigh_now(params, seen, B))

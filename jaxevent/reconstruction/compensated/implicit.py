@@ -15,7 +15,7 @@ from jax.scipy.sparse.linalg import bicgstab, cg
 from jaxtyping import Array, Float
 
 from jaxevent.reconstruction.compensated.trajectories import OUTSIDE
-from jaxevent.reconstruction.compensated.warping import places, sample, within
+from jaxevent.reconstruction.compensated.warping import places, sample, spread_purely, within
 from jaxevent.reconstruction.features import Numeric
 
 ITERATIONS = 30  # of conjugate gradients
@@ -94,7 +94,7 @@ def equations(p: Array, seen: Seen, numbers: Numbers) -> Equations:
     """The normal equations of `trajectories.step`, as a pure function."""
     L, V, s, present = seen
     count, h, w = L.shape
-    Y, X = (one.astype(p.dtype) for one in places(p, s, h, w))
+    Y, X = (one.astype(p.dtype) for one in places(spread_purely(p, h, w), s))
     inside = within(Y, X, h, w)
     gx, gy = _slopes(L)
     L, V, gx, gy = (sample(images, Y, X) for images in (L, V, gx, gy))

@@ -125,21 +125,40 @@ def around(X, Y, h, w):
     return inside, x0, y0, x1, y1, X - np.float32(x0), Y - np.float32(y0)
 
 
-@compiled
-def _fetch(begin, end, images, s, near, p, floor, nu, points, M):
-    """Images along the trajectories of some rows, (h, w, K, 4): L, weight R, gradient; their mean.
+@part
+def robust_mean(values, W, near, nu, R):
+    """The mean of values with information W, and their weights R in it.
 
     The near instants decide first what the target looks like; then robustly all of them.
     """
+    one, total, mean = np.float32(1), np.float32(0), np.float32(0)
+    for k in range(len(values)):
+        R[k] = W[k] * near[k]
+        total += R[k]
+        mean += R[k] * values[k]
+    m = mean / total
+    for _ in range(2):
+        total, mean = np.float32(0), np.float32(0)
+        for k in range(len(values)):
+            e = values[k] - m
+            R[k] = W[k] / (one + e * e * W[k] / nu)
+            total += R[k]
+            mean += R[k] * values[k]
+        m = mean / total
+    return m
+
+
+@compiled
+def _fetch(begin, end, images, s, near, p, floor, nu, points, M):
+    """Images along trajectories of some rows, (h, w, K, 4): L, weight R, gradient; their mean."""
     count, h, w, _ = images.shape
-    one, zero = np.float32(1), np.float32(0)
+    one = np.float32(1)
     at = np.empty(4, np.float32)
     W = np.empty(count, np.float32)
     for y in range(begin, end):
         for x in range(w):
             between(p, y, x, at)
             vx, vy, ax, ay = at[0], at[1], at[2], at[3]
-            total, mean = zero, zero
             for k in range(count):
                 X = np.float32(x) + (vx + ax * s[k]) * s[k]
                 Y = np.float32(y) + (vy + ay * s[k]) * s[k]
@@ -154,20 +173,7 @@ def _fetch(begin, end, images, s, near, p, floor, nu, points, M):
                         + d * images[k, y1, x1, q]
                     )
                 W[k] = one / (points[y, x, k, 1] + floor) if inside else OUTSIDE
-                R = W[k] * near[k]
-                total += R
-                mean += R * points[y, x, k, 0]
-            m = mean / total
-            for _ in range(2):
-                total, mean = zero, zero
-                for k in range(count):
-                    e = points[y, x, k, 0] - m
-                    R = W[k] / (one + e * e * W[k] / nu)
-                    points[y, x, k, 1] = R
-                    total += R
-                    mean += R * points[y, x, k, 0]
-                m = mean / total
-            M[y, x] = m
+            M[y, x] = robust_mean(points[y, x, :, 0], W, near, nu, points[y, x, :, 1])
 
 
 @compiled
@@ -681,16 +687,14 @@ def advect(p: NDArray[np.float32], s: float, unit: float) -> NDArray[np.float32]
 
 
 @compiled
-def _velocity(begin, end, p, out):
-    at = np.empty(4, np.float32)
+def _spread(begin, end, p, out):
     for y in range(begin, end):
         for x in range(out.shape[1]):
-            between(p, y, x, at)
-            out[y, x, 0], out[y, x, 1] = at[0], at[1]
+            between(p, y, x, out[y, x])
 
 
-def velocity(p: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """du/ds at the target for every pixel, (h, w, 2): x and y."""
-    out = np.empty((*size, 2), np.float32)
-    over_rows(_velocity, size[0], p, out)
+def spread(p: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """The paths of all pixels, (h, w, 4), from those of nodes."""
+    out = np.empty((*size, 4), np.float32)
+    over_rows(_spread, size[0], p, out)
     return out

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.kernels import compiled, over_rows
-from jaxevent.reconstruction.compensated.trajectories import around, between
+from jaxevent.reconstruction.compensated.trajectories import around
 from jaxevent.reconstruction.features import Numeric
 
 CUBIC = -0.75  # slope of the cubic kernel at 1, as OpenCV's; the sharper of the usual two
@@ -35,15 +35,14 @@ def _cubic(f, out):
 
 
 @compiled
-def _warp(begin, end, L, V, clear, s, p, out_L, out_V, out_clear, inside):
+def _warp(begin, end, L, V, clear, s, paths, out_L, out_V, out_clear, inside):
     count, h, w = L.shape
     one, zero = np.float32(1), np.float32(0)
-    at = np.empty(4, np.float32)
     across, down = np.empty(4, np.float32), np.empty(4, np.float32)
     for y in range(begin, end):
         for x in range(w):
-            between(p, y, x, at)
-            vx, vy, ax, ay = at[0], at[1], at[2], at[3]
+            path = paths[y, x]
+            vx, vy, ax, ay = path[0], path[1], path[2], path[3]
             for k in range(count):
                 X = np.float32(x) + (vx + ax * s[k]) * s[k]
                 Y = np.float32(y) + (vy + ay * s[k]) * s[k]
@@ -72,15 +71,15 @@ def _warp(begin, end, L, V, clear, s, p, out_L, out_V, out_clear, inside):
                 out_L[k, y, x] = total
 
 
-def warp(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, p: NDArray) -> Along:
-    """Images (K, h, w) float32 at instants s (K,) along trajectories p (rows, columns, 4)."""
+def warp(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, paths: NDArray) -> Along:
+    """Images (K, h, w) float32 at instants s (K,) along the paths of pixels, (h, w, 4)."""
     out = Along(*(np.empty(L.shape, np.float32) for _ in range(4)))
-    over_rows(_warp, L.shape[1], L, V, clear, s, p, *out)
+    over_rows(_warp, L.shape[1], L, V, clear, s, paths, *out)
     return out
 
 
-def displaced(p: Array, s: Array, height: int, width: int) -> Array:
-    """How far points have gone at s (K,): x and y, (K, h, w, 2)."""
+def spread_purely(p: Array, height: int, width: int) -> Array:
+    """The same as `trajectories.spread`; differentiable."""
     rows, columns, _ = p.shape
 
     def upsampled(nodes: int, size: int) -> tuple[Array, Array, Array]:
@@ -93,14 +92,19 @@ def displaced(p: Array, s: Array, height: int, width: int) -> Array:
     fy, fx = fy[:, None, None], fx[None, :, None]
     top = (1 - fx) * p[i][:, j] + fx * p[i][:, j1]
     bottom = (1 - fx) * p[i1][:, j] + fx * p[i1][:, j1]
-    full = (1 - fy) * top + fy * bottom
+    return (1 - fy) * top + fy * bottom
+
+
+def displaced(paths: Array, s: Array) -> Array:
+    """How far the points of pixels, of paths (h, w, 4), have gone at s (K,): x, y, (K, h, w, 2)."""
     s = s[:, None, None, None]
-    return (full[..., :2] + full[..., 2:] * s) * s
+    return (paths[..., :2] + paths[..., 2:] * s) * s
 
 
-def places(p: Array, s: Array, height: int, width: int) -> tuple[Array, Array]:
+def places(paths: Array, s: Array) -> tuple[Array, Array]:
     """Where points are at instants: y and x, (K, h, w)."""
-    gone = displaced(p, s, height, width)
+    height, width, _ = paths.shape
+    gone = displaced(paths, s)
     return jnp.arange(height)[:, None] + gone[..., 1], jnp.arange(width) + gone[..., 0]
 
 
@@ -123,10 +127,10 @@ def within(Y: Array, X: Array, height: int, width: int) -> Array:
     return (X >= -0.5) & (X <= width - 0.5) & (Y >= -0.5) & (Y <= height - 0.5)
 
 
-def warp_purely(L: Array, V: Array, clear: Array, s: Array, p: Array) -> Along:
+def warp_purely(L: Array, V: Array, clear: Array, s: Array, paths: Array) -> Along:
     """The same as `warp`; differentiable."""
     _, h, w = L.shape
-    Y, X = places(p, s, h, w)
+    Y, X = places(paths, s)
     inside = within(Y, X, h, w)
     V, clear = sample(V, Y, X), sample(clear, Y, X)
     Y, X = jnp.clip(Y, 0, h - 1), jnp.clip(X, 0, w - 1)

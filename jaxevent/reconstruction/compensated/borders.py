@@ -1,0 +1,111 @@
+"""Whose trajectory each pixel takes where surfaces meet that move in different ways.
+
+Trajectories are bilinear between nodes, which lie two pixels apart, and smooth. Where surfaces meet
+that leaves pixels on paths that nothing follows. So each takes the path of a pixel nearby if images
+agree better along it, by the same robust squares that motion is found with, gathered over a
+Gaussian:
+
+    sum_k rho((L_k(x + u(x', s_k)) - M(x))^2 W_k(x + u)),   x' the pixel nearby
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.kernels import fast, fast_part, over_rows
+from jaxevent.reconstruction.compensated.agreement import blurred
+from jaxevent.reconstruction.compensated.trajectories import OUTSIDE, around, robust_mean
+
+# How far away (px) the pixels are whose paths are tried, and the Gaussian (px), turn by turn.
+# Chosen on objects of other seeds and on the first half of slider_depth.
+TURNS = ((8, 2.0), (4, 1.5), (2, 1.0))
+DIRECTIONS = np.array([(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)])
+APART = np.float32(0.5)  # px at the farthest instant, by which paths differ that are compared
+
+
+@fast_part
+def _cost(images, s, near, y, x, path, floor, nu, level, W, R):
+    """How badly images (K, h, w, 4) agree along a path of the pixel y, x: robust squares."""
+    count, h, w, _ = images.shape
+    one = np.float32(1)
+    for k in range(count):
+        X = np.float32(x) + (path[0] + path[2] * s[k]) * s[k]
+        Y = np.float32(y) + (path[1] + path[3] * s[k]) * s[k]
+        inside, x0, y0, x1, y1, fx, fy = around(X, Y, h, w)
+        a, b = (one - fy) * (one - fx), (one - fy) * fx
+        c, d = fy * (one - fx), fy * fx
+        upper, lower = images[k, y0], images[k, y1]
+        level[k] = a * upper[x0, 0] + b * upper[x1, 0] + c * lower[x0, 0] + d * lower[x1, 0]
+        V = a * upper[x0, 1] + b * upper[x1, 1] + c * lower[x0, 1] + d * lower[x1, 1]
+        W[k] = one / (V + floor) if inside else OUTSIDE
+    m = robust_mean(level, W, near, nu, R)
+    cost, product = 0.0, 1.0
+    for k in range(count):
+        e = level[k] - m
+        product *= 1.0 + e * e * W[k] / nu
+        if k % 16 == 15:  # one logarithm for many takes less time; nor is this too large for it
+            cost, product = cost + np.log(product), 1.0
+    return nu * np.float32(cost + np.log(product))
+
+
+@fast
+def _begin(begin, end, images, s, near, paths, floor, nu, cost):
+    level, W, R = np.empty((3, len(s)), np.float32)
+    for y in range(begin, end):
+        for x in range(paths.shape[1]):
+            cost[y, x] = _cost(images, s, near, y, x, paths[y, x], floor, nu, level, W, R)
+
+
+@fast
+def _try(begin, end, images, s, near, paths, whose, offsets, floor, nu, cost, out):
+    """Costs (n, h, w) of the paths that the pixels at `offsets` have taken."""
+    h, w, _ = paths.shape
+    level, W, R = np.empty((3, len(s)), np.float32)
+    for y in range(begin, end):
+        for x in range(w):
+            own = paths[whose[y, x] // w, whose[y, x] % w]
+            for n in range(len(offsets)):
+                i = min(max(y + offsets[n, 0], 0), h - 1)
+                j = min(max(x + offsets[n, 1], 0), w - 1)
+                other = paths[whose[i, j] // w, whose[i, j] % w]
+                apart = np.float32(0)
+                for c in range(2):
+                    v, a = other[c] - own[c], other[c + 2] - own[c + 2]
+                    apart = max(apart, abs(v) + abs(a))
+                if apart < APART:
+                    out[n, y, x] = cost[y, x]
+                else:
+                    out[n, y, x] = _cost(images, s, near, y, x, other, floor, nu, level, W, R)
+
+
+def choose(
+    images: NDArray[np.float32],
+    s: NDArray[np.float32],
+    paths: NDArray[np.float32],
+    floor: float,
+    nu: float,
+) -> NDArray[np.int32]:
+    """The pixel, counted row by row, whose path each pixel takes, (h, w).
+
+    Args:
+        images: As `trajectories.pack` makes them, (K, h, w, 4).
+        s: Their times, -1..1.
+        paths: Of all pixels, (h, w, 4).
+        floor: As in `trajectories`.
+        nu: As in `trajectories`.
+    """
+    h, w, _ = paths.shape
+    near = np.exp(-2 * s**2).astype(np.float32)
+    numbers = (np.float32(floor), np.float32(nu))
+    whose = np.arange(h * w, dtype=np.int32).reshape(h, w)
+    costs = np.empty((1 + len(DIRECTIONS), h, w), np.float32)
+    over_rows(_begin, h, images, s, near, paths, *numbers, costs[0])
+    row, column = np.mgrid[:h, :w]
+    for far, sigma in TURNS:
+        offsets = DIRECTIONS * far
+        given = (images, s, near, paths, whose, offsets, *numbers, costs[0], costs[1:])
+        over_rows(_try, h, *given)
+        best = np.stack([blurred(one, sigma) for one in costs]).argmin(0)
+        dy, dx = np.concatenate([[(0, 0)], offsets])[best].transpose(2, 0, 1)
+        whose = whose[(row + dy).clip(0, h - 1), (column + dx).clip(0, w - 1)]
+        costs[0] = np.take_along_axis(costs, best[None], 0)[0]
+    return whose
