@@ -460,6 +460,8 @@ def test_the_end_of_a_path_is_less_sure():
     np.testing.assert_allclose(lone.covariance[:, 5, 5], grown)
     np.testing.assert_allclose(lone.covariance[:, :5, :5], np.tile(np.eye(5) * 1e-4, (11, 1, 1)))
     np.testing.assert_allclose(apart, (2.0 * 0.1) ** 2)
+    short = sequence._blended(np.zeros(1, int), fits[:1], half, 100_000, -4000, 4000)
+    assert list(short.t) == [-4000, -2000, 0, 2000, 4000]
     first = told.covariance[told.t == -100_000, 5, 5]
     assert first > (sequence.BENT * 0.2) ** 2
 

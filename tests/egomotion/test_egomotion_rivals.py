@@ -53,6 +53,21 @@ def test_rotation_alone_makes_about_the_same_flow():
     np.testing.assert_allclose(np.asarray(B(0.0, 0.0, f)) @ still.O[0], middle, rtol=1e-5)
 
 
+@pytest.mark.parametrize("better", [0.1, -0.1])
+def test_rotation_alone_starts_from_the_sharpest_too(monkeypatch, better):
+    """That one is taken which events left out tell; the path's turn may be false."""
+    path = Path.constant(np.array([1.0, 0, 0]), np.array([0.0, 0.9, 0]), np.full(4, -1.0))
+    sharpest = np.array([0.3, 0.1, -0.2])
+    monkeypatch.setattr(rivals.Trial, "fit", lambda self, path, moves: (path, moves))
+    monkeypatch.setattr(rivals.Trial, "z", lambda self, one, other: better)
+    found, moves = inspect.unwrap(rivals.Trial.rotation)(
+        object.__new__(rivals.Trial), path, sharpest
+    )
+    expected = sharpest if better > 0 else rivals.without_translation(path).O[0]
+    np.testing.assert_allclose(found.O[0], expected)
+    assert not moves and not found.O[1:].any() and np.exp(found.log_rho).max() < 1e-3
+
+
 def test_skew_is_that_by_which_pixels_end_where_they_began():
     # Three ON and two OFF events at every pixel; one more shows ON events alone.
     rows = []
@@ -88,5 +103,10 @@ def test_pixels_left_out_are_others_and_no_more_events(first):
     windows = Windows(Recording("r", 64, 48, events, camera=camera), Params(), camera)
     centre, half = len(x) // 2, 1.0
     parts = windows.tracks(centre, half, 300, first), windows.tracks(centre, half, 300, 300, first)
+    # A recording may be shorter than a window.
+    path = Path.constant(np.array([1.0, 0, 0]), np.zeros(3), np.full(4, np.log(0.5)))
+    lasts = 1e-6 * (len(x) - 1)
+    all_of_them = windows.tracks(centre, half, 10_000)
+    assert windows.parallax(path, all_of_them) == pytest.approx(lasts * 50 * 0.5, rel=0.05)
     held = [set(part.x) for part in parts]
     assert held[0] and held[1] and not held[0] & held[1]

@@ -130,7 +130,8 @@ def _blended(
     of how far its motion there is from that at its middle.
     """
     end = 2 * half // 3
-    t = np.arange(max(centres[0] - end, first), min(centres[-1] + end, last) + 1, max(step // 5, 1))
+    every = max(min(step // 5, (last - first) // 4), 1)
+    t = np.arange(max(centres[0] - end, first), min(centres[-1] + end, last) + 1, every)
     heading, Omega = np.zeros((len(t), 3)), np.zeros((len(t), 3))
     covariance, total, agreement = np.zeros((len(t), 6, 6)), np.zeros(len(t)), np.zeros(len(t))
     reach = min(end, step)

@@ -26,7 +26,7 @@ from jaxevent.egomotion.batch_fit.alignment import Window, refine, score
 from jaxevent.egomotion.batch_fit.depths import depths
 from jaxevent.egomotion.batch_fit.path import SEGMENTS, Path, Prior
 from jaxevent.egomotion.batch_fit.photometric import Report, adjust, compute_covariance
-from jaxevent.egomotion.batch_fit.rivals import SIGMA, Trial, without_translation
+from jaxevent.egomotion.batch_fit.rivals import SIGMA, Trial
 from jaxevent.egomotion.batch_fit.starts import (
     Plane,
     before_a_plane,
@@ -452,7 +452,7 @@ class Windows:
             return None
         ranked = self.ranked(left)
         first, seen = ranked[0]
-        parallax = self.parallax(first.path, half)
+        parallax = self.parallax(first.path, tracks)
         few = least > 0 or parallax < PARALLAX or seen.inliers < AGREED
         limit = np.inf if few else ALIKE * self.cost(*ranked[0])
         close = [one for one in ranked if self.cost(*one) <= limit]
@@ -467,7 +467,8 @@ class Windows:
         if trial and few:
             others = [(one.path, fit) for (one, _), fit in zip(close, fits, strict=True)]
             best = others.pop(chosen)[1]
-            path, covariance = _with_rivals(trial, scene.path, best, others, covariance)
+            still = trial.rotation(scene.path, self.rotation(centre))
+            path, covariance = _with_rivals(trial, scene.path, still, best, others, covariance)
             scene = scene._replace(path=path)
         return Fit(
             scene.path,
@@ -477,9 +478,10 @@ class Windows:
             scene.map,
         )
 
-    def parallax(self, path: Path, half: float) -> float:
-        """How far (px) the usual point moves in a window by translation."""
-        return 2 * half * self.f * float(np.exp(np.median(path.log_rho)))
+    def parallax(self, path: Path, tracks: Tracks) -> float:
+        """How far (px) the usual point moves by translation while a window's events last."""
+        lasts = float(np.ptp(tracks.tau)) if len(tracks.tau) else 0.0
+        return lasts * self.f * float(np.exp(np.median(path.log_rho)))
 
     def trial(self, centre: int) -> Trial:
         """Pixels of a window for the comparison of rivals."""
@@ -510,18 +512,18 @@ class Windows:
 def _with_rivals(
     trial: Trial,
     path: Path,
+    still: Scene,
     best: Scene,
     others: list[tuple[Path, Scene]],
     covariance: NDArray[np.float64],
 ) -> tuple[Path, NDArray[np.float64]]:
     """Path and covariance with what rivals leave open, compared on pixels left out (`rivals`).
 
-    Where rotation alone explains these about as well nothing tells the heading. The path is then
+    Where `still`, rotation alone, explains these about as well nothing tells the heading. The path is then
     the rotation's, with hardly a translation, and Omega may be either's. Else other motions count
     by their likelihood, exp(-z^2 / 2).
     """
     told = covariance.copy()
-    still = trial.fit(without_translation(path), moves=False)
     if trial.z(still, best) < TELLING:
         heading, turn = path.D[0], still.path.O[0] - path.O[0]
         told[:3], told[:, :3] = 0, 0
