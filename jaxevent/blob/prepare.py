@@ -24,7 +24,7 @@ from jaxevent.blob.seeds import read_seeds, span_of
 from jaxevent.errors import InputError
 from jaxevent.estimator import Described
 from jaxevent.events.filters import supported
-from jaxevent.kernels import compiled
+from jaxevent.kernels import lean
 from jaxevent.recording import Recording, Times, check_times
 
 STEPS = (4, 8, 16, 32, 64, 128, 256)  # per chunk
@@ -240,11 +240,10 @@ class Packing:
             wanted = self.polarity[owner]
             kept &= (owner < 0) | (wanted < 0) | (wanted == part.p)
         given = _Given(part.t, part.x, part.y, part.p, kept, owner)
-        order = _spread(part.t, len(part) if self._as_stored else TIES)
-        if not len(order):
-            order = np.arange(len(part))
-            if first == at and last == upto:
-                return given, order + first
+        order = np.arange(len(part))
+        spread = _spread(part.t, len(part) if self._as_stored else TIES, order)
+        if not spread and first == at and last == upto:
+            return given, order + first
         order = order[at - first : upto - first]
         return _Given(*(values[order] for values in given)), order + first
 
@@ -375,32 +374,30 @@ def _leave_open(place: _Place, out: _Chunks) -> tuple[int, _Place]:
     return row, _Place(chunk, 0, 0, place.previous, place.begin, 0, begun)
 
 
-@compiled
-def _spread(t: Any, least: int) -> Any:
-    """An order in which runs of at least so many equal times are spread; empty if there are none.
+@lean
+def _spread(t: Any, least: int, order: Any) -> bool:
+    """Spread runs of more than so many equal times in an order; whether there are any.
 
     Places of a run of n are taken in steps of about .618 n, so that a few that follow each other
     are of all parts of the run.
     """
-    order = np.empty(0, np.int64)
-    begin = 0
+    begin, spread = 0, False
     for end in range(1, len(t) + 1):
         if end < len(t) and t[end] == t[begin]:
             continue
         n = end - begin
         if n > least:
-            if len(order) == 0:
-                order = np.arange(len(t))
+            spread = True
             step = np.int64(0.618034 * n)
             while math.gcd(step, n) > 1:
                 step += 1
             for k in range(n):
                 order[begin + k] = begin + k * step % n
         begin = end
-    return order
+    return spread
 
 
-@compiled
+@lean
 def _pack(given, first_row, final, bounds, place, out):
     """Fill chunks until they are full or events end: (full or ended, events used, place).
 
