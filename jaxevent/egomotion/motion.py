@@ -67,8 +67,8 @@ class Motion(Shown):
     log-likelihood of the events since the estimate before. The last two are NaN where an estimator
     has none. `agreement` (n,), where an estimator tells it, is the share of the events that the
     motion explains. `cloud` (n, particles, d), where it was asked for, is some of a filter's
-    particles: the likelier a motion, the more of them are near it. `recording` is the name of the recording
-    and `span` (us) from when to when it lasts; without a span, all times may be asked for.
+    particles: the likelier a motion, the more of them are near it. `recording` is the recording's
+    name and `span` (us) from when to when it lasts; without a span, all times may be asked for.
     """
 
     model: type[Model]
@@ -158,8 +158,8 @@ class Motion(Shown):
 
         if self.valid.any() and stands_still(recording):
             return self._of_things(), (
-                "the camera seems to stand still while things move: edges that the frames show make "
-                "no events; sigmas count that, and jaxevent track follows things"
+                "the camera seems to stand still while things move: edges that the frames show "
+                "make no events; sigmas count that, and jaxevent track follows things"
             )
         found = layers(recording, self.model)
         if found is None or not found.several:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 
 import numpy as np
 import pytest
@@ -14,12 +15,13 @@ from jaxevent.egomotion import geometry
 from jaxevent.egomotion.batch_fit import photometric, sequence, starts
 from jaxevent.egomotion.batch_fit import windows as batch
 from jaxevent.egomotion.batch_fit.depths import depths as look_for_depths
+from jaxevent.egomotion.batch_fit.frames import DARK, look_at
 from jaxevent.egomotion.batch_fit.path import ROWS, Path, advanced, normalised, warp
 from jaxevent.egomotion.batch_fit.photometric import Report, compute_covariance
 from jaxevent.egomotion.batch_fit.tracks import Scene, misfits, placed
 from jaxevent.egomotion.twists import Twists
 from jaxevent.errors import InputError
-from jaxevent.recording import Events, Recording
+from jaxevent.recording import Events, Frames, Recording
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]  # it computes long
 
@@ -34,8 +36,8 @@ ROOF = ((-0.5, 0.1, 1.0), 1.6), ((0.6, 0.3, 1.0), 1.5)
 
 
 @functools.cache
-def seen(planes: tuple = ROOF, finest: float = 9.0) -> Recording:
-    """Textured planes, 1 to 2 m away: events where log intensity passes levels.
+def seen(planes: tuple = ROOF, finest: float = 9.0, frames: bool = False) -> Recording:
+    """Textured planes, 1 to 2 m away: events where log intensity passes levels; 7 frames.
 
     The poses are exp(t (T, Omega)) by the closed form, t from the middle.
     """
@@ -76,7 +78,15 @@ def seen(planes: tuple = ROOF, finest: float = 9.0) -> Recording:
     events = Events(
         np.rint(t).astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), p.astype(bool)
     )
-    return Recording("planes", WIDTH, HEIGHT, events, camera=CAMERA)
+    recording = Recording("planes", WIDTH, HEIGHT, events, camera=CAMERA)
+    if not frames:
+        return recording
+    images = [0.2 * np.exp(seen_at(pose)).reshape(HEIGHT, WIDTH) for pose in poses[5:150:23]]
+    times = np.rint(1e6 * (steps[5:150:23] + SECONDS / 2)).astype(np.int64)
+    shown = np.clip(images, 0, 1).astype(np.float32)
+    shown[1::2] *= 0.8  # exposures that change
+    taken = Frames(times, shown, np.zeros(len(times), np.int64))
+    return dataclasses.replace(recording, frames=taken)
 
 
 GIVEN = {"events": 8192, "fewest": 500, "starts": 3, "rivals": 1, "flow_max": 120.0, "cell": 16}
@@ -349,6 +359,36 @@ def test_the_photometric_fit_ends_at_the_truth():
     assert np.degrees(np.arccos(heading @ T / np.linalg.norm(T))) < 3
     assert np.linalg.norm(Omega - OMEGA) < 0.06 * np.linalg.norm(OMEGA)
     assert report.noise < 0.05 and report.inliers > 0.9
+
+
+def test_frames_tell_their_intensity_in_units_of_the_threshold():
+    recording = seen(frames=True)
+    shown = look_at(recording, 0, 300_000)
+    assert shown is not None and len(shown.t) == 7 and (shown.trust > 0.5).mean() > 0.9
+    logarithm = np.log(recording.frames.intensity.reshape(7, -1) + DARK)
+    slope = np.polyfit(logarithm.ravel(), shown.level.ravel(), 1)[0]
+    assert slope == pytest.approx(1 / 0.25, rel=0.15)
+    assert look_at(recording, 0, 50_000) is None  # one frame tells no change
+    exchanged = dataclasses.replace(recording.events, p=~recording.events.p)
+    assert look_at(dataclasses.replace(recording, events=exchanged), 0, 300_000) is None
+    mirrored = dataclasses.replace(recording.frames, images=recording.frames.images[:, :, ::-1])
+    assert look_at(dataclasses.replace(recording, frames=mirrored), 0, 300_000) is None
+
+
+def test_frames_tell_motion_where_events_are_few():
+    """From 6 degrees beside it, with a tenth of the events."""
+    off = []
+    for given in (True, False):
+        params = batch.Params.of({**GIVEN, "frames": given})
+        windows = batch.Windows(seen(frames=True), params, CAMERA)
+        tracks, prior = windows.tracks(150_000, 0.15, 1500), windows.prior(150_000, 0.15)
+        assert (len(tracks.x) > tracks.events) == given
+        path = true_path(np.full(math.prod(tracks.nodes), np.log(np.linalg.norm(T) / 1.5)))
+        path.D[0] += np.array([0.1, 0, 0])
+        stages = tuple(batch.Stage(sigma, 12) for sigma in (0.3, 0.2, 0.05))
+        (scene, _) = batch._begun(tracks, normalised(path), prior, stages)
+        off.append(np.degrees(np.arccos(scene.path.D[0] @ T / np.linalg.norm(T))))
+    assert off[0] < 4 and off[0] < 0.5 * off[1], off
 
 
 def test_the_covariance_is_that_of_repeated_fits():

@@ -17,20 +17,27 @@ pytestmark = pytest.mark.slow
 F, HALF, NODE = 20.0, 0.15, 4
 SHAPE, CORNER = (20, 24), (-12.0, -10.0)
 PIXELS, EACH = 40, 5  # that see events, and how many each
+FRAME = 25  # rows of them that are pixels of a frame
 # Differences of 1e-6 tell slopes to rounding by that, some 1e-9.
 STEP = 1e-6
 
 
 def some_tracks() -> Tracks:
+    """Events of pixels, and the pixels of a frame, which count less."""
     rng = np.random.default_rng(0)
     pixel = np.repeat(rng.choice(16 * 12, PIXELS, replace=False), EACH)
     tau = np.sort(rng.uniform(-HALF, HALF, (PIXELS, EACH)), 1).ravel()
     p = rng.choice([-1.0, 1.0], (PIXELS, EACH))
     number = np.tile(np.arange(EACH) + 1.0, PIXELS)
-    begin = EACH * np.arange(PIXELS + 1)
+    begin, trust, events = EACH * np.arange(PIXELS + 1), np.ones(len(pixel)), len(pixel) - FRAME
+    level = np.cumsum(p, 1).ravel()
+    level[events:] = rng.normal(size=FRAME)
+    begin = np.append(begin[begin <= events], len(pixel))
+    number[events:] = p.reshape(-1)[events:] = 0
+    tau[events:], trust[events:] = tau[events], 0.6
     return Tracks(
-        pixel % 16 - 7.5, pixel // 16 - 5.5, tau, np.cumsum(p, 1).ravel(), number, p.ravel(), begin,
-        F, HALF, SHAPE, CORNER, NODE,
+        pixel % 16 - 7.5, pixel // 16 - 5.5, tau, level, number, p.ravel(),
+        trust, events, begin, F, HALF, SHAPE, CORNER, NODE,
     )  # fmt: skip
 
 

@@ -14,13 +14,15 @@ SPOT = 12  # px, of which each has its own
 
 def _tried_depths(path: Path, tracks: Tracks, depths: NDArray) -> tuple[NDArray, NDArray]:
     """Signed contrast and number of events about nodes, (n, rows, columns), by inverse depth."""
-    real, none = tracks.x.dtype, np.zeros_like(tracks.x)
-    rx, ry = warp(path, tracks.f, tracks.x, tracks.y, tracks.tau, none)
-    X, Y = warp(path, tracks.f, tracks.x, tracks.y, tracks.tau, none + 1)
+    events = slice(tracks.events)
+    at = tracks.x[events], tracks.y[events], tracks.tau[events]
+    real, none = tracks.x.dtype, np.zeros_like(at[0])
+    rx, ry = warp(path, tracks.f, *at, none)
+    X, Y = warp(path, tracks.f, *at, none + 1)
     S, N = np.empty((len(depths), *tracks.nodes)), np.empty((len(depths), *tracks.nodes))
     both, work = np.empty((2, *tracks.shape), real), np.empty(tracks.shape, real)
     images.depth_maps(
-        np.stack([rx, ry, X - rx, Y - ry]).astype(real), tracks.p, depths.astype(real),
+        np.stack([rx, ry, X - rx, Y - ry]).astype(real), tracks.p[events], depths.astype(real),
         tracks.corner, tracks.node, SPOT, both, work, S, N,
     )  # fmt: skip
     return S, N

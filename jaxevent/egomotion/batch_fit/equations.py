@@ -115,8 +115,8 @@ def look(problem: Problem, scene: Scene, weight: NDArray) -> Seen:
     e = places.value - tracks.level - tracks.x.dtype.type(scene.skew) * tracks.number
     weight = weight.copy()
     of_places, cost = weigh(
-        e, places.inside, places.first, tracks.begin, problem.limit, usual, plane, tracks.grids,
-        weight,
+        e, places.inside, tracks.trust, tracks.events, places.first, tracks.begin, problem.limit,
+        usual, plane, tracks.grids, weight,
     )  # fmt: skip
     unit = units_of_rows(scene.path, tracks.f, tracks.half)
     known, side, constant = problem.pull(scene.path, unit)
@@ -128,7 +128,7 @@ def look(problem: Problem, scene: Scene, weight: NDArray) -> Seen:
     differences = sum(float(np.vdot(d, d)) for d in (np.diff(image, axis=k) for k in (0, 1)))
     energy += (float(prior.flat) * differences + TINY * float(np.vdot(image, image))) / 2
     energy += 0.5 * problem.information * of_places
-    number = max(float(places.inside.sum()), 1.0)
+    number = max(float(places.inside[: tracks.events].sum()), 1.0)
     return Seen(scene, places, e, weight, float(energy), float(cost) / number)
 
 

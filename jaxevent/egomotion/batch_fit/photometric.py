@@ -21,7 +21,7 @@ change, so that events there mislead. Single misfits do not stand out there, but
 larger: where misfits are large on average, within `PLACE`, all events count less.
 Nothing is gained by squeezing events together, which biases contrast, and no event is compared that
 tells only the gradient along the flow. An ON threshold C (1 + skew) and an OFF one of C (1 - skew)
-are allowed for.
+are allowed for. Pixels of frames, where there are any, are fitted to the same map (`frames`).
 
 Depth is interpolated between nodes 4 px apart, and an event lies on the nearest surface that its
 ray meets: what is behind is hidden. `depths` gives every node the depth at which the events around
@@ -175,9 +175,10 @@ def tilt(path: Path, tracks: Tracks, change: NDArray) -> NDArray[np.float64]:
 
 
 def report(problem: Problem, kept: Seen) -> Report:
-    """What a fit tells of its end."""
-    left, on = kept.e.copy(), kept.places.inside
+    """What a fit tells of its end, of the events."""
+    left, events = kept.e.copy(), problem.tracks.events
     subtract_mean(left, kept.weight, problem.tracks.begin)
+    left, on = left[:events], kept.places.inside[:events]
     number = max(float(on.sum()), 1.0)
     within = np.abs(left[on > 0])
     noise = 1.48 * float(np.median(within)) if len(within) else 0.0
@@ -205,7 +206,7 @@ def spread(equations: Equations) -> NDArray[np.float64]:
     """
     problem, seen, left = equations.problem, equations.seen, equations.left
     tracks, weight = problem.tracks, seen.weight
-    u = left**2 / problem.limit
+    u = (tracks.trust * left) ** 2 / problem.limit
     curved = float((weight * (1 - 3 * u) / (1 + u)).sum()) / max(float(weight.sum()), 1.0)
     less = 1 / max(curved, 0.1) ** 2
     rows, columns = (-(-n // CELLS[0]) for n in tracks.shape)

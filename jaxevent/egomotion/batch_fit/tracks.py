@@ -20,7 +20,9 @@ class Tracks:
 
     Arrays of events are (E,): place `x`, `y` (px, undistorted, from the principal point), `tau` (s
     from the reference time), `level`, the sum of the track's polarities up to and with it, `number`
-    of these, and its polarity `p`, +-1. Those of track k begin at `begin[k]`, (tracks + 1,).
+    of these, and its polarity `p`, +-1. Those of track k begin at `begin[k]`, (tracks + 1,). After
+    `events` of them there may be pixels of frames, `number` and `p` 0, in a track for each frame
+    (`frames`). `trust` divides the noise of an event by their own, at most 1.
     """
 
     x: NDArray
@@ -29,6 +31,8 @@ class Tracks:
     level: NDArray
     number: NDArray
     p: NDArray
+    trust: NDArray
+    events: int
     begin: NDArray[np.int64]
     f: float  # px
     half: float  # s

@@ -71,9 +71,10 @@ def subtract_mean(values, weight, begin):
 
 
 @fast
-def weigh(e, on, first, begin, limit, usual, plane, grids, weight):
-    """Write events' weights, from those before; returns the places' cost and the events'.
+def weigh(e, on, trust, till, first, begin, limit, usual, plane, grids, weight):
+    """Write rows' weights, from those before; returns the places' cost and that of the events.
 
+    Misfits count times `trust`; rows from `till` on are pixels of frames.
     Events at a place of mean cost q cost 4 q / (1 + q / usual), of slope 1 at the usual q. A plane
     hides nothing of itself.
     """
@@ -91,7 +92,8 @@ def weigh(e, on, first, begin, limit, usual, plane, grids, weight):
         subtract_mean(left, weight, begin)
         flat[:] = 0
         for k in range(len(e)):
-            cost[k] = on[k] * left[k] ** 2 / (1 + left[k] ** 2 / limit)
+            square = (trust[k] * left[k]) ** 2
+            cost[k] = on[k] * square / (1 + square / limit)
             flat[first[k] + middle] += cost[k]
         around(image, sums)
         flat[:] = 0
@@ -105,5 +107,7 @@ def weigh(e, on, first, begin, limit, usual, plane, grids, weight):
             flat[at] += on[k] * slope / n
         around(image, sums)
         for k in range(len(e)):
-            weight[k] = on[k] / (1 + left[k] ** 2 / limit) ** 2 * around_it[first[k] + middle]
-    return of_places, cost.sum()
+            t = trust[k] ** 2
+            w = on[k] * t / (1 + t * left[k] ** 2 / limit) ** 2
+            weight[k] = w * around_it[first[k] + middle]
+    return of_places, cost[:till].sum()

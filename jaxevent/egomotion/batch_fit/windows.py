@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.batch_fit.alignment import Window, refine, score
 from jaxevent.egomotion.batch_fit.depths import depths
+from jaxevent.egomotion.batch_fit.frames import look_at, with_frames
 from jaxevent.egomotion.batch_fit.path import SEGMENTS, Path, Prior
 from jaxevent.egomotion.batch_fit.photometric import Report, adjust, compute_covariance
 from jaxevent.egomotion.batch_fit.rivals import SIGMA, Trial
@@ -40,7 +41,7 @@ from jaxevent.egomotion.batch_fit.starts import (
 from jaxevent.egomotion.batch_fit.tracks import Scene, Tracks
 from jaxevent.egomotion.candidates import coordinates
 from jaxevent.egomotion.twists import Twists
-from jaxevent.parameters import Count, Number, Parameters, Positive
+from jaxevent.parameters import Choice, Count, Number, Parameters, Positive
 from jaxevent.recording import Recording
 
 NODE = 4  # px between nodes of depth
@@ -69,6 +70,8 @@ class Stage(NamedTuple):
 
 ROUNDS = Stage(1.0, 6), Stage(0.5, 6), Stage(0.2, 10), Stage(0.1, 10)  # after a trial of depths
 FINAL = Stage(0.05, 20, 10), Stage(0.02, 20, 3)
+# Sigma (C) and steps by which the map first takes the frames' brightness, some 10 C from 0.
+BRIGHTNESS = (20.0, 4), (5.0, 3)
 # Of a path that is about right: all of the above takes 1.6 times as long and ends no nearer.
 FOLLOWING = (Stage(0.5, 6), Stage(0.1, 8)), (Stage(0.05, 10, 10),)
 # Rivals remain whose cost is so many times the least, and so much more (C^2): depths that were just
@@ -124,6 +127,7 @@ class Params(Parameters):
     alike = Positive(10.0, "", "how many events together tell as much as one: errors are alike")
     omega_scale = Number(0.0, "rad/s", "prior: |Omega| is about so much or less; 0: not known")
     gyro_std = Positive(0.03, "rad/s", "of a gyro, if one is given")
+    frames = Choice((True, False), "whether frames are fitted beside the events")
     flow_max = Positive(220.0, "px/s", "flows of patches that are tried, without the rotation")
 
 
@@ -284,10 +288,15 @@ class Windows:
     def tracks(
         self, centre: int, half: float, most: int, limit: int | None = None, skip: int = 0
     ) -> Tracks:
-        """All of a window's events of as many pixels as have so many in total, the rest empty.
+        """All of a window's events of as many pixels as have so many in total.
 
-        Or of as many as have `limit` events, after those that have `skip`.
+        Beside them as many pixels of frames, where there are any. Or, without frames, the events of
+        as many pixels as have `limit`, after those that have `skip`.
         """
+        seen = None
+        if limit is None and self.params.frames:
+            span = round(half * 1e6)
+            seen = look_at(self.recording, centre - span, centre + span)
         most = min(most, self.params.events)
         limit = most if limit is None else min(limit, most)
         first, last = self.rows(centre, half)
@@ -316,13 +325,15 @@ class Windows:
         rows = x, y, (events.t[keep] - centre) * 1e-6, total - (total - p)[begin]
         rows += np.arange(n) - begin + 1, p
         x, y, tau, level, number, p = (np.ascontiguousarray(row, self.real) for row in rows)
-        return Tracks(
+        tracks = Tracks(
             x,
             y,
             tau,
             level,
             number,
             p,
+            np.ones_like(x),
+            n,
             np.append(np.flatnonzero(begins), n),
             self.f,
             half,
@@ -330,6 +341,9 @@ class Windows:
             (float(lower[0]), float(lower[1])),
             NODE,
         )
+        if seen is None:
+            return tracks
+        return with_frames(tracks, seen, self.xi.reshape(-1, 2), centre, most, self.seed)
 
     def aligned(self, centre: int, paths: list[Path]) -> list[Path]:
         """Starts followed by the alignment of segments, the best first, some degrees apart."""
@@ -519,9 +533,9 @@ def _with_rivals(
 ) -> tuple[Path, NDArray[np.float64]]:
     """Path and covariance with what rivals leave open, compared on pixels left out (`rivals`).
 
-    Where `still`, rotation alone, explains these about as well nothing tells the heading. The path is then
-    the rotation's, with hardly a translation, and Omega may be either's. Else other motions count
-    by their likelihood, exp(-z^2 / 2).
+    Where `still`, rotation alone, explains these about as well nothing tells the heading. The path
+    is then the rotation's, with hardly a translation, and Omega may be either's. Else other motions
+    count by their likelihood, exp(-z^2 / 2).
     """
     told = covariance.copy()
     if trial.z(still, best) < TELLING:
@@ -561,6 +575,11 @@ def _begun(
 ) -> Rival:
     """Through stages, from a path alone: first the map is made."""
     scene = Scene(path, np.zeros(tracks.shape, tracks.x.dtype), prior.skew)
+    if len(tracks.x) > tracks.events:
+        for sigma, steps in BRIGHTNESS:
+            scene, _ = adjust(
+                tracks, scene, prior, sigma=sigma, settle=steps, steps=steps, plane=plane
+            )
     scene, report = adjust(
         tracks, scene, prior, sigma=ROUNDS[0].sigma, settle=2, steps=2, plane=plane
     )
