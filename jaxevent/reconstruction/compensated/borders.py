@@ -15,9 +15,9 @@ from jaxevent.kernels import fast, fast_part, over_rows
 from jaxevent.reconstruction.compensated.agreement import blurred
 from jaxevent.reconstruction.compensated.trajectories import OUTSIDE, around, robust_mean
 
-# Every how many pixels are compared, how far away those are whose paths are tried, and the Gaussian,
-# both in units of that: turn by turn. Chosen on objects of other seeds and the first half of
-# slider_depth: three turns of all pixels (8, 4 and 2 px) are as good and take 1.8 times as long.
+# Every how many pixels are compared, how far away those are whose paths are tried, and the
+# Gaussian, both in units of that: turn by turn. Chosen on objects of other seeds and the first half
+# of slider_depth: three turns of all pixels (8, 4 and 2 px) are as good and take 1.8 times as long.
 TURNS = ((2, 4, 1.0), (1, 3, 1.0))
 DIRECTIONS = np.array([(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)])
 APART = np.float32(0.5)  # px at the farthest instant, by which paths differ that are compared
@@ -50,7 +50,7 @@ def _cost(images, s, near, y, x, path, floor, nu, level, W, R):
 
 @fast
 def _try(begin, end, images, s, near, step, paths, offsets, floor, nu, out):
-    """Costs (1 + n, h, w) of pixels, every `step`-th along both axes: of their paths and others'."""
+    """Costs (1 + n, h, w) of every `step`-th pixel along both axes: of its path and others'."""
     h, w, _ = paths.shape
     level, W, R = np.empty((3, len(s)), np.float32)
     for y in range(begin, end):
@@ -93,9 +93,10 @@ def choose(
     row, column = np.mgrid[:h, :w]
     for step, far, sigma in TURNS:
         some = paths.reshape(-1, 4)[whose[::step, ::step]]
-        costs = np.empty((1 + len(DIRECTIONS), *some.shape[:2]), np.float32)
+        rows, columns, _ = some.shape
+        costs = np.empty((1 + len(DIRECTIONS), rows, columns), np.float32)
         given = (images, s, near, step, some, DIRECTIONS * far, np.float32(floor), np.float32(nu))
-        over_rows(_try, len(some), *given, costs)
+        over_rows(_try, rows, *given, costs)
         best = np.stack([blurred(one, sigma) for one in costs]).argmin(0)
         moves = step * far * np.concatenate([[(0, 0)], DIRECTIONS])[best]
         dy, dx = moves[row // step, column // step].transpose(2, 0, 1)
