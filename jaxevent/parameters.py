@@ -390,7 +390,8 @@ def _elementwise(name: str, values: Array) -> Array:
         return getattr(jnp, name)(values)
     with np.errstate(divide="ignore"):  # the logarithm of 0
         known = getattr(np, name)(np.asarray(values))
-    return jnp.asarray(known, known.dtype)  # without the type JAX compiles a copy
+    # Without the type JAX compiles a copy.
+    return jnp.asarray(known, jax.dtypes.canonicalize_dtype(known.dtype))
 
 
 def _stored(number: Number, value: Any, dtype: Any = None) -> Array:

@@ -73,3 +73,11 @@ def test_values_travel_through_jit_and_vmap():
     seen = []
     jax.jit(lambda p: seen.append(repr(p)) or p.sigma)(params)
     assert "sigma=float64[]" in seen[0] or "sigma=f64[]" in seen[0]
+
+
+def test_values_made_in_double_precision_are_read_in_single():
+    params = Given(sigma=0.3)
+    with jax.enable_x64(False):
+        assert params.sigma.dtype == np.float32 and float(params.sigma) == pytest.approx(0.3)
+        under_jit = jax.jit(lambda params: params.sigma)(params)
+        np.testing.assert_allclose(params.sigma, under_jit, rtol=1e-6)
