@@ -9,7 +9,7 @@ from jaxevent.egomotion.candidates import coordinates
 from jaxevent.egomotion.geometry import rotation_basis
 from jaxevent.egomotion.models import Model, Planar, Rotation
 from jaxevent.egomotion.patch_fits import looks, planar, rotation, sharpness, standard
-from jaxevent.egomotion.patches import usual_speed
+from jaxevent.egomotion.patches import Speed, usual_speed
 from jaxevent.recording import Recording
 
 Z = 3.0  # from which parts of the image move differently
@@ -42,14 +42,17 @@ def layers(
     recording: Recording,
     model: type[Model] = Planar,
     camera: PinholeCamera | None = None,
+    speed: Speed | None = None,
 ) -> Layers | None:
     """Whether the image moves as one, as planar motion or a rotation does; None where nothing is
     seen to move, and of other models.
 
-    Every patch may go its own share of the way that the model makes there.
+    Every patch may go its own share of the way that the model makes there. `speed` is the usual
+    one, if it is known.
     """
     camera = camera or recording.camera
-    speed = usual_speed(recording, camera) if model in (Planar, Rotation) else None
+    uniform = model in (Planar, Rotation)
+    speed = (speed or usual_speed(recording, camera)) if uniform else None
     seen = [] if speed is None else looks(recording, speed, camera)
     _, f = coordinates(recording.width, recording.height, camera)
     differ, factors, speeds = [], [], []

@@ -154,14 +154,16 @@ class Motion(Shown):
         motion but theirs.
         """
         from jaxevent.egomotion.layers import layers
+        from jaxevent.egomotion.patches import usual_speed
         from jaxevent.egomotion.still import stands_still
 
-        if self.valid.any() and stands_still(recording):
+        speed = usual_speed(recording) if recording.frames else None
+        if self.valid.any() and stands_still(recording, speed):
             return self._of_things(), (
                 "the camera seems to stand still while things move: edges that the frames show "
                 "make no events; sigmas count that, and jaxevent track follows things"
             )
-        found = layers(recording, self.model)
+        found = layers(recording, self.model, speed=speed)
         if found is None or not found.several:
             return self, ""
         mean = np.nan_to_num(self.mean)

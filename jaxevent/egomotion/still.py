@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
 
-from jaxevent.egomotion.patches import usual_speed
+from jaxevent.egomotion.patches import Speed, usual_speed
 from jaxevent.recording import Recording
 
 TIMES = 6  # frames that are looked at
@@ -21,20 +21,21 @@ DARK = 0.05  # of full scale, added before the logarithm: darker greys are noise
 STILL = 0.3
 
 
-def stands_still(recording: Recording) -> bool:
-    """Whether the edges that frames show make no events; false without frames."""
-    share = edges_with_events(recording)
+def stands_still(recording: Recording, speed: Speed | None) -> bool:
+    """Whether the edges that frames show make no events; false without frames or a speed."""
+    share = None if speed is None else edges_with_events(recording, speed)
     return share is not None and share < STILL
 
 
-def edges_with_events(recording: Recording) -> float | None:
+def edges_with_events(recording: Recording, speed: Speed | None = None) -> float | None:
     """The share (median over frames) of the strongest edges with events beside them.
 
     None where nothing is seen to move, and where no frame has events before and after it for as
     long as the image takes to go `WAY`.
     """
     frames, events, n = recording.frames, recording.events, len(recording.events)
-    speed = usual_speed(recording) if frames else None
+    if frames and speed is None:
+        speed = usual_speed(recording)
     if frames is None or speed is None:
         return None
     half = round(5e5 * WAY / speed.usual)
@@ -44,7 +45,7 @@ def edges_with_events(recording: Recording) -> float | None:
         return None
     rows = np.unique(rows[((np.arange(TIMES) + 0.5) * len(rows) / TIMES).astype(int)])
     shares = []
-    for at, image in zip(frames.t[rows].tolist(), np.asarray(frames.images[rows]), strict=True):
+    for at, image in zip(frames.t[rows].tolist(), frames[rows].intensity, strict=True):
         edges = _edges(image)
         part = events[events.index(at - half) : events.index(at + half)]
         seen = np.zeros(edges.shape, bool)
@@ -53,9 +54,8 @@ def edges_with_events(recording: Recording) -> float | None:
     return float(np.median(shares))
 
 
-def _edges(image: NDArray) -> NDArray[np.bool_]:
-    """The pixels of a frame where log intensity is steepest."""
-    scale = np.iinfo(image.dtype).max if image.dtype.kind == "u" else 1.0
-    smooth = gaussian_filter(np.log(image / scale + DARK), 1.0)
+def _edges(image: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """The pixels of a frame (intensity) where log intensity is steepest."""
+    smooth = gaussian_filter(np.log(image + DARK), 1.0)
     steep = np.hypot(np.gradient(smooth, axis=0), np.gradient(smooth, axis=1))
     return steep >= np.quantile(steep, 1 - STRONG)

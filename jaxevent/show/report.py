@@ -25,9 +25,7 @@ Kind = Literal["image", "error", "uncertainty"]
 # The logarithm shows at most this many halvings below the brightest value (96 dB): pixels that are
 # dark up to rounding, say 1e-9, would otherwise take most of the grey scale.
 OCTAVES = 16
-UNCHANGED = (
-    0.01  # of ln(1 + I): less, a tenth of a threshold, tells nothing of how large changes are
-)
+UNCHANGED = 0.01  # of ln(1 + I), a tenth of a threshold: smaller changes do not count for limits
 
 
 def display_limits(images: ArrayLike, how: str = "linear") -> tuple[float, float]:
@@ -43,7 +41,7 @@ def display_limits(images: ArrayLike, how: str = "linear") -> tuple[float, float
     if how == "linear":
         return 0.0, 1.0
     if how == "changes":
-        size = np.abs(_change(images.astype(np.float64)))
+        size = np.abs(_scaled(images.astype(np.float64), how))
         size = size[size > UNCHANGED]
         most = float(np.percentile(size, 95)) if len(size) else 1.0
         return math.expm1(-most), math.expm1(most)
@@ -76,11 +74,8 @@ def tone_map(
             f"the display limits {low} and {high} do not suit the tone {how!r}; give two finite"
             f"{' positive' if logarithmic else ''} intensities, black below white"
         )
-    shown = np.clip(images, low, high)
-    if logarithmic:
-        shown, low, high = np.log2(shown), math.log2(low), math.log2(high)
-    elif how == "changes":
-        shown, low, high = _change(shown), *_change(np.array([low, high])).tolist()
+    shown = _scaled(np.clip(images, low, high), how)
+    low, high = _scaled(np.array([low, high]), how).tolist()
     shown = np.clip((shown - low) / (high - low), 0, 1)
     if how == "clahe":
         shown = _equalised(shown)
@@ -95,8 +90,11 @@ def _bounded(images: ArrayLike) -> NDArray[np.floating]:
     return checked(images, "images")
 
 
-def _change(images: NDArray[np.floating]) -> NDArray[np.floating]:
-    return np.log1p(np.maximum(images, 2.0**-OCTAVES - 1))
+def _scaled(intensity: NDArray[np.floating], how: str) -> NDArray[np.floating]:
+    """What a tone shows evenly."""
+    if how == "changes":
+        return np.log1p(np.maximum(intensity, 2.0**-OCTAVES - 1))
+    return np.log2(intensity) if _is_logarithmic(how) else intensity
 
 
 def _is_logarithmic(how: str) -> bool:

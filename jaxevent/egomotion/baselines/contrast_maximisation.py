@@ -499,8 +499,8 @@ def solve(params: Params, given: Given) -> Motion:
         alone = windows.change(*rows[k], found.mean[k])
         rate = np.outer(alone, alone) / max(1e6 * spans[k], 1) ** 2
     found = found.calibrated(CALIBRATION.behind(given.camera), np.array(spans), alone)
-    halves = (round(1e6 * windows.half(*rows[k])) for k in (0, -1))
-    return found.reaching(t[0] - next(halves), t[-1] + next(halves), rate)
+    before, after = (round(1e6 * windows.half(*rows[k])) for k in (0, -1))
+    return found.reaching(t[0] - before, t[-1] + after, rate)
 
 
 def lengths(params: Params, speed: Speed) -> dict[str, float]:

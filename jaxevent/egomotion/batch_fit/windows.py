@@ -171,6 +171,8 @@ class Windows:
     ):
         self.recording, self.params, self.gyro, self.seed = recording, params, gyro, seed
         self.least: dict[int, float] = {}  # C, sigma at least, by windows
+        # Stages look at the same window one after another.
+        self.look_at = functools.lru_cache(2)(functools.partial(look_at, recording))
         self.real = np.dtype(jax.dtypes.canonicalize_dtype(float))
         self.xi, self.f = coordinates(recording.width, recording.height, camera)
         flat = self.xi.reshape(-1, 2)
@@ -296,7 +298,7 @@ class Windows:
         seen = None
         if limit is None and self.params.frames:
             span = round(half * 1e6)
-            seen = look_at(self.recording, centre - span, centre + span)
+            seen = self.look_at(centre - span, centre + span)
         most = min(most, self.params.events)
         limit = most if limit is None else min(limit, most)
         first, last = self.rows(centre, half)
