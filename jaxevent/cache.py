@@ -25,16 +25,17 @@ MAPS = 30_000
 def keep_compiled() -> Path | None:
     """Have JAX keep what it compiles; returns the folder, or None where nothing is changed.
 
-    The settings are variables of the environment too, because processes started later inherit them.
+    The settings are variables of the environment too, because processes started later inherit them;
+    in those, they are ours and not the user's own.
     The folder is named by the processor, whose instructions compiled programs use: homes are shared
     by machines.
     """
-    wanted = os.environ.get("JAXEVENT_CACHE", "")
     theirs = {"JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE"} & os.environ.keys()
     jax = sys.modules.get("jax")  # if it was imported before, it has read its variables already
-    if wanted == "0" or theirs or (jax and jax.config.jax_compilation_cache_dir):
-        return None
     folder = folder_for_compiled()
+    inherited = folder and os.environ.get("JAX_COMPILATION_CACHE_DIR") == str(folder)
+    if not inherited and (theirs or (jax and jax.config.jax_compilation_cache_dir)):
+        return None
     if folder is None:
         return None
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
@@ -43,7 +44,7 @@ def keep_compiled() -> Path | None:
         least = float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"])
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
-    # What cannot be kept, or was damaged, is compiled again.
+    # What cannot be kept, was damaged, or is being written by another process is compiled again.
     warnings.filterwarnings("ignore", "Error (read|writ)ing persistent compilation cache")
     return folder
 

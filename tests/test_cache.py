@@ -77,8 +77,10 @@ def test_they_are_released_after_each_task(monkeypatch):
     assert len(released) == 2
 
 
+@pytest.mark.parametrize("inherited", [False, True])
 @pytest.mark.parametrize("spoilt", [b"", b"foreign", None])
-def test_a_damaged_file_is_compiled_again(spoilt, tmp_path):
+def test_a_damaged_file_is_compiled_again(spoilt, inherited, tmp_path):
+    """Or one that another process is writing; also by a process that another of ours started."""
     code = (
         "import jaxevent, jax; jax.config.update('jax_persistent_cache_min_compile_time_secs', 0)\n"
         "print(jax.jit(lambda x: x * 2)(1.0))"
@@ -89,5 +91,6 @@ def test_a_damaged_file_is_compiled_again(spoilt, tmp_path):
     for path in kept:
         content = path.read_bytes()
         path.write_bytes(content[: len(content) // 2] if spoilt is None else spoilt)
-    done = ran(code, JAXEVENT_CACHE=tmp_path)
+    ours = {"JAX_COMPILATION_CACHE_DIR": kept[0].parent} if inherited else {}
+    done = ran(code, JAXEVENT_CACHE=tmp_path, **ours)
     assert (done.returncode, done.stdout, done.stderr) == (0, "2.0\n", "")
