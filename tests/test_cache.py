@@ -36,12 +36,12 @@ def test_programs_are_kept_in_the_users_folder(tmp_path):
     assert told("import jax, jaxevent" + LOOK, XDG_CACHE_HOME=tmp_path, HOME=tmp_path) == folder
 
 
-@pytest.mark.parametrize("first", ["import jaxevent", "import jax, jaxevent"])
-def test_the_user_decides(first, tmp_path):
-    assert told(first + LOOK, JAXEVENT_CACHE=0) == "None"
-    mine = told(first + LOOK, JAXEVENT_CACHE=tmp_path / "mine")
-    assert mine.startswith(str(tmp_path / "mine"))
-    assert told(first + LOOK, JAX_COMPILATION_CACHE_DIR=tmp_path / "jax") == str(tmp_path / "jax")
+def test_the_user_decides(tmp_path):
+    first, later = "import jaxevent" + LOOK, "import jax, jaxevent" + LOOK
+    assert told(later, JAXEVENT_CACHE=0) == "None"
+    assert told(first, JAXEVENT_CACHE=tmp_path / "mine").startswith(str(tmp_path / "mine"))
+    for code in (first, later):
+        assert told(code, JAX_COMPILATION_CACHE_DIR=tmp_path / "jax") == str(tmp_path / "jax")
 
 
 def test_without_a_place_everything_works():
@@ -77,20 +77,17 @@ def test_they_are_released_after_each_task(monkeypatch):
     assert len(released) == 2
 
 
-@pytest.mark.parametrize("inherited", [False, True])
-@pytest.mark.parametrize("spoilt", [b"", b"foreign", None])
-def test_a_damaged_file_is_compiled_again(spoilt, inherited, tmp_path):
+def test_a_damaged_file_is_compiled_again(tmp_path):
     """Or one that another process is writing; also by a process that another of ours started."""
     code = (
         "import jaxevent, jax; jax.config.update('jax_persistent_cache_min_compile_time_secs', 0)\n"
         "print(jax.jit(lambda x: x * 2)(1.0))"
     )
     assert told(code, JAXEVENT_CACHE=tmp_path) == "2.0"
-    kept = [path for path in tmp_path.rglob("*-cache") if path.is_file()]
-    assert kept
-    for path in kept:
-        content = path.read_bytes()
-        path.write_bytes(content[: len(content) // 2] if spoilt is None else spoilt)
-    ours = {"JAX_COMPILATION_CACHE_DIR": kept[0].parent} if inherited else {}
-    done = ran(code, JAXEVENT_CACHE=tmp_path, **ours)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "2.0\n", "")
+    kept = {path: path.read_bytes() for path in tmp_path.rglob("*-cache") if path.is_file()}
+    ours = {"JAX_COMPILATION_CACHE_DIR": next(iter(kept)).parent}
+    for spoilt, inherited in ((b"", {}), (b"foreign", ours), (None, ours), (None, {})):
+        for path, content in kept.items():
+            path.write_bytes(content[: len(content) // 2] if spoilt is None else spoilt)
+        done = ran(code, JAXEVENT_CACHE=tmp_path, **inherited)
+        assert (done.returncode, done.stdout, done.stderr) == (0, "2.0\n", "")

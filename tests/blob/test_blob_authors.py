@@ -183,14 +183,13 @@ def test_the_likelihood_has_its_gradient(golden):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("preset", ["paper", "authors"])
-def test_targets_may_be_born_too(preset):
+def test_targets_may_be_born_too():
     """Two dots, found on the grid and followed in single steps until the events end."""
     circles = [Circle((x, 32.0), 4.0, 10.0, size=(2.0, 2.0)) for x in (24.0, 72.0)]
     dots = [Target(circle, 2e4) for circle in circles]
     recording, truth = simulate_blobs(dots, (96, 64), 0.06, 0, 2)
     small = {"lambda0": 5.0, "gate_min": 8.0, "n_birth": 10.0}
-    params = chi2.Params(preset=preset, **small)
+    params = chi2.Params(preset="authors", **small)
     tracks = chi2.estimate(recording, params, smooth=False)
     assert len(tracks) == 2 and tracks.ended == ("end", "end")
     told, true = tracks([0.05]).mean[0, :, :2], truth(np.array([0.05]))[0, :, :2]

@@ -4,6 +4,7 @@ import dataclasses
 import os
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from scipy import stats
@@ -57,7 +58,7 @@ def test_two_that_cross_keep_their_identities(crossed):
     # What is prepared and run by hand is the same.
     params = blob.moment.Params(**found.settings())
     features, out = blob.moment.prepare(recording, times, params, found=found)
-    again = blob.moment.read(params, blob.moment.run(params, features)[0], out)
+    again = jax.jit(lambda p: blob.moment.read(p, blob.moment.run(p, features)[0], out))(params)
     filtered = tracks.filtered(times)
     np.testing.assert_allclose(again.mean, filtered.mean, rtol=1e-4, atol=1e-3)
 
@@ -196,7 +197,7 @@ def stopped():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["moment", "chi2", "constant_velocity"])
+@pytest.mark.parametrize("method", ["moment", "constant_velocity"])
 def test_a_silent_target_stands_still(method, stopped):
     recording, truth, found = stopped
     assert len(found) == 1

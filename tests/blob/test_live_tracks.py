@@ -63,9 +63,8 @@ def by_confirmation(tracks, given: int) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["moment", "constant_velocity"])
-def test_states_are_those_of_the_whole_however_it_is_divided(method):
-    recording, tracker = scene(), getattr(blob, method)
+def test_states_are_those_of_the_whole_however_it_is_divided():
+    recording, tracker = scene(), blob.constant_velocity
     params = tracker.Params(**FEW)
     seeds = [(60.0, 80.0, 8.0), (168.0, 92.0, 8.0, 0.03)]
     start = recording.start

@@ -77,11 +77,9 @@ COMMANDS = {
     "evaluate": ["evaluate", "run.toml", "--out", "out"],
 }
 PLACES = [
-    ("convert", "file", 1, signal.SIGINT),
     ("convert", "write", 1, signal.SIGTERM),
     ("convert gzip", "write", 4, signal.SIGINT),
     ("track", "file", 3, signal.SIGTERM),
-    ("track", "write", 2, signal.SIGINT),
     ("fit", "file", 2, signal.SIGTERM),
     ("evaluate", "file", 2, signal.SIGINT),
 ]

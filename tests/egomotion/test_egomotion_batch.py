@@ -397,7 +397,7 @@ def test_the_covariance_is_that_of_repeated_fits():
     tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
     rng = np.random.default_rng(0)
     rows, told = [], []
-    for _ in range(24):
+    for _ in range(12):
         tau = tracks.tau + 5e-3 * rng.normal(size=len(tracks.tau))
         noisy = dataclasses.replace(tracks, tau=tau)
         scene, _ = adjust(noisy, scene_of(fit), prior, 0.2, 1, 8)
@@ -415,9 +415,7 @@ def test_steps_never_cost_more():
     depths = np.log(0.6) + 0.1 * rng.normal(size=tracks.nodes[0] * tracks.nodes[1])
     scene = Scene(true_path(depths), np.zeros(tracks.shape), 0.0)
     scene, first = adjust(tracks, scene, prior, 0.1, 3, 3)
-    costs = [
-        adjust(tracks, scene, prior, 0.1, 0, steps)[1].cost for steps in (1, 2, 4, 8, 16, 32, 64)
-    ]
+    costs = [adjust(tracks, scene, prior, 0.1, 0, steps)[1].cost for steps in (1, 2, 4, 8, 16, 32)]
     assert costs[-1] < 0.1 * first.cost
     assert (np.diff(costs) <= 1e-3 * np.array(costs[:-1])).all()
 

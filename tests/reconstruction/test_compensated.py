@@ -420,9 +420,9 @@ def held(params, L, P, case, samples):
     _, taken, shots, paths = case
     ones = jnp.ones((7, *L.shape), np.float32)
     fused = fusion.Fused(jnp.asarray(L), jnp.asarray(P), ones[:5], ones[:2])
-    rest: tuple = (taken, shots, samples)
-    quick = exposures.constrain(params, fused, paths, *rest)
-    pure = exposures.constrain_purely(params, fused, jnp.asarray(paths, float), *rest)
+    quick = exposures.constrain(params, fused, paths, taken, shots, samples)
+    purely = jax.jit(exposures.constrain_purely, static_argnames="samples")
+    pure = purely(params, fused, jnp.asarray(paths, float), taken, shots, samples=samples)
     for one, other in ((quick.L, pure.L), (quick.P, pure.P)):
         np.testing.assert_allclose(one, other, rtol=2e-4, atol=2e-4)
     return np.asarray(quick.L), np.asarray(quick.P)

@@ -186,7 +186,7 @@ def whole_at(images, i):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["akf", "aks", "cf", "edi"])
+@pytest.mark.parametrize("name", ["akf", "aks", "edi"])
 @examples(6)  # each window takes 30 ms, however short it is
 @given(recording=recordings(fewest_frames=1, most=24), events=st.sampled_from([1, 5, 13]))
 def test_windows_do_not_change_the_result(name, recording, events):
@@ -480,7 +480,6 @@ SLOPE = jax.jit(jax.grad(weighted, 1), static_argnums=0)
     [
         ("akf", 3_000, PARAMS),
         ("akf", 0, OPTIONS),
-        ("aks", 0, PARAMS),
         ("aks", 3_000, OPTIONS),
         ("cf-augmented", 3_000, OPTIONS),
     ],
@@ -556,7 +555,7 @@ def test_gradients_are_finite_at_corners(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["akf", "aks"])
 def test_gradients_are_finite_at_extremes(name):
-    """Each number at 0 or its least, at a millionth and 10,000 times its default."""
+    """Each number at 0 or its least, and at 10,000 times its default."""
     method, recording = jaxevent.METHODS[name], random_recording(9, 50, 4, span=24_000)
     plain = followed(params_of(method, **OPTIONS))
     features, out = method.prepare(recording, recording.frames.t + 1, plain, extrapolate=True)
@@ -564,7 +563,7 @@ def test_gradients_are_finite_at_extremes(name):
     given = 0
     for setting, number in method.Params.numbers.items():
         most = 10.0 if number.unit == "ln I" else 1e4  # thresholds: e^10 is beyond any scene
-        for factor in (0.0, 1e-6, most) if number.gradient and np.ndim(number.default) == 0 else ():
+        for factor in (0.0, most) if number.gradient and np.ndim(number.default) == 0 else ():
             value = max(factor * max(number.default, 1e-2), number.least)
             if setting in ("share", "rho_ref"):
                 continue

@@ -317,7 +317,7 @@ def killed_twice(folder: Path, out: Path, *options: str) -> Path:
         wait_for(2, out / "tasks", client)
         lines = (out / "tasks" / "log.txt").read_text().splitlines()
         os.kill(int(lines[0].split()[2]), signal.SIGKILL)
-        wait_for(len(log(out / "tasks", "finished")) + 3, out / "tasks", client)
+        wait_for(len(log(out / "tasks", "finished")) + 1, out / "tasks", client)
         client.kill()
     assert not (out / "results.json").exists()
     assert len(list((out / "tasks").glob("*.json"))) < TASKS
@@ -342,15 +342,6 @@ def several(tmp_path_factory) -> tuple[Path, list[dict]]:
         jaxevent.save(long(seed), folder / f"{seed}.h5")
     with jax.enable_x64(False):
         return folder, evaluate(write_config(folder, SEVERAL))
-
-
-@pytest.mark.slow
-def test_processes_may_die(several, tmp_path, float32, monkeypatch):
-    monkeypatch.setattr("jaxevent.show.page.page", lambda *arguments: "")
-    folder, expected = several
-    out = killed_twice(folder, tmp_path / "out", "--workers", "2")
-    rows = evaluate(folder / "run.toml", out)
-    check_nothing_twice(out, rows, expected)
 
 
 @pytest.mark.slow

@@ -67,7 +67,7 @@ def test_outcomes_are_in_order_and_finished_tasks_are_kept(place, tmp_path):
     assert [outcome.result["name"] for outcome in again] == ["a", "e", "c", "a"]
     assert calls(tmp_path) == {"a": 2, "b": 1, "c": 2, "d": 2, "e": 1}  # once without a key
     (folder / "key-e.json").write_text('{"result": ')
-    assert run(errand, tasks_of(tmp_path, e=""), folder, place)[0].result["name"] == "e"
+    assert run(errand, tasks_of(tmp_path, e=""), folder)[0].result["name"] == "e"
     assert calls(tmp_path)["e"] == 2
     assert json.loads((folder / "key-e.json").read_text())["result"]["name"] == "e"
 
