@@ -30,7 +30,7 @@ from typing import Any, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.stats
+import scipy.special
 from jaxtyping import Array
 from numpy.typing import NDArray
 
@@ -185,7 +185,7 @@ class _Sample:
         tail = 0.5 + LEVEL / 2
         degrees = self.count - max(len(self.at), 1)
         return float(
-            scipy.stats.t.ppf(tail, degrees) if self.robust else scipy.stats.norm.ppf(tail)
+            scipy.special.stdtrit(degrees, tail) if self.robust else scipy.special.ndtri(tail)
         )
 
     def raw(self, at: NDArray[np.float64]) -> dict[str, Array]:
