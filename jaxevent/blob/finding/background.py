@@ -96,7 +96,7 @@ class Background:
     def _rates(self, over: int) -> tuple[NDArray[np.float64], int]:
         """Rates of cells of so many px: means of `over` x `over` px where they are known finely.
 
-        At the rim of what is bright those of the middle alone are too few.
+        At the rim of what is bright the middle alone has too few events; inside, the mean has.
         """
         if over not in self._means:
             by = 1 if over % FINE == 0 else 2
@@ -104,7 +104,8 @@ class Background:
             mean = ndimage.uniform_filter(rate, max(1, over * by // FINE))
             finely = ndimage.binary_dilation(self.bright, np.ones((3, 3)))
             finely = np.kron(finely, np.ones((by * CELL // FINE,) * 2)) > 0
-            rate = np.where(finely, np.maximum(mean, self.rate.min()), rate)
+            least = rate if self.scene is None else rate.min()
+            rate = np.where(finely, np.maximum(mean, least), rate)
             self._means[over] = rate, FINE // by
         return self._means[over]
 
