@@ -15,7 +15,7 @@ from jaxevent.egomotion import geometry
 from jaxevent.egomotion.batch_fit import photometric, sequence, starts
 from jaxevent.egomotion.batch_fit import windows as batch
 from jaxevent.egomotion.batch_fit.depths import depths as look_for_depths
-from jaxevent.egomotion.batch_fit.frames import DARK, look_at
+from jaxevent.egomotion.batch_fit.frames import DARK, look_at, offset
 from jaxevent.egomotion.batch_fit.path import ROWS, Path, advanced, normalised, warp
 from jaxevent.egomotion.batch_fit.photometric import Report, compute_covariance
 from jaxevent.egomotion.batch_fit.tracks import Scene, misfits, placed
@@ -375,12 +375,28 @@ def test_frames_tell_their_intensity_in_units_of_the_threshold():
     assert look_at(dataclasses.replace(recording, frames=mirrored), 0, 300_000) is None
 
 
+def stamped(late: int) -> Recording:
+    """The recording with frames whose stamps are so many us early."""
+    recording = seen(frames=True)
+    frames = dataclasses.replace(recording.frames, t=recording.frames.t - late)
+    return dataclasses.replace(recording, frames=frames)
+
+
+def test_frames_stamps_are_held_against_the_events():
+    for late in (-6000, 0, 9000):
+        assert abs(offset(stamped(late)) - late) < 1500  # in which the image moves by 0.07 px
+    recording = stamped(9000)
+    mirrored = dataclasses.replace(recording.frames, images=recording.frames.images[:, :, ::-1])
+    assert offset(dataclasses.replace(recording, frames=mirrored)) == 0
+    assert offset(dataclasses.replace(recording, frames=recording.frames[:1])) == 0
+
+
 def test_frames_tell_motion_where_events_are_few():
-    """From 6 degrees beside it, with a tenth of the events."""
+    """From 6 degrees beside it, with a tenth of the events; frames are stamped 9 ms early."""
     off = []
     for given in (True, False):
         params = batch.Params.of({**GIVEN, "frames": given})
-        windows = batch.Windows(seen(frames=True), params, CAMERA)
+        windows = batch.Windows(stamped(9000), params, CAMERA)
         tracks, prior = windows.tracks(150_000, 0.15, 1500), windows.prior(150_000, 0.15)
         assert (len(tracks.x) > tracks.events) == given
         path = true_path(np.full(math.prod(tracks.nodes), np.log(np.linalg.norm(T) / 1.5)))

@@ -8,6 +8,10 @@ So the pixels of a frame are a track of their own, of which the mean is not know
 threshold C is how much the logarithm changes from frame to frame where events were several, for
 each of them: between the slopes of either by the other, as both are noisy. Where they do not agree,
 as in frames of another view, or with the polarities exchanged, frames are left out.
+
+Stamps of frames may be off: on slider_depth they are 4 ms before the middle of the exposure by the
+clock of events, on evbench_seq3 8 ms after it. `offset` finds by how much changes from frame to
+frame agree best with the events between them.
 """
 
 import dataclasses
@@ -28,6 +32,9 @@ AGREEING = 0.5  # the least correlation of changes and events
 STEEP = 0.5  # the share of pixels, those with the steepest surroundings, that are fitted
 STEP = 1 / 512  # grey, the noise of 8 bits at least
 NOISE = 0.1  # C, of events: what is noisier counts less
+FOLLOWING = 50_000  # us after a frame within which the next event tells of its level
+PAIRS = 20  # of frames, those with most events between them, that tell the offset
+FARTHEST, APART = 20_000, 2000  # us, of offsets that are tried, and from one to the next
 # What no image of gentle slopes has (Immerkaer, 1996), 6 times the noise of a pixel.
 ROUGH = np.outer([1, -2, 1], [1, -2, 1])
 
@@ -41,16 +48,18 @@ class FramePixels(NamedTuple):
     steep: NDArray[np.bool_]  # (pixels,)
 
 
-def look_at(recording: Recording, first: int, last: int) -> FramePixels | None:
-    """The frames of a window (us); None where they tell nothing beside the events."""
+def look_at(recording: Recording, first: int, last: int, late: int = 0) -> FramePixels | None:
+    """The frames of a window (us); None where they tell nothing beside the events.
+
+    `late` us are added to their stamps.
+    """
     frames = recording.frames
-    rows = np.flatnonzero((frames.t > first) & (frames.t < last)) if frames else ()
+    rows = np.flatnonzero((frames.t + late > first) & (frames.t + late < last)) if frames else ()
     if frames is None or len(rows) < 2:
         return None
     grey = frames[slice(int(rows[0]), int(rows[-1]) + 1)].intensity.astype(np.float64)
-    t = frames.t[rows]
-    told = (grey > CLIPPED[0]) & (grey < CLIPPED[1])
-    level = np.log(np.maximum(grey, 0) + DARK)
+    t = frames.t[rows] + late
+    level, told = _levels(grey)
     threshold = _threshold(recording, t, level, told)
     if threshold is None:
         return None
@@ -64,25 +73,82 @@ def look_at(recording: Recording, first: int, last: int) -> FramePixels | None:
     return FramePixels(t, level.reshape(flat) / threshold, trust.reshape(flat), steep.ravel())
 
 
+def offset(recording: Recording) -> int:
+    """How many us to add to the frames' stamps; 0 where no offset agrees with the events."""
+    frames = recording.frames
+    if frames is None or len(frames.t) < 2:
+        return 0
+    lasts, begins = np.diff(frames.t), [recording.events.index(int(t)) for t in frames.t]
+    most = min(FARTHEST, int(lasts.min()) // 2) // APART * APART
+    pairs = []
+    for k in np.argsort(-np.diff(begins), kind="stable")[:PAIRS]:
+        level, told = _levels(frames[slice(int(k), int(k) + 2)].intensity.astype(np.float64))
+        pairs.append((frames.t[k : k + 2], level, told.all(0)))
+    tried = np.arange(-most, most + 1, APART)
+    agree = np.array([_agreement(recording, pairs, int(late)) for late in tried])
+    best = int(np.argmax(agree))
+    if not 0 < best < len(tried) - 1 or not agree[best] > AGREEING:
+        return 0
+    before, at, after = agree[best - 1 : best + 2]
+    bend = max(2 * at - before - after, 1e-9)  # of the parabola, whose top it is
+    return int(tried[best] + round(APART * (after - before) / 2 / bend))
+
+
+def _levels(grey: NDArray) -> tuple[NDArray, NDArray]:
+    """Log intensity, and where it is told."""
+    return np.log(np.maximum(grey, 0) + DARK), (grey > CLIPPED[0]) & (grey < CLIPPED[1])
+
+
+def _change(
+    recording: Recording, t: NDArray, level: NDArray, told: NDArray
+) -> tuple[NDArray, NDArray, NDArray] | None:
+    """Of pixels told in two frames at t (us), changes of level and sums of polarities between.
+
+    Sums lag: they tell the level at the last event. Between that and the next it is about halfway.
+    The third are sums of such levels.
+    """
+    first, last, till = (recording.events.index(int(at)) for at in (*t, t[1] + FOLLOWING))
+    events, pixels = recording.events[first:till], told.size
+    pixel = events.y.astype(np.int64) * recording.width + events.x
+    p, between = np.where(events.p, 1, -1), last - first
+    told = told.ravel()
+    quiet = told & (np.bincount(pixel[:between], minlength=pixels) == 0)
+    if not quiet.any():
+        return None
+    number = np.bincount(pixel[:between], p[:between], pixels)
+    halfway = number.copy()
+    for sign, begin in ((-1, 0), (1, between)):
+        following = np.zeros(pixels)
+        following[pixel[begin:][::-1]] = p[begin:][::-1]  # what is written last is the first
+        halfway += sign / 2 * following
+    change = (level[1] - level[0]).ravel()
+    # Exposures may change.
+    return change[told] - np.median(change[quiet]), number[told], halfway[told]
+
+
+def _agreement(
+    recording: Recording, pairs: list[tuple[NDArray, NDArray, NDArray]], late: int
+) -> float:
+    """The correlation of changes and sums, of frames so much later than their stamps."""
+    found = [_change(recording, t + late, level, told) for t, level, told in pairs]
+    kept = [one for one in found if one is not None]
+    if not kept:
+        return 0.0
+    y, _, n = (np.concatenate(parts) for parts in zip(*kept, strict=True))
+    return float(y @ n / np.sqrt(max((y @ y) * (n @ n), 1e-30)))
+
+
 def _threshold(recording: Recording, t: NDArray, level: NDArray, told: NDArray) -> float | None:
     """The contrast threshold; None where events do not agree with the frames."""
-    pixels, changes, numbers = level[0].size, [], []
+    parts = []
     for k in range(len(t) - 1):
-        first, last = (recording.events.index(int(at)) for at in t[k : k + 2])
-        events = recording.events[first:last]
-        pixel = events.y.astype(np.int64) * recording.width + events.x
-        number = np.bincount(pixel, np.where(events.p, 1, -1), pixels)
-        both = told[k : k + 2].all(0).ravel()
-        quiet = both & (np.bincount(pixel, minlength=pixels) == 0)
-        if not quiet.any():
-            continue
-        several = both & (np.abs(number) >= SEVERAL)
-        change = (level[k + 1] - level[k]).ravel()
-        changes.append(change[several] - np.median(change[quiet]))  # exposures may change
-        numbers.append(number[several])
-    if sum(map(len, numbers)) < ENOUGH:
+        found = _change(recording, t[k : k + 2], level[k : k + 2], told[k] & told[k + 1])
+        if found is not None:
+            several = np.abs(found[1]) >= SEVERAL
+            parts.append([part[several] for part in found[:2]])
+    if sum(len(change) for change, _ in parts) < ENOUGH:
         return None
-    y, n = np.concatenate(changes), np.concatenate(numbers)
+    y, n = (np.concatenate(part) for part in zip(*parts, strict=True))
     yy, yn, nn = y @ y, y @ n, n @ n
     if not yn > AGREEING * np.sqrt(yy * nn):
         return None

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.batch_fit.alignment import Window, refine, score
 from jaxevent.egomotion.batch_fit.depths import depths
-from jaxevent.egomotion.batch_fit.frames import look_at, with_frames
+from jaxevent.egomotion.batch_fit.frames import FramePixels, look_at, offset, with_frames
 from jaxevent.egomotion.batch_fit.path import SEGMENTS, Path, Prior
 from jaxevent.egomotion.batch_fit.photometric import Report, adjust, compute_covariance
 from jaxevent.egomotion.batch_fit.rivals import SIGMA, Trial
@@ -172,7 +172,7 @@ class Windows:
         self.recording, self.params, self.gyro, self.seed = recording, params, gyro, seed
         self.least: dict[int, float] = {}  # C, sigma at least, by windows
         # Stages look at the same window one after another.
-        self.look_at = functools.lru_cache(2)(functools.partial(look_at, recording))
+        self.look_at = functools.lru_cache(2)(self._look_at)
         self.real = np.dtype(jax.dtypes.canonicalize_dtype(float))
         self.xi, self.f = coordinates(recording.width, recording.height, camera)
         flat = self.xi.reshape(-1, 2)
@@ -183,6 +183,14 @@ class Windows:
         self.shape = (int(cells[1]) * params.cell, int(cells[0]) * params.cell)
         ends = flat[:, 0].min(), flat[:, 0].max(), flat[:, 1].min(), flat[:, 1].max()
         self.box = (float(ends[0]), float(ends[1]), float(ends[2]), float(ends[3]))
+
+    @functools.cached_property
+    def late(self) -> int:
+        """How many us frames are later than their stamps."""
+        return offset(self.recording)
+
+    def _look_at(self, first: int, last: int) -> FramePixels | None:
+        return look_at(self.recording, first, last, self.late)
 
     def rows(self, centre: int, half: float) -> tuple[int, int]:
         """The events of a window."""
