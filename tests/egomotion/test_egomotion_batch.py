@@ -407,6 +407,19 @@ def test_frames_tell_motion_where_events_are_few():
     assert off[0] < 4 and off[0] < 0.5 * off[1], off
 
 
+def test_a_lens_leaves_errors_across_the_heading():
+    bent = dataclasses.replace(CAMERA, distortion=(-0.1, 0.0, 0.0, 0.0, 0.0))
+    ideal, real = (batch.Windows(seen(), PARAMS, camera) for camera in (CAMERA, bent))
+    heading = T / np.linalg.norm(T)
+    near, far = (Path.constant(heading, np.zeros(3), np.full(4, np.log(d))) for d in (2.0, 1.0))
+    assert not ideal.of_lens(near).any()
+    one, other = real.of_lens(near), real.of_lens(far)
+    np.testing.assert_allclose(one[:3, :3] @ heading, 0, atol=1e-12)
+    # Of a translation alone the heading is as well told at any speed, Omega errs with the speed.
+    np.testing.assert_allclose(one[:3, :3], other[:3, :3])
+    np.testing.assert_allclose(one[3:, 3:], 4 * other[3:, 3:])
+
+
 def test_the_covariance_is_that_of_repeated_fits():
     """Of the same events at times that are off by some ms, anew each time."""
     windows, fit = fitted()
