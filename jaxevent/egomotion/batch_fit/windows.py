@@ -93,7 +93,7 @@ SKEW = 0.03  # standard deviation of the thresholds' skew by counts, at least
 # Where the thresholds themselves are noisy sigma is never less than that noise: else half of the
 # events are fitted exactly, and the others are outliers, for any motion. Simulated without noise
 # the stage NOISY shows 0.07 C, slider_depth 0.07 to 0.1 C, evbench_seq3 0.13 C and more. With 0.05
-# headings of slider_depth are at most 2.2 degrees off, but Omega up to 4.8 degrees/s.
+# headings of slider_depth are 2.2 degrees off at most, not 3.1, but simulated textures lose.
 NOISY, NOISE = 0.5, 0.1  # C: the stage's sigma, the noise
 # The share of inliers below which rivals are compared, whatever they cost. Walls seen with uneven
 # thresholds have 0.70, whichever motion; ideal ones 0.97.
