@@ -143,31 +143,25 @@ def test_pixels_take_the_path_of_their_side():
     s = np.array([-1, -0.5, 0, 0.5, 1], np.float32)
     x = np.arange(56)
     still, moving = moved((0, 0), (0, 0), s), moved((6.0, -3.0), (0, 0), s)
+    images = trajectories.pack(np.where(x < 28, still, moving), np.full_like(still, 1e-3))
     # Between both motions a ramp, 12 px wide, as nodes leave it.
-    part = np.clip((33.5 - x) / 12, 0, 1)[None, :, None] * np.ones((40, 1, 1))
+    part = np.clip((x - 21.5) / 12, 0, 1)[None, :, None] * np.ones((40, 1, 1))
     paths = (part * [6.0, -3, 0, 0]).astype(np.float32)
-    truth = np.where(x < 28, 6.0, 0.0)
-
-    def wrong(paths, where):
-        return (np.abs(paths[4:-4, where, 0] - truth[where]) > 0.7).mean()
-
-    def choose(edges, paths):
-        """Paths, where what moves is left of an edge (K,) and hides what is still."""
-        images = np.where(x < np.reshape(edges, (-1, 1, 1)), moving, still)
-        packed = trajectories.pack(images, np.full_like(still, 1e-3))
-        return borders.choose(packed, s, (0, 2, 4), paths, 2e-4)
-
+    whose = borders.choose(images, s, paths, 2e-4, 10.0)
+    chosen = paths.reshape(-1, 4)[whose][4:-4]
+    before = paths[4:-4]
+    truth = np.where(x < 28, 0.0, 6.0)
     near = (np.abs(x - 27.5) < 8) & (np.abs(x - 27.5) > 1)
-    assert wrong(paths, near) > 0.5
-    for speed in (0.0, 6.0):  # with the edge still, pixels of what moves come from behind it
-        chosen = paths.reshape(-1, 4)[choose(28 + speed * s, paths)]
-        assert wrong(chosen, near) < 0.1
-    # What the edge is yet to hide is seen before alone.
-    assert wrong(chosen, (x > 29) & (x < 34)) < 0.15
+
+    def wrong(paths):
+        return (np.abs(paths[..., 0] - truth)[:, near] > 0.7).mean()
+
+    # What moves has left the image's other half, so that some pixels see it in few instants.
+    assert wrong(before) > 0.5 and wrong(chosen) < 0.25
     # Where all move alike none is better, and each keeps its own.
     even = np.broadcast_to(np.float32([6, -3, 0, 0]), paths.shape).copy()
     own = np.arange(40 * 56).reshape(40, 56)
-    np.testing.assert_array_equal(choose(56 + 0 * s, even), own)
+    np.testing.assert_array_equal(borders.choose(images, s, even, 2e-4, 10.0), own)
 
 
 @functools.cache

@@ -365,6 +365,7 @@ class Follower:
         """The target at a time (us)."""
         instants = self.schedule(t)
         p = self._begin(t, instants)
+        s = instants.s
         L, V, clear, smooth = self._images(instants)
         if self.start is not None and not self.start.refine:
             p = trajectories.Motion(p, 1).at(0, *L.shape[1:]).p
@@ -383,8 +384,7 @@ class Follower:
         packed = trajectories.pack(better, doubted)
         for _ in range(STEPS):
             p = trajectories.step(packed, s, p, *self._settings)
-        at, paths = (instants.before, own, instants.after), trajectories.spread(p, L.shape[1:])
-        whose = borders.choose(packed, s, at, paths, self._settings[0])
+        whose = borders.choose(packed, s, trajectories.spread(p, L.shape[1:]), *self._settings[:2])
         return Followed(instants, L, V, clear, p, whose, smooth)
 
 
