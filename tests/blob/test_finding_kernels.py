@@ -1,7 +1,5 @@
 """Compiled loops of `jaxevent.blob.finding` beside slow programs that say the same."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -65,31 +63,16 @@ def test_pixels_are_those_of_the_events(stream):
     np.testing.assert_array_equal(pixels.n[order], counts)
 
 
-def expected_around(background, g, t):
-    """Events per s of 3x3 cells of g px: of the middle; near what is bright of all, if more."""
-    near = np.kron(ndimage.maximum_filter(background.bright, 3), np.ones((CELL // g, CELL // g)))
-    pixels = np.kron(background.rate, np.ones((FINE, FINE)))
-    wide = np.pad(pixels, g, "symmetric")
-    rows, columns = near.shape
-    sums = [[wide[i * g : (i + 3) * g, j * g : (j + 3) * g].sum() for j in range(columns)]
-            for i in range(rows)]  # fmt: skip
-    middle = pixels[g // 2 :: g, g // 2 :: g] * 9 * g * g
-    return (
-        np.where(near, np.maximum(sums, middle), middle) * background.activity[background.slice(t)]
-    )
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("g", [2, 4])
 def test_blobs_are_neighbouring_cells_with_more_events_than_background(stream, background, g):
-    bright = np.arange(WIDTH // CELL) < 2 + np.zeros((HEIGHT // CELL, 1))
-    background = dataclasses.replace(background, bright=bright)
     scale = Scale(0.02, g, np.full((HEIGHT // CELL, WIDTH // CELL), 1.3))
     part = stream.window(0.1, 0.12)
     counts = np.zeros((HEIGHT // g, WIDTH // g))
     np.add.at(counts, (part.y // g, part.x // g), 1)
     around = ndimage.convolve(counts, np.ones((3, 3)), mode="constant")
-    mu = expected_around(background, g, 0.11) * 0.02
+    y, x = np.mgrid[: HEIGHT // g, : WIDTH // g] * g + g // 2
+    mu = background.at(x, y, 0.11) * 0.02 * 9 * g * g
     enough = np.log(counts.size * DURATION / 0.02 / FALSE_ALARMS)
     hit = (counts > 0) & (evidence(around, mu, 1.3) > enough)
     labels = np.zeros(hit.shape, np.int32)
@@ -342,7 +325,7 @@ def test_a_target_is_updated_as_by_a_kalman_filter(background):
     np.testing.assert_allclose(live.p, p + K[0] * z)
     np.testing.assert_allclose(live.P[0, :2], (1 - K[0]) * P[0, :2])
     np.testing.assert_allclose(live.C[0], 4 * np.eye(2) + 0.2 * 0.8 * (D[0] - 4 * np.eye(2)))
-    mu = background.at(*live.p[0], t, 8) * 0.01 * np.pi * 9 * np.sqrt(np.linalg.det(live.C[0]))
+    mu = background.at(*live.p[0], t) * 0.01 * np.pi * 9 * np.sqrt(np.linalg.det(live.C[0]))
     assert live.nats[0] == pytest.approx(float(evidence(16, mu, 1.0)))
     # Two windows of silence: it stands still where it was.
     live.v[:] = 50.0

@@ -68,7 +68,7 @@ class Background:
     duration: float
     scene: SceneMotion | None = None
     corner: tuple[int, int] = (0, 0)
-    _means: dict[int, tuple[NDArray[np.float64], int]] = dataclasses.field(
+    _means: dict[int, NDArray[np.float64]] = dataclasses.field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
@@ -80,34 +80,27 @@ class Background:
     def at(
         self, x: NDArray | float | int, y: NDArray | float | int, t: Any, over: int = FINE
     ) -> Any:
-        """Rates, 1/(px s), at some pixels at a time (s): means of `over` x `over` px about them."""
+        """Rates, 1/(px s), at some pixels at a time (s); in a scene means of `over` x `over` px."""
         place = self.place(x, y, t)
-        return look_up(*self._rates(over), *place) * self.activity[self.slice(t)]
+        return look_up(self._rates(over), FINE, *place) * self.activity[self.slice(t)]
 
     def field(self, t: float | int, over: int = FINE) -> Field:
         """The same of all pixels at one time, for kernels."""
         now = min(max(int(t / self.duration * SLICES), 0), SLICES - 1)
-        return Field(*self._rates(over), float(self.activity[now]), self.placing(t))
+        return Field(self._rates(over), FINE, float(self.activity[now]), self.placing(t))
 
     def field_of(self, values: NDArray[np.float64], cell: int, t: float | int) -> Field:
         """Other values of the same places, in cells of so many px."""
         return Field(values, cell, 1.0, self.placing(t))
 
-    def _rates(self, over: int) -> tuple[NDArray[np.float64], int]:
-        """Rates of cells of so many px: means of `over` x `over` px where they are known finely.
-
-        At the rim of what is bright the middle alone has too few events; inside, the mean has.
-        """
-        if over not in self._means:
-            by = 1 if over % FINE == 0 else 2
-            rate = np.kron(self.rate, np.ones((by, by)))
-            mean = ndimage.uniform_filter(rate, max(1, over * by // FINE))
-            finely = ndimage.binary_dilation(self.bright, np.ones((3, 3)))
-            finely = np.kron(finely, np.ones((by * CELL // FINE,) * 2)) > 0
-            least = rate if self.scene is None else rate.min()
-            rate = np.where(finely, np.maximum(mean, least), rate)
-            self._means[over] = rate, FINE // by
-        return self._means[over]
+    def _rates(self, over: int) -> NDArray[np.float64]:
+        if self.scene is None:
+            return self.rate
+        cells = max(1, round(over / FINE))
+        if cells not in self._means:
+            mean = ndimage.uniform_filter(self.rate, cells)
+            self._means[cells] = np.maximum(mean, self.rate.min())
+        return self._means[cells]
 
     def placing(self, t: float | int) -> NDArray[np.float64]:
         """`place` at one time as a map (2, 3)."""
