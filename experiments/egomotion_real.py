@@ -174,6 +174,7 @@ def slider(data: Path) -> Rows:
         }
     )
     motion = batch.estimate(recording[:3.1])
+    late = 1e-3 * offset(recording)
     for first, last in ((0.0, 1.0), (1.0, 2.0), (2.0, 3.1)):
         here = motion.valid & (motion.t >= 1e6 * first) & (motion.t < 1e6 * last)
         mean, covariance = motion.mean[here], motion.covariance[here]
@@ -185,7 +186,7 @@ def slider(data: Path) -> Rows:
                 "recording": f"slider, {first} to {last} s",
                 "method": "batch",
                 "estimates": len(mean),
-                "frames late by ms": 1e-3 * offset(recording),
+                "frames late by ms": late,
                 "lost": int((motion.t[~motion.valid] // 1e6 == first).sum()),
                 "heading deg, median": np.median(heading),
                 "worst": heading.max(),

@@ -30,13 +30,12 @@ def keep_compiled() -> Path | None:
     The folder is named by the processor, whose instructions compiled programs use: homes are shared
     by machines.
     """
-    theirs = {"JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE"} & os.environ.keys()
     jax = sys.modules.get("jax")  # if it was imported before, it has read its variables already
     folder = folder_for_compiled()
-    inherited = folder and os.environ.get("JAX_COMPILATION_CACHE_DIR") == str(folder)
-    if not inherited and (theirs or (jax and jax.config.jax_compilation_cache_dir)):
-        return None
-    if folder is None:
+    named = {os.environ.get("JAX_COMPILATION_CACHE_DIR")}
+    named |= {jax.config.jax_compilation_cache_dir} if jax else set()
+    theirs = named - {None, str(folder)} or "JAX_ENABLE_COMPILATION_CACHE" in os.environ
+    if folder is None or theirs:
         return None
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(LEAST))

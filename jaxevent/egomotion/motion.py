@@ -29,6 +29,11 @@ def decided(model: str | type[Model], covariance: NDArray[np.floating]) -> NDArr
     return told
 
 
+def left_by_lens(camera: PinholeCamera | None) -> float:
+    """The share of a motion that a camera's calibration leaves: `LENS` if its lens distorts."""
+    return LENS if camera is not None and any(camera.distortion) else 0.0
+
+
 class Calibration(NamedTuple):
     """What errors are made of beside the covariance C of a fit of a motion m:
 
@@ -45,10 +50,8 @@ class Calibration(NamedTuple):
     change: float = 0.0
 
     def behind(self, camera: PinholeCamera | None) -> "Calibration":
-        """The same, with what a camera's calibration leaves, if its lens distorts."""
-        if camera is None or not any(camera.distortion):
-            return self
-        return self._replace(share=float(np.hypot(self.share, LENS)))
+        """The same, with what a camera's calibration leaves."""
+        return self._replace(share=float(np.hypot(self.share, left_by_lens(camera))))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -100,14 +100,14 @@ def _levels(grey: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _change(
-    recording: Recording, t: NDArray, level: NDArray, told: NDArray
-) -> tuple[NDArray, NDArray, NDArray] | None:
+    recording: Recording, t: NDArray, level: NDArray, told: NDArray, following: int = 0
+) -> tuple[NDArray, NDArray] | None:
     """Of pixels told in two frames at t (us), changes of level and sums of polarities between.
 
-    Sums lag: they tell the level at the last event. Between that and the next it is about halfway.
-    The third are sums of such levels.
+    Sums lag: they tell the level at the last event. Between that and the next it is about halfway,
+    and sums of such levels are told where the next is looked for, in so many us (`following`).
     """
-    first, last, till = (recording.events.index(int(at)) for at in (*t, t[1] + FOLLOWING))
+    first, last, till = (recording.events.index(int(at)) for at in (*t, t[1] + following))
     events, pixels = recording.events[first:till], told.size
     pixel = events.y.astype(np.int64) * recording.width + events.x
     p, between = np.where(events.p, 1, -1), last - first
@@ -116,25 +116,24 @@ def _change(
     if not quiet.any():
         return None
     number = np.bincount(pixel[:between], p[:between], pixels)
-    halfway = number.copy()
-    for sign, begin in ((-1, 0), (1, between)):
-        following = np.zeros(pixels)
-        following[pixel[begin:][::-1]] = p[begin:][::-1]  # what is written last is the first
-        halfway += sign / 2 * following
+    for sign, begin in ((-1, 0), (1, between)) if following else ():
+        next_one = np.zeros(pixels)
+        next_one[pixel[begin:][::-1]] = p[begin:][::-1]  # what is written last is the first
+        number += sign / 2 * next_one
     change = (level[1] - level[0]).ravel()
     # Exposures may change.
-    return change[told] - np.median(change[quiet]), number[told], halfway[told]
+    return change[told] - np.median(change[quiet]), number[told]
 
 
 def _agreement(
     recording: Recording, pairs: list[tuple[NDArray, NDArray, NDArray]], late: int
 ) -> float:
     """The correlation of changes and sums, of frames so much later than their stamps."""
-    found = [_change(recording, t + late, level, told) for t, level, told in pairs]
+    found = [_change(recording, t + late, level, told, FOLLOWING) for t, level, told in pairs]
     kept = [one for one in found if one is not None]
     if not kept:
         return 0.0
-    y, _, n = (np.concatenate(parts) for parts in zip(*kept, strict=True))
+    y, n = (np.concatenate(parts) for parts in zip(*kept, strict=True))
     return float(y @ n / np.sqrt(max((y @ y) * (n @ n), 1e-30)))
 
 
@@ -145,7 +144,7 @@ def _threshold(recording: Recording, t: NDArray, level: NDArray, told: NDArray) 
         found = _change(recording, t[k : k + 2], level[k : k + 2], told[k] & told[k + 1])
         if found is not None:
             several = np.abs(found[1]) >= SEVERAL
-            parts.append([part[several] for part in found[:2]])
+            parts.append([part[several] for part in found])
     if sum(len(change) for change, _ in parts) < ENOUGH:
         return None
     y, n = (np.concatenate(part) for part in zip(*parts, strict=True))

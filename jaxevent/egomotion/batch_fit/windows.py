@@ -40,7 +40,7 @@ from jaxevent.egomotion.batch_fit.starts import (
 )
 from jaxevent.egomotion.batch_fit.tracks import Scene, Tracks
 from jaxevent.egomotion.candidates import coordinates
-from jaxevent.egomotion.motion import LENS
+from jaxevent.egomotion.motion import left_by_lens
 from jaxevent.egomotion.twists import Twists
 from jaxevent.parameters import Choice, Count, Number, Parameters, Positive
 from jaxevent.recording import Recording
@@ -172,7 +172,7 @@ class Windows:
         seed: int = 0,
     ):
         self.recording, self.params, self.gyro, self.seed = recording, params, gyro, seed
-        self.distorts = any(camera.distortion)
+        self.lens = left_by_lens(camera)
         self.least: dict[int, float] = {}  # C, sigma at least, by windows
         # Stages look at the same window one after another.
         self.look_at = functools.lru_cache(2)(self._look_at)
@@ -511,11 +511,10 @@ class Windows:
         That is a share of the image's motion, which heading and Omega make up for.
         """
         rho, heading = float(np.exp(np.median(path.log_rho))), path.D[0]
-        moved = LENS * (rho + float(np.linalg.norm(path.O[0])))  # rad/s
+        moved = self.lens * (rho + float(np.linalg.norm(path.O[0])))  # rad/s
         left = np.zeros((6, 6))
-        if self.distorts:
-            left[:3, :3] = (moved / rho) ** 2 * (np.eye(3) - np.outer(heading, heading))
-            left[3:, 3:] = moved**2 * np.eye(3)
+        left[:3, :3] = (moved / rho) ** 2 * (np.eye(3) - np.outer(heading, heading))
+        left[3:, 3:] = moved**2 * np.eye(3)
         return left
 
     def parallax(self, path: Path, tracks: Tracks) -> float:
