@@ -35,7 +35,7 @@ import jaxevent
 from jaxevent import egomotion
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import batch, contrast, voting
-from jaxevent.egomotion.baselines.tracked_points import Params, _followed, _undistorted
+from jaxevent.egomotion.baselines.tracked_points import Params, followed, undistorted
 from jaxevent.egomotion.batch_fit.frames import offset
 from jaxevent.egomotion.candidates import coordinates
 from jaxevent.errors import require
@@ -211,7 +211,7 @@ def axis(data: Path) -> Rows:
     for first in range(2, len(frames) - 10, 8):
         grey = frames[first : first + 11].intensity
         images = [np.rint(255 * image).astype(np.uint8) for image in grey]
-        ends = (_undistorted(at, positions) / f for at in _followed(cv2, params, images))
+        ends = (undistorted(at, positions) / f for at in followed(cv2, params, images))
         begin, end = (np.concatenate([at, np.ones((len(at), 1))], 1) for at in ends)
         far = np.linalg.norm(end - begin, axis=1) > 6 / f
         lines = np.cross(begin[far], end[far])

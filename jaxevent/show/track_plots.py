@@ -85,8 +85,8 @@ def write_track_plot(
     filled_P = np.where(valid[..., None, None], covariance, np.eye(8))
     m, P = jnp.asarray(filled), jnp.asarray(filled_P)
     grown, spread, grows = _growths(t, m, P, valid, Q, Q_lambda)
-    variances = np.diagonal(filled_P, axis1=2, axis2=3)[..., 4:6]
-    grows &= _scales(filled[..., 4:6], variances, valid)
+    sizes = filled[..., 4:6], np.diagonal(filled_P, axis1=2, axis2=3)[..., 4:6]
+    grows &= _scales(*sizes, valid)
 
     asked = [_TTC] * bool(grows.any() or len(pairs)) + [_RANGE] * (extent is not None)
     names = [_SIZE, *asked] if valid.any() else []
@@ -105,18 +105,7 @@ def write_track_plot(
     ranges = None
     if extent is not None and focal is not None:
         ranges = jax.jit(size_range)(m, P, extent, focal, size_factor)
-    for i in np.flatnonzero(valid.any(0)).tolist():
-        one, seen, label = known[i], valid[:, i], f"{known[i]}"
-        line: dict[str, Any] = {
-            "color": "#{:02x}{:02x}{:02x}".format(*track_colour(one, dark=True))
-        }
-        for axis, more in ((4, {"label": label}), (5, {"ls": "--"})):
-            bands.add(_SIZE, filled[:, i, axis], filled_P[:, i, axis, axis], seen, **line, **more)
-        if grows[i]:
-            bands.add(_TTC, grown[:, i], spread[:, i], seen, **line, label=f"{one}, growth")
-        if ranges is not None:
-            value, variance = ranges
-            bands.add(_RANGE, value[:, i], variance[:, i], seen, **line, label=label)
+    _draw_states(bands, known, valid, sizes, (grown, spread, grows), ranges)
     for pair, ls in zip(pairs if names else (), itertools.cycle(_PAIRS)):
         a, b = (known.index(one) for one in pair)
         value, variance = jax.jit(inverse_ttc)(m[:, a], P[:, a], m[:, b], P[:, b])
@@ -125,6 +114,32 @@ def write_track_plot(
     bands.finish(len(known), len(number) if total is None else total)
     with complete(Path(path)) as temporary:
         figure.savefig(temporary, format=suffix, dpi=150)
+
+
+def _draw_states(
+    bands: "_Bands",
+    known: Sequence[int],
+    valid: NDArray[np.bool_],
+    sizes: tuple[NDArray, NDArray],
+    growths: tuple[NDArray, NDArray, NDArray],
+    ranges: tuple[Array, Array] | None,
+) -> None:
+    """Draw both sizes (T, N, 2) of tracks, their growth and range (T, N), each with its variance.
+
+    The growth is drawn of those tracks (N) that the last of `growths` names.
+    """
+    grown, spread, grows = growths
+    for i in np.flatnonzero(valid.any(0)).tolist():
+        one, seen, label = known[i], valid[:, i], f"{known[i]}"
+        colour = "#{:02x}{:02x}{:02x}".format(*track_colour(one, dark=True))
+        for axis, more in enumerate(({"label": label}, {"ls": "--"})):
+            size, variance = (part[:, i, axis] for part in sizes)
+            bands.add(_SIZE, size, variance, seen, colour, **more)
+        if grows[i]:
+            bands.add(_TTC, grown[:, i], spread[:, i], seen, colour, label=f"{one}, growth")
+        if ranges is not None:
+            value, variance = ranges
+            bands.add(_RANGE, value[:, i], variance[:, i], seen, colour, label=label)
 
 
 def _longest(valid: NDArray[np.bool_], also: Sequence[int]) -> NDArray[np.bool_]:

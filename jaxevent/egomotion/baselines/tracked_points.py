@@ -62,8 +62,8 @@ def solve(params: Params, given: Given) -> Motion:
     fits, pairs = [], _pairs(frames, float(params.span) if model.half_line else 0.0)
     for one, two in bar(pairs, desc="track points", unit="pair", progress=given.progress):
         images = [np.rint(255 * i).astype(np.uint8) for i in frames[one : two + 1].intensity]
-        begin, end = _followed(cv2, params, images)
-        before, after = _undistorted(begin, positions), _undistorted(end, positions)
+        begin, end = followed(cv2, params, images)
+        before, after = undistorted(begin, positions), undistorted(end, positions)
         dt = float(frames.t[two] - frames.t[one]) * 1e-6
         # Points of a cell share what they show.
         cells = np.floor(begin / CELL).astype(int) @ np.array([1, recording.width // CELL + 1])
@@ -87,7 +87,7 @@ def _pairs(frames: Frames, span: float) -> list[tuple[int, int]]:
     return pairs or [(0, len(t) - 1)]
 
 
-def _followed(
+def followed(
     cv2: Any, params: Params, images: list[NDArray[np.uint8]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Positions (n, 2) in the first image and in the last one of points seen in all of them."""
@@ -127,7 +127,7 @@ def _tracked(
     return end, good
 
 
-def _undistorted(at: NDArray[np.floating], positions: NDArray[np.float64]) -> NDArray[np.float64]:
+def undistorted(at: NDArray[np.floating], positions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Undistorted places between pixels, bilinearly."""
     height, width = positions.shape[:2]
     i = np.clip(np.floor(at).astype(int), 0, [max(width - 2, 0), max(height - 2, 0)])
