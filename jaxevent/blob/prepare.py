@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
 from jaxevent.blob.finding.found import Found
-from jaxevent.blob.finding.paths import ANYBODY, NOBODY, candidates, join
+from jaxevent.blob.finding.paths import NOBODY, candidates, join
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.seeds import read_seeds, span_of
 from jaxevent.errors import InputError
@@ -52,7 +52,7 @@ class Features(Described):
     seed: Int[Numeric, " seeds"]  # the chunk at whose start each seed begins; -1: not in these
     seed_xi: Float[Numeric, "seeds 2"]  # px
     seed_size: Float[Numeric, " seeds"]  # px; 0: lambda0
-    owner: Int[Numeric, "chunks steps M"] | None  # see `Found`: a seed, or ANYBODY; None: anybody
+    owner: Int[Numeric, "chunks steps M 2"] | None  # see `candidates`; None: anybody
     own: dict[str, Float[Numeric, " seeds"]]  # numbers (`raw`) that are a seed's own
     frame: Float[Numeric, " 2"]  # width and height, px
     detect: bool = eqx.field(static=True)
@@ -139,7 +139,7 @@ class Packing:
             seeds, detect = found.seeds(begin, end), False
         detect = seeds is None if detect is None else detect
         self.recording, self.start, self.stop = recording, begin, end
-        self.joined = self.ends = self.polarity = None
+        self.joined = self.ends = None
         self.own: dict[str, Numeric] = {}
         if found is not None and len(found):
             self.joined = join(found.paths)
@@ -148,9 +148,6 @@ class Packing:
                 [end if p.end >= end - p.window else p.end for p in found.paths], np.int64
             )
             self.own |= found.own(params)
-            self.polarity = np.array(
-                [-1 if p.polarity is None else p.polarity for p in found.paths], np.int8
-            )
         self.seeds = read_seeds(recording, seeds, begin, end)
         # Without births and tentative tracks less is to be decided.
         self.period = max(1, round((1 if detect else 10) * 1e6 * float(params.cycle)))
@@ -192,7 +189,7 @@ class Packing:
             np.zeros(self.chunks, np.int32),
             np.zeros(self.chunks, bool),
             np.full(len(self.seeds.t), -1, np.int32),
-            np.full(shape, ANYBODY, np.int32),
+            np.full((*shape, 2), NOBODY, np.int32),
         )
         stop = NEVER if more else self.stop
         bounds = _Bounds(self.start, stop, self.period, self.seeds.t)
@@ -232,13 +229,10 @@ class Packing:
             first = max(events.index(begin), self.rows[0])
             last = min(events.index(end + 1), self.rows[1])
         part = events[first:last]
-        kept, owner = self._kept(part, first), np.full(len(part), ANYBODY, np.int32)
+        kept, owner = self._kept(part, first), np.full((len(part), 2), NOBODY, np.int32)
         if self.joined is not None and len(part):
             owner = candidates(part, self.joined, NEAR)
-            kept &= owner != NOBODY
-            assert self.polarity is not None
-            wanted = self.polarity[owner]
-            kept &= (owner < 0) | (wanted < 0) | (wanted == part.p)
+            kept &= owner[:, 0] != NOBODY
         given = _Given(part.t, part.x, part.y, part.p, kept, owner)
         order = np.arange(len(part))
         spread = _spread(part.t, len(part) if self._as_stored else TIES, order)
@@ -442,7 +436,8 @@ def _pack(given, first_row, final, bounds, place, out):
         out.xi[chunk, step, slot, 1] = given.y[i]
         out.polarity[chunk, step, slot] = 1 if given.p[i] else -1
         out.row[chunk, step, slot] = first_row + i
-        out.owner[chunk, step, slot] = given.owner[i]
+        out.owner[chunk, step, slot, 0] = given.owner[i, 0]
+        out.owner[chunk, step, slot, 1] = given.owner[i, 1]
         fill += 1
         i += 1
     return False, i, _Place(chunk, opened, fill, previous, begin, end, following)

@@ -18,7 +18,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxevent.blob.association import gate_radius
 from jaxevent.blob.authors import Memory, nearest, remember, take
-from jaxevent.blob.finding.paths import ANYBODY
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import LONGEST
 from jaxevent.blob.steps import Batch, Filter, choose
@@ -193,7 +192,7 @@ def look_ahead(
     gates = jax.vmap(filter.gate, (None, None, None, 0))
     inside = gates(fixed, now, radius, residual)
     if owner is not None:
-        inside = jnp.where(owner == ANYBODY, inside, owner == slot.id)
+        inside = (owner == slot.id).any(1) & (inside | (owner[:, 1] < 0))
     inside &= alive & valid
     near = gates(fixed, now, jnp.maximum(fixed.surround, 1) * radius, residual) & alive
     return Ahead(state, alive, radius, inside, near, density)

@@ -19,7 +19,7 @@ P = TypeVar("P", bound=TrackerParams)
 LONGER = (1 / (3 * 2**0.5), 1.0, 2**0.5)
 
 FIRST = 4  # windows that tell the size at the start
-FOREVER = 1e3  # s; what was found tells when targets end
+FOREVER, ANYWHERE = 1e3, 1e9  # s, px; what was found tells when targets end
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Found:
             "t_coast": FOREVER,
             "t_merge": FOREVER,
             "aspect_max": 1e3,
-            "sigma_max": float(np.hypot(self.recording.width, self.recording.height)),
+            "sigma_max": ANYWHERE,
             "cycle": W,
         }
 

@@ -11,7 +11,7 @@ from jaxevent.kernels import lean, lean_part
 from jaxevent.recording import Events
 
 STILL = 2  # windows of silence after which a target stands still
-NOBODY, ANYBODY = -1, -2  # whose an event is: of no path, of one of several
+NOBODY = -1  # whose an event is: of no path
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +69,7 @@ class Joined(NamedTuple):
 
     first: NDArray[np.int64]
     window: NDArray[np.int64]
+    polarity: NDArray[np.int8]  # that an event of each path has; -1: either
     t: NDArray[np.int64]
     p: NDArray[np.float64]
     S: NDArray[np.float64]  # (rows, 3): of events about p, xx, xy, yy
@@ -83,6 +84,7 @@ def join(paths: Sequence[Path]) -> Joined:
     return Joined(
         np.cumsum([0, *(len(path.t) for path in paths)]),
         np.array([path.window for path in paths]),
+        np.array([-1 if p.polarity is None else p.polarity for p in paths], np.int8),
         np.concatenate([path.t for path in paths]),
         np.concatenate([path.p for path in paths]),
         np.stack([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]], 1),
@@ -90,25 +92,30 @@ def join(paths: Sequence[Path]) -> Joined:
 
 
 def candidates(events: Events, joined: Joined, sigmas: float | int) -> NDArray[np.int32]:
-    """Of which path each event may be: its number, `NOBODY` or, of several, `ANYBODY`.
+    """Of which paths each event may be, (events, 2): `NOBODY`, or the likelier one first.
 
-    Of a path are events within `sigmas` standard deviations while it is seen.
+    Of a path are events of its polarity within `sigmas` standard deviations while it is seen; of
+    more than two paths an event is of the likeliest two.
     """
-    t, whose, half = events.t, np.full(len(events), NOBODY, np.int32), joined.window // 2
+    t, half = events.t, joined.window // 2
+    whose, far = np.full((len(events), 2), NOBODY, np.int32), np.empty((len(events), 2))
     begins, ends = joined.t[joined.first[:-1]] - half, joined.t[joined.first[1:] - 1] + half
     rows = np.stack([np.searchsorted(t, begins), np.searchsorted(t, ends)])
-    _candidates(t, events.x, events.y, joined, rows, float(sigmas) ** 2, whose)
+    _candidates(t, events.x, events.y, events.p, joined, rows, float(sigmas) ** 2, whose, far)
     return whose
 
 
 @lean
 def _candidates(
-    t: Any, x: Any, y: Any, joined: Any, rows: Any, limit: float | int, whose: Any
+    t: Any, x: Any, y: Any, p: Any, joined: Any, rows: Any, limit: float | int, whose: Any, far: Any
 ) -> None:
+    """Fill in whose events are; `far` are minus twice their log likelihoods, up to a constant."""
     for k in range(len(joined.window)):
         row, last, w = joined.first[k], joined.first[k + 1] - 1, joined.window[k]
-        looked, box = -1, (0.0, 0.0, 0.0, 0.0)
+        looked, box, wanted = -1, (0.0, 0.0, 0.0, 0.0), joined.polarity[k]
         for i in range(rows[0, k], rows[1, k]):
+            if wanted >= 0 and wanted != p[i]:
+                continue
             while row < last and joined.t[row + 1] <= t[i]:
                 row += 1
             following = min(row + 1, last)
@@ -126,8 +133,19 @@ def _candidates(
             b = joined.S[row, 1] + part * (joined.S[following, 1] - joined.S[row, 1])
             c = joined.S[row, 2] + part * (joined.S[following, 2] - joined.S[row, 2])
             ex, ey = x[i] - px, y[i] - py
-            if c * ex * ex - 2 * b * ex * ey + a * ey * ey <= limit * (a * c - b * b):
-                whose[i] = k if whose[i] == -1 else -2
+            squared, determinant = c * ex * ex - 2 * b * ex * ey + a * ey * ey, a * c - b * b
+            if squared <= limit * determinant:
+                _enter(whose[i], far[i], k, squared / determinant + np.log(determinant))
+
+
+@lean_part
+def _enter(whose: Any, far: Any, k: int, distance: float) -> None:
+    """Path k is one of the likeliest two, or not."""
+    if whose[0] < 0 or distance < far[0]:
+        whose[1], far[1] = whose[0], far[0]
+        whose[0], far[0] = k, distance
+    elif whose[1] < 0 or distance < far[1]:
+        whose[1], far[1] = k, distance
 
 
 @lean_part

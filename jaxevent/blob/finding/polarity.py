@@ -76,8 +76,8 @@ def _add(
     `rows` are those at which the search in each path begins.
     """
     for i in range(len(t)):
-        k = whose[i]
-        if k < 0 or hot[y[i], x[i]]:
+        k = whose[i, 0]
+        if k < 0 or whose[i, 1] >= 0 or hot[y[i], x[i]]:
             continue
         last, half = joined.first[k + 1] - 1, joined.window[k] / 2
         while rows[k] < last and joined.t[rows[k]] + half <= t[i]:

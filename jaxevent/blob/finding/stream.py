@@ -68,7 +68,7 @@ class Stream:
         joined = join(paths)
         for row in range(first, last, BATCH):
             events = self.recording.events[row : min(row + BATCH, last)]
-            near = candidates(events, joined, sigmas) != NOBODY
+            near = candidates(events, joined, sigmas)[:, 0] != NOBODY
             kept[row - first : row - first + len(near)] &= ~near
         stream.hot, stream._kept = self.hot, kept
         return stream

@@ -57,7 +57,7 @@ class Chunks(NamedTuple):
     xi: NDArray
     polarity: NDArray
     valid: NDArray[np.bool_]
-    owner: NDArray[np.int32]  # or empty
+    owner: NDArray[np.int32]  # of two each, or empty
     elapsed: NDArray[np.int32]
     stop: NDArray[np.int32]
     cycle: NDArray[np.bool_]
@@ -178,7 +178,8 @@ def _run_steps(functions, given, settings, chunks, memory, chunk, work, marks):
             work[VALID, i] = valid[step, i]
         if owned:
             for i in range(room):
-                marks[i] = chunks.owner[chunk, step, i]
+                marks[i] = chunks.owner[chunk, step, i, 0]
+                marks[room + i] = chunks.owner[chunk, step, i, 1]
         alive = 0
         for k in range(len(cells)):
             if time - whole[k, HEARD] <= whole[k, LIMIT]:

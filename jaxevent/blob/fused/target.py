@@ -163,7 +163,7 @@ def program_of(
     def shared(params, held, density):
         return {"weight": filter.share(params, held, density)}
 
-    owner = shape(events, kind=np.int32) if owned else None
+    owner = shape(events, 2, kind=np.int32) if owned else None
     valid = shape(events, kind=bool)
     given = {"slot": slot, "time": times, "batch": batch}
     seen = {**given, "limit": times, "valid": valid, "owner": owner}
@@ -222,6 +222,7 @@ def _elements(single: bool) -> tuple[dict[str, str], dict[str, str]]:
         "batch.polarity.0": f"work[{POLARITY} * room + {i}]",
         "valid.0": f"work[{VALID} * room + {i}] != 0",
         "owner.0": f"marks[{i}]",
+        "owner.1": f"marks[room + {i}]",
         "ahead.inside.0": f"work[(row + {HELD}) * room + {i}] != 0",
         "ahead.near.0": f"work[(row + {NEAR}) * room + {i}] != 0",
         "ahead.density.0": f"work[(row + {DENSITY}) * room + {i}]",

@@ -53,7 +53,7 @@ class FusedRun:
             np.empty((chunks if begins else 0, *memory.whole.shape), np.int64),
             *(np.empty((chunks, targets), kind) for kind in kinds),
         )
-        owner = np.empty((0, 0, 0), np.int32) if features.owner is None else features.owner
+        owner = np.empty((0, 0, 0, 0), np.int32) if features.owner is None else features.owner
         given = Chunks(*(
             np.asarray(part)
             for part in (
@@ -63,7 +63,7 @@ class FusedRun:
             )
         ))  # fmt: skip
         work = np.zeros((TARGETS + ROWS * targets, events), self.dtype)
-        marks = np.zeros(events, np.int64)
+        marks = np.zeros(2 * events, np.int64)
         kernel = self._kernel
         run(kernel.functions, kernel.numbers, self._settings, given, memory, told, work, marks)
         rest = [np.asarray(one, np.int32) for one in memory.at]
