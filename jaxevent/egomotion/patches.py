@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.candidates import coordinates
-from jaxevent.kernels import compiled
+from jaxevent.kernels import lean
 from jaxevent.recording import Recording
 
 PATCH = 24  # px
@@ -149,7 +149,9 @@ def look(
     since = (events.t[keep] - middle) * 1e-6 / length
     ways = np.arange(-reach, reach + 1.0)
     energy = np.zeros((2, len(taken), len(ways), len(ways)))
-    _energies(local, since, sign, which, halves, ways, energy)
+    side = (PATCH + 2 * MARGIN) // GRAIN
+    images = np.empty((2, len(taken), side, side))
+    _energies(local, since, sign, which, halves, ways, images, energy)
     for k in range(2):
         share = np.bincount(which[halves == k], minlength=len(taken))
         energy[k] /= np.maximum(share, 1)[:, None, None]
@@ -157,11 +159,10 @@ def look(
     return Look(middle, length, centre, count[taken], energy, ways)
 
 
-@compiled
-def _energies(at, since, sign, patch, half, ways, energy):
+@lean
+def _energies(at, since, sign, patch, half, ways, images, energy):
     """Sums of squares of patches' signed images, of pixels of `GRAIN`, for every way."""
-    side = (PATCH + 2 * MARGIN) // GRAIN
-    images = np.zeros((2, energy.shape[1], side, side))
+    side = images.shape[3]
     for row in range(len(ways)):
         for column in range(len(ways)):
             images[:] = 0

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.kernels import kept
+from jaxevent.kernels.parts import part_of_others
 
 # numba makes two functions more of each. The one for those that call it by its address is left out;
 # without the one for Python a call from there would end the process.
@@ -40,29 +41,17 @@ def lean(function: Callable) -> Any:
 
 def lean_part(function: Callable) -> Any:
     """The same for what such functions alone call; raises `TypeError` where Python does."""
-    # The function for Python takes as long again to compile as one of many arrays.
-    alone = {**_USUAL, **_LEAN, "no_cpython_wrapper": True}
-    made: Any = numba.njit(error_model="numpy", **alone)(inspect.unwrap(function))
-    made._insert, made._compile_for_args = _ignore, _refuse
-    return made
-
-
-def _ignore(*_: Any) -> None:
-    """Do not note for Python what was compiled: it would call nothing, and the process end."""
-
-
-def _refuse(*_: Any, **named: Any) -> None:
-    raise TypeError("this is for compiled functions to call, not for Python")
+    return part_of_others(function, error_model="numpy", nogil=True, **_LEAN)
 
 
 def fast(function: Callable) -> Any:
-    """Compile as `compiled` does, sums in whatever order is fastest: the same one every time."""
-    return kept.compiled(inspect.unwrap(function), **_USUAL, **_LOOSE)
+    """Compile as `lean` does, sums in whatever order is fastest: the same one every time."""
+    return kept.compiled(inspect.unwrap(function), **_USUAL, **_LEAN, **_LOOSE)
 
 
 def fast_part(function: Callable) -> Any:
-    """The same for what such functions alone call."""
-    return numba.njit(**_USUAL, **_LOOSE)(inspect.unwrap(function))
+    """The same for what such functions alone call; raises `TypeError` where Python does."""
+    return part_of_others(function, nogil=True, **_LEAN, **_LOOSE)
 
 
 class Blank:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled
+from jaxevent.kernels import lean
 from jaxevent.reconstruction.clock import Clock
 from jaxevent.reconstruction.features import ImagePoints, ReadOut
 from jaxevent.reconstruction.layout import SLOTS, SlotMap
@@ -147,15 +147,15 @@ class Reader:
         self._row = _read(
             basis.stream, basis.events, self._row, times, at.exposure, basis.counts,
             basis.slot_map, self._states, DeadTime(basis.rho, growth), basis.reach,
-            clock.origin, out,
+            clock.origin, np.empty(len(self._states.last), np.int64), out,
         )  # fmt: skip
         self._time = times[-1] if len(times) else self._time
         points = at.points(self._room, basis.dtype, out.on, out.off)
         return ReadOut(points, out.slot, out.since)
 
 
-@compiled
-def _read(stream, own, row, times, frame, counts, slot_map, states, dead, reach, origin, out):
+@lean
+def _read(stream, own, row, times, frame, counts, slot_map, states, dead, reach, origin, seen, out):
     """At each time, every pixel's last slot, the time since, and its counts in the piece.
 
     Begins with the event `row` of the window's `own` and returns the next one.
@@ -166,7 +166,8 @@ def _read(stream, own, row, times, frame, counts, slot_map, states, dead, reach,
     kind, lane_of, shapes = slot_map.kind, slot_map.lane, slot_map.shapes
     round_tile, round_first = slot_map.round_tile, slot_map.round_first
     slot, since, on, off = out.slot, out.since, out.on, out.off
-    seen = np.full(len(last), -1)
+    for pixel in range(len(last)):
+        seen[pixel] = -1
     for j in range(len(times)):
         while row < own and t[row] <= times[j]:
             pixel = np.int64(y[row]) * width + x[row]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled
+from jaxevent.kernels import compiled, lean, lean_part
 from jaxevent.recording import Events, Recording
 
 
@@ -88,7 +88,7 @@ def count_events(x, y, width, pixels):
     return counts
 
 
-@compiled
+@lean_part
 def equivalent(gap, dead):
     """How many events one after the gap (us) at its pixel stands for."""
     if dead.rho == 0:
@@ -99,7 +99,7 @@ def equivalent(gap, dead):
     return 1e6 * gap / (rest * rest) if dead.growth else gap / rest
 
 
-@compiled
+@lean
 def note_latest(stream, last):
     """Bring the times of each pixel's last event, `last`, to the stream's end."""
     t, x, y = stream.t, stream.x, stream.y
@@ -107,28 +107,35 @@ def note_latest(stream, last):
         last[np.int64(y[i]) * stream.width + x[i]] = t[i]
 
 
-@compiled
-def weigh(stream, last, dead):
+def weigh(stream: Stream, last: NDArray[np.int64], dead: DeadTime) -> NDArray[np.float64]:
     """What each event stands for; `last` holds the times of the events before, at each pixel."""
+    out = np.empty(len(stream.t))
+    _weigh(stream, last, dead, out)
+    return out
+
+
+@lean
+def _weigh(stream, last, dead, out):
     t, x, y = stream.t, stream.x, stream.y
-    out = np.empty(len(t), np.float64)
     for i in range(len(t)):
         pixel = np.int64(y[i]) * stream.width + x[i]
         out[i] = equivalent(t[i] - last[pixel], dead)
         last[pixel] = t[i]
-    return out
 
 
-@compiled
-def count_before(stream, weight, edges, now):
+def count_before(stream: Stream, weight: NDArray, edges: NDArray, now: NDArray) -> NDArray:
     """ON and OFF events of each pixel earlier than each edge: [edges, 2, pixels].
 
     `now` (2, pixels) are the counts at the stream's beginning, and is brought to the last edge.
     """
+    out = np.empty((len(edges), *now.shape), now.dtype)
+    _count_before(stream, weight, edges, now, out)
+    return out
+
+
+@lean
+def _count_before(stream, weight, edges, now, out):
     t, x, y, p = stream.t, stream.x, stream.y, stream.p
-    out = np.zeros((len(edges), 2, now.shape[1]), now.dtype)
-    if len(edges) == 0:
-        return out
     i = 0
     for e in range(len(edges)):
         while i < len(t) and t[i] < edges[e]:
@@ -136,7 +143,6 @@ def count_before(stream, weight, edges, now):
             i += 1
         for pixel in range(now.shape[1]):  # one by one: numba takes 1.5 s to compile a slice
             out[e, 0, pixel], out[e, 1, pixel] = now[0, pixel], now[1, pixel]
-    return out
 
 
 @compiled

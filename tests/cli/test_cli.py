@@ -1,6 +1,7 @@
 """The command line: what it writes, and that bad input is said in one line and leaves nothing."""
 
 import contextlib
+import gc
 import hashlib
 import os
 import re
@@ -229,6 +230,16 @@ def as_process(*arguments: object, env: dict[str, str] | None = None) -> subproc
         stderr=subprocess.PIPE,
         text=True,
     )
+
+
+def test_garbage_is_collected_as_before():
+    """A command collects seldom, and tells Python to leave all as it is where the process ends."""
+    known = gc.get_threshold(), gc.get_freeze_count()
+    assert cli.main(["info", "none.h5"]) == 2
+    assert (gc.get_threshold(), gc.get_freeze_count()) == known
+    code = "import gc, sys; from jaxevent import cli; sys.argv = ['jaxevent', 'info', 'none.h5']; "
+    code += "cli.main(); sys.exit(gc.get_freeze_count() > 0)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 1
 
 
 def test_as_a_process(tmp_path):

@@ -206,9 +206,9 @@ def times(system: solving.System, v: fit.Unknowns) -> fit.Unknowns:
     out, out_depth = np.empty(SHAPE), np.empty(system.hold.shape)
     t = np.ascontiguousarray(v[1][: len(system.known)])
     depth = np.ascontiguousarray(v[2]).reshape(system.hold.shape)
-    found = solving.multiply(
-        system, np.ascontiguousarray(v[0]), t, depth, np.empty(PIXELS * EACH), out, out_depth
-    )
+    value, found = np.empty(PIXELS * EACH), np.empty_like(t)
+    image = np.ascontiguousarray(v[0])
+    solving.multiply(system, image, t, depth, value, out, found, out_depth)
     return out, found, out_depth
 
 
@@ -249,7 +249,8 @@ def test_the_preconditioner_is_exact_where_the_matrix_is_of_blocks(damping):
     for v in np.eye(free + nodes):
         depth = v[free:].reshape(system.hold.shape)
         out = np.empty_like(depth)
-        t = solving.ease_rest(system, v[:free].copy(), depth.copy(), out)
+        t = np.empty(free)
+        solving.ease_rest(system, v[:free].copy(), depth.copy(), t, out)
         eased.append(np.append(t, out))
     upper, mixed = equations.upper[:free, :free], equations.mixed[:, :free]
     stiff = (damping + 1e-3) * np.diag(equations.stiff[:free])

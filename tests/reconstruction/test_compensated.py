@@ -26,6 +26,7 @@ from jaxevent.reconstruction.compensated import (
     warping,
 )
 from jaxevent.reconstruction.compensated.parameters import OTHERS, SIGNS, Params
+from jaxevent.reconstruction.compensated.solving import solve
 from jaxevent.recording import Frames
 from jaxevent.simulate import Sensor, simulate
 
@@ -113,8 +114,7 @@ def test_equations_are_solved():
     across, down = weights[0], weights[1]
     smooth = np.array([2, 2, 3, 3], np.float32)
     ridge = np.array([0.1, 0.1, 0.5, 0.5], np.float32)
-    d = np.empty_like(p)
-    trajectories._solve(N, b, p, across, down, smooth, ridge, 60, d)
+    d = solve(N, b, p, across, down, smooth, ridge, 60)
 
     size = rows * columns
     laplacian = np.zeros((size, size))
@@ -770,19 +770,18 @@ def balanced():
 def test_equations_are_those_of_the_steps():
     p, (L, V, s, _), numbers = jax.tree.map(np.asarray, balanced())
     near = np.exp(-2 * s**2).astype(np.float32)
-    points, M = np.empty((9, 10, 3, 4), np.float32), np.empty((9, 10), np.float32)
     N, b = np.empty((5, 5, 10), np.float32), np.empty((5, 5, 4), np.float32)
-    edge, softened = np.empty((5, 5), np.float32), np.empty((5, 5, 10), np.float32)
+    edge = np.empty((5, 5), np.float32)
     images = trajectories.pack(L, V)
-    trajectories._fetch(0, 9, images, s, near, p, numbers.floor, numbers.robust, points, M)
+    floor, nu = float(numbers.floor), float(numbers.robust)
+    points, M = trajectories.fetch(images, s, near, p, floor, nu)
     trajectories._linearise(0, 5, points, s, M, N, b, edge)
     found = jax.jit(implicit.equations)(*balanced())
-    trajectories._soften(N, softened)
+    softened = trajectories.soften(N)
     upper = [found.N[..., i, j] for i in range(4) for j in range(i, 4)]
     scale = np.abs(softened).max()
     np.testing.assert_allclose(np.stack(upper, -1), softened, atol=1e-4 * scale)
-    trajectories._soften(b, softened[..., :4])
-    np.testing.assert_allclose(found.b, softened[..., :4], atol=1e-4 * np.abs(b).max())
+    np.testing.assert_allclose(found.b, trajectories.soften(b), atol=1e-4 * np.abs(b).max())
     across, down = np.zeros((2, 5, 5), np.float32)
     smoothness = trajectories.Smoothness(*(float(v) for v in numbers[2:]))
     trajectories._weigh_differences(p, edge, np.float32(1), smoothness, across, down)

@@ -21,9 +21,10 @@ def _tried_depths(path: Path, tracks: Tracks, depths: NDArray) -> tuple[NDArray,
     X, Y = warp(path, tracks.f, *at, none + 1)
     S, N = np.empty((len(depths), *tracks.nodes)), np.empty((len(depths), *tracks.nodes))
     both, work = np.empty((2, *tracks.shape), real), np.empty(tracks.shape, real)
+    strips = np.empty((2, tracks.nodes[0], tracks.shape[1]))
     images.depth_maps(
         np.stack([rx, ry, X - rx, Y - ry]).astype(real), tracks.p[events], depths.astype(real),
-        tracks.corner, tracks.node, SPOT, both, work, S, N,
+        tracks.corner, tracks.node, SPOT, both, work, strips, S, N,
     )  # fmt: skip
     return S, N
 

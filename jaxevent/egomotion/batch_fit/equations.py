@@ -33,7 +33,7 @@ from jaxevent.egomotion.batch_fit.slopes import (
 )
 from jaxevent.egomotion.batch_fit.solving import System, conjugate_gradients
 from jaxevent.egomotion.batch_fit.tracks import Places, Scene, Tracks, read
-from jaxevent.egomotion.batch_fit.weighing import subtract_mean, weigh
+from jaxevent.egomotion.batch_fit.weighing import Room, subtract_mean, weigh
 
 BEND = 0.1  # a larger difference of log depth between nodes is an edge
 FREE = 6 * ROWS  # numbers of a path's rows; after them come the skew and the plane's normal
@@ -116,7 +116,7 @@ def look(problem: Problem, scene: Scene, weight: NDArray) -> Seen:
     weight = weight.copy()
     of_places, cost = weigh(
         e, places.inside, tracks.trust, tracks.events, places.first, tracks.begin, problem.limit,
-        usual, plane, tracks.grids, weight,
+        usual, plane, Room.of(tracks.grids.height, tracks.grids.width, e), weight,
     )  # fmt: skip
     unit = units_of_rows(scene.path, tracks.f, tracks.half)
     known, side, constant = problem.pull(scene.path, unit)
@@ -199,8 +199,9 @@ def linearise(problem: Problem, seen: Seen, settling: bool) -> Equations:
     nodes, grids = math.prod(tracks.nodes), tracks.grids
     raw, diagonal = np.zeros((n, n)), np.zeros(tracks.shape, real)
     raw_mixed, lumped = np.zeros((nodes, n), real), np.zeros(nodes)
+    rows = np.empty((int(np.diff(tracks.begin).max(initial=0)) + 1, n), real)
     blocks(
-        slopes, weight, tracks.begin, grids.width, grids.columns, raw, raw_mixed, lumped,
+        slopes, weight, tracks.begin, grids.width, grids.columns, rows, raw, raw_mixed, lumped,
         diagonal.reshape(-1),
     )  # fmt: skip
     whole = np.zeros((n, FREE + 4))
@@ -290,6 +291,7 @@ def system_of(equations: Equations, damping: float) -> System:
         on(damping * equations.diagonal), on(1e-3 + damping * lumped, tracks.nodes),
         on(equations.across), on(equations.down), on(1 / (eased_by * equations.diagonal)),
         on(1 / (eased_by * lumped)), on(mixed), np.linalg.inv(small).astype(np.float64),
+        np.empty((6, POWERS), real), np.empty(n - FREE, real), np.empty(n),
     )  # fmt: skip
 
 

@@ -123,10 +123,11 @@ def measure(images, others, gain, cell, sums):
 
 
 @fast
-def contrast_and_slope(x, y, tau, p, M, basis, corner, f, blurs, image, work, slope):
+def contrast_and_slope(x, y, tau, p, M, basis, corner, f, blurs, image, work, terms, slope):
     """Minus the sum of squares of the blurred image of events moved by exp(M tau), and its slopes.
 
     Those by factors of `basis` (n, 3, 3), which M is the sum of, are written to `slope` (n,).
+    `terms` (2, 3, 9) is room.
     """
     image[:] = 0
     for e in range(len(x)):
@@ -139,12 +140,12 @@ def contrast_and_slope(x, y, tau, p, M, basis, corner, f, blurs, image, work, sl
             total -= float(image[j, i]) ** 2
     blur(image, work, blurs)
     slope[:] = 0
+    by, term = terms[0], terms[1]
     for e in range(len(x)):
         a, b, c = x[e] / f, y[e] / f, 1.0
         X, Y, Z, t = a, b, c, tau[e]
         # The terms M^k x tau^k / k! one after the other, by M and by each of its nine numbers.
-        by = np.zeros((3, 9))
-        term = np.zeros((3, 9))
+        terms[:] = 0
         for k in range(1, 6):
             scale, old = t / k, (a, b, c)
             for n in range(9):
@@ -211,13 +212,13 @@ def turned(x, y, tau, M, f, X, Y):
 
 
 @fast
-def flow_maps(x, y, tau, p, flows, corner, images, work, S, N):
+def flow_maps(x, y, tau, p, flows, corner, images, work, squares, S, N):
     """Write contrast and number of events of patches (flows, rows, columns), by flows (px/s).
 
-    Patches are 24 px, 16 px apart: sums of 3 x 3 squares of 8 px. `images` are (2, height, width).
+    Patches are 24 px, 16 px apart: sums of 3 x 3 squares of 8 px. `images` (2, height, width)
+    and `squares` (2, height // 8, width // 8) are room.
     """
     height, width = images.shape[1:]
-    squares = np.zeros((2, height // 8, width // 8))
     for n in range(len(flows)):
         images[:] = 0
         for e in range(len(x)):
@@ -246,17 +247,16 @@ def flow_maps(x, y, tau, p, flows, corner, images, work, S, N):
 
 
 @fast
-def depth_maps(rays, p, depths, corner, node, spot, images, work, S, N):
+def depth_maps(rays, p, depths, corner, node, spot, images, work, strips, S, N):
     """Write contrast and number of events about nodes (depths, rows, columns), by inverse depths.
 
     `rays` are r and d (4, events): at inverse depth rho an event lies at r + rho d. A node's are
-    those of the square of `spot` px about it.
+    those of the square of `spot` px about it. `strips` (2, rows, width) is room.
     """
     rx, ry, dx, dy = rays
     height, width = images.shape[1:]
     rows, columns = S.shape[1:]
     before = spot // 2
-    strips = np.zeros((2, rows, width))
     for n in range(len(depths)):
         images[:] = 0
         rho = depths[n]

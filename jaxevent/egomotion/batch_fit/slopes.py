@@ -179,23 +179,21 @@ def back(slopes, z, width, columns, image, coefficients, more, depth):
 
 
 @fast
-def blocks(slopes, weight, begin, width, columns, upper, mixed, lumped, diagonal):
+def blocks(slopes, weight, begin, width, columns, rows, upper, mixed, lumped, diagonal):
     """Write blocks of J' W J: of coefficients and more, these with depths, and two diagonals.
 
     Coefficients come as `base` counts them, one after another, each with its powers. Of the depths'
-    block `lumped` is each row's sum, of the map's `diagonal` counts events apart.
+    block `lumped` is each row's sum, of the map's `diagonal` counts events apart. `rows` is room,
+    of one more than the most events of a track.
     """
     n, m = len(upper), 6 * POWERS
-    rows = np.zeros((8, n), weight.dtype)
-    mean = np.zeros(n, weight.dtype)
+    mean = rows[len(rows) - 1]
     upper[:] = 0
     mixed[:] = 0
     lumped[:] = 0
     diagonal[:] = 0
     for track in range(len(begin) - 1):
         start, stop = begin[track], begin[track + 1]
-        if stop - start > len(rows):
-            rows = np.zeros((2 * (stop - start), n), weight.dtype)
         total = 0.0
         mean[:] = 0
         for e in range(start, stop):

@@ -62,24 +62,25 @@ class System(NamedTuple):
     ease_nodes: NDArray  # (rows * columns,)
     mixed: NDArray  # (rows * columns, n)
     inverse: NDArray[np.float64]  # (n, n)
+    coefficients: NDArray  # (6, POWERS), room
+    more: NDArray  # (n - 6 POWERS,), room
+    side: NDArray[np.float64]  # (n,), room
 
 
 @fast
-def multiply(system, map_, t, depth, value, out, out_depth):
-    """H times (map, t, depth): writes that of map and depth, and J's change of misfits, `value`.
-
-    Returns that of t.
-    """
+def multiply(system, map_, t, depth, value, out, out_t, out_depth):
+    """Write H times (map, t, depth), and J's change of misfits, `value`."""
     slopes, real = system.slopes, map_.dtype.type
     n, m = len(t), 6 * POWERS
     width, columns = map_.shape[1], depth.shape[1]
-    coefficients = np.zeros((6, POWERS), map_.dtype)
+    coefficients, more = system.coefficients, system.more
     for k in range(m):
         s = 0.0
         for i in range(m):
             s += system.chain[k, i] * t[i]
         coefficients[k // POWERS, k % POWERS] = s
-    more = t[m:].astype(map_.dtype)
+    for i in range(m, n):
+        more[i - m] = t[i]
     flat, nodes = map_.reshape(-1), depth.reshape(-1)
     forward(slopes, flat, coefficients, more, nodes, width, columns, value)
     subtract_mean(value, system.weight, system.begin)
@@ -88,42 +89,41 @@ def multiply(system, map_, t, depth, value, out, out_depth):
         value[e] *= scale * system.weight[e]
     to_map, to_depth = out.reshape(-1), out_depth.reshape(-1)
     back(slopes, value, width, columns, to_map, coefficients, more, to_depth)
-    found = np.zeros(n)
     for i in range(m):
+        out_t[i] = 0.0
         for k in range(m):
-            found[i] += system.chain[k, i] * coefficients[k // POWERS, k % POWERS]
+            out_t[i] += system.chain[k, i] * coefficients[k // POWERS, k % POWERS]
     for i in range(m, n):
-        found[i] = more[i - m]
+        out_t[i] = more[i - m]
     for i in range(n):
         for k in range(n):
-            found[i] += system.known[i, k] * t[k]
+            out_t[i] += system.known[i, k] * t[k]
     _add_priors(
         map_, depth, real(system.flat), real(system.tiny), system.damp, system.hold,
         system.across, system.down, out, out_depth,
     )  # fmt: skip
-    return found
 
 
-@fast_part
-def ease_rest(system, t, depth, out_depth):
-    """About H^-1 of path and depths, these lumped: writes depths, returns t."""
-    n, nodes, to = len(t), depth.reshape(-1), out_depth.reshape(-1)
-    side = t.copy()
+@fast
+def ease_rest(system, t, depth, out_t, out_depth):
+    """Write about H^-1 of path and depths, these lumped."""
+    n, nodes, to, side = len(t), depth.reshape(-1), out_depth.reshape(-1), system.side
+    for i in range(n):
+        side[i] = t[i]
     for k in range(len(nodes)):
         to[k] = nodes[k] * system.ease_nodes[k]
         row = system.mixed[k]
         for i in range(n):
             side[i] -= to[k] * row[i]
-    found = np.zeros(n)
     for i in range(n):
+        out_t[i] = 0.0
         for k in range(n):
-            found[i] += system.inverse[i, k] * side[k]
+            out_t[i] += system.inverse[i, k] * side[k]
     for k in range(len(nodes)):
         s, row = 0.0, system.mixed[k]
         for i in range(n):
-            s += row[i] * found[i]
+            s += row[i] * out_t[i]
         to[k] -= s * system.ease_nodes[k]
-    return found
 
 
 @fast_part
@@ -134,50 +134,85 @@ def _dot(a, b):
     return s
 
 
-@fast
-def conjugate_gradients(system, side_map, side_t, side_depth, steps, enough):
+class _Parts(NamedTuple):
+    """Vectors of all unknowns: of the map (V, height, width), the path, and depths."""
+
+    map: NDArray
+    t: NDArray[np.float64]
+    depth: NDArray
+
+
+# The vectors that conjugate gradients keep.
+_FOUND, _LEFT, _WAY, _OUT, _BETTER = range(5)
+
+
+def conjugate_gradients(
+    system: System,
+    side_map: NDArray,
+    side_t: NDArray[np.float64],
+    side_depth: NDArray,
+    steps: int,
+    enough: float,
+) -> tuple[NDArray, NDArray[np.float64], NDArray, int]:
     """H^-1 of a side, by so many steps of conjugate gradients from 0.
 
     They end where the size of what is left, as the preconditioner measures it, is `enough` of the
     first. Returns map, t, depths and the number of steps.
     """
-    left, left_t, left_depth = side_map.copy(), side_t.copy(), side_depth.copy()
-    found, found_t, found_depth = left * 0, left_t * 0, left_depth * 0
-    out, out_depth, better = left * 0, left_depth * 0, left_depth * 0
-    value = np.empty(len(system.weight), left.dtype)
-    ease, p, q, r, s = (
-        system.ease_map.reshape(-1), found.reshape(-1), left.reshape(-1), out.reshape(-1), 0.0,
+    sides = side_map, side_t, side_depth
+    parts = _Parts(*(np.zeros((5, *side.shape), side.dtype) for side in sides))
+    for part, side in zip(parts, sides, strict=True):
+        part[_LEFT] = side
+    value = np.empty(len(system.weight), side_map.dtype)
+    done = _conjugate_gradients(system, parts, steps, enough, value)
+    return parts.map[_FOUND], parts.t[_FOUND], parts.depth[_FOUND], done
+
+
+@fast
+def _conjugate_gradients(system, parts, steps, enough, value):
+    way, way_t, way_depth = parts.map[_WAY], parts.t[_WAY], parts.depth[_WAY]
+    out, out_t, out_depth = parts.map[_OUT], parts.t[_OUT], parts.depth[_OUT]
+    found_t, left_t, better_t = parts.t[_FOUND], parts.t[_LEFT], parts.t[_BETTER]
+    left_depth, better = parts.depth[_LEFT], parts.depth[_BETTER]
+    ease, p, q, d, r, s = (
+        system.ease_map.reshape(-1), parts.map[_FOUND].reshape(-1), parts.map[_LEFT].reshape(-1),
+        way.reshape(-1), out.reshape(-1), 0.0,
     )  # fmt: skip
-    way = left * system.ease_map
-    d = way.reshape(-1)
-    way_t = ease_rest(system, left_t, left_depth, better)
-    way_depth = better.copy()
-    size = _dot(q, d) + _dot(left_t, way_t) + _dot(left_depth.reshape(-1), way_depth.reshape(-1))
+    a, b, c, g, h = (
+        parts.depth[_FOUND].reshape(-1), left_depth.reshape(-1), way_depth.reshape(-1),
+        out_depth.reshape(-1), better.reshape(-1),
+    )  # fmt: skip
+    for i in range(len(p)):
+        d[i] = q[i] * ease[i]
+    ease_rest(system, left_t, left_depth, way_t, way_depth)
+    size = _dot(q, d) + _dot(left_t, way_t) + _dot(b, c)
     first, done = size, 0
     while done < steps and size > enough * enough * first:
         done += 1
-        out_t = multiply(system, way, way_t, way_depth, value, out, out_depth)
-        s = _dot(d, r) + _dot(way_t, out_t) + _dot(way_depth.reshape(-1), out_depth.reshape(-1))
+        multiply(system, way, way_t, way_depth, value, out, out_t, out_depth)
+        s = _dot(d, r) + _dot(way_t, out_t) + _dot(c, g)
         length = size / max(s, 1e-30)
-        step = left.dtype.type(length)
+        step = out.dtype.type(length)
         new = 0.0
         for i in range(len(p)):
             p[i] += step * d[i]
             q[i] -= step * r[i]
             new += q[i] * q[i] * ease[i]
-        found_t += length * way_t
-        left_t -= length * out_t
-        found_depth += step * way_depth
-        left_depth -= step * out_depth
-        better_t = ease_rest(system, left_t, left_depth, better)
-        new += _dot(left_t, better_t) + _dot(left_depth.reshape(-1), better.reshape(-1))
+        for i in range(len(way_t)):
+            found_t[i] += length * way_t[i]
+            left_t[i] -= length * out_t[i]
+        for i in range(len(a)):
+            a[i] += step * c[i]
+            b[i] -= step * g[i]
+        ease_rest(system, left_t, left_depth, better_t, better)
+        new += _dot(left_t, better_t) + _dot(b, h)
         share = new / max(size, 1e-30)
-        more = left.dtype.type(share)
+        more = out.dtype.type(share)
         for i in range(len(p)):
             d[i] = ease[i] * q[i] + more * d[i]
-        way_t = better_t + share * way_t
-        for j in range(better.shape[0]):
-            for i in range(better.shape[1]):
-                way_depth[j, i] = better[j, i] + more * way_depth[j, i]
+        for i in range(len(way_t)):
+            way_t[i] = better_t[i] + share * way_t[i]
+        for i in range(len(a)):
+            c[i] = h[i] + more * c[i]
         size = new
-    return found, found_t, found_depth, done
+    return done

@@ -46,12 +46,13 @@ def _sharpest(
     """Values of generators of the highest contrast, from some on, and minus that contrast."""
     per_px, real, least = 1 / (window.f * window.half), window.x.dtype, 0.0
     image, work = np.empty(window.shape, real), np.empty(window.shape, real)
+    terms = np.empty((2, 3, 9))
 
     def loss(values: NDArray, times: int) -> tuple[float, NDArray]:
         M, slope = np.tensordot(values, basis, 1), np.empty(len(basis))
         told = images.contrast_and_slope(
             window.x, window.y, window.tau, window.p, M, basis, window.corner, window.f, times,
-            image, work, slope,
+            image, work, terms, slope,
         )  # fmt: skip
         return told, slope
 
@@ -129,8 +130,9 @@ def _flow_maps(window: Window, Omega: NDArray, flows: NDArray) -> tuple[NDArray,
     rows, columns = (max((n // 8 - 3) // 2 + 1, 0) for n in window.shape)
     S, N = np.empty((len(flows), rows, columns)), np.empty((len(flows), rows, columns))
     both, work = np.empty((2, *window.shape), real), np.empty(window.shape, real)
+    squares = np.empty((2, window.shape[0] // 8, window.shape[1] // 8))
     images.flow_maps(
-        X, Y, window.tau, window.p, flows.astype(real), window.corner, both, work, S, N
+        X, Y, window.tau, window.p, flows.astype(real), window.corner, both, work, squares, S, N
     )
     return S, N
 

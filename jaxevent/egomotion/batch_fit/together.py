@@ -80,14 +80,14 @@ def solve(system: System, sides: NDArray[np.float64]) -> Columns:
 
     def times(given: Columns, out: Columns) -> None:
         for k in range(number):
-            (image, depth), to = halves(given.rest[k]), halves(out.rest[k])
-            out.t[k] = multiply(system, image, given.t[k], depth, value, *to)
+            (image, depth), (to_image, to_depth) = halves(given.rest[k]), halves(out.rest[k])
+            multiply(system, image, given.t[k], depth, value, to_image, out.t[k], to_depth)
 
     def ease(given: Columns, out: Columns) -> None:
         for k in range(number):
             (image, depth), (to_image, to_depth) = halves(given.rest[k]), halves(out.rest[k])
             np.multiply(image, system.ease_map, out=to_image)
-            out.t[k] = ease_rest(system, given.t[k], depth, to_depth)
+            ease_rest(system, given.t[k], depth, out.t[k], to_depth)
 
     found, left, better, image = (blank() for _ in range(4))
     left.t[:] = sides

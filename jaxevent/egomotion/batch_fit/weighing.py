@@ -4,7 +4,10 @@ Events are in the order of their tracks: of the k-th they are those from `begin[
 of `begin` is the number of all. The map is a quadratic B-spline of 1 px.
 """
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from jaxevent.kernels import fast, fast_part
 
@@ -42,11 +45,14 @@ def spline_slope(m, t):
     return -2 * t if m == 1 else (m - 1) * 0.5 + t
 
 
-@fast
-def around(image, sums):
-    """Write sums over squares of 5 px about each pixel of a map (height, width)."""
+@fast_part
+def _around(image, rows, sums):
+    """Write sums over squares of 5 px about each pixel of a map (height, width).
+
+    `rows` (height, width + 4) is room.
+    """
     height, width = image.shape
-    rows = np.zeros((height, width + 4), image.dtype)
+    rows[:] = 0
     for j in range(height):
         for k in range(max(j - 2, 0), min(j + 3, height)):
             for i in range(width):
@@ -70,32 +76,49 @@ def subtract_mean(values, weight, begin):
             values[e] -= mean
 
 
+class Room(NamedTuple):
+    """Room for `weigh`: of the map's shape, and of the rows'."""
+
+    image: NDArray
+    rows: NDArray  # four columns wider
+    sums: NDArray
+    number: NDArray
+    left: NDArray
+    cost: NDArray
+
+    @classmethod
+    def of(cls, height: int, width: int, e: NDArray) -> "Room":
+        image, sums, number = np.empty((3, height, width), e.dtype)
+        rows = np.empty((height, width + 4), e.dtype)
+        return cls(image, rows, sums, number, np.empty_like(e), np.empty_like(e))
+
+
 @fast
-def weigh(e, on, trust, till, first, begin, limit, usual, plane, grids, weight):
+def weigh(e, on, trust, till, first, begin, limit, usual, plane, room, weight):
     """Write rows' weights, from those before; returns the places' cost and that of the events.
 
     Misfits count times `trust`; rows from `till` on are pixels of frames.
     Events at a place of mean cost q cost 4 q / (1 + q / usual), of slope 1 at the usual q. A plane
     hides nothing of itself.
     """
-    image = np.zeros((grids.height, grids.width), e.dtype)
-    sums, number = np.empty_like(image), np.empty_like(image)
-    flat, middle = image.reshape(-1), grids.width + 1
-    left, cost = np.empty_like(e), np.empty_like(e)
+    image, rows, sums, number, left, cost = room
+    flat, middle = image.reshape(-1), image.shape[1] + 1
+    flat[:] = 0
     for k in range(len(e)):
         flat[first[k] + middle] += on[k]
-    around(image, number)
+    _around(image, rows, number)
     events, around_it = number.reshape(-1), sums.reshape(-1)
-    of_places = 0.0
+    of_places, of_events = 0.0, e.dtype.type(0)
     for _ in range(2):
-        left[:] = e
+        for k in range(len(e)):
+            left[k] = e[k]
         subtract_mean(left, weight, begin)
         flat[:] = 0
         for k in range(len(e)):
             square = (trust[k] * left[k]) ** 2
             cost[k] = on[k] * square / (1 + square / limit)
             flat[first[k] + middle] += cost[k]
-        around(image, sums)
+        _around(image, rows, sums)
         flat[:] = 0
         of_places = 0.0
         for k in range(len(e)):
@@ -105,9 +128,11 @@ def weigh(e, on, trust, till, first, begin, limit, usual, plane, grids, weight):
             slope = 1.0 if plane else 4 / (1 + q / usual) ** 2
             of_places += on[k] * (q if plane else 4 * q / (1 + q / usual))
             flat[at] += on[k] * slope / n
-        around(image, sums)
+        _around(image, rows, sums)
         for k in range(len(e)):
             t = trust[k] ** 2
             w = on[k] * t / (1 + t * left[k] ** 2 / limit) ** 2
             weight[k] = w * around_it[first[k] + middle]
-    return of_places, cost[:till].sum()
+    for k in range(till):
+        of_events += cost[k]
+    return of_places, of_events

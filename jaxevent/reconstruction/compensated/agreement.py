@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled, over_rows, part
+from jaxevent.kernels import lean, lean_part, over_rows
 from jaxevent.reconstruction.compensated.instants import Instants
 from jaxevent.reconstruction.compensated.parameters import Params
 from jaxevent.reconstruction.compensated.warping import Along
@@ -195,7 +195,7 @@ class _Settings(NamedTuple):
     high: Any
 
 
-@part
+@lean_part
 def _across(row, taps, padded, out):
     """`row` blurred along x; the image's border goes on."""
     w, reach = len(row), len(taps) // 2
@@ -211,7 +211,7 @@ def _across(row, taps, padded, out):
             out[x] += tap * padded[i + x]
 
 
-@part
+@lean_part
 def _down(image, y, taps, out):
     """The row y of an image that is blurred along y."""
     h, w = image.shape
@@ -223,7 +223,7 @@ def _down(image, y, taps, out):
             out[x] += tap * row[x]
 
 
-@part
+@lean_part
 def _steep(image, y, out):
     """|grad|^2 in the row y."""
     h, w = image.shape
@@ -238,7 +238,7 @@ def _steep(image, y, out):
         out[x] = gx * gx + gy * gy
 
 
-@part
+@lean_part
 def _variance(V, inside, steep, settings, here, out):
     for x in range(len(V)):
         added = settings.place * steep[x] + settings.between
@@ -246,7 +246,7 @@ def _variance(V, inside, steep, settings, here, out):
         out[x] = base if here else base + added
 
 
-@part
+@lean_part
 def _add(L, clear, variance, seen, settings, total, mean):
     one = np.float32(1)
     for x in range(len(L)):
@@ -256,7 +256,7 @@ def _add(L, clear, variance, seen, settings, total, mean):
         mean[x] += R * L[x]
 
 
-@part
+@lean_part
 def _see(misfit, tolerance, most, seen):
     one = np.float32(1)
     for x in range(len(misfit)):
@@ -264,39 +264,52 @@ def _see(misfit, tolerance, most, seen):
         seen[x] = one / (one + ratio * ratio)
 
 
-@part
+@lean_part
 def _differ(L, M, variance, out):
     for x in range(len(L)):
         out[x] = (L[x] - M[x]) * (L[x] - M[x]) / variance[x]
 
 
-@part
+@lean_part
+def _copy(a, out):
+    for x in range(len(a)):
+        out[x] = a[x]
+
+
+@lean_part
+def _multiply(a, b, out):
+    for x in range(len(a)):
+        out[x] = a[x] * b[x]
+
+
+@lean_part
 def _divide(a, b, out):
     for x in range(len(a)):
         out[x] = a[x] / b[x]
 
 
-@compiled
-def _blur_across(begin, end, image, taps, out):
-    padded = np.empty(image.shape[1] + len(taps), np.float32)
+@lean
+def _blur_across(begin, end, image, taps, room, out):
+    padded = room[begin]
     for y in range(begin, end):
         _across(image[y], taps, padded, out[y])
 
 
-@compiled
+@lean
 def _blur_down(begin, end, image, taps, out):
     for y in range(begin, end):
         _down(image, y, taps, out[y])
 
 
-@compiled
-def _find_mean(begin, end, along, near, misfits, M, steep, settings, own, turn, taps, out):
+@lean
+def _find_mean(begin, end, along, near, misfits, M, steep, settings, own, turn, taps, room, out):
     """The mean over instants of some rows; `misfits` are blurred across."""
-    count, _, w = along.L.shape
-    variance, misfit, seen, total, mean, slope = np.empty((6, w), np.float32)
+    count, own_room = along.L.shape[0], room[begin]
+    variance, misfit, seen = own_room[0], own_room[1], own_room[2]
+    total, mean, slope = own_room[3], own_room[4], own_room[5]
     for y in range(begin, end):
         _steep(M, y, slope)
-        steep[y] = slope
+        _copy(slope, steep[y])
         total[:] = np.float32(0)
         mean[:] = np.float32(0)
         for k in range(count):
@@ -311,21 +324,20 @@ def _find_mean(begin, end, along, near, misfits, M, steep, settings, own, turn, 
         _divide(mean, total, out[y])
 
 
-@compiled
-def _find_misfits(begin, end, along, M, steep, settings, own, taps, misfits):
+@lean
+def _find_misfits(begin, end, along, M, steep, settings, own, taps, room, padded, misfits):
     """Squared differences from M in parts of their variances, blurred across."""
-    count, _, w = along.L.shape
-    variance, ratio = np.empty((2, w), np.float32)
-    padded = np.empty(w + len(taps), np.float32)
+    count = len(along.L)
+    variance, ratio = room[begin, 0], room[begin, 1]
     for y in range(begin, end):
         for k in range(count):
             here = k == own
             _variance(along.V[k, y], along.inside[k, y], steep[y], settings, here, variance)
             _differ(along.L[k, y], M[y], variance, ratio)
-            _across(ratio, taps, padded, misfits[k, y])
+            _across(ratio, taps, padded[begin], misfits[k, y])
 
 
-@part
+@lean_part
 def _gather(along, y, k, seen, variance, settings, place, out):
     """Add an instant to what the means are made of."""
     one, zero = np.float32(1), np.float32(0)
@@ -353,7 +365,7 @@ def _gather(along, y, k, seen, variance, settings, place, out):
         usual[x] += R * (one - clear[x]) * V[x]
 
 
-@part
+@lean_part
 def _exceed(L, clear, M, misfit, variance, settings, excess, weight):
     one, plainly, expected = np.float32(1), np.float32(PLAIN), np.float32(0.6)
     for x in range(len(L)):
@@ -365,18 +377,18 @@ def _exceed(L, clear, M, misfit, variance, settings, excess, weight):
         weight[x] += plain * eta
 
 
-@part
+@lean_part
 def _change(early, late, out):
     for x in range(len(out)):
         out[x] += (late[x] - early[x]) * (late[x] - early[x])
 
 
-@compiled
-def _finish(begin, end, L, along, misfits, steep, settings, place, taps, out, excess, weight):
+@lean
+def _finish(begin, end, L, along, misfits, steep, settings, place, taps, room, out, excess, weight):
     """What is told of some rows; scatter is yet to be gathered."""
     count, _, w = along.L.shape
-    misfit, variance = np.empty((2, count, w), np.float32)
-    seen, sums = np.empty(w, np.float32), np.empty((9, w), np.float32)
+    seen, sums = room[begin, 0], room[begin, 1:10]
+    misfit, variance = room[begin, 10 : 10 + count], room[begin, 10 + count :]
     own, a, b = place.own, place.before, place.after
     for y in range(begin, end):
         sums[:] = np.float32(0)
@@ -388,17 +400,17 @@ def _finish(begin, end, L, along, misfits, steep, settings, place, taps, out, ex
             _variance(along.V[k, y], along.inside[k, y], steep[y], settings, here, variance[k])
             _gather(along, y, k, seen, variance[k], settings, place, sums)
             if k == a:
-                out.seen[0, y] = seen * along.inside[k, y]
+                _multiply(seen, along.inside[k, y], out.seen[0, y])
             if k == b:
-                out.seen[1, y] = seen * along.inside[k, y]
+                _multiply(seen, along.inside[k, y], out.seen[1, y])
             if settings.low < k and k + 1 < settings.high:
                 _change(L[k, y], L[k + 1, y], out.activity[y])
-        out.total[y] = sums[0]
+        _copy(sums[0], out.total[y])
         _divide(sums[1], sums[0], out.M[y])
-        out.near_information[y] = sums[2]
+        _copy(sums[2], out.near_information[y])
         for x in range(w):
             out.near[y, x] = sums[3, x] / max(sums[2, x], np.float32(1e-9))
-        out.frame_information[y] = sums[4]
+        _copy(sums[4], out.frame_information[y])
         _divide(sums[8], sums[0], out.usual[y])
         for part_of in range(3):
             _divide(sums[5 + part_of], sums[0], out.parts[part_of, y])
@@ -411,7 +423,8 @@ def blurred(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
     """`blur` of an image (h, w), in loops."""
     taps = taps_of(sigma)
     across, out = np.empty_like(image), np.empty_like(image)
-    over_rows(_blur_across, len(image), image, taps, across)
+    room = np.empty((len(image), image.shape[1] + len(taps)), np.float32)
+    over_rows(_blur_across, len(image), image, taps, room, across)
     over_rows(_blur_down, len(image), across, taps, out)
     return out
 
@@ -428,10 +441,14 @@ def agree(params: Params, L: NDArray, along: Along, place: Place) -> Agreement:
     misfits = np.empty((count, h, w), np.float32)
     steep, M = np.empty((2, h, w), np.float32)
     seen_from = blurred(np.ascontiguousarray(L[own]), 1.0)
+    # Room for whoever works on some of the rows is that of the first of them.
+    room = np.empty((h, 10 + 2 * count, w), np.float32)
+    padded = np.empty((h, w + len(taps)), np.float32)
     for turn in range(3):
-        given = (along, weights, misfits, seen_from, steep, settings, own, turn, taps, M)
-        over_rows(_find_mean, h, *given)
-        over_rows(_find_misfits, h, along, M, steep, settings, own, taps, misfits)
+        given = (along, weights, misfits, seen_from, steep, settings, own, turn, taps)
+        over_rows(_find_mean, h, *given, room, M)
+        given = (along, M, steep, settings, own, taps, room, padded)
+        over_rows(_find_misfits, h, *given, misfits)
         seen_from = M.copy()
     images = np.empty((8, h, w), np.float32)
     M, total, scatter, near, near_information, frame_information, activity, usual = images
@@ -439,6 +456,7 @@ def agree(params: Params, L: NDArray, along: Along, place: Place) -> Agreement:
     told = (M, total, scatter, near, near_information, frame_information, activity)
     out = Agreement(*told, parts, seen, usual)
     excess, weight = np.empty((2, h, w), np.float32)
-    over_rows(_finish, h, L, along, misfits, steep, settings, place, taps, out, excess, weight)
+    given = (L, along, misfits, steep, settings, place, taps, room)
+    over_rows(_finish, h, *given, out, excess, weight)
     scatter = np.maximum(blurred(excess, SCATTER) / blurred(weight, SCATTER), 0)
     return out._replace(scatter=scatter)

@@ -49,10 +49,10 @@ def _cost(images, s, near, y, x, path, floor, nu, level, W, R):
 
 
 @fast
-def _try(begin, end, images, s, near, step, paths, offsets, floor, nu, out):
+def _try(begin, end, images, s, near, step, paths, offsets, floor, nu, room, out):
     """Costs (1 + n, h, w) of every `step`-th pixel along both axes: of its path and others'."""
     h, w, _ = paths.shape
-    level, W, R = np.empty((3, len(s)), np.float32)
+    level, W, R = room[begin, 0], room[begin, 1], room[begin, 2]
     for y in range(begin, end):
         for x in range(w):
             at, own = (y * step, x * step), paths[y, x]
@@ -96,7 +96,8 @@ def choose(
         rows, columns, _ = some.shape
         costs = np.empty((1 + len(DIRECTIONS), rows, columns), np.float32)
         given = (images, s, near, step, some, DIRECTIONS * far, np.float32(floor), np.float32(nu))
-        over_rows(_try, rows, *given, costs)
+        room = np.empty((rows, 3, len(s)), np.float32)  # of each first row of a part
+        over_rows(_try, rows, *given, room, costs)
         best = np.stack([blurred(one, sigma) for one in costs]).argmin(0)
         moves = step * far * np.concatenate([[(0, 0)], DIRECTIONS])[best]
         dy, dx = moves[row // step, column // step].transpose(2, 0, 1)

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled, over_rows
+from jaxevent.kernels import lean, over_rows
 from jaxevent.reconstruction.augment import clipped_side, clipping_bound, unclipped
 from jaxevent.reconstruction.compensated.agreement import MISFIT, blur, steepness
 from jaxevent.reconstruction.compensated.fusion import Fused
@@ -101,7 +101,7 @@ def returned(error: Array, shares: Array, D: Array) -> Array:
     return sample(parts, Y, X).sum(0)
 
 
-@compiled
+@lean
 def _smear(begin, end, L, D, B, shares):
     n, count, h, w, _ = D.shape
     one = np.float32(1)
@@ -121,7 +121,7 @@ def _smear(begin, end, L, D, B, shares):
                 B[k, y, x] = np.log(total / np.float32(count))
 
 
-@compiled
+@lean
 def _return(begin, end, error, shares, D, out):
     n, count, h, w, _ = D.shape
     one = np.float32(1)

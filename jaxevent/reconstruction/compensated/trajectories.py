@@ -16,11 +16,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled, over_rows, part
+from jaxevent.kernels import lean, lean_part, over_rows
+from jaxevent.reconstruction.compensated.solving import solve
 
 CHANNELS = 4  # of packed images: log intensity, its variance, its gradient along x and y
 OUTSIDE = np.float32(1e-6)  # weight of what lies outside the image
 FARTHEST = np.float32(1.5)  # px, at the horizon: the longest step
+_TAPS = np.array([1, 4, 6, 4, 1], np.float32) / np.float32(16)
 
 
 class Smoothness(NamedTuple):
@@ -39,7 +41,7 @@ def pack(L: NDArray, V: NDArray) -> NDArray[np.float32]:
     return out
 
 
-@compiled
+@lean_part
 def _gradient(image, y, x):
     """Along x and y; five taps: exact for polynomials of degree 4."""
     h, w = image.shape
@@ -51,7 +53,7 @@ def _gradient(image, y, x):
     return gx * twelfth, gy * twelfth
 
 
-@compiled
+@lean
 def _pack(begin, end, L, V, out):
     count, h, w = L.shape
     for k in range(count):
@@ -62,23 +64,27 @@ def _pack(begin, end, L, V, out):
                 out[k, y, x, 2], out[k, y, x, 3] = _gradient(L[k], y, x)
 
 
-@compiled
-def _halve(begin, end, images, out):
-    """Blur by (1, 4, 6, 4, 1) / 16 along both axes and keep every second: half the size."""
+def _room(rows: int, count: int) -> NDArray[np.float32]:
+    """Room for `count` numbers of whoever works on some of these rows: that of its first row."""
+    return np.empty((rows, count), np.float32)
+
+
+@lean
+def _halve(begin, end, images, room, out):
+    """Blur by `_TAPS` along both axes and keep every second: half the size."""
     count, h, w = images.shape
-    taps = np.array([1, 4, 6, 4, 1], np.float32) / np.float32(16)
-    column = np.empty(w, np.float32)
+    column = room[begin]
     for k in range(count):
         for y in range(begin, end):
             for x in range(w):
                 total = np.float32(0)
                 for i in range(5):
-                    total += taps[i] * images[k, min(max(2 * y + i - 2, 0), h - 1), x]
+                    total += _TAPS[i] * images[k, min(max(2 * y + i - 2, 0), h - 1), x]
                 column[x] = total
             for x in range(out.shape[2]):
                 total = np.float32(0)
                 for j in range(5):
-                    total += taps[j] * column[min(max(2 * x + j - 2, 0), w - 1)]
+                    total += _TAPS[j] * column[min(max(2 * x + j - 2, 0), w - 1)]
                 out[k, y, x] = total
 
 
@@ -86,11 +92,11 @@ def halve(images: NDArray[np.float32]) -> NDArray[np.float32]:
     """Images (K, h, w) at half the resolution, rounded up."""
     count, h, w = images.shape
     out = np.empty((count, (h + 1) // 2, (w + 1) // 2), np.float32)
-    over_rows(_halve, out.shape[1], images, out)
+    over_rows(_halve, out.shape[1], images, _room(out.shape[1], w), out)
     return out
 
 
-@compiled
+@lean_part
 def between(values, y, x, out):
     """Values (rows, columns, 4) of nodes at the pixel y, x, bilinear."""
     rows, columns, _ = values.shape
@@ -110,7 +116,7 @@ def between(values, y, x, out):
         out[c] = top + fy * (bottom - top)
 
 
-@compiled
+@lean_part
 def around(X, Y, h, w):
     """Whether a point lies in an image, the pixels around it (or its border) and its place there.
 
@@ -125,7 +131,7 @@ def around(X, Y, h, w):
     return inside, x0, y0, x1, y1, X - np.float32(x0), Y - np.float32(y0)
 
 
-@part
+@lean_part
 def robust_mean(values, W, near, nu, R):
     """The mean of values with information W, and their weights R in it.
 
@@ -148,13 +154,12 @@ def robust_mean(values, W, near, nu, R):
     return m
 
 
-@compiled
-def _fetch(begin, end, images, s, near, p, floor, nu, points, M):
+@lean
+def _fetch(begin, end, images, s, near, p, floor, nu, room, points, M):
     """Images along trajectories of some rows, (h, w, K, 4): L, weight R, gradient; their mean."""
     count, h, w, _ = images.shape
     one = np.float32(1)
-    at = np.empty(4, np.float32)
-    W = np.empty(count, np.float32)
+    at, W = room[begin, :4], room[begin, 4:]
     for y in range(begin, end):
         for x in range(w):
             between(p, y, x, at)
@@ -176,7 +181,7 @@ def _fetch(begin, end, images, s, near, p, floor, nu, points, M):
             M[y, x] = robust_mean(points[y, x, :, 0], W, near, nu, points[y, x, :, 1])
 
 
-@compiled
+@lean
 def _linearise(begin, end, points, s, M, N, b, edge):
     """Normal equations of the nodes of some rows: N (10 entries), b (4); and |grad M|.
 
@@ -238,11 +243,16 @@ def _linearise(begin, end, points, s, M, N, b, edge):
             edge[i, j] = slope * share
 
 
-@compiled
-def _soften(values, out):
-    """Blur nodes (rows, columns, channels) by (1, 6, 1) / 8: a Gaussian of 1 px."""
+def soften(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Nodes (rows, columns, channels) blurred by (1, 6, 1) / 8: by a Gaussian of 1 px."""
+    out = np.empty_like(values)
+    _soften(values, np.empty_like(values[0]), out)
+    return out
+
+
+@lean
+def _soften(values, row, out):
     rows, columns, channels = values.shape
-    row = np.empty((columns, channels), np.float32)
     for i in range(rows):
         up, down = max(i - 1, 0), min(i + 1, rows - 1)
         for j in range(columns):
@@ -258,7 +268,7 @@ def _soften(values, out):
                 ) / np.float32(8)
 
 
-@compiled
+@lean
 def _weigh_differences(p, edge, reach, smoothness, across, down):
     """Weights of the differences between neighbouring nodes; `reach` is the horizon."""
     rows, columns, _ = p.shape
@@ -279,182 +289,19 @@ def _weigh_differences(p, edge, reach, smoothness, across, down):
                     down[i, j] = weight
 
 
-@part
-def _add_product(a, b, out):
-    for x in range(len(out)):
-        out[x] += a[x] * b[x]
+@lean
+def _move(p, d, reach, moved, window, out):
+    """p + d, no longer than `FARTHEST` at the horizon, then the median of 3 x 3 nodes.
 
-
-@part
-def _add_difference(weight, a, b, out):
-    for x in range(len(out)):
-        out[x] += weight[x] * (a[x] - b[x])
-
-
-@part
-def _scale_and_add(factor, a, out):
-    """out = factor out + a."""
-    for x in range(len(out)):
-        out[x] = factor * out[x] + a[x]
-
-
-@part
-def _add_scaled(factor, a, out):
-    for x in range(len(out)):
-        out[x] += factor * a[x]
-
-
-@part
-def _times(N, i, q, out):
-    """Symmetric 4 x 4 matrices of a row of nodes, times vectors (4, columns)."""
-    for c in range(4):
-        out[c] = np.float32(0)
-        for e in range(4):
-            low, high = min(c, e), max(c, e)
-            _add_product(N[low * (7 - low) // 2 + high, i], q[e], out[c])
-
-
-@part
-def _rough(q, across, down, i, out):
-    """The weighted graph Laplacian (columns,) of a channel in a row; all are padded by a node."""
-    width = len(out)
-    here, left, right = q[i + 1, 1:-1], q[i + 1, :width], q[i + 1, 2:]
-    out[:] = np.float32(0)
-    _add_difference(across[i, :width], here, left, out)
-    _add_difference(across[i, 1:], here, right, out)
-    _add_difference(down[i], here, q[i, 1:-1], out)
-    _add_difference(down[i + 1], here, q[i + 2, 1:-1], out)
-
-
-@compiled
-def _invert(N, added, out):
-    """The inverse (10 entries) of a symmetric 4 x 4 matrix with `added` on its diagonal."""
-    # Cholesky, in double precision: nodes without texture are nearly singular.
-    A = np.empty((4, 4))
-    at = 0
-    for i in range(4):
-        for j in range(i, 4):
-            A[i, j] = N[at]
-            A[j, i] = N[at]
-            at += 1
-        A[i, i] += added[i]
-    C = np.zeros((4, 4))
-    for i in range(4):
-        for j in range(i + 1):
-            total = A[i, j]
-            for k in range(j):
-                total -= C[i, k] * C[j, k]
-            C[i, j] = np.sqrt(max(total, 1e-12)) if i == j else total / C[j, j]
-    inverse = np.zeros((4, 4))  # of C
-    for j in range(4):
-        for i in range(j, 4):
-            total = 1.0 if i == j else 0.0
-            for k in range(j, i):
-                total -= C[i, k] * inverse[k, j]
-            inverse[i, j] = total / C[i, i]
-    at = 0
-    for i in range(4):
-        for j in range(i, 4):
-            total = 0.0
-            for k in range(j, 4):
-                total += inverse[k, i] * inverse[k, j]
-            out[at] = total
-            at += 1
-
-
-@compiled
-def _solve(N, b, p, across, down, smooth, ridge, iterations, d):
-    """(N + smooth Laplacian + ridge) d = b - smooth Laplacian p - ridge p, by conjugate gradients.
-
-    The preconditioner are the nodes' own 4 x 4 blocks. Here channels come first, rows of nodes are
-    what loops go over at once.
+    `moved`, like `p`, and `window` [9] are room.
     """
-    rows, columns, _ = p.shape
-    A, P = np.empty((2, 10, rows, columns), np.float32)
-    beside, below = (
-        np.zeros((rows, columns + 1), np.float32),
-        np.zeros((rows + 1, columns), np.float32),
-    )
-    q = np.zeros((4, rows + 2, columns + 2), np.float32)
-    r, found = np.zeros((2, rows, 4, columns), np.float32)
-    Aq, z = np.empty((2, rows, 4, columns), np.float32)
-    rough, sums = np.empty((2, columns), np.float32)
-    added, block = np.empty(4, np.float32), np.empty(10, np.float32)
-    for i in range(rows):
-        for j in range(columns):
-            beside[i, j + 1] = across[i, j] if j < columns - 1 else np.float32(0)
-            below[i + 1, j] = down[i, j] if i < rows - 1 else np.float32(0)
-            for c in range(4):
-                q[c, i + 1, j + 1] = p[i, j, c]
-    for i in range(rows):
-        for c in range(4):
-            _rough(q[c], beside, below, i, rough)
-            for j in range(columns):
-                pull = smooth[c] * rough[j] + ridge[c] * p[i, j, c]
-                r[i, c, j] = b[i, j, c] - pull
-        for j in range(columns):
-            degree = beside[i, j] + beside[i, j + 1] + below[i, j] + below[i + 1, j]
-            for c in range(4):
-                added[c] = smooth[c] * degree + ridge[c] + np.float32(1e-6)
-            _invert(N[i, j], added, block)
-            for c in range(10):
-                P[c, i, j] = block[c]
-                A[c, i, j] = N[i, j, c]
-    rz = 0.0
-    for turn in range(iterations + 1):
-        sums[:] = np.float32(0)
-        for i in range(rows):
-            _times(P, i, r[i], z[i])
-            for c in range(4):
-                _add_product(r[i, c], z[i, c], sums)
-        following = 0.0
-        for j in range(columns):
-            following += sums[j]
-        share = np.float32(following / (rz + 1e-20)) if turn else np.float32(0)
-        rz = following
-        if turn == iterations:
-            break
-        for i in range(rows):
-            for c in range(4):
-                if turn == 0:
-                    for j in range(columns):  # a slice would take longer to compile
-                        q[c, i + 1, j + 1] = z[i, c, j]
-                else:
-                    _scale_and_add(share, z[i, c], q[c, i + 1, 1:-1])
-        sums[:] = np.float32(0)
-        for i in range(rows):
-            _times(A, i, q[:, i + 1, 1:-1], Aq[i])
-            for c in range(4):
-                _rough(q[c], beside, below, i, rough)
-                _add_scaled(smooth[c], rough, Aq[i, c])
-                _add_scaled(ridge[c], q[c, i + 1, 1:-1], Aq[i, c])
-                _add_product(q[c, i + 1, 1:-1], Aq[i, c], sums)
-        curvature = 0.0
-        for j in range(columns):
-            curvature += sums[j]
-        step = np.float32(rz / (curvature + 1e-20))
-        for i in range(rows):
-            for c in range(4):
-                _add_scaled(step, q[c, i + 1, 1:-1], found[i, c])
-                _add_scaled(-step, Aq[i, c], r[i, c])
-    for i in range(rows):
-        for c in range(4):
-            for j in range(columns):
-                d[i, j, c] = found[i, c, j]
-
-
-@compiled
-def _move(p, d, reach, out):
-    """p + d, no longer than `FARTHEST` at the horizon, then the median of 3 x 3 nodes."""
     rows, columns, channels = p.shape
-    moved = np.empty_like(p)
     for i in range(rows):
         for j in range(columns):
             for c in range(channels):
                 scale = reach if c < 2 else reach * reach * np.float32(0.25)
                 far = min(max(d[i, j, c] * scale, -FARTHEST), FARTHEST)
                 moved[i, j, c] = p[i, j, c] + far / scale
-    window = np.empty(9, np.float32)
     for i in range(rows):
         for j in range(columns):
             for c in range(channels):
@@ -486,25 +333,22 @@ def step(
     near = np.exp(-2 * (s / reach) ** 2).astype(np.float32)
     N, b = np.empty((*shape, 10), np.float32), np.empty((*shape, 4), np.float32)
     edge = np.empty(shape, np.float32)
-    points, M = _fetched(images, s, near, p, floor, nu)
+    points, M = fetch(images, s, near, p, floor, nu)
     over_rows(_linearise, shape[0], points, s, M, N, b, edge)
-    blurred_N, blurred_b = np.empty_like(N), np.empty_like(b)
-    _soften(N, blurred_N)
-    _soften(b, blurred_b)
-    across, down = np.zeros((2, *shape), np.float32)
+    across, down = (np.zeros(shape, np.float32) for _ in range(2))
     _weigh_differences(p, edge, reach, smoothness, across, down)
     reach2 = reach * reach
     smooth = np.float32(smoothness.weight) * reach2 * np.array([1, 1, reach2, reach2], np.float32)
     bend = np.float32(smoothness.straight) * reach2 * reach2
     tiny = np.float32(1e-5) * smooth[0]
     ridge = np.array([tiny, tiny, bend, bend], np.float32)
-    d, out = np.empty_like(p), np.empty_like(p)
-    _solve(blurred_N, blurred_b, p, across, down, smooth, ridge, iterations, d)
-    _move(p, d, reach, out)
+    d = solve(soften(N), soften(b), p, across, down, smooth, ridge, iterations)
+    out = np.empty_like(p)
+    _move(p, d, reach, np.empty_like(p), np.empty(9, np.float32), out)
     return out
 
 
-def _fetched(
+def fetch(
     images: NDArray[np.float32],
     s: NDArray[np.float32],
     near: NDArray[np.float32],
@@ -515,7 +359,8 @@ def _fetched(
     """What `_fetch` writes: of every pixel its instants' points, and their mean."""
     count, h, w, _ = images.shape
     points, M = np.empty((h, w, count, 4), np.float32), np.empty((h, w), np.float32)
-    over_rows(_fetch, h, images, s, near, p, np.float32(floor), np.float32(nu), points, M)
+    room = _room(h, 4 + count)
+    over_rows(_fetch, h, images, s, near, p, np.float32(floor), np.float32(nu), room, points, M)
     return points, M
 
 
@@ -527,7 +372,7 @@ def misfit(
     nu: float,
 ) -> float:
     """How badly packed images (K, h, w, 4) agree along trajectories: robust squares, a mean."""
-    points, M = _fetched(images, s, np.exp(-2 * s**2).astype(np.float32), p, floor, nu)
+    points, M = fetch(images, s, np.exp(-2 * s**2).astype(np.float32), p, floor, nu)
     return float(((points[..., 0] - M[..., None]) ** 2 * points[..., 1]).mean())
 
 
@@ -545,7 +390,7 @@ def by_clock(
     return np.einsum("ab,ijbc->ijac", change, paths).reshape(p.shape).astype(np.float32)
 
 
-@compiled
+@lean
 def _resize(p, out, scale):
     """Nodes at another resolution, bilinear, displacements times `scale`."""
     rows, columns, channels = p.shape
@@ -654,7 +499,7 @@ def follow(
     return motion
 
 
-@compiled
+@lean
 def _advect(begin, end, p, s, out):
     rows, columns, _ = p.shape
     half = np.float32(0.5)  # nodes per px
@@ -686,7 +531,7 @@ def advect(p: NDArray[np.float32], s: float, unit: float) -> NDArray[np.float32]
     return out * np.array([unit, unit, unit**2, unit**2], np.float32)
 
 
-@compiled
+@lean
 def _spread(begin, end, p, out):
     for y in range(begin, end):
         for x in range(out.shape[1]):

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled, over_rows
+from jaxevent.kernels import lean, lean_part, over_rows
 from jaxevent.reconstruction.compensated.trajectories import around
 from jaxevent.reconstruction.features import Numeric
 
@@ -23,7 +23,7 @@ class Along(NamedTuple):
     inside: Float[Numeric, "k h w"]  # 1, or 0 beyond the image's border
 
 
-@compiled
+@lean_part
 def _cubic(f, out):
     a, one, two, three = np.float32(CUBIC), np.float32(1), np.float32(2), np.float32(3)
     far = one + f
@@ -34,11 +34,11 @@ def _cubic(f, out):
     out[3] = one - out[0] - out[1] - out[2]
 
 
-@compiled
-def _warp(begin, end, L, V, clear, s, paths, out_L, out_V, out_clear, inside):
+@lean
+def _warp(begin, end, L, V, clear, s, paths, room, out_L, out_V, out_clear, inside):
     count, h, w = L.shape
     one, zero = np.float32(1), np.float32(0)
-    across, down = np.empty(4, np.float32), np.empty(4, np.float32)
+    across, down = room[begin, :4], room[begin, 4:]
     for y in range(begin, end):
         for x in range(w):
             path = paths[y, x]
@@ -74,7 +74,8 @@ def _warp(begin, end, L, V, clear, s, paths, out_L, out_V, out_clear, inside):
 def warp(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, paths: NDArray) -> Along:
     """Images (K, h, w) float32 at instants s (K,) along the paths of pixels, (h, w, 4)."""
     out = Along(*(np.empty(L.shape, np.float32) for _ in range(4)))
-    over_rows(_warp, L.shape[1], L, V, clear, s, paths, *out)
+    room = np.empty((L.shape[1], 8), np.float32)  # of each first row of a part
+    over_rows(_warp, L.shape[1], L, V, clear, s, paths, room, *out)
     return out
 
 

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled, lean, lean_part, part
+from jaxevent.kernels import lean, lean_part
 from jaxevent.reconstruction.fused.loop import (
     Bands,
     FrameRows,
@@ -67,6 +67,22 @@ class FrameLine(NamedTuple):
     exists: NDArray[np.float64]  # 1, or 0 for frames that measure nothing
 
 
+class Room(NamedTuple):
+    """Room for passes: that of the first of the bands that a pass goes over."""
+
+    sums: NDArray  # [bands, 3 * stride], of rows and of events so far
+    counts: NDArray  # [bands, 3, stride], see `sum_segments`
+    times: NDArray[np.float64]  # [bands, 3, stride]
+
+    @classmethod
+    def of(cls, bands: int, stride: int, dtype: np.dtype) -> "Room":
+        return cls(
+            np.empty((bands, 3 * stride), dtype),
+            np.empty((bands, 3, stride), dtype),
+            np.empty((bands, 3, stride)),
+        )
+
+
 class GivenFrames(NamedTuple):
     """What passes over a stretch of frames rest on."""
 
@@ -79,6 +95,7 @@ class GivenFrames(NamedTuple):
     slot: NDArray[np.int64]  # of each band in the memory
     rates: NDArray[np.float64]  # see `follow_events`; empty: no change is spread
     reach: int  # us, the longest time over which a change is spread
+    room: Room
 
 
 class Instants(NamedTuple):
@@ -98,17 +115,23 @@ class Spreading(NamedTuple):
     rate: NDArray[np.float64]  # of its count until the next event, 1/us; of OFF events negative
 
 
-@compiled
-def follow_events(bands, stride, reach):
+def follow_events(bands: Bands, stride: int, reach: int) -> NDArray[np.float64]:
     """Of each event the rate (1/us) at which its pixel's count grows until the next, OFF negative.
 
     An event is late: where no more than `reach` (us) lies between two, the second's change is
     spread over that time (`Timing`). Else the rate is 0, as after one at the recording's start.
     """
+    rates = np.zeros(bands.first[-1])
+    _follow(bands, reach, np.empty(stride, np.int64), rates)
+    return rates
+
+
+@lean
+def _follow(bands, reach, ahead, rates):
     events, weights, first = bands.events, bands.weights, bands.first
-    rates = np.zeros(first[-1], np.float64)
     for band in range(len(first) - 1):
-        ahead = np.full(stride, -1)
+        for z in range(len(ahead)):
+            ahead[z] = -1
         for j in range(first[band + 1] - first[band]):
             i = first[band + 1] - 1 - j
             z, now = (events[i] >> 1) & 0xFFFF, events[i] >> 17
@@ -119,12 +142,14 @@ def follow_events(bands, stride, reach):
                 if 0 < gap <= reach:
                     one = np.float64(weights[k]) if len(weights) > 0 else 1.0
                     rates[i] = (one if events[k] & 1 else -one) / gap
-    return rates
 
 
-@part
-def _blank(stride):
-    return Spreading(np.zeros(stride, np.float64), np.zeros(stride, np.float64))
+@lean_part
+def _blank(room, band):
+    times = room.times[band]
+    for z in range(times.shape[1]):
+        times[1, z] = times[2, z] = 0
+    return Spreading(times[1], times[2])
 
 
 @lean_part
@@ -183,8 +208,8 @@ def _sum_around(cells, of, to, above, width, rows, stride):
 
 
 @lean_part
-def _look(band, k, given, cells, spreading, room):
-    """A frame's image, and what events say of its exposure; `room` is that of `sum_segments`."""
+def _look(band, k, given, cells, spreading, begin):
+    """A frame's image, and what events say of its exposure; the room is that of band `begin`."""
     bands, frames, places = given.bands, given.frames, given.places
     stride, top, bottom = places.stride, bands.edges[band], bands.edges[band + 1]
     a, b = bands.first[band], bands.first[band + 1]
@@ -201,7 +226,8 @@ def _look(band, k, given, cells, spreading, room):
             cells[z] = 0
     sum_segments(
         bands.events, bands.weights, a, b, left, frames.mid[k], right, given.functions.excess,
-        given.numbers, cells, places.total, stride, room[0], room[1],
+        given.numbers, cells, places.total, stride,
+        given.room.counts[begin], given.room.times[begin, 0],
     )  # fmt: skip
     if places.inside >= 0:
         inside = places.inside * stride
@@ -226,7 +252,7 @@ def _measure_clipped(k, row, given, cells, begin, end):
             )
 
 
-@compiled
+@lean
 def filter_frames(begin, end, given, memory, starts, linked):
     """Pass forwards over a stretch of frames; its state is the one before the first frame.
 
@@ -236,8 +262,7 @@ def filter_frames(begin, end, given, memory, starts, linked):
     numbers, stride, counts = given.numbers, places.stride, places.counts
     width, padded = np.int64(bands.width), np.int64(bands.width + 2)
     on, off = counts[0] * stride, counts[1] * stride
-    above, spreading = np.zeros(stride, numbers.dtype), _blank(stride)
-    room = np.zeros((3, stride), numbers.dtype), np.zeros(stride)
+    above, spreading = given.room.sums[begin, :stride], _blank(given.room, begin)
     for band in range(begin, end):
         cells, rows = memory[given.slot[band]], bands.edges[band + 1] - bands.edges[band]
         first, last = padded, (rows + 1) * padded
@@ -245,7 +270,7 @@ def filter_frames(begin, end, given, memory, starts, linked):
             functions.start(cells.ctypes, numbers.ctypes, 0, first, last, 0.0, 0.0, 0.0)
         for k in range(len(line.mid)):
             row = np.int64((places.work + k * places.kept) * stride)
-            _look(band, k, given, cells, spreading, room)
+            _look(band, k, given, cells, spreading, begin)
             gain, seconds = np.float64(given.frames.gain[k]), line.seconds[k]
             functions.frame(
                 cells.ctypes, numbers.ctypes, row, first, last, gain, line.exists[k], 0.0
@@ -323,15 +348,15 @@ def _count_until(given, band, now, cells, spreading):
         _add_begun(cells, on, off, mid, spreading, 1.0)
 
 
-@compiled
+@lean
 def read_images(begin, end, given, memory, instants, images):
     """Images at sorted instants of a smoothed stretch."""
     bands, places, functions = given.bands, given.places, given.functions
     numbers, stride, counts = given.numbers, places.stride, places.counts
     width, pixels = np.int64(bands.width), images.mean.shape[1]
     size = np.int64(images.slopes.shape[2] * images.slopes.shape[3])
-    padded, above, spreading = width + 2, np.zeros(stride, numbers.dtype), _blank(stride)
-    held = np.zeros(2 * stride, numbers.dtype)
+    padded, spreading = width + 2, _blank(given.room, begin)
+    above, held = given.room.sums[begin, :stride], given.room.sums[begin, stride:]
     for band in range(begin, end):
         cells, rows = memory[given.slot[band]], bands.edges[band + 1] - bands.edges[band]
         known, i = -1, np.int64(0)

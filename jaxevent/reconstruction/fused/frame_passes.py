@@ -13,6 +13,7 @@ from jaxevent.reconstruction.fused.frame_loop import (
     FramePlaces,
     GivenFrames,
     Instants,
+    Room,
     follow_events,
 )
 from jaxevent.reconstruction.fused.loop import Bands, Images
@@ -153,6 +154,7 @@ class FramePasses:
         return GivenFrames(
             bands, _line(self.clock, stretch), frames, self.places, self.kernel.functions,
             self.kernel.numbers, slot, rates, reach,
+            Room.of(self.bands, self.layout.stride, self.dtype),
         )  # fmt: skip
 
     def room(self, times: int) -> Images:

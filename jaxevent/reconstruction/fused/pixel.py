@@ -159,18 +159,23 @@ def traced(
     def scalar(leaf: Any) -> Any:
         return jnp.broadcast_to(leaf, (1, 1))[0, 0]
 
-    def start(params: Any, v: dict[str, Any]) -> Any:
-        observer = observe(params, frames_of(v))
+    def observed(params: Any, v: dict[str, Any]) -> tuple[Any, Point]:
         point = Point(*(v[f.name] for f in dataclasses.fields(Point)))
+        return observe(params, frames_of(v)), point
+
+    def begun(params: Any, observer: Any, point: Point) -> Any:
         state = method.initial_state(params, observer, point.points(False))
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (1,))[0], state)
 
+    def start(params: Any, v: dict[str, Any]) -> Any:
+        return begun(params, *observed(params, v))
+
     def at_point(params: Any, v: dict[str, Any], state: Any) -> Any:
-        observer = observe(params, frames_of(v))
-        point = Point(*(v[f.name] for f in dataclasses.fields(Point)))
+        observer, point = observed(params, v)
         frame = jax.tree.map(scalar, observer(point.points(True)))
         event = {name: v[name] for name in ("since", "near", "polarity")}
-        return start(params, v), *method.at_pixel(params, frame, state, **event)
+        first = begun(params, observer, point)
+        return first, *method.at_pixel(params, frame, state, **event)
 
     try:
         state = jax.eval_shape(start, params, given)
