@@ -178,14 +178,16 @@ def run(
     if not told.valid.any() and not (method or params or smooth) and kind.otherwise:
         print(f"{estimator.name} found no motion, so {kind.otherwise} is tried")
         estimator = find_estimator(kind.otherwise)
-        told, values = _told(estimator, recording, params, settings, (imu, bias, turned))
+        gyro = imu, bias, turned
+        told, values = _told(estimator, recording, params, settings, gyro, again=True)
     told, warning = told.with_layers(recording)
     if warning:
         print(warning)
     seconds = time.perf_counter() - clock
     about = {"seed": seed, "smooth": smooth, "gyro": imu, "centred": centred}
     written = output.write(recording, told, about, true, show_progress(), estimator.name, values)
-    print("\n".join([f"{kind.title} by {estimator.name}:", *written.summary()]))
+    hint = _truth_there(whole, kind) if truth is None else []
+    print("\n".join([f"{kind.title} by {estimator.name}:", *written.summary(), *hint]))
     count = len(recording.events)
     print(
         f"\n{', '.join(written.files)} in {out}: {count:,} events in {seconds:.2f} s, "
@@ -222,6 +224,14 @@ def _with_camera(recording: Any, focal: float | int | None) -> Any:
     return dataclasses.replace(recording, camera=PinholeCamera(focal, focal, *centre))
 
 
+def _truth_there(recording: Any, kind: Any) -> list[str]:
+    """A line that says that the recording itself tells its motion, if it does."""
+    has = {"poses": recording.poses, "gyro": recording.imu}
+    sources = ("poses",) if kind.fits_depth and recording.camera is not None else kind.known_from
+    known = [name for name in sources if has[name] is not None and len(has[name])]
+    return [f"the recording's {known[0]} can tell errors: add --truth"] if known else []
+
+
 def _need_camera(recording: Any, kind: Any) -> None:
     from jaxevent.egomotion import MODELS
 
@@ -245,14 +255,24 @@ def _parameters(estimator: Any, kind: Any, path: Path | None) -> tuple[Any, set[
 
 
 def _told(
-    estimator: Any, recording: Any, params: Path | None, settings: dict[str, Any], gyro: Any
+    estimator: Any,
+    recording: Any,
+    params: Path | None,
+    settings: dict[str, Any],
+    gyro: Any,
+    *,
+    again: bool = False,
 ) -> tuple[Any, Any]:
     """The motion by a method, with parameters that suit the recording, and these.
 
-    `gyro` tells whether the IMU helps, its bias and its axes.
+    `gyro` tells whether the IMU helps, its bias and its axes. How the image moves is not said
+    `again`, of a second method.
     """
     values, given = _parameters(estimator, settings["model"], params)
     values, line = estimator.suit(recording, values, given=given)
+    if again:
+        windows = line.partition(": ")[2]
+        line = f"{estimator.name}: {windows}" if windows else ""
     if line:
         print(line)
     more = {"cloud": CLOUD} if "cloud" in estimator.options else {}

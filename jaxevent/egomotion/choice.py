@@ -24,7 +24,7 @@ from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.batch_fit.translation import Guess, told
 from jaxevent.egomotion.candidates import coordinates
 from jaxevent.egomotion.geometry import rotation_basis
-from jaxevent.egomotion.models import General, Model, Planar, Rotation
+from jaxevent.egomotion.models import MODELS, General, Model, Planar, Rotation
 from jaxevent.egomotion.patch_fits import (
     WAY,
     along,
@@ -103,7 +103,7 @@ def decide(z: dict[tuple[str, str], float], longer: Callable[[], list[float]]) -
     """The choice by z of patches and, where rotation is the simplest left, those of `longer`
     windows, of general motion over rotation."""
     lines = [
-        f"{one} explains events left out {_than(value)} {other} (z = {value:.1f})"
+        _line(one, other, value, Z_DEPTH if one == General.name else Z)
         for (one, other), value in z.items()
     ]
     # Where these two do equally well, a camera that turns is likelier than a scene before one wall.
@@ -114,10 +114,7 @@ def decide(z: dict[tuple[str, str], float], longer: Callable[[], list[float]]) -
         value = float(sum(moves) / np.sqrt(max(len(moves), 1)))
         if moves:
             z = z | {("general", "rotation"): value}
-            lines.append(
-                f"in longer windows general motion explains them {_than(value)} rotation "
-                f"(z = {value:.1f})"
-            )
+            lines.append(f"in longer windows {_line('general', 'rotation', value, Z)}")
         chosen = General if value > Z else Rotation
         sure = chosen is General or (bool(moves) and value < UNSURE)
     lines.append(f"chosen: {chosen.title}")
@@ -134,5 +131,10 @@ def _guess(seen: Look, turn: NDArray, six: NDArray) -> Guess:
     return Guess(seen.middle, WAY / seen.length, turn / seen.length, six[:3], six[3:] / seen.length)
 
 
-def _than(z: float) -> str:
-    return "better than" if z > Z else "worse than" if z < -Z else "as well as"
+def _line(one: str, other: str, z: float, enough: float) -> str:
+    """Whether one model explains events better than another, which z beyond `enough` says."""
+    than = "better than" if z > enough else "worse than" if z < -enough else "as well as"
+    return (
+        f"{MODELS[one].title} explains events that it was not fitted to {than} "
+        f"{MODELS[other].title} (z = {z:.1f}, which counts from {enough:g} on)"
+    )

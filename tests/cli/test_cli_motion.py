@@ -19,6 +19,7 @@ from jaxevent import cli, egomotion, methods
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import voting
 from jaxevent.egomotion.comparison import compare
+from jaxevent.egomotion.estimator import MotionEstimator
 from jaxevent.egomotion.models import MODELS, General, Planar
 from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.particle_filter.estimator import Voting
@@ -80,10 +81,14 @@ def test_columns_are_exact():
 def test_another_method_is_tried_where_the_usual_one_finds_nothing(folder, capsys, monkeypatch):
     monkeypatch.setattr(Voting, "estimate", lambda self, *_, model, **__: Motion.nothing(model))
     monkeypatch.setattr(Planar, "otherwise", "planes")
+    line = "the image moves at 9 px/s: window = 2 s"
+    monkeypatch.setattr(MotionEstimator, "suit", lambda self, _, params, **__: (params, line))
     words = ["motion", str(folder / "planar.h5"), "--model", "planar", "--out", str(folder / "out")]
     assert cli.main(words) == 0
     printed = capsys.readouterr().out
     assert "voting found no motion, so planes is tried" in printed
+    # How fast the image moves is said once, the windows of either method.
+    assert printed.count("moves at 9 px/s") == 1 and "\nplanes: window = 2 s\n" in printed
     assert "planar motion by planes" in printed and "never found" not in printed
     assert cli.main([*words[:-1], str(folder / "other"), "--method", "voting"]) == 0
     assert "never found" in capsys.readouterr().out  # a method that was asked for stays
@@ -175,7 +180,7 @@ def test_a_rotation_against_poses_and_gyro(folder, capsys):
     assert header == ["t", "wx", "wy", "wz", "sigma_wx", "sigma_wy", "sigma_wz", "lost"]
     assert 0.02 <= table[0, 0] < 0.021 and 0.176 < table[-1, 0] < 0.18
     np.testing.assert_allclose(np.diff(table[:, 0]), 0.002, atol=1e-9)
-    assert "against poses" in said and "vector_error" in said
+    assert "against poses" in said and "vector_error" in said and "add --truth" not in said
     found = table[:, -1] == 0
     truth = read_table(folder / "turn.csv")[1][0, 1:]  # constant
     assert np.linalg.norm(table[found, 1:4].mean(0) - truth) < 0.03 * np.linalg.norm(truth)
