@@ -1,11 +1,14 @@
 """Windows of slider_depth that follow the one before: by the stages they pass, and by all of them.
 
-    python experiments/egomotion_following.py --data FOLDER
+    python experiments/egomotion_following.py --data FOLDER [--turned 3]
 
 At three times a window of 300 ms is fitted from the path 0.1 s before, once through all stages of a
 window that starts from nothing and once through those of `windows.FOLLOWING`. Prints the error of
 the heading (degrees; truth is T to the right), |Omega| (degrees/s; truth 0), the cost per event and
 CPU seconds.
+
+With `--turned` windows at 0.5 s begin from a camera that turns about the vertical by so many
+degrees/s, one way and the other, before depths that make the same flow in the middle of the image.
 """
 
 import argparse
@@ -20,16 +23,42 @@ from jaxevent.egomotion.batch_fit.path import Path, advanced
 
 CENTRES = 700_000, 1_500_000, 2_500_000  # us
 BEFORE = 100_000
+TURNED = 500_000  # us
+USUAL = 0.43  # 1/m in units of 1/|T|, the depth there
 ALL = batch.ROUNDS, batch.FINAL[:-1]
 FEW = batch.FOLLOWING
+
+
+def turned(windows: batch.Windows, rate: float) -> None:
+    """Where a window ends that begins from a turn (degrees/s) about the vertical."""
+    half, turn = float(windows.params.half_window), np.radians(rate)
+    nodes = np.prod(windows.tracks(TURNED, half, 2000).nodes)
+    level = np.full(nodes, np.log(USUAL - turn), windows.real)
+    begun = Path.constant(np.array([1.0, 0, 0]), np.array([0, turn, 0]), level)
+    fit = windows.ended(TURNED, [windows.followed(TURNED, begun)])
+    assert fit is not None
+    heading, Omega = (part[0] for part in fit.path.twist(0.0))
+    print(
+        f"from {rate:+.1f} deg/s: wy {np.degrees(Omega[1]):+.2f}, its sigma "
+        f"{np.degrees(np.sqrt(fit.covariance[4, 4])):.2f}, heading "
+        f"{np.degrees(np.arccos(heading[0])):.2f}, events explained {fit.agreement:.2f}, sigma of "
+        f"misfits at least {windows.least[TURNED]:.2f} C",
+        flush=True,
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--data", type=Place, required=True, help="folder of slider_depth.zip")
-    recording = jaxevent.load(parser.parse_args().data / "slider_depth.zip")
+    parser.add_argument("--turned", type=float, help="degrees/s that windows begin with")
+    arguments = parser.parse_args()
+    recording = jaxevent.load(arguments.data / "slider_depth.zip")
     assert recording.camera is not None
     windows = batch.Windows(recording, batch.Params.of({}), recording.camera)
+    if arguments.turned is not None:
+        for rate in (0.0, arguments.turned, -arguments.turned):
+            turned(windows, rate)
+        return
     half = float(windows.params.half_window)
     for centre in CENTRES:
         nodes = np.prod(windows.tracks(centre - BEFORE, half, 2000).nodes)
