@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob.prepare import LONGEST
-from jaxevent.kernels import compiled, part
+from jaxevent.kernels import lean, lean_part
 
 # Functions that are passed as arguments are called through their address.
 warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
@@ -98,14 +98,26 @@ class Told(NamedTuple):
     death: NDArray[np.int32]
 
 
-@compiled
-def run(functions, numbers, settings, chunks, memory, told, work, marks):
+class Space(NamedTuple):
+    """Where a step is worked on; nothing in it is kept."""
+
+    work: NDArray  # [rows, events], see above
+    marks: NDArray[np.int64]  # whose the events are
+    targets: NDArray[np.int64]  # those that are alive
+    around: NDArray  # [rows, columns] sums over 3x3 cells of the grid,
+    above: NDArray  # [columns + 2] and over the three cells of a column
+
+
+@lean
+def run(functions, numbers, settings, chunks, memory, told, space):
     """Track through chunks; the memory is that at their end.
 
     Targets at chunks' starts are told of only where `told` has room for them.
     """
     cells, whole = memory.cells, memory.whole
-    given = cells.ctypes, whole.ctypes, work.ctypes, marks.ctypes, numbers.ctypes
+    given = (
+        cells.ctypes, whole.ctypes, space.work.ctypes, space.marks.ctypes, numbers.ctypes,
+    )  # fmt: skip
     for chunk in range(len(chunks.t)):
         _begin_chunk(functions, given, settings, chunks, memory, chunk)
         if len(told.cells):
@@ -113,16 +125,16 @@ def run(functions, numbers, settings, chunks, memory, told, work, marks):
             _copy(whole, told.whole[chunk])
         for k in range(len(cells)):
             functions.limit(*given, k, 0, 0, 1)
-        _run_steps(functions, given, settings, chunks, memory, chunk, work, marks)
+        _run_steps(functions, given, settings, chunks, memory, chunk, space)
         for k in range(len(cells)):
             told.before[chunk, k] = told.after[chunk, k] = whole[k, ID]
             told.confirmed[chunk, k] = whole[k, CONFIRMED] != 0
             told.ended[chunk, k] = told.death[chunk, k] = 0
         if chunks.cycle[chunk]:
-            _end_cycle(functions, given, settings, chunks, memory, chunk, told)
+            _end_cycle(functions, given, settings, chunks, memory, chunk, told, space)
 
 
-@part
+@lean_part
 def _copy(table, out):
     """Copy numbers one by one: numba takes over a second to compile the copy of an array."""
     for k in range(table.shape[0]):
@@ -130,7 +142,7 @@ def _copy(table, out):
             out[k, field] = table[k, field]
 
 
-@part
+@lean_part
 def _begin_chunk(functions, given, settings, chunks, memory, chunk):
     """Count times from the chunk's start, and begin the tracks of its seeds."""
     cells, whole, elapsed = memory.cells, memory.whole, np.int64(chunks.elapsed[chunk])
@@ -146,7 +158,7 @@ def _begin_chunk(functions, given, settings, chunks, memory, chunk):
             _begin_track(functions, given, cells, whole, k, x, y, size, 0, k, 1)
 
 
-@part
+@lean_part
 def _begin_track(functions, given, cells, whole, k, x, y, size, time, serial, confirmed):
     """A track begins at rest."""
     cells[k, XI], cells[k, XI + 1], cells[k, SIZE] = x, y, size
@@ -156,15 +168,15 @@ def _begin_track(functions, given, cells, whole, k, x, y, size, time, serial, co
     whole[k, ID], whole[k, CONFIRMED] = serial, confirmed
 
 
-@part
-def _run_steps(functions, given, settings, chunks, memory, chunk, work, marks):
+@lean_part
+def _run_steps(functions, given, settings, chunks, memory, chunk, space):
     """The steps of a chunk; the grid counts the events that are near no target."""
     cells, whole, sums = memory.cells, memory.whole, memory.sums
+    work, marks, targets = space.work, space.marks, space.targets
     t, xi, polarity = chunks.t[chunk], chunks.xi[chunk], chunks.polarity[chunk]
     valid = chunks.valid[chunk]
     steps, room = t.shape
     owned, micro = len(chunks.owner) > 0, work.dtype.type(1e-6)
-    targets = np.empty(len(cells), np.int64)
     stop, faded = np.int64(chunks.stop[chunk]), False
     for step in range(steps):
         if not valid[step, 0]:
@@ -204,7 +216,7 @@ def _run_steps(functions, given, settings, chunks, memory, chunk, work, marks):
             faded = _count_strays(settings, sums, memory.at, t[step], stop, alive, work, faded)
 
 
-@part
+@lean_part
 def _share_out(functions, given, settings, alive, room, work):
     """The weight of each event for each target."""
     apart = settings.apart
@@ -224,7 +236,7 @@ def _share_out(functions, given, settings, alive, room, work):
             functions.share(*given, 0, i, room, alive)
 
 
-@part
+@lean_part
 def _count_strays(settings, sums, at, t, stop, alive, work, faded):
     """Add a step's unassociated events to the grid, as `lifecycle.count_strays` does."""
     rows, columns = sums.shape[1:]
@@ -237,7 +249,7 @@ def _count_strays(settings, sums, at, t, stop, alive, work, faded):
         if near > 0:
             continue
         if not faded:
-            sums *= np.exp(-(sums.dtype.type(stop - at[0]) * micro) / tau)
+            _fade(sums, np.exp(-(sums.dtype.type(stop - at[0]) * micro) / tau))
             at[0], faded = stop, True
         weight = np.exp(-(sums.dtype.type(stop - t[i]) * micro) / tau)
         x, y = work[X, i], work[Y, i]
@@ -249,8 +261,17 @@ def _count_strays(settings, sums, at, t, stop, alive, work, faded):
     return faded
 
 
-@part
-def _end_cycle(functions, given, settings, chunks, memory, chunk, told):
+@lean_part
+def _fade(sums, factor):
+    """Multiply the grid."""
+    for kind in range(sums.shape[0]):
+        for row in range(sums.shape[1]):
+            for column in range(sums.shape[2]):
+                sums[kind, row, column] *= factor
+
+
+@lean_part
+def _end_cycle(functions, given, settings, chunks, memory, chunk, told, space):
     """Confirmations, deaths, mergers and births at a chunk's end; see `lifecycle.end_cycle`."""
     cells, whole, seeds = memory.cells, memory.whole, len(chunks.seed)
     stop, number = np.int64(chunks.stop[chunk]), len(cells)
@@ -279,21 +300,20 @@ def _end_cycle(functions, given, settings, chunks, memory, chunk, told):
             functions.start(*given, k, 0, 0, 1)
             cells[k, GATE] = gate
     if settings.births:
-        _bear(functions, given, settings, memory, stop, seeds)
+        _bear(functions, given, settings, memory, stop, seeds, space)
     for k in range(number):
         told.after[chunk, k] = whole[k, ID]
 
 
-@part
-def _bear(functions, given, settings, memory, stop, seeds):
+@lean_part
+def _bear(functions, given, settings, memory, stop, seeds, space):
     """Tracks are born where the grid's 3x3 sums are largest, which empties 5x5 cells."""
     cells, whole, sums, at = memory.cells, memory.whole, memory.sums, memory.at
     elapsed = sums.dtype.type(stop - at[0]) * sums.dtype.type(1e-6)
-    sums *= np.exp(-elapsed / sums.dtype.type(settings.tau))
+    _fade(sums, np.exp(-elapsed / sums.dtype.type(settings.tau)))
     at[0] = stop
     rows, columns = sums.shape[1:]
-    around, above = np.empty((rows, columns), sums.dtype), np.empty(columns + 2, sums.dtype)
-    free = seeds
+    around, above, free = space.around, space.above, seeds
     while True:
         while free < len(cells) and whole[free, ID] >= 0:
             free += 1
@@ -307,18 +327,28 @@ def _bear(functions, given, settings, memory, stop, seeds):
                     top, row, column = around[r, c], r, c
         if not top > settings.least:
             return
-        near = np.zeros(3, sums.dtype)
-        for kind in range(3):
-            for r in range(max(row - 1, 0), min(row + 2, rows)):
-                for c in range(max(column - 1, 0), min(column + 2, columns)):
-                    near[kind] += sums[kind, r, c]
-        x, y, size = near[1] / near[0], near[2] / near[0], cells.dtype.type(settings.size)
+        n = _sum_near(sums[0], row, column)
+        x, y = _sum_near(sums[1], row, column) / n, _sum_near(sums[2], row, column) / n
+        size = cells.dtype.type(settings.size)
         _begin_track(functions, given, cells, whole, free, x, y, size, stop, at[1], 0)
         at[1] += 1
-        sums[:, max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = 0
+        for r in range(max(row - 2, 0), min(row + 3, rows)):
+            for c in range(max(column - 2, 0), min(column + 3, columns)):
+                sums[0, r, c] = sums[1, r, c] = sums[2, r, c] = 0
 
 
-@part
+@lean_part
+def _sum_near(counts, row, column):
+    """The sum over the 3x3 cells around one."""
+    rows, columns = counts.shape
+    total = counts.dtype.type(0)
+    for r in range(max(row - 1, 0), min(row + 2, rows)):
+        for c in range(max(column - 1, 0), min(column + 2, columns)):
+            total += counts[r, c]
+    return total
+
+
+@lean_part
 def _sum_around(counts, above, around):
     """Sums over 3x3 cells."""
     rows, columns = counts.shape

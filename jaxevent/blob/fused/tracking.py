@@ -7,7 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.fused.loop import FRAME, ROWS, TARGETS, Chunks, Memory, Settings, Told, run
+from jaxevent.blob.fused.loop import (
+    FRAME,
+    ROWS,
+    TARGETS,
+    Chunks,
+    Memory,
+    Settings,
+    Space,
+    Told,
+    run,
+)
 from jaxevent.blob.fused.target import kernel_of, shares_apart
 from jaxevent.blob.lifecycle import Log, State
 from jaxevent.blob.params import TrackerParams
@@ -62,10 +72,14 @@ class FusedRun:
                 features.seed_size,
             )
         ))  # fmt: skip
-        work = np.zeros((TARGETS + ROWS * targets, events), self.dtype)
-        marks = np.zeros(2 * events, np.int64)
+        rows, columns = memory.sums.shape[1:]
+        space = Space(
+            np.zeros((TARGETS + ROWS * targets, events), self.dtype),
+            np.zeros(2 * events, np.int64), np.empty(targets, np.int64),
+            np.empty((rows, columns), self.dtype), np.empty(columns + 2, self.dtype),
+        )  # fmt: skip
         kernel = self._kernel
-        run(kernel.functions, kernel.numbers, self._settings, given, memory, told, work, marks)
+        run(kernel.functions, kernel.numbers, self._settings, given, memory, told, space)
         rest = [np.asarray(one, np.int32) for one in memory.at]
         if state.grid is not None:
             rest.insert(0, memory.sums)
