@@ -233,13 +233,10 @@ class Packing:
         if self.joined is not None and len(part):
             owner = candidates(part, self.joined, NEAR)
             kept &= owner[:, 0] != NOBODY
-        given = _Given(part.t, part.x, part.y, part.p, kept, owner)
         order = np.arange(len(part))
-        spread = _spread(part.t, len(part) if self._as_stored else TIES, order)
-        if not spread and first == at and last == upto:
-            return given, order + first
+        _spread(part.t, len(part) if self._as_stored else TIES, order)
         order = order[at - first : upto - first]
-        return _Given(*(values[order] for values in given)), order + first
+        return _Given(part.t, part.x, part.y, part.p, kept, owner, order), order + first
 
     def whole(self) -> Features:
         """All chunks at once, for recordings that fit into memory."""
@@ -313,7 +310,7 @@ def count_steps(features: Features, chunk: NDArray, time: NDArray) -> NDArray[np
 
 
 class _Given(NamedTuple):
-    """Events to be packed, (events,) each."""
+    """Events to be packed, and others of the first and the last one's times."""
 
     t: NDArray
     x: NDArray
@@ -321,6 +318,7 @@ class _Given(NamedTuple):
     p: NDArray
     kept: NDArray  # by the prefilter
     owner: NDArray
+    order: NDArray  # places of those that are packed, one after another
 
 
 class _Bounds(NamedTuple):
@@ -369,26 +367,24 @@ def _leave_open(place: _Place, out: _Chunks) -> tuple[int, _Place]:
 
 
 @lean
-def _spread(t: Any, least: int, order: Any) -> bool:
-    """Spread runs of more than so many equal times in an order; whether there are any.
+def _spread(t: Any, least: int, order: Any) -> None:
+    """Spread runs of more than so many equal times in an order.
 
     Places of a run of n are taken in steps of about .618 n, so that a few that follow each other
     are of all parts of the run.
     """
-    begin, spread = 0, False
+    begin = 0
     for end in range(1, len(t) + 1):
         if end < len(t) and t[end] == t[begin]:
             continue
         n = end - begin
         if n > least:
-            spread = True
             step = np.int64(0.618034 * n)
             while math.gcd(step, n) > 1:
                 step += 1
             for k in range(n):
                 order[begin + k] = begin + k * step % n
         begin = end
-    return spread
 
 
 @lean
@@ -400,12 +396,13 @@ def _pack(given, first_row, final, bounds, place, out):
     chunk, opened, fill, previous, begin, end, following = place
     seed_t, finish = bounds.seed_t, bounds.stop
     chunks, steps, size = out.t.shape
-    i, count = 0, len(given.t)
+    i, count, order = 0, len(given.order), given.order
     while i < count + (1 if final else 0):
-        if i < count and not given.kept[i] and not (opened and given.t[i] >= end):
+        k = order[i] if i < count else 0
+        if i < count and not given.kept[k] and not (opened and given.t[k] >= end):
             i += 1
             continue
-        now = given.t[i] if i < count else finish
+        now = given.t[k] if i < count else finish
         if not opened:
             if chunk == chunks:
                 return True, i, _Place(chunk, 0, 0, previous, begin, 0, following)
@@ -432,12 +429,12 @@ def _pack(given, first_row, final, bounds, place, out):
             continue
         step, slot = fill // size, fill % size
         out.t[chunk, step, slot:] = now - begin
-        out.xi[chunk, step, slot, 0] = given.x[i]
-        out.xi[chunk, step, slot, 1] = given.y[i]
-        out.polarity[chunk, step, slot] = 1 if given.p[i] else -1
+        out.xi[chunk, step, slot, 0] = given.x[k]
+        out.xi[chunk, step, slot, 1] = given.y[k]
+        out.polarity[chunk, step, slot] = 1 if given.p[k] else -1
         out.row[chunk, step, slot] = first_row + i
-        out.owner[chunk, step, slot, 0] = given.owner[i, 0]
-        out.owner[chunk, step, slot, 1] = given.owner[i, 1]
+        out.owner[chunk, step, slot, 0] = given.owner[k, 0]
+        out.owner[chunk, step, slot, 1] = given.owner[k, 1]
         fill += 1
         i += 1
     return False, i, _Place(chunk, opened, fill, previous, begin, end, following)
