@@ -166,6 +166,7 @@ def tracker_bench() -> tuple[dict[str, float], dict[str, float]]:
         params, seeds = moment.Params(events_per_step=M), [(*start, 20.0)]
         many, _ = blob_scene("lissajous", 0, rate=3e6 if M > 1 else 3e5)
         packing = Packing(many, params, seeds)
+        packing.lengthen()  # as `estimate` does
         stretch = packing.pack(packing.first)
         state = begin_state(moment.filter, params, stretch.features)
         kernel = FusedRun(moment.filter, params, packing)
