@@ -162,6 +162,12 @@ def test_pixels_take_the_path_of_their_side():
     even = np.broadcast_to(np.float32([6, -3, 0, 0]), paths.shape).copy()
     own = np.arange(40 * 56).reshape(40, 56)
     np.testing.assert_array_equal(borders.choose(images, s, even, 2e-4, 10.0), own)
+    # What noise prefers is not chosen: here nothing but noise tells paths apart.
+    rng = np.random.default_rng(4)
+    noise = rng.normal(0, 0.05, still.shape).astype(np.float32)
+    images = trajectories.pack(noise, np.full_like(still, 0.01))
+    rough = rng.normal(0, 1, paths.shape).astype(np.float32)
+    assert (borders.choose(images, s, rough, 2e-4, 10.0) != own).mean() < 0.05
 
 
 @functools.cache
