@@ -231,6 +231,7 @@ def compared(targets: Iterator[tuple]) -> Iterator[dict[str, Any]]:
         yield {
             "label": label,
             "ingredients": np.asarray(told.ingredients),
+            "known": np.asarray(told.known),
             "signs": np.asarray(told.signs),
             "usual": np.asarray(told.usual),
             "beyond": np.asarray(told.beyond),
@@ -278,6 +279,7 @@ def fit(
 
     X = column(lambda r: some(r["signs"]).T)
     Y = column(lambda r: some(r["ingredients"]).T)
+    known = column(lambda r: some(np.log(r["known"]))[:, None])
     truth = column(lambda r: some(r["truth"]))
     I0 = column(lambda r: np.full(len(some(r["truth"])), r["I0"]))
     R = column(lambda r: some(noise_in(r, noises)))
@@ -299,7 +301,7 @@ def fit(
     level = jnp.log(truth + I0)
 
     def choose(W):
-        q = jax.nn.softmax(jnp.concatenate([jnp.zeros_like(X[:, :1]), X @ W.T], 1))
+        q = jax.nn.softmax(jnp.concatenate([jnp.zeros_like(X[:, :1]), X @ W.T + known], 1))
         return (q * Y).sum(1)
 
     def loss(W):
@@ -353,6 +355,7 @@ def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:
     for r in rows:
         told = fusion.Comparison(
             jnp.asarray(r["ingredients"]),
+            jnp.asarray(r["known"]),
             jnp.asarray(r["signs"]),
             jnp.zeros((3, 1, 1)),
             jnp.zeros((2, 1, 1)),

@@ -272,6 +272,12 @@ def test_other_ingredients_can_be_chosen(name):
         fused = fuse(params, L, np.full_like(L, 0.01), still(L), place(*numbers))
         expected = {"smoothed": L[own], "blend": L[frame]}[name]
         np.testing.assert_allclose(fused.L, expected, atol=1e-5)
+    # What is not known in place is not chosen, whatever the signs say.
+    mild = Params(choice=(np.array(only(name).choice) / 10).tolist())
+    V = np.full_like(L, 0.01)
+    V[:, 5, 7] = 9.0
+    share = np.asarray(fuse(mild, L, V, still(L), at).sources)[3 + OTHERS.index(name)]
+    assert share[5, 7] < 0.03 and np.delete(share, 5, 0).min() > 0.97
 
 
 def test_a_scene_at_rest_is_as_its_last_frame():
