@@ -6,7 +6,8 @@ Tables:
 
     objects     simulated objects, 25 Hz, halfway between frames, of the seeds that
                 experiments/motion_compensated.py scores: the motion found, the true one as means
-                of 2 x 2 pixels, the true one of pixels, and the true visibility beside it; all
+                of 2 x 2 pixels, the true one of pixels, and the true visibility beside it; the
+                true one of objects that reach farther than they do, by parts of a pixel; all
                 errors, and those within 2 px of where surfaces meet
     pans        fast pans of HDR scenes: MSE of ln(I + I0) of dark, well-exposed, bright pixels, of
                 the smoother, of `mc` with the motion found and the true one, of the fusion alone,
@@ -36,18 +37,31 @@ from jaxevent.reconstruction.compensated.warping import Along, warp
 from jaxevent.simulate import TESTING, Objects, Pan, Sensor, scene, simulate
 
 RATE, IMAGES, EDGE = 25.0, 6, 2.0  # Hz; images per recording; px
+GROWN = (0.25, 0.5)  # px
 MISMATCH, SEEDS = (0.03, 0.1, 0.15), (2, 3)
 mc = jaxevent.METHODS["mc"]
 
 
-def truly_along(target: Followed, source: Objects, t: int) -> tuple[Along, NDArray[np.bool_]]:
-    """A target's images along the true trajectories, and where the points are hidden."""
+def truly_along(
+    target: Followed, source: Objects, t: int, grown: float = 0.0
+) -> tuple[Along, NDArray[np.bool_]]:
+    """A target's images along the true trajectories, and where the points are hidden.
+
+    The trajectories of pixels within `grown` (px) of an object are that object's.
+    """
     instants, L, V, clear, *_ = target
     count, h, w = L.shape
     y, x = np.mgrid[:h, :w].astype(float)
     warped, hidden = np.zeros((4, count, h, w), np.float32), np.zeros((count, h, w), bool)
+    whose = np.zeros((h, w), int)
+    for k, surface in enumerate(source.surfaces):
+        if surface.distance is not None:
+            px, py = surface.place(t * 1e-6)
+            whose[surface.distance(x - px, y - py, surface.radius) < grown] = k
     for k, at in enumerate(instants.t):
-        moved, hidden[k] = source.displacement(t * 1e-6, float(at) * 1e-6)
+        _, hidden[k] = source.displacement(t * 1e-6, float(at) * 1e-6)
+        gone = [one.place(float(at) * 1e-6) - one.place(t * 1e-6) for one in source.surfaces]
+        moved = np.array(gone)[whose]
         Y, X = y + moved[..., 1], x + moved[..., 0]
         for n, (image, order) in enumerate(((L[k], 3), (V[k], 1), (clear[k] * 1.0, 1))):
             warped[n, k] = map_coordinates(image, [Y, X], order=order, mode="nearest")
@@ -92,6 +106,12 @@ def objects(folder: Path) -> Iterator[str]:
                 ),
                 "true motion": true,
                 "true motion and visibility": true._replace(inside=true.inside * ~hidden),
+                **{
+                    f"true motion, objects {grown:g} px larger": truly_along(
+                        target, source, t, grown
+                    )[0]
+                    for grown in GROWN
+                },
             }
             for name, along in cases.items():
                 told = fusion.compare(
