@@ -76,6 +76,14 @@ class Blank:
 THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def room_over(rows: int, *shape: int) -> NDArray[np.float32]:
+    """Room for kernels of `over_rows`, (rows, ...): who begins with a row has that of this row.
+
+    Memory is taken by what is written alone.
+    """
+    return np.empty((rows, *shape), np.float32)
+
+
 @functools.cache
 def _workers() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(THREADS)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.kernels import lean, lean_part, over_rows
+from jaxevent.kernels import lean, lean_part, over_rows, room_over
 from jaxevent.reconstruction.compensated.instants import Instants
 from jaxevent.reconstruction.compensated.parameters import Params
 from jaxevent.reconstruction.compensated.warping import Along
@@ -423,7 +423,7 @@ def blurred(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
     """`blur` of an image (h, w), in loops."""
     taps = taps_of(sigma)
     across, out = np.empty_like(image), np.empty_like(image)
-    room = np.empty((len(image), image.shape[1] + len(taps)), np.float32)
+    room = room_over(len(image), image.shape[1] + len(taps))
     over_rows(_blur_across, len(image), image, taps, room, across)
     over_rows(_blur_down, len(image), across, taps, out)
     return out
@@ -441,9 +441,7 @@ def agree(params: Params, L: NDArray, along: Along, place: Place) -> Agreement:
     misfits = np.empty((count, h, w), np.float32)
     steep, M = np.empty((2, h, w), np.float32)
     seen_from = blurred(np.ascontiguousarray(L[own]), 1.0)
-    # Room for whoever works on some of the rows is that of the first of them.
-    room = np.empty((h, 10 + 2 * count, w), np.float32)
-    padded = np.empty((h, w + len(taps)), np.float32)
+    room, padded = room_over(h, 10 + 2 * count, w), room_over(h, w + len(taps))
     for turn in range(3):
         given = (along, weights, misfits, seen_from, steep, settings, own, turn, taps)
         over_rows(_find_mean, h, *given, room, M)

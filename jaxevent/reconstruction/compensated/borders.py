@@ -11,7 +11,7 @@ Gaussian:
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import fast, fast_part, over_rows
+from jaxevent.kernels import fast, fast_part, over_rows, room_over
 from jaxevent.reconstruction.compensated.agreement import blurred
 from jaxevent.reconstruction.compensated.trajectories import OUTSIDE, around, robust_mean
 
@@ -101,8 +101,7 @@ def choose(
         rows, columns, _ = some.shape
         costs = np.empty((1 + len(DIRECTIONS), rows, columns), np.float32)
         given = (images, s, near, step, some, DIRECTIONS * far, np.float32(floor), np.float32(nu))
-        room = np.empty((rows, 3, len(s)), np.float32)  # of each first row of a part
-        over_rows(_try, rows, *given, room, costs)
+        over_rows(_try, rows, *given, room_over(rows, 3, len(s)), costs)
         found = np.stack([blurred(one, sigma) for one in costs])
         found[1:] += CLEARLY * len(s)
         best = found.argmin(0)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import lean, lean_part, over_rows
+from jaxevent.kernels import lean, lean_part, over_rows, room_over
 from jaxevent.reconstruction.compensated.solving import solve
 
 CHANNELS = 4  # of packed images: log intensity, its variance, its gradient along x and y
@@ -64,11 +64,6 @@ def _pack(begin, end, L, V, out):
                 out[k, y, x, 2], out[k, y, x, 3] = _gradient(L[k], y, x)
 
 
-def _room(rows: int, count: int) -> NDArray[np.float32]:
-    """Room for `count` numbers of whoever works on some of these rows: that of its first row."""
-    return np.empty((rows, count), np.float32)
-
-
 @lean
 def _halve(begin, end, images, room, out):
     """Blur by `_TAPS` along both axes and keep every second: half the size."""
@@ -92,7 +87,7 @@ def halve(images: NDArray[np.float32]) -> NDArray[np.float32]:
     """Images (K, h, w) at half the resolution, rounded up."""
     count, h, w = images.shape
     out = np.empty((count, (h + 1) // 2, (w + 1) // 2), np.float32)
-    over_rows(_halve, out.shape[1], images, _room(out.shape[1], w), out)
+    over_rows(_halve, out.shape[1], images, room_over(out.shape[1], w), out)
     return out
 
 
@@ -359,7 +354,7 @@ def fetch(
     """What `_fetch` writes: of every pixel its instants' points, and their mean."""
     count, h, w, _ = images.shape
     points, M = np.empty((h, w, count, 4), np.float32), np.empty((h, w), np.float32)
-    room = _room(h, 4 + count)
+    room = room_over(h, 4 + count)
     over_rows(_fetch, h, images, s, near, p, np.float32(floor), np.float32(nu), room, points, M)
     return points, M
 

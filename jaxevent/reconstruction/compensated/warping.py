@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.kernels import lean, lean_part, over_rows
+from jaxevent.kernels import lean, lean_part, over_rows, room_over
 from jaxevent.reconstruction.compensated.trajectories import around
 from jaxevent.reconstruction.features import Numeric
 
@@ -74,8 +74,8 @@ def _warp(begin, end, L, V, clear, s, paths, room, out_L, out_V, out_clear, insi
 def warp(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, paths: NDArray) -> Along:
     """Images (K, h, w) float32 at instants s (K,) along the paths of pixels, (h, w, 4)."""
     out = Along(*(np.empty(L.shape, np.float32) for _ in range(4)))
-    room = np.empty((L.shape[1], 8), np.float32)  # of each first row of a part
-    over_rows(_warp, L.shape[1], L, V, clear, s, paths, room, *out)
+    rows = L.shape[1]
+    over_rows(_warp, rows, L, V, clear, s, paths, room_over(rows, 8), *out)
     return out
 
 
