@@ -82,7 +82,7 @@ def real(data: Path, methods: Sequence[str]) -> Iterator[dict[str, Any]]:
     assert imu is not None
     for name in methods:
         method = METHODS[name]
-        params, _ = method.suit(disk, method.Params.of({}))
+        params = method.suit(disk, method.Params.of({})).params
         half = 5e5 * float(getattr(params, "duration", 0.03))  # us
         # y-up axes; wx and wy, which the unknown lens makes, are not compared.
         roll = []

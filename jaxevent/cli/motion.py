@@ -174,12 +174,8 @@ def run(
     settings: dict[str, Any] = {"model": kind, "seed": seed, "progress": show_progress()}
     if smooth:
         settings["smooth"] = True
-    told, values = _told(estimator, recording, params, settings, (imu, bias, turned))
-    if not told.valid.any() and not (method or params or smooth) and kind.otherwise:
-        print(f"{estimator.name} found no motion, so {kind.otherwise} is tried")
-        estimator = find_estimator(kind.otherwise)
-        gyro = imu, bias, turned
-        told, values = _told(estimator, recording, params, settings, gyro, again=True)
+    gyro, other = (imu, bias, turned), not (method or params or smooth)
+    estimator, told, values = _estimated(estimator, recording, params, settings, gyro, other)
     told, warning = told.with_layers(recording)
     if warning:
         print(warning)
@@ -254,32 +250,43 @@ def _parameters(estimator: Any, kind: Any, path: Path | None) -> tuple[Any, set[
     return values, {*table, *table.get(estimator.name, {})}
 
 
-def _told(
+def _estimated(
     estimator: Any,
     recording: Any,
     params: Path | None,
     settings: dict[str, Any],
     gyro: Any,
-    *,
-    again: bool = False,
-) -> tuple[Any, Any]:
-    """The motion by a method, with parameters that suit the recording, and these.
+    other: bool,
+) -> tuple[Any, Any, Any]:
+    """The method, the motion by it, and its parameters, which suit the recording.
 
-    `gyro` tells whether the IMU helps, its bias and its axes. How the image moves is not said
-    `again`, of a second method.
+    Where it finds nothing, by the model's `other` method. `gyro` is that of `_told`.
     """
-    values, given = _parameters(estimator, settings["model"], params)
-    values, line = estimator.suit(recording, values, given=given)
-    if again:
-        windows = line.partition(": ")[2]
-        line = f"{estimator.name}: {windows}" if windows else ""
-    if line:
-        print(line)
+    from jaxevent.runs.egomotion import find_estimator
+
+    kind = settings["model"]
+    values, given = _parameters(estimator, kind, params)
+    suited = estimator.suit(recording, values, given=given)
+    if suited.line:
+        print(suited.line)
+    told = _told(estimator, recording, suited.params, settings, gyro)
+    if told.valid.any() or not other or not kind.otherwise:
+        return estimator, told, suited.params
+    print(f"{estimator.name} found no motion, so {kind.otherwise} is tried")
+    estimator = find_estimator(kind.otherwise)
+    suited = estimator.suit(recording, estimator.start(kind), speed=suited.speed)
+    if suited.lengths:
+        print(f"{estimator.name}: {suited.lengths}")
+    return estimator, _told(estimator, recording, suited.params, settings, gyro), suited.params
+
+
+def _told(estimator: Any, recording: Any, values: Any, settings: dict[str, Any], gyro: Any) -> Any:
+    """The motion by a method; `gyro` tells whether the IMU helps, its bias and its axes."""
     more = {"cloud": CLOUD} if "cloud" in estimator.options else {}
     helps, bias, turned = gyro
     if helps:
         more["gyro"] = _gyro(estimator, recording, values, settings, bias, turned)
-    return estimator.estimate(recording, values, **settings, **more), values
+    return estimator.estimate(recording, values, **settings, **more)
 
 
 def _gyro(

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -39,6 +39,23 @@ class Stretch(NamedTuple):
     def cut(self) -> Recording:
         """Its events."""
         return self.recording[self.start : self.stop]
+
+
+@dataclasses.dataclass(frozen=True)
+class Suited(Generic[P]):
+    """Parameters that suit a recording, how fast its image moves, and what is said of both.
+
+    `moves` says the speed, `lengths` the windows.
+    """
+
+    params: P
+    speed: Speed | None
+    moves: str
+    lengths: str
+
+    @property
+    def line(self) -> str:
+        return ": ".join(filter(None, (self.moves, self.lengths)))
 
 
 class Batch(eqx.Module):
@@ -128,19 +145,21 @@ class MotionEstimator(Estimator[P]):
         *,
         camera: PinholeCamera | None = None,
         given: Collection[str] = (),
-    ) -> tuple[P, str]:
-        """Parameters with windows as long as the recording needs, and a line that says so.
+        speed: Speed | None = None,
+    ) -> Suited[P]:
+        """Parameters with windows as long as the recording needs, and lines that say so.
 
-        Lengths of time are chosen by how fast the image moves (`patches.usual_speed`), where the
-        defaults are far from right. Those named in `given` stay as they are.
+        Lengths of time are chosen by how fast the image moves, where the defaults are far from
+        right: by `speed`, or `patches.usual_speed`. Those named in `given` stay as they are.
         """
         if self.lengths is None:
-            return params, ""
-        speed = usual_speed(recording, camera)
+            return Suited(params, speed, "", "")
+        speed = speed or usual_speed(recording, camera)
         if speed is None:
-            return params, (
+            still = (
                 "nothing was seen to move in windows of 1.6 ms to 1.6 s; windows are as by default"
             )
+            return Suited(params, None, still, "")
         chosen = self.lengths(params, speed)
         chosen = {name: value for name, value in chosen.items() if name not in given}
         said = ", ".join(
@@ -148,7 +167,8 @@ class MotionEstimator(Estimator[P]):
             for name, value in chosen.items()
         )
         moves = f"the image moves at about {speed.usual:.3g} px/s"
-        return params.replace(**chosen), f"{moves}: {said or 'windows are as given or by default'}"
+        said = said or "windows are as given or by default"
+        return Suited(params.replace(**chosen), speed, moves, said)
 
     def follow(
         self,
@@ -306,5 +326,5 @@ class OnHost(MotionEstimator[P]):
         """
         given, _ = self.prepare(recording, np.zeros(0, np.int64), params, **options)
         if params is None:
-            params, _ = self.suit(recording, self.start(given.model), camera=given.camera)
+            params = self.suit(recording, self.start(given.model), camera=given.camera).params
         return self.run(params, given)[0]

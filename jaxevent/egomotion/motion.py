@@ -72,6 +72,7 @@ class Motion(Shown):
     motion explains. `cloud` (n, particles, d), where it was asked for, is some of a filter's
     particles: the likelier a motion, the more of them are near it. `recording` is the recording's
     name and `span` (us) from when to when it lasts; without a span, all times may be asked for.
+    Of the estimates `held`, at the ends, repeat the one beside (`reaching`).
     """
 
     model: type[Model]
@@ -86,6 +87,7 @@ class Motion(Shown):
     agreement: NDArray[np.floating] | None = None
     recording: str = "the recording"
     span: tuple[int, int] | None = None
+    held: int = 0
 
     @classmethod
     def of(
@@ -223,7 +225,7 @@ class Motion(Shown):
             if added:
                 arrays["covariance"][row] += float(at - arrays["t"][row]) ** 2 * rate
                 arrays["t"][row] = at
-        return dataclasses.replace(self, **arrays)
+        return dataclasses.replace(self, **arrays, held=self.held + early + late)
 
     def _change(self) -> NDArray[np.float64]:
         """The mean square (d, d) of changes from an estimate to the next, per us^2."""

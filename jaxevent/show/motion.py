@@ -331,10 +331,8 @@ class Written:
         return lines
 
     def _count(self) -> str:
-        """Of estimates, without those at the ends that hold the one beside (`Motion.reaching`)."""
-        mean = self.motion.mean
-        held = sum(np.array_equal(mean[k], mean[j]) for k, j in ((0, 1), (-1, -2)) if len(mean) > 1)
-        number = max(len(mean) - held, min(len(mean), 1))
+        """Of estimates, without those that are held."""
+        number = len(self.motion) - self.motion.held
         return f"{number:,} estimate{'s' * (number != 1)}"
 
     def _found(self) -> list[str]:

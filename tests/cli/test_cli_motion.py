@@ -19,10 +19,11 @@ from jaxevent import cli, egomotion, methods
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import voting
 from jaxevent.egomotion.comparison import compare
-from jaxevent.egomotion.estimator import MotionEstimator
+from jaxevent.egomotion.estimator import MotionEstimator, Suited
 from jaxevent.egomotion.models import MODELS, General, Planar
 from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.particle_filter.estimator import Voting
+from jaxevent.egomotion.patches import Speed
 from jaxevent.egomotion.truth import Known
 from jaxevent.errors import InputError, install_command
 from jaxevent.estimator import Estimate
@@ -81,14 +82,20 @@ def test_columns_are_exact():
 def test_another_method_is_tried_where_the_usual_one_finds_nothing(folder, capsys, monkeypatch):
     monkeypatch.setattr(Voting, "estimate", lambda self, *_, model, **__: Motion.nothing(model))
     monkeypatch.setattr(Planar, "otherwise", "planes")
-    line = "the image moves at 9 px/s: window = 2 s"
-    monkeypatch.setattr(MotionEstimator, "suit", lambda self, _, params, **__: (params, line))
+    found, asked = Speed(9.0, 8.0, 10.0, ()), []
+
+    def suit(self, _, params, speed=None, **__):
+        asked.append(speed)
+        return Suited(params, found, "the image moves at 9: px/s", "window = 2 s")
+
+    monkeypatch.setattr(MotionEstimator, "suit", suit)
     words = ["motion", str(folder / "planar.h5"), "--model", "planar", "--out", str(folder / "out")]
     assert cli.main(words) == 0
     printed = capsys.readouterr().out
     assert "voting found no motion, so planes is tried" in printed
     # How fast the image moves is said once, the windows of either method.
-    assert printed.count("moves at 9 px/s") == 1 and "\nplanes: window = 2 s\n" in printed
+    assert asked == [None, found]  # measured once
+    assert printed.count("moves at 9: px/s") == 1 and "\nplanes: window = 2 s\n" in printed
     assert "planar motion by planes" in printed and "never found" not in printed
     assert cli.main([*words[:-1], str(folder / "other"), "--method", "voting"]) == 0
     assert "never found" in capsys.readouterr().out  # a method that was asked for stays
@@ -108,8 +115,9 @@ def test_a_folder_of_everything(folder, capsys):
 
     recording = jaxevent.load(path)[:0.2]
     given = read_toml(folder / "mine.toml")
-    params, line = voting.suit(recording, voting.Params.of(given), given=given)
-    assert "px/s" in line and line in said
+    suited = voting.suit(recording, voting.Params.of(given), given=given)
+    params = suited.params
+    assert "px/s" in suited.line and suited.line in said
     motion, _ = voting.estimate(recording, params, seed=3, cloud=64).with_layers(recording)
     header, table = read_table(out / "motion.csv")
     assert header == ["t", "vx", "vy", "sigma_vx", "sigma_vy", "lost"]

@@ -51,13 +51,13 @@ def test_a_speed_is_told(speed, seconds):
     recording = moving(lambda x: np.tile([0.8 * speed, -0.6 * speed], (len(x), 1)), seconds)
     found = usual_speed(recording)
     assert found is not None and abs(found.usual / speed - 1) < 0.2
-    suited, line = contrast.suit(recording, contrast.Params())
-    way = float(suited.duration) * speed
-    assert 4 < way < 61 and "px/s" in line
-    suited, _ = contrast.suit(recording, contrast.Params(duration=0.07), given=["duration"])
-    assert float(suited.duration) == pytest.approx(0.07)  # a number that is given wins
-    suited, _ = voting.suit(recording, voting.Params())
-    assert float(suited.tau_max) * speed > float(suited.baseline)
+    suited = contrast.suit(recording, contrast.Params())
+    way = float(suited.params.duration) * speed
+    assert 4 < way < 61 and "px/s" in suited.moves and suited.speed == found
+    given = contrast.suit(recording, contrast.Params(duration=0.07), given=["duration"])
+    assert float(given.params.duration) == pytest.approx(0.07)  # a number that is given wins
+    params = voting.suit(recording, voting.Params(), speed=found).params
+    assert float(params.tau_max) * speed > float(params.baseline)
 
 
 def test_noise_has_no_speed():
@@ -66,8 +66,9 @@ def test_noise_has_no_speed():
     x, y = (rng.integers(0, size, n).astype(np.uint16) for size in (WIDTH, HEIGHT))
     noise = Recording("noise", WIDTH, HEIGHT, Events(t, x, y, rng.random(n) < 0.5), camera=CAMERA)
     assert usual_speed(noise) is None
-    params, line = voting.suit(noise, voting.Params())
-    assert "nothing was seen" in line and params.values() == voting.Params().values()
+    suited = voting.suit(noise, voting.Params())
+    assert suited.speed is None and "nothing was seen" in suited.line
+    assert suited.params.values() == voting.Params().values()
     with pytest.raises(InputError, match="nothing is seen to move"):
         choose(noise)
 
@@ -148,7 +149,7 @@ def test_a_heading_that_nothing_tells_is_said():
     covariance = np.tile(np.diag([1.2, 1.2, 0, 1e-4, 1e-4, 1e-4]), (2, 1, 1))
     for sigma2, said in ((1.2, True), (1e-4, False)):
         covariance[:, [0, 1], [0, 1]] = sigma2
-        motion = Motion.of("general", t, mean, covariance)
+        motion = dataclasses.replace(Motion.of("general", t, mean, covariance), held=1)
         lines = Written([], t, motion(t), motion, None, None, None).summary()
         assert lines[0].startswith("1 estimate, found")  # the other one holds it
         assert ("not observable" in " ".join(lines)) == ("not told" in lines[2]) == said
@@ -220,6 +221,7 @@ def test_a_lone_estimate_and_what_it_reaches():
     told = motion.calibrated(Calibration(change=0.5), 0.2, np.array([0.0, 4.0]))
     np.testing.assert_allclose(told.covariance[0], np.diag([1, 1 + 0.25 * 16]))
     rate = np.diag([0, 4.0**2]) / 2e5**2
+    assert (told.held, told.reaching(0, 200_000).held) == (0, 2)
     whole = told.reaching(0, 200_000, rate).within(moving(lambda x: x, 0.2))
     assert list(whole.t) == [0, 100_000, 200_000] and whole.valid.all()
     np.testing.assert_allclose(whole.mean, np.tile(mean, (3, 1)))

@@ -198,7 +198,7 @@ class Voting(MotionEstimator[Params]):
         """
         if params is None:
             found, _ = self.place(recording, model, camera)
-            params, _ = self.suit(recording, self.start(found), camera=camera)
+            params = self.suit(recording, self.start(found), camera=camera).params
         kind, gatherer = self.gatherer(recording, params, model, camera)
         batches = -(-CHUNK // params.batch)
         events = len(recording.events) // params.every
