@@ -1,6 +1,6 @@
 """Windows of slider_depth that follow the one before: by the stages they pass, and by all of them.
 
-    python experiments/egomotion_following.py --data FOLDER [--turned 3]
+    python experiments/egomotion_following.py --data FOLDER [--turned 3 [--exact]]
 
 At three times a window of 300 ms is fitted from the path 0.1 s before, once through all stages of a
 window that starts from nothing and once through those of `windows.FOLLOWING`. Prints the error of
@@ -9,15 +9,20 @@ CPU seconds.
 
 With `--turned` windows at 0.5 s begin from a camera that turns about the vertical by so many
 degrees/s, one way and the other, before depths that make the same flow in the middle of the image.
+With `--exact` they go on at one sigma of misfits by steps of Gauss and Newton, which are solved as
+in the library, or by so many steps of conjugate gradients that they are about exact. Prints where
+the turn goes, and what is minimised (half a squared misfit by its variance is 1).
 """
 
 import argparse
+import functools
 import time
 from pathlib import Path as Place
 
 import numpy as np
 
 import jaxevent
+from jaxevent.egomotion.batch_fit import equations, photometric
 from jaxevent.egomotion.batch_fit import windows as batch
 from jaxevent.egomotion.batch_fit.path import Path, advanced
 
@@ -29,13 +34,45 @@ ALL = batch.ROUNDS, batch.FINAL[:-1]
 FEW = batch.FOLLOWING
 
 
-def turned(windows: batch.Windows, rate: float) -> None:
-    """Where a window ends that begins from a turn (degrees/s) about the vertical."""
+SIGMA, STEPS = 0.1, 12  # C; of Gauss and Newton
+EARLY, EXACT = (equations.SOLVE, equations.LEFT), (640, 1e-4)  # of conjugate gradients
+
+
+def begun(windows: batch.Windows, rate: float) -> batch.Rival:
+    """A window that follows a turn (degrees/s) about the vertical."""
     half, turn = float(windows.params.half_window), np.radians(rate)
     nodes = np.prod(windows.tracks(TURNED, half, 2000).nodes)
     level = np.full(nodes, np.log(USUAL - turn), windows.real)
-    begun = Path.constant(np.array([1.0, 0, 0]), np.array([0, turn, 0]), level)
-    fit = windows.ended(TURNED, [windows.followed(TURNED, begun)])
+    path = Path.constant(np.array([1.0, 0, 0]), np.array([0, turn, 0]), level)
+    return windows.followed(TURNED, path)
+
+
+def exact(windows: batch.Windows, rate: float) -> None:
+    """Where the turn goes by solutions that are stopped early, and by others."""
+    (equations.SOLVE, left), half = EARLY, float(windows.params.half_window)
+    photometric.solve = functools.partial(equations.solve, left=left)
+    scene, _ = begun(windows, rate)
+    tracks = windows.tracks(TURNED, half, windows.params.events)
+    problem, weight = photometric.begin(tracks, scene, windows.prior(TURNED, half), SIGMA, False)
+    for equations.SOLVE, left in (EARLY, EXACT):
+        photometric.solve = functools.partial(equations.solve, left=left)
+        kept = equations.look(problem, scene, weight)
+        told = [kept]
+        for _ in range(STEPS):
+            kept = equations.look(problem, photometric.step(problem, kept, 0.0, False), kept.weight)
+            told.append(kept)
+        turns = [np.degrees(one.scene.path.twist(0.0)[1][0, 1]) for one in told]
+        print(
+            f"from {rate:+.1f} deg/s, {equations.SOLVE} steps of conjugate gradients at most: wy "
+            f"{' '.join(f'{turn:+.2f}' for turn in turns)}, of energy "
+            f"{' '.join(f'{one.energy:.0f}' for one in told[1:])}",
+            flush=True,
+        )
+
+
+def turned(windows: batch.Windows, rate: float) -> None:
+    """Where a window ends that begins from a turn (degrees/s) about the vertical."""
+    fit = windows.ended(TURNED, [begun(windows, rate)])
     assert fit is not None
     heading, Omega = (part[0] for part in fit.path.twist(0.0))
     print(
@@ -51,13 +88,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--data", type=Place, required=True, help="folder of slider_depth.zip")
     parser.add_argument("--turned", type=float, help="degrees/s that windows begin with")
+    parser.add_argument("--exact", action="store_true", help="by exact steps from there")
     arguments = parser.parse_args()
     recording = jaxevent.load(arguments.data / "slider_depth.zip")
     assert recording.camera is not None
     windows = batch.Windows(recording, batch.Params.of({}), recording.camera)
     if arguments.turned is not None:
         for rate in (0.0, arguments.turned, -arguments.turned):
-            turned(windows, rate)
+            (exact if arguments.exact else turned)(windows, rate)
         return
     half = float(windows.params.half_window)
     for centre in CENTRES:
