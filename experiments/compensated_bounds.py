@@ -8,22 +8,28 @@ Tables:
                 experiments/motion_compensated.py scores: the motion found, the true one as means
                 of 2 x 2 pixels, the true one of pixels, and the true visibility beside it; the
                 true one of objects that reach farther than they do, by parts of a pixel; all
-                errors, and those within 2 px of where surfaces meet
+                errors, and what parts of the image add to them: pixels that an edge covers in part,
+                others that are hidden in a frame next to the target, and the rest by how far away
+                surfaces meet
     pans        fast pans of HDR scenes: MSE of ln(I + I0) of dark, well-exposed, bright pixels, of
                 the smoother, of `mc` with the motion found and the true one, of the fusion alone,
                 and with the best ingredient at every pixel; which part of the dark error of a pixel
-                is that of all instants along its true trajectory
+                is that of all instants along its true trajectory. With --fitted that of the fit of
+                experiments/ahdr.py, as it scores them
     thresholds  fast pans of HDR scenes by sensors whose pixels' thresholds differ more and more:
                 MSE of ln(I + I0) of bright pixels and of all, with and without learning these
 
-Recordings are simulated into the folder. Sensors' common thresholds are given, nothing is fitted.
+Recordings are simulated into the folder. Sensors' common thresholds are given, nothing is fitted
+but with --fitted.
 """
 
 import argparse
 import dataclasses
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
+import ahdr
 import numpy as np
 from motion_compensated import SCORING, halfway, objects_at
 from numpy.typing import NDArray
@@ -36,7 +42,8 @@ from jaxevent.reconstruction.compensated.estimator import Followed, place_of
 from jaxevent.reconstruction.compensated.warping import Along, warp
 from jaxevent.simulate import TESTING, Objects, Pan, Sensor, scene, simulate
 
-RATE, IMAGES, EDGE = 25.0, 6, 2.0  # Hz; images per recording; px
+RATE, IMAGES = 25.0, 6  # Hz; images per recording
+EDGES = (2.0, 4.0)  # px from where surfaces meet
 GROWN = (0.25, 0.5)  # px
 MISMATCH, SEEDS = (0.03, 0.1, 0.15), (2, 3)
 mc = jaxevent.METHODS["mc"]
@@ -82,19 +89,43 @@ def by_nodes(target: Followed, source: Objects, t: int) -> NDArray[np.float32]:
     return trajectories.spread(nodes, (h, w))
 
 
+def regions(source: Objects, t: int, frames: NDArray[np.int64]) -> dict[str, NDArray[np.bool_]]:
+    """Parts of the image at a time (us) that errors are told of; `frames` are times next to it."""
+    seen, (h, w) = source.visible(t * 1e-6), source.size[::-1]
+    y, x = np.mgrid[:h, :w].astype(float)
+    partly = np.zeros((h, w), bool)
+    for surface in source.surfaces:
+        if surface.distance is not None:
+            px, py = surface.place(t * 1e-6)
+            distance = surface.distance(x - px, y - py, surface.radius)
+            partly = (partly & (distance > -0.5)) | (abs(distance) < 0.5)
+    hidden = np.zeros((h, w), bool)
+    for frame in frames.tolist():
+        hidden |= source.displacement(t * 1e-6, frame * 1e-6)[1]
+    meet = np.zeros((h, w), bool)
+    meet[:, 1:] |= seen[:, 1:] != seen[:, :-1]
+    meet[1:] |= seen[1:] != seen[:-1]
+    away, (near, far) = np.asarray(distance_transform_edt(~meet)), EDGES
+    rest = ~partly & ~hidden
+    return {
+        "covered in part": partly,
+        "hidden at a frame": hidden & ~partly,
+        f"within {near:g} px": rest & (away < near),
+        f"{near:g} to {far:g} px": rest & (away >= near) & (away < far),
+        "farther": rest & (away >= far),
+    }
+
+
 def objects(folder: Path) -> Iterator[str]:
-    """The table, line by line."""
+    """The table, line by line: of each region how much of the mean over the image it adds."""
     params = mc.Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4)
     found: dict[str, list] = {}
+    shares, where = [], {}
     for seed in SCORING:
         source, recording = objects_at(folder, RATE, seed)
         video = mc.estimate(recording, params, progress=False)
         for t in halfway(recording, IMAGES).tolist():
-            truth, seen = source.intensity(t * 1e-6).clip(0, 1), source.visible(t * 1e-6)
-            meet = np.zeros(seen.shape, bool)
-            meet[:, 1:] |= seen[:, 1:] != seen[:, :-1]
-            meet[1:] |= seen[1:] != seen[:-1]
-            near = np.asarray(distance_transform_edt(~meet)) < EDGE
+            truth = source.intensity(t * 1e-6).clip(0, 1)
             target = video.follow(t)
             instants, L, V, clear, *_ = target
             place = place_of(instants, clear, len(instants))
@@ -113,20 +144,23 @@ def objects(folder: Path) -> Iterator[str]:
                     for grown in GROWN
                 },
             }
+            images = {"smoother": L[instants.own]}
             for name, along in cases.items():
                 told = fusion.compare(
                     agree(params, L, along, place), fusion.views(L, V, along, place)
                 )
-                image = np.exp(np.asarray(fusion.decide(params, told).L)) - float(params.I0)
-                error = (image.clip(0, 1) - truth) ** 2
-                found.setdefault(name, []).append(
-                    (error.mean(), (error * near).sum() / error.sum())
-                )
-    yield "| objects | MSE x 1e-2 | of it near edges |"
-    yield "|---|---:|---:|"
+                images[name] = np.asarray(fusion.decide(params, told).L)
+            where = regions(source, t, instants.t[[instants.before, instants.after]])
+            for name, image in images.items():
+                error = ((np.exp(image) - float(params.I0)).clip(0, 1) - truth) ** 2
+                parts = [(error * part).mean() for part in where.values()]
+                found.setdefault(name, []).append([error.mean(), *parts])
+            shares.append([part.mean() for part in where.values()])
+    yield "| MSE x 1e-2 | all | " + " | ".join(where) + " |"
+    yield "|---|---:|" + "---:|" * len(where)
+    yield "| share of pixels | | " + " | ".join(f"{v:.0%}" for v in np.mean(shares, 0)) + " |"
     for name, rows in found.items():
-        error, share = np.mean(rows, 0)
-        yield f"| {name} | {100 * error:.4f} | {100 * share:.0f} % |"
+        yield f"| {name} | " + " | ".join(f"{100 * v:.4f}" for v in np.mean(rows, 0)) + " |"
 
 
 def truly_panned(target: Followed, source: Pan, t: int) -> Along:
@@ -152,9 +186,11 @@ def truly_panned(target: Followed, source: Pan, t: int) -> Along:
     return Along(*warped)
 
 
-def pans(folder: Path) -> Iterator[str]:
+def pans(folder: Path, fitted: Path | None = None) -> Iterator[str]:
     """The table, line by line: geometric means over recordings."""
     params = mc.Params(preset="hdr", c_on=0.2, c_off=0.18, rho_ref=5e-4)
+    if fitted is not None:
+        [(_, _, params)] = ahdr.choose(["mc"], fitted)
     found: dict[str, list] = {}
     common = []
     for name in TESTING:
@@ -236,7 +272,9 @@ def main() -> None:
     tables = {"objects": objects, "pans": pans, "thresholds": thresholds}
     parser.add_argument("--tables", nargs="+", default=list(tables), choices=tables)
     parser.add_argument("--out", type=Path, required=True, help="folder for everything made")
+    parser.add_argument("--fitted", type=Path, help="params.toml of experiments/ahdr.py, for pans")
     arguments = parser.parse_args()
+    tables["pans"] = functools.partial(pans, fitted=arguments.fitted)
     out = arguments.out.absolute()
     out.mkdir(parents=True, exist_ok=True)
     for name in arguments.tables:

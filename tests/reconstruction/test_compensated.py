@@ -158,6 +158,14 @@ def test_pixels_take_the_path_of_their_side():
 
     # What moves has left the image's other half, so that some pixels see it in few instants.
     assert wrong(before) > 0.5 and wrong(chosen) < 0.25
+    # Steps from paths of others leave fewer wrong ones than steps alone; sizes may be odd.
+    rules = 2e-4, 10.0, trajectories.Smoothness(40.0, 0.04, 0.1, 0.2)
+    odd, p = np.ascontiguousarray(images[:, :39, :55]), paths[::2, ::2]
+    refined, of = borders.refine(odd, s, p, *rules)
+    plain = trajectories.step(odd, s, trajectories.step(odd, s, p, *rules), *rules)
+    near, truth = near[:55], truth[:55]
+    after, steps_alone = (trajectories.spread(one, (39, 55)) for one in (refined, plain))
+    assert of.shape == (39, 55) and wrong(after) < 0.9 * wrong(steps_alone)
     # Where all move alike none is better, and each keeps its own.
     even = np.broadcast_to(np.float32([6, -3, 0, 0]), paths.shape).copy()
     own = np.arange(40 * 56).reshape(40, 56)

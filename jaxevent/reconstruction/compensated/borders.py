@@ -6,6 +6,9 @@ agree clearly better along it, by the same robust squares that motion is found w
 Gaussian:
 
     sum_k rho((L_k(x + u(x', s_k)) - M(x))^2 W_k(x + u)),   x' the pixel nearby
+
+Steps go on from such paths: near borders more of them are right then, so more pixels have one to
+take.
 """
 
 import numpy as np
@@ -13,12 +16,22 @@ from numpy.typing import NDArray
 
 from jaxevent.kernels import fast, fast_part, over_rows, room_over
 from jaxevent.reconstruction.compensated.agreement import blurred
-from jaxevent.reconstruction.compensated.trajectories import OUTSIDE, around, robust_mean
+from jaxevent.reconstruction.compensated.trajectories import (
+    OUTSIDE,
+    Smoothness,
+    around,
+    robust_mean,
+    spread,
+    step,
+)
 
 # Every how many pixels are compared, how far away those are whose paths are tried, and the
 # Gaussian, both in units of that: turn by turn. Chosen on objects of other seeds and the first half
 # of slider_depth: three turns of all pixels (8, 4 and 2 px) are as good and take 1.8 times as long.
 TURNS = ((2, 4, 1.0), (1, 3, 1.0))
+# Between steps, at nodes. All turns there take a further 3 % off the error of such objects and
+# nothing off that of slider_depth; an image takes 7 % longer.
+BETWEEN = TURNS[:1]
 DIRECTIONS = np.array([(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)])
 # By how much for every instant. By less, pixels of one surface take what noise prefers: with 0 so
 # do three of four in slow HDR pans, and well-exposed ones have 1.7 times the error. Chosen on the
@@ -52,28 +65,41 @@ def _cost(images, s, near, y, x, path, floor, nu, level, W, R):
     return nu * np.float32(cost + np.log(product))
 
 
+@fast_part
+def _apart(own, other):
+    """By how many px at the farthest instant two paths differ, at most."""
+    x = abs(other[0] - own[0]) + abs(other[2] - own[2])
+    return max(x, abs(other[1] - own[1]) + abs(other[3] - own[3]))
+
+
 @fast
 def _try(begin, end, images, s, near, step, paths, offsets, floor, nu, room, out):
-    """Costs (1 + n, h, w) of every `step`-th pixel along both axes: of its path and others'."""
+    """Costs (1 + n, h, w) of every `step`-th pixel along both axes: of its path and others'.
+
+    Only differences between them count, so they are 0 where no path differs.
+    """
     h, w, _ = paths.shape
     level, W, R = room[begin, 0], room[begin, 1], room[begin, 2]
     for y in range(begin, end):
         for x in range(w):
-            at, own = (y * step, x * step), paths[y, x]
-            out[0, y, x] = _cost(images, s, near, *at, own, floor, nu, level, W, R)
+            at, own, alike = (y * step, x * step), paths[y, x], True
+            for n in range(len(offsets)):
+                i = min(max(y + offsets[n, 0], 0), h - 1)
+                j = min(max(x + offsets[n, 1], 0), w - 1)
+                alike = alike and _apart(own, paths[i, j]) < APART
+            out[0, y, x] = np.float32(0)
+            if not alike:
+                out[0, y, x] = _cost(images, s, near, *at, own, floor, nu, level, W, R)
             good = out[0, y, x] < CLEARLY * len(s)  # no other path is clearly better
             for n in range(len(offsets)):
                 i = min(max(y + offsets[n, 0], 0), h - 1)
                 j = min(max(x + offsets[n, 1], 0), w - 1)
-                other = paths[i, j]
-                apart = np.float32(0)
-                for c in range(2):
-                    v, a = other[c] - own[c], other[c + 2] - own[c + 2]
-                    apart = max(apart, abs(v) + abs(a))
-                if good or apart < APART:
+                if good or _apart(own, paths[i, j]) < APART:
                     out[1 + n, y, x] = out[0, y, x]
                 else:
-                    out[1 + n, y, x] = _cost(images, s, near, *at, other, floor, nu, level, W, R)
+                    out[1 + n, y, x] = _cost(
+                        images, s, near, *at, paths[i, j], floor, nu, level, W, R
+                    )
 
 
 def choose(
@@ -82,6 +108,7 @@ def choose(
     paths: NDArray[np.float32],
     floor: float,
     nu: float,
+    turns: tuple[tuple[int, int, float], ...] = TURNS,
 ) -> NDArray[np.int32]:
     """The pixel, counted row by row, whose path each pixel takes, (h, w).
 
@@ -91,21 +118,42 @@ def choose(
         paths: Of all pixels, (h, w, 4).
         floor: As in `trajectories`.
         nu: As in `trajectories`.
+        turns: As `TURNS`.
     """
     h, w, _ = paths.shape
     near = np.exp(-2 * s**2).astype(np.float32)
     whose = np.arange(h * w, dtype=np.int32).reshape(h, w)
     row, column = np.mgrid[:h, :w]
-    for step, far, sigma in TURNS:
-        some = paths.reshape(-1, 4)[whose[::step, ::step]]
+    for every, far, sigma in turns:
+        some = paths.reshape(-1, 4)[whose[::every, ::every]]
         rows, columns, _ = some.shape
         costs = np.empty((1 + len(DIRECTIONS), rows, columns), np.float32)
-        given = (images, s, near, step, some, DIRECTIONS * far, np.float32(floor), np.float32(nu))
+        given = (images, s, near, every, some, DIRECTIONS * far, np.float32(floor), np.float32(nu))
         over_rows(_try, rows, *given, room_over(rows, 3, len(s)), costs)
         found = np.stack([blurred(one, sigma) for one in costs])
         found[1:] += CLEARLY * len(s)
         best = found.argmin(0)
-        moves = step * far * np.concatenate([[(0, 0)], DIRECTIONS])[best]
-        dy, dx = moves[row // step, column // step].transpose(2, 0, 1)
+        moves = every * far * np.concatenate([[(0, 0)], DIRECTIONS])[best]
+        dy, dx = moves[row // every, column // every].transpose(2, 0, 1)
         whose = whose[(row + dy).clip(0, h - 1), (column + dx).clip(0, w - 1)]
     return whose
+
+
+def refine(
+    images: NDArray[np.float32],
+    s: NDArray[np.float32],
+    p: NDArray[np.float32],
+    floor: float,
+    nu: float,
+    smoothness: Smoothness,
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Trajectories p (rows, columns, 4) after two steps, and what `choose` tells of them.
+
+    Nodes take the paths of others between the steps. Arguments are as those of `trajectories.step`.
+    """
+    size = images.shape[1:3]
+    paths = spread(step(images, s, p, floor, nu, smoothness), size)
+    whose = choose(images, s, paths, floor, nu, BETWEEN)
+    nodes = paths.reshape(-1, paths.shape[-1])[whose[::2, ::2]]
+    p = step(images, s, nodes, floor, nu, smoothness)
+    return p, choose(images, s, spread(p, size), floor, nu)

@@ -72,7 +72,7 @@ KEPT = 96  # images of instants that a video remembers
 FADE = 0.35  # of variances from one resolution to the half of it
 APART = 8  # steps of the schedule between anchors
 ANCHORS = 2  # whose motion is remembered
-STEPS = 2  # with which a target's motion is found at half and at full resolution
+STEPS = 2  # with which a target's motion is found at half resolution
 CLEARLY = 0.97  # of the misfit by time, where the course tells more than noise
 FASTEST = 2.0  # times as fast as what moves on the whole: what exposures are sampled for
 INFLATE = 3.0  # of the variance of an image that motion is refined with
@@ -382,9 +382,7 @@ class Follower:
         better[own] = fused.L
         doubted[own] = INFLATE * np.asarray(fused.P) + self._settings[0]
         packed = trajectories.pack(better, doubted)
-        for _ in range(STEPS):
-            p = trajectories.step(packed, s, p, *self._settings)
-        whose = borders.choose(packed, s, trajectories.spread(p, L.shape[1:]), *self._settings[:2])
+        p, whose = borders.refine(packed, s, p, *self._settings)
         return Followed(instants, L, V, clear, p, whose, smooth)
 
 
