@@ -8,7 +8,11 @@ import platformdirs
 # optimisations compiling takes half as long, running 1.4 times as long; `optimised` undoes it.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 # The older code generator of XLA takes a fifth less of the time again: 42 s in place of 52 s.
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+# Programs in parts for several cores take more to compile, and all cores have tests of their own.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1",
+)
 # What one test, worker or command has compiled, the others take from the user's cache folder, and
 # so does the next run. The environment reaches the commands that tests start.
 os.environ.setdefault(

@@ -80,13 +80,12 @@ def _gather(eqn: Any, x: NDArray, indices: NDArray) -> NDArray:
         raise Untranslatable("a gather with batch dimensions")
     batch = indices.shape[:-1]
     kept = [size for axis, size in enumerate(sizes) if axis not in numbers.collapsed_slice_dims]
-    out = np.empty((*batch, *kept), x.dtype)
-    for place in np.ndindex(*batch):
-        start = [0] * x.ndim
-        for axis, value in zip(numbers.start_index_map, indices[place], strict=True):
-            start[axis] = int(np.clip(int(value), 0, x.shape[axis] - sizes[axis]))
-        part = x[tuple(slice(s, s + n) for s, n in zip(start, sizes, strict=True))]
-        out[place] = part.reshape(kept)[()]
+    start = [np.zeros(batch, np.int64)] * x.ndim
+    for axis, values in zip(numbers.start_index_map, np.moveaxis(indices, -1, 0), strict=True):
+        start[axis] = np.clip(values.astype(np.int64), 0, x.shape[axis] - sizes[axis])
+    within = np.ogrid[tuple(slice(size) for size in sizes)]
+    along = tuple(s.reshape(*batch, *[1] * x.ndim) + w for s, w in zip(start, within, strict=True))
+    out = x[along].reshape(*batch, *kept)
     axes = list(range(len(batch), out.ndim))
     order = [0] * out.ndim
     at_offset, rest = iter(axes), iter(range(len(batch)))

@@ -267,6 +267,15 @@ def test_numbers_of_parameters_are_found_without_compiling():
         made = run(closed, [np.asarray(v) for v in given_numbers])
         for one, other in zip(made, numbers(*given_numbers), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-12)
+
+    def places(x, i):
+        return x[i], x[:, i], x[i, :, i], jnp.take(x, i, axis=2), x[1:3, i[0], 2:4]
+
+    x, i = np.random.default_rng(0).random((4, 5, 6)), np.array([[0, 3], [1, 1], [-1, 2]])
+    for one, other in zip(
+        run(jax.make_jaxpr(places)(x, i), [x, i]), places(x, jnp.asarray(i)), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
     program = HostProgram()
     first = program.add_input(np.asarray(2.0))
     greater = jax.make_jaxpr(lambda x: x > 1)(2.0).eqns[0]

@@ -221,7 +221,7 @@ def test_windows_do_not_change_the_evidence_of_mc():
 
 
 @pytest.mark.slow
-def test_many_frames_and_uneven_pixels_in_windows():
+def test_many_frames_and_uneven_pixels_in_windows(monkeypatch):
     """Hundreds of frames and a pixel with thousands of events use every kind of tile."""
     recording = random_recording(1, 5_000, 150, exposure=500, hot=4_500)
     params = params_of(jaxevent.akf, **PARAMS)
@@ -237,10 +237,11 @@ def test_many_frames_and_uneven_pixels_in_windows():
         image.reshape(expected[0].shape), expected[0], rtol=1e-12, atol=1e-12
     )
     np.testing.assert_allclose(variance.reshape(expected[1].shape), expected[1], rtol=1e-12)
-    small = jaxevent.akf.estimate(recording, params, window_events=100)
+    monkeypatch.setattr(video, "BEGINS", 8)
+    small = jaxevent.akf.estimate(recording, params, window_events=400)
     np.testing.assert_allclose(look(small, times), expected, rtol=1e-12, atol=1e-12)
     # More windows than states are kept: some images are filtered to from further back.
-    assert len(small._begins) <= video.BEGINS < 5_000 / 100
+    assert len(small._begins) <= video.BEGINS < 5_000 / 400
     for i in (3, 17, 11):
         again = [image[0] for image in look(small, times[i])]
         np.testing.assert_allclose(again, [e[i] for e in expected], rtol=1e-12, atol=1e-12)

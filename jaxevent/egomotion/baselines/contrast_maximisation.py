@@ -152,7 +152,7 @@ def image(
         return blur(warped, params.blur if times is None else times)
 
     def more(J, k):
-        return jnp.where(k < times, blur(J), J), None
+        return lax.cond(k < times, blur, lambda J: J, J), None
 
     return lax.scan(more, warped, jnp.arange(max(COARSE, params.blur)))[0]
 
