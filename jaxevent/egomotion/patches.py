@@ -9,7 +9,9 @@ way d (px in L) of a grid. The signed image of a patch of 24 px is sharpest at t
 reach tells a patch's speed |d| / L best.
 """
 
-from typing import NamedTuple
+import contextlib
+import weakref
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +33,8 @@ ALIKE = 0.2  # of the patches whose halves tell one way, at least; of noise 0.1
 ENOUGH = 6  # patches that tell a speed, at least
 MARGIN = 6  # px of a patch's image around it
 GRAIN = 2  # px of its pixels
+
+_latest: list[tuple[Any, Any, "Speed | None"]] = []  # of `usual_speed`: events, sensor, answer
 
 
 class Speed(NamedTuple):
@@ -70,11 +74,23 @@ def middles(recording: Recording, number: int) -> list[int]:
 def usual_speed(recording: Recording, camera: PinholeCamera | None = None) -> Speed | None:
     """How fast things move in the image (px/s, undistorted); None where that is not seen.
 
-    Windows of 1.6 ms to 1.6 s are tried at six times, spread evenly over the events.
+    Windows of 1.6 ms to 1.6 s are tried at six times, spread evenly over the events. The latest
+    answer is kept: the windows of each method, the choice of the model and scores ask for it.
     """
+    asked = recording.width, recording.height, camera or recording.camera
+    for events, known, speed in _latest:
+        if events() is recording.events and known == asked:
+            return speed
+    speed = _measured(recording, asked[2])
+    with contextlib.suppress(TypeError):  # a source of the user's own may not take references
+        _latest[:] = [(weakref.ref(recording.events), asked, speed)]
+    return speed
+
+
+def _measured(recording: Recording, camera: PinholeCamera | None) -> Speed | None:
     if len(recording.events) < FEWEST:
         return None
-    xi, _ = coordinates(recording.width, recording.height, camera or recording.camera)
+    xi, _ = coordinates(recording.width, recording.height, camera)
     speeds, at, patches = [], [], 0
     for middle in middles(recording, TIMES):
         found: dict[tuple[float, ...], tuple[float, float]] = {}

@@ -51,6 +51,7 @@ def test_a_speed_is_told(speed, seconds):
     recording = moving(lambda x: np.tile([0.8 * speed, -0.6 * speed], (len(x), 1)), seconds)
     found = usual_speed(recording)
     assert found is not None and abs(found.usual / speed - 1) < 0.2
+    assert usual_speed(recording) is found and usual_speed(recording, CAMERA) is found
     suited = contrast.suit(recording, contrast.Params())
     way = float(suited.params.duration) * speed
     assert 4 < way < 61 and "px/s" in suited.moves and suited.speed == found
@@ -100,6 +101,7 @@ def test_models_are_told_apart():
     assert turns.z["rotation", "planar"] > 3 and "better than" in " ".join(turns.lines)
     assert "not sure" in turns.lines[-1] and "not sure" not in " ".join(slides.lines)
     flat, several, rolling = layers(plane), layers(sliding), layers(turning)
+    assert usual_speed(turning) != usual_speed(sliding) != usual_speed(plane)
     assert rolling is not None and rolling.several and rolling.spread > 0.5 and rolling.both
     assert flat is None or not flat.several
     assert (
