@@ -87,19 +87,7 @@ def growth(
     reference = jnp.sum(jnp.where(valid, logarithm, 0)) / jnp.maximum(jnp.sum(valid), 1)
     w = jnp.exp(reference - logarithm)
     dt = jnp.diff(times, prepend=times[:1])
-    # Sizes known exactly would make the covariances singular.
-    R = w**2 * jnp.maximum(relative, 1e-10)
-    if Q_lambda is not None:
-        # A filter of a walk of density Q that has settled at the variance P forgets over
-        # tau = P / Q. Of P one half is noise that it passes on, the other its lag behind a walk,
-        # which steady growth is not. The mean of many samples whose errors have the correlation
-        # r^k, r = exp(-dt / tau), has the variance of independent ones times (1 + r) / (1 - r) =
-        # coth(dt / (2 tau)). So samples at dt << tau make P^2 / Q, the density of events' noise.
-        P_lambda = jnp.maximum((covariance[:, 4, 4] + covariance[:, 5, 5]) / 2, 1e-10)
-        last = jnp.max(jnp.where(valid, times, times[0]))
-        span = last - jnp.min(jnp.where(valid, times, times[-1]))
-        every = jnp.maximum(span, 0) / jnp.maximum(jnp.sum(valid) - 1, 1)
-        R = R / 2 / jnp.tanh(jnp.maximum(every * Q_lambda / (2 * P_lambda), 1e-6))
+    R = w**2 * _relative_noise(times, relative, covariance, valid, Q_lambda)
 
     def product(a, b):
         return jnp.sum(a[:, :, None] * b[None], 1)  # faster to compile and run than a dot
@@ -140,6 +128,26 @@ def growth(
     value = -m[:, 1] / m[:, 0]
     slope = -jnp.stack([value, jnp.ones_like(value)], -1) / m[:, :1]
     return value, jnp.einsum("ti,tij,tj->t", slope, P, slope)
+
+
+def _relative_noise(
+    times: Array, relative: Array, covariance: Array, valid: Array, Q_lambda: Number | None
+) -> Float[Array, " times"]:
+    """The variances of log sizes, as of errors that are independent; see `growth`."""
+    # Sizes known exactly would make the covariances singular.
+    R = jnp.maximum(relative, 1e-10)
+    if Q_lambda is None:
+        return R
+    # A filter of a walk of density Q that has settled at the variance P forgets over tau = P / Q.
+    # Of P one half is noise that it passes on, the other its lag behind a walk, which steady growth
+    # is not. The mean of many samples whose errors have the correlation r^k, r = exp(-dt / tau),
+    # has the variance of independent ones times (1 + r) / (1 - r) = coth(dt / (2 tau)). So samples
+    # at dt << tau make P^2 / Q, the density of events' noise.
+    P_lambda = jnp.maximum((covariance[:, 4, 4] + covariance[:, 5, 5]) / 2, 1e-10)
+    last = jnp.max(jnp.where(valid, times, times[0]))
+    span = last - jnp.min(jnp.where(valid, times, times[-1]))
+    every = jnp.maximum(span, 0) / jnp.maximum(jnp.sum(valid) - 1, 1)
+    return R / 2 / jnp.tanh(jnp.maximum(every * Q_lambda / (2 * P_lambda), 1e-6))
 
 
 def size_range(

@@ -227,22 +227,9 @@ class Voting(MotionEstimator[Params]):
                 shown.update(int(made.row.max(initial=0)) + 1 - shown.n)
                 number += 1
 
-        def whole(name: str) -> NDArray:
-            return np.concatenate([getattr(info, name) for _, info in parts])
-
+        motion = _told(kind, parts, cloud > 0).within(recording)
         if not parts:
-            return Motion.nothing(type(kind)).within(recording)
-        motion = Motion(
-            type(kind),
-            np.concatenate([t for t, _ in parts]),
-            whole("mean"),
-            whole("covariance"),
-            ~whole("searching"),
-            whole("lag"),
-            whole("contrast"),
-            whole("evidence"),
-            whole("cloud") if cloud else None,
-        ).within(recording)
+            return motion
         by = (PLANAR if kind.uniform else OTHERS).behind(camera or recording.camera)
         return (smoothed(motion, params) if smooth else motion).calibrated(by, 2 * motion.lag)
 
@@ -376,6 +363,27 @@ class Followed(Batch):
             along(chosen, self),
             placed,
         )
+
+
+def _told(model: Model, parts: list[tuple[NDArray, Any]], cloud: bool) -> Motion:
+    """The motion of what a filter says, times and `Info` of one stretch after another."""
+    if not parts:
+        return Motion.nothing(type(model))
+
+    def whole(name: str) -> NDArray:
+        return np.concatenate([getattr(info, name) for _, info in parts])
+
+    return Motion(
+        type(model),
+        np.concatenate([t for t, _ in parts]),
+        whole("mean"),
+        whole("covariance"),
+        ~whole("searching"),
+        whole("lag"),
+        whole("contrast"),
+        whole("evidence"),
+        whole("cloud") if cloud else None,
+    )
 
 
 def _corners(model: Model, gatherer: Gatherer) -> NDArray[np.floating]:
