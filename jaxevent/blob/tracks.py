@@ -35,6 +35,7 @@ from jaxevent.shown import Shown
 
 BEGINS = 32  # stretches from which tracking can be taken up again
 READS = 64  # times read per call
+TOGETHER = 2**12  # states that are told of at once
 KEPT = 2**24  # numbers of what later events say that are kept between readings
 
 _begin = jax.jit(begin, static_argnames="filter")
@@ -105,6 +106,15 @@ def _path_of(
     events = *events, None if f.owner is None else f.owner[chunk]
     _, steps = scan_steps(filter, params, "states", f.frame, before, events)
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), before, steps.slots)
+
+
+def _joined(parts: Sequence[TrackStates]) -> TrackStates:
+    """States of the same tracks, at the times of all."""
+    mean, covariance, valid, idle = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("mean", "covariance", "valid", "idle")
+    )
+    return TrackStates(mean, covariance, valid, idle, parts[0].id)
 
 
 class Events(NamedTuple):
@@ -209,12 +219,10 @@ class Tracks(Shown):
         chosen = self._chosen(ids)
         if not parts:
             return self._nothing(times, chosen)
+        told = _joined(parts)
         back = np.argsort(order, kind="stable")
-        mean, covariance, valid, idle = (
-            np.concatenate([getattr(part, name) for part in parts])[back]
-            for name in ("mean", "covariance", "valid", "idle")
-        )
-        return TrackStates(mean, covariance, valid, idle, self.id[chosen])
+        told = (value[back] for value in (told.mean, told.covariance, told.valid, told.idle))
+        return TrackStates(*told, self.id[chosen])
 
     def batches(
         self,
@@ -223,7 +231,20 @@ class Tracks(Shown):
         *,
         extrapolate: bool = False,
     ) -> Iterator[tuple[NDArray[np.int64], TrackStates]]:
-        """The same, one stretch of sorted times after another: `times, states`."""
+        """The same, some of the sorted times after others: `times, states`."""
+        held: list[tuple[NDArray[np.int64], TrackStates]] = []
+        for piece in self._pieces(times, ids, extrapolate):
+            held.append(piece)
+            if sum(states.valid.size for _, states in held) >= TOGETHER:
+                yield np.concatenate([t for t, _ in held]), _joined([now for _, now in held])
+                held = []
+        if held:
+            yield np.concatenate([t for t, _ in held]), _joined([now for _, now in held])
+
+    def _pieces(
+        self, times: Times, ids: Sequence[int] | NDArray[np.integer] | None, extrapolate: bool
+    ) -> Iterator[tuple[NDArray[np.int64], TrackStates]]:
+        """The same, chunk by chunk."""
         times = np.atleast_1d(microseconds(times))
         if (times[1:] < times[:-1]).any():
             raise InputError("times must be sorted to be read in batches; sort them")

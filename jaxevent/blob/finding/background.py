@@ -8,7 +8,6 @@ flicker are, cells are smaller, and how its counts disperse is measured for each
 
 import dataclasses
 import functools
-import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -137,6 +136,21 @@ def placing(scene: SceneMotion, corner: tuple[int, int], t: float | int) -> NDAr
     return np.stack([[x[1] - x[0], y[1] - y[0]], [x[2] - x[0], y[2] - y[0]], first], 1)
 
 
+def in_steps(
+    spans: NDArray[np.float64], scene: SceneMotion | None, corner: tuple[int, int]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Spans (n, 2) s in which a scene stands still, of such in which it moves.
+
+    And `placing` (n, 2, 3) of each, and of which of those given it is a part.
+    """
+    if scene is None:
+        return spans, np.tile(UNMOVED, (len(spans), 1, 1)), np.arange(len(spans))
+    times = [scene.steps(*span) for span in spans]
+    parts = np.concatenate([np.stack([t[:-1], t[1:]], 1) for t in times])
+    places = np.stack([placing(scene, corner, t) for t in parts.mean(1)])
+    return parts, places, np.repeat(np.arange(len(spans)), [len(t) - 1 for t in times])
+
+
 def look_up(values: NDArray, cell: int, x: NDArray | float | int, y: NDArray | float | int) -> Any:
     """Values (rows, columns) of cells of so many px at some pixels."""
     rows, columns = values.shape
@@ -175,14 +189,14 @@ def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
 
 def measure_background(stream: Stream) -> Background:
     """The background of a stream; hot pixels are marked in the stream."""
-    counts = np.zeros((stream.height, stream.width), np.int32)
-    stream.add_cells(0, stream.duration, UNMOVED, 1, counts)
-    stream.hot = find_hot_pixels(counts)
+    counts, all = np.zeros((1, stream.height, stream.width), np.int32), np.array([0])
+    stream.add_cells(np.array([[0, stream.duration]]), UNMOVED[None], 1, counts, all)
+    stream.hot = find_hot_pixels(counts[0])
     fine = -(-stream.height // CELL) * CELL // FINE, -(-stream.width // CELL) * CELL // FINE
     cells = np.zeros((SLICES, *fine), np.int32)
     edges = np.linspace(0, stream.duration, SLICES + 1)
-    for begin, end, now in zip(edges[:-1], edges[1:], cells, strict=True):
-        stream.add_cells(begin, end, UNMOVED, FINE, now)
+    spans, places = np.stack([edges[:-1], edges[1:]], 1), np.tile(UNMOVED, (SLICES, 1, 1))
+    stream.add_cells(spans, places, FINE, cells, np.arange(SLICES))
     return _of_counts(cells, stream.duration)
 
 
@@ -208,9 +222,10 @@ def _of_counts(cells: NDArray[np.int32], duration: float) -> Background:
     while g > FINE:
         g //= 2
         full = np.kron(full & (quarter >= PLENTY), np.ones((2, 2), bool))
-        quarter, m = _quiet(pooled(cells, g // FINE).astype(float))
-        density = np.kron(density, np.ones((2, 2)))
-        density = np.where(full, np.maximum(m / g**2, least), density)
+        density, quarter = density.repeat(2, 0).repeat(2, 1), np.zeros(full.shape)
+        if full.any():
+            quarter, m = _quiet(pooled(cells, g // FINE).astype(float))
+            density = np.where(full, np.maximum(m / g**2, least), density)
     return Background(density / (duration / SLICES), calm, bright, activity, duration)
 
 
@@ -244,12 +259,9 @@ def measure_dispersion(
     middles = (np.arange(number) + np.arange(number) * GOLDEN % 1) / number * stream.duration
     slices = background.slice(middles)
     N = np.zeros((number, rows, columns), np.int32)
-    for k, middle in enumerate(middles):
-        times = np.array([middle - window / 2, middle + window / 2])
-        if background.scene is not None:
-            times = background.scene.steps(*times)
-        for t, end in itertools.pairwise(times.tolist()):
-            stream.add_cells(t, end, background.placing((t + end) / 2), CELL, N[k])
+    spans = np.stack([middles - window / 2, middles + window / 2], 1)
+    spans, places, into = in_steps(spans, background.scene, background.corner)
+    stream.add_cells(spans, places, CELL, N, into)
     calm, activity = background.calm[slices], background.activity[slices]
     sums = np.zeros((6, rows, columns))
     _moments(N, calm, activity, background.bright, sums)

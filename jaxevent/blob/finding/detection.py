@@ -236,27 +236,24 @@ def blob_moments(x: Any, y: Any, events: Any, labels: Any, number: int, blobs: A
     n, p, C = blobs
     for k in range(number):
         n[k] = p[k, 0] = p[k, 1] = C[k, 0, 0] = C[k, 0, 1] = C[k, 1, 1] = 0.0
+    # One pass: sums of whole numbers are exact.
     for i in range(len(x)):
         k = labels[i] - 1
         if k >= 0:
-            n[k] += events[i]
-            p[k, 0] += events[i] * x[i]
-            p[k, 1] += events[i] * y[i]
-    for k in range(number):
-        p[k, 0] /= max(n[k], 1.0)
-        p[k, 1] /= max(n[k], 1.0)
-    for i in range(len(x)):
-        k = labels[i] - 1
-        if k >= 0:
-            ex, ey = x[i] - p[k, 0], y[i] - p[k, 1]
-            C[k, 0, 0] += events[i] * ex * ex
-            C[k, 0, 1] += events[i] * ex * ey
-            C[k, 1, 1] += events[i] * ey * ey
+            m, at_x, at_y = float(events[i]), float(x[i]), float(y[i])
+            n[k] += m
+            p[k, 0] += m * at_x
+            p[k, 1] += m * at_y
+            C[k, 0, 0] += m * at_x * at_x
+            C[k, 0, 1] += m * at_x * at_y
+            C[k, 1, 1] += m * at_y * at_y
     for k in range(number):
         over = 1 / max(n[k], 1.0)
-        C[k, 0, 0] = C[k, 0, 0] * over + 1 / 12
-        C[k, 0, 1] = C[k, 1, 0] = C[k, 0, 1] * over
-        C[k, 1, 1] = C[k, 1, 1] * over + 1 / 12
+        mx, my = p[k, 0] * over, p[k, 1] * over
+        p[k, 0], p[k, 1] = mx, my
+        C[k, 0, 0] = C[k, 0, 0] * over - mx * mx + 1 / 12
+        C[k, 0, 1] = C[k, 1, 0] = C[k, 0, 1] * over - mx * my
+        C[k, 1, 1] = C[k, 1, 1] * over - my * my + 1 / 12
 
 
 def touching(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> Any:

@@ -6,13 +6,12 @@ scene.
 """
 
 import dataclasses
-import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from jaxevent.blob.finding.background import CELL, FINE, FULL, SLICES, Background, placing, pooled
+from jaxevent.blob.finding.background import CELL, FINE, FULL, SLICES, Background, in_steps, pooled
 from jaxevent.blob.finding.detection import detect
 from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.scale import STRETCHES, Choice
@@ -148,10 +147,9 @@ def measure_moving_background(stream: Stream, scene: SceneMotion) -> Background:
     seen = np.moveaxis((x >= 0) & (x < size[0]) & (y >= 0) & (y < size[1]), 2, 0)
     by = CELL // FINE
     cells = np.zeros((SLICES, rows * by, columns * by), np.int32)
-    for k, now in enumerate(cells):
-        times = scene.steps(*(np.array([k, k + 1]) / SLICES * stream.duration))
-        for t, end in itertools.pairwise(times.tolist()):
-            stream.add_cells(t, end, placing(scene, corner, (t + end) / 2), FINE, now)
+    edges = np.arange(SLICES + 1) / SLICES * stream.duration
+    spans, places, into = in_steps(np.stack([edges[:-1], edges[1:]], 1), scene, corner)
+    stream.add_cells(spans, places, FINE, cells, into)
 
     N = np.where(seen, pooled(cells, by), np.inf)
     rank = np.ceil(CALM * seen.sum(0)).astype(int) - 1

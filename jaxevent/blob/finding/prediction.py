@@ -1,5 +1,6 @@
 """What two windows of events predict of the next one's, by blobs at some scale."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,22 +81,31 @@ def predict(
     second: Pixels,
     scored: Scored,
     background: Background,
-    scale: Scale,
+    scales: Sequence[Scale],
     size: tuple[int, int],
     t: float | int,
-) -> Told:
-    """What two windows tell of the third, which begins at t (s). `size`: rows and columns, px."""
-    ground = ground_of(background, scale, size, t)
+) -> list[Told]:
+    """What two windows tell of the third, which begins at t (s), at scales of such windows.
+
+    `size`: rows and columns, px.
+    """
     bins = tuple(
         _bins(*(n // g + table.shape[-1] for n in size))
         for table, g in zip(_TABLES, BINS, strict=True)
     )
-    cells = blank_cells(size, scale.cell)
-    density, told = np.zeros((len(scored.x), 1 + KERNELS)), np.zeros(3)
     strips = size[0] // STRIP + 1
     space = _Space.of(max(len(first), len(second)), len(scored.x), strips)
-    _predict(first, second, scored.x, scored.y, ground, cells, bins, _TABLES, space, density, told)
-    return Told(density, scored.background, scored.number, *told.tolist())
+    densities = np.zeros((len(scales), len(scored.x), 1 + KERNELS))
+    sums = np.zeros((len(scales), 3))
+    for scale, density, told in zip(scales, densities, sums, strict=True):
+        ground, cells = ground_of(background, scale, size, t), blank_cells(size, scale.cell)
+        _predict(
+            first, second, scored.x, scored.y, ground, cells, bins, _TABLES, space, density, told
+        )
+    return [
+        Told(density, scored.background, scored.number, *told)
+        for density, told in zip(densities, sums.tolist(), strict=True)
+    ]
 
 
 class _Space(NamedTuple):
@@ -142,8 +152,8 @@ def score(told: list[Told]) -> Score:
     expected, large, split = (
         np.array([getattr(one, name) for one in told]) for name in ("expected", "large", "split")
     )
-    gains, share = np.zeros(len(told)), np.full((2, 1 + KERNELS), 1 / (1 + KERNELS))
-    _gains(density, b, weight, ends, share, gains)
+    gains = np.zeros(len(told))
+    _gains(density, b, weight, ends, gains)
     parts = (gains - expected) / number
     raw = float(parts.sum())
     lost = SPLIT * abs(raw) * float(split.sum()) / max(float(large.sum()), 1e-9)
@@ -151,31 +161,26 @@ def score(told: list[Told]) -> Score:
 
 
 @lean
-def _gains(density: Any, b: Any, weight: Any, ends: Any, shares: Any, nats: Any) -> None:
+def _gains(density: Any, b: Any, weight: Any, ends: Any, nats: Any) -> None:
     """Log likelihood ratios of windows with the likeliest shares of ellipses and kernels."""
-    share, new = shares[0], shares[1]
+    e = f = g = h = 1 / (1 + KERNELS)
     for _ in range(ROUNDS):
-        for j in range(1 + KERNELS):
-            new[j] = 0.0
+        to_e = to_f = to_g = to_h = 0.0
         for k in range(len(weight)):
             for i in range(ends[k], ends[k + 1]):
-                total = b[i]
-                for j in range(1 + KERNELS):
-                    total += density[i, j] * share[j]
-                part = weight[k] / total
-                for j in range(1 + KERNELS):
-                    new[j] += part * density[i, j]
-        total = 0.0
-        for j in range(1 + KERNELS):
-            share[j] = share[j] * new[j] + 1e-12
-            total += share[j]
-        for j in range(1 + KERNELS):
-            share[j] /= total
+                one = density[i]
+                part = weight[k] / (b[i] + one[0] * e + one[1] * f + one[2] * g + one[3] * h)
+                to_e += part * one[0]
+                to_f += part * one[1]
+                to_g += part * one[2]
+                to_h += part * one[3]
+        e, f, g, h = e * to_e + 1e-12, f * to_f + 1e-12, g * to_g + 1e-12, h * to_h + 1e-12
+        total = e + f + g + h
+        e, f, g, h = e / total, f / total, g / total, h / total
     for k in range(len(weight)):
         for i in range(ends[k], ends[k + 1]):
-            total = 0.0
-            for j in range(1 + KERNELS):
-                total += density[i, j] * share[j]
+            one = density[i]
+            total = one[0] * e + one[1] * f + one[2] * g + one[3] * h
             nats[k] += weight[k] * np.log(total / b[i] + 1)
 
 
@@ -290,11 +295,14 @@ def _add_kernels(
         row, column = int(py[k] / g + reach), int(px[k] / g + reach)
         if 0 <= row < rows and 0 <= column < columns:
             counts[row, column] += events[k]
+    # Of what may be negative numba asks at every place: that takes two fifths of the time.
+    wide, side = np.uint64(2 * reach + 1), np.uint64(g)
     for j in range(len(x)):
-        row, column, total = y[j] // g, x[j] // g, 0.0
-        v, u = y[j] - row * g, x[j] - column * g
-        for a in range(2 * reach + 1):
-            for b in range(2 * reach + 1):
+        at_y, at_x, total = np.uint64(y[j]), np.uint64(x[j]), 0.0
+        row, column = at_y // side, at_x // side
+        v, u = at_y - row * side, at_x - column * side
+        for a in range(wide):
+            for b in range(wide):
                 total += table[v, u, a, b] * counts[row + a, column + b]
         out[j] = total
     for k in range(pixels):

@@ -14,7 +14,6 @@ import dataclasses
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from jaxevent.blob.finding.background import Background, measure_dispersion
 from jaxevent.blob.finding.detection import CONTACT, Scale, detect, measure_blobs, touching
@@ -25,7 +24,7 @@ WINDOWS = 500 * 2 ** np.arange(12)  # us
 CELLS = (2, 4, 8, 16)  # px
 LEAST_WINDOWS = 8  # in a recording
 STRETCHES, FIRST = 24, 4  # in which scales are compared; every fourth one tells the worse ones:
-WORSE, SIGMAS = 0.7, 2.0  # of the best one's nats, and standard deviations of their difference
+WORSE, SIGMAS = 0.85, 2.0  # of the best one's nats, and standard deviations of their difference
 PLATEAU, TIE = 0.03, 0.005  # shares of the score that scales may lose as equally good
 MERGED = 0.3  # share of events in blobs in which smaller cells see a larger blob apart
 SHARP = 0.9  # share of the most that a cell's blobs tell in windows in which they are sharp
@@ -94,14 +93,14 @@ class _Trial:
         stream, background = self.stream, self.background
         size = stream.height, stream.width
         for i in np.flatnonzero(self.tried.any(1)).tolist():
-            w = float(self.windows[i])
+            w, cells = float(self.windows[i]), np.flatnonzero(self.tried[i]).tolist()
+            scales = [self.scale(i, j) for j in cells]
             for t in self.begins[stretches, i].tolist():
                 before, last = (stream.pixels(t + k * w, t + (k + 1) * w) for k in (-2, -1))
                 scored = choose_scored(stream.window(t, t + w), background, t, w)
-                for j in np.flatnonzero(self.tried[i]).tolist():
-                    scale = self.scale(i, j)
-                    told = predict(before, last, scored, background, scale, size, t)
-                    self.told[i][j].append(told)
+                told = predict(before, last, scored, background, scales, size, t)
+                for j, one in zip(cells, told, strict=True):
+                    self.told[i][j].append(one)
 
     def drop(self) -> None:
         """Try no more the scales that are clearly worse than the best ones of equal cells."""
@@ -128,6 +127,7 @@ class _Gaps:
         self.stream, self.background = stream, background
         self.size = stream.height, stream.width
         self.clusters: dict[tuple[float, float, int], tuple[Pixels, NDArray, int]] = {}
+        self.image = np.full(self.size, -1, np.int32)  # of clusters, filled where it is looked at
 
     def split(self, scale: Scale, begins: NDArray[np.float64], smaller: list[Scale]) -> float:
         """Share of events in blobs in which smaller cells see another blob, larger and apart.
@@ -155,9 +155,9 @@ class _Gaps:
         if key not in self.clusters:
             self.clusters[key] = self._clusters(t, scale)
         wide, cluster_of, clusters = self.clusters[key]
-        image = np.full(self.size, -1, np.int32)
-        image[wide.y, wide.x] = cluster_of
-        cluster = image[pixels.y, pixels.x]
+        self.image[wide.y, wide.x] = cluster_of
+        cluster = self.image[pixels.y, pixels.x]
+        self.image[wide.y, wide.x] = -1
         both = (labels > 0) & (cluster >= 0)
         place = labels[both] * clusters + cluster[both]
         table = np.bincount(place, pixels.n[both], (labels.max(initial=0) + 1) * clusters)
@@ -176,6 +176,17 @@ class _Gaps:
         large = large[blobs.n[large] >= LARGE]
         p, C = blobs.p[large], blobs.C[large]
         cluster = np.full(number + 1, -1, np.int32)
-        clusters, of_large = connected_components(touching(p[:, None], C[:, None], p, C) < CONTACT)
-        cluster[large + 1] = of_large
-        return pixels, cluster[labels], clusters
+        first = _connected(touching(p[:, None], C[:, None], p, C) < CONTACT)
+        clusters, cluster[large + 1] = np.unique(first, return_inverse=True)
+        return pixels, cluster[labels], len(clusters)
+
+
+def _connected(touch: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """The first of all that each is connected with, of which two touch (n, n)."""
+    first = np.arange(len(touch))
+    while len(first):
+        nearer = np.where(touch, first, len(touch)).min(1)
+        if (nearer == first).all():
+            break
+        first = nearer
+    return first

@@ -12,6 +12,7 @@ from jaxevent.recording import Events, Recording
 
 _counts = Blank(np.int32)
 BATCH = 1 << 20  # events read at a time
+HELD = 1 << 22  # events: so many and fewer are read once
 ALL = np.ones(0, bool)  # all events are kept
 
 
@@ -41,7 +42,7 @@ class Stream:
     """Events of a recording from `start` to before `stop` (us), without those that are left out.
 
     Left out are `hot` pixels, once they are known, and what is near the paths given to `without`.
-    Events are read where they are needed; `without` takes a byte for each.
+    More than `HELD` events are read where they are needed; `without` takes a byte for each.
     """
 
     def __init__(self, recording: Recording, start: int, stop: int):
@@ -50,6 +51,8 @@ class Stream:
         self.hot = np.zeros((recording.height, recording.width), bool)
         self._first, self._last = (recording.events.index(t) for t in (start, stop))
         self._kept: NDArray[np.bool_] | None = None  # of all these rows
+        few = len(self) <= HELD
+        self._held = recording.events[self._first : self._last] if few else None
 
     @property
     def duration(self) -> float:
@@ -86,16 +89,33 @@ class Stream:
         return Pixels(x[:number], y[:number], n[:number])
 
     def add_cells(
-        self, begin: float | int, end: float | int, place: NDArray, cell: int, counts: NDArray
+        self,
+        spans: NDArray[np.float64],
+        places: NDArray[np.float64],
+        cell: int,
+        counts: NDArray[np.int32],
+        into: NDArray[np.int64],
     ) -> None:
-        """Count these events in cells (rows, columns) of the px to which a map (2, 3) takes them.
+        """Count the events of some spans (n, 2) s in cells: counts (spans or fewer, rows, columns).
 
-        What is beyond them is counted at their edge.
+        Cells are those of the px to which a span's map (n, 2, 3) takes events; what is beyond them
+        is counted at their edge. `into` says which counts a span is added to.
         """
-        first, last = self._span(begin, end)
-        for row in range(first, last, BATCH):
-            events, kept = self._of_rows(row, min(row + BATCH, last))
-            _add_cells(events.x, events.y, self.hot, kept, place, cell, counts)
+        us = self.start + np.rint(1e6 * spans).astype(np.int64)
+        us = np.clip(us, self.start, self.stop)
+        if self._held is not None:
+            rows = np.searchsorted(self._held.t, us)
+            kept = ALL if self._kept is None else self._kept
+            x, y = self._held.x, self._held.y
+            _add_cells(x, y, self.hot, kept, rows, places, cell, counts, into)
+            return
+        for k, (begin, end) in enumerate(us.tolist()):
+            one, first, last = slice(k, k + 1), self._index(begin), self._index(end)
+            for row in range(first, last, BATCH):
+                events, kept = self._of_rows(row, min(row + BATCH, last))
+                rows = np.array([[0, len(events)]])
+                at = places[one], cell, counts, into[one]
+                _add_cells(events.x, events.y, self.hot, kept, rows, *at)
 
     def times(self, number: int) -> NDArray[np.float64]:
         """Times (s) of some events that are equally many events apart."""
@@ -106,14 +126,20 @@ class Stream:
 
     def _span(self, begin: float | int, end: float | int) -> tuple[int, int]:
         us = [self.start + round(1e6 * t) for t in (begin, end)]
-        us = [min(max(t, self.start), self.stop) for t in us]
-        first, last = (self.recording.events.index(t) for t in us)
+        first, last = (self._index(min(max(t, self.start), self.stop)) for t in us)
         return first, last
+
+    def _index(self, us: int) -> int:
+        """The first row that is not before a time (us) of the stream."""
+        if self._held is None:
+            return self.recording.events.index(us)
+        return self._first + int(np.searchsorted(self._held.t, us))
 
     def _of_rows(self, first: int, last: int) -> tuple[Events, NDArray[np.bool_]]:
         """Some events, and which of them are kept, or `ALL`."""
-        kept = ALL if self._kept is None else self._kept[first - self._first : last - self._first]
-        return self.recording.events[first:last], kept
+        some = slice(first - self._first, last - self._first)
+        kept = ALL if self._kept is None else self._kept[some]
+        return self.recording.events[first:last] if self._held is None else self._held[some], kept
 
     def _rows(self, first: int, last: int) -> Part:
         events, kept = self._of_rows(first, last)
@@ -166,7 +192,11 @@ def cell_at(A: Any, x: Any, y: Any, cell: int, shape: Any) -> tuple[int, int]:
 
 
 @lean
-def _add_cells(x: Any, y: Any, hot: Any, kept: Any, A: Any, cell: int, counts: Any) -> None:
-    for i in range(len(x)):
-        if _stays(i, x, y, hot, kept):
-            counts[cell_at(A, x[i], y[i], cell, counts.shape)] += 1
+def _add_cells(
+    x: Any, y: Any, hot: Any, kept: Any, rows: Any, places: Any, cell: int, counts: Any, into: Any
+) -> None:
+    for k in range(len(rows)):
+        own = counts[into[k]]
+        for i in range(rows[k, 0], rows[k, 1]):
+            if _stays(i, x, y, hot, kept):
+                own[cell_at(places[k], x[i], y[i], cell, own.shape)] += 1
