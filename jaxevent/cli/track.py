@@ -82,6 +82,11 @@ def add(commands: Any) -> None:
         help="behind the tracks in the video; default: events",
     )
     arguments.add_size(one)
+    _add_quantities(one)
+    arguments.add_output(one, "--out", metavar="DIR_or_FILE", required=True, help="what to write")
+
+
+def _add_quantities(one: Any) -> None:
     group = one.add_argument_group(
         "time to contact and range, in quantities.csv, the plot and, with --at events, for each "
         "event in quantities.h5"
@@ -102,7 +107,6 @@ def add(commands: Any) -> None:
         type=float,
         help="lambda over the diameter in the image; default: 0.354, of an even rim",
     )
-    arguments.add_output(one, "--out", metavar="DIR_or_FILE", required=True, help="what to write")
 
 
 def run(

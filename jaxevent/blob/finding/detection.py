@@ -50,7 +50,7 @@ class Blobs(NamedTuple):
         return cls(np.empty(number), np.empty((number, 2)), np.empty((number, 2, 2)))
 
 
-class Room(NamedTuple):
+class Space(NamedTuple):
     """Where kernels look for blobs of so many pixels; int64 but for `labels`."""
 
     place: NDArray[np.int64]  # the cell of each pixel
@@ -60,7 +60,7 @@ class Room(NamedTuple):
     labels: NDArray[np.int32]  # the blob of each pixel, from 1 on; 0: none
 
     @classmethod
-    def of(cls, pixels: int) -> "Room":
+    def of(cls, pixels: int) -> "Space":
         place, filled, hit, waiting = np.empty((4, pixels), np.int64)
         return cls(place, filled, hit, waiting, np.empty(pixels, np.int32))
 
@@ -104,10 +104,10 @@ def detect(
     events than background would give to one in 10 recordings. Blobs come in the order of their
     cells' first events. `size`: rows and columns, px.
     """
-    ground, room = ground_of(background, scale, size, t), Room.of(len(part))
+    ground, space = ground_of(background, scale, size, t), Space.of(len(part))
     cells = blank_cells(size, scale.cell)
-    number = _detect(part.x, part.y, _events_of(part), ground, cells, room)
-    return room.labels, number
+    number = _detect(part.x, part.y, _events_of(part), ground, cells, space)
+    return space.labels, number
 
 
 def blank_cells(size: tuple[int, int], cell: int) -> NDArray[np.int32]:
@@ -121,49 +121,49 @@ def blank_cells(size: tuple[int, int], cell: int) -> NDArray[np.int32]:
 
 
 @lean
-def _detect(x: Any, y: Any, number: Any, ground: Any, cells: Any, room: Any) -> int:
-    return find_blobs(x, y, number, ground, cells, room)
+def _detect(x: Any, y: Any, number: Any, ground: Any, cells: Any, space: Any) -> int:
+    return find_blobs(x, y, number, ground, cells, space)
 
 
 @lean_part
-def find_blobs(x: Any, y: Any, number: Any, ground: Any, cells: Any, room: Any) -> int:
+def find_blobs(x: Any, y: Any, number: Any, ground: Any, cells: Any, space: Any) -> int:
     """How many blobs there are of pixels with so many events each, as `detect`.
 
-    `cells` are 0, and are again; the pixels' blobs are in `room.labels`.
+    `cells` are 0, and are again; the pixels' blobs are in `space.labels`.
     """
-    filled = _count(x, y, number, ground, cells, room)
-    hits = _significant(filled, ground, cells, room)
+    filled = _count(x, y, number, ground, cells, space)
+    hits = _significant(filled, ground, cells, space)
     for i in range(filled):
-        cells[room.filled[i]] = 0
-    return _label(len(x), hits, ground.wide, cells, room)
+        cells[space.filled[i]] = 0
+    return _label(len(x), hits, ground.wide, cells, space)
 
 
 @lean_part
-def _count(x: Any, y: Any, number: Any, ground: Any, cells: Any, room: Any) -> int:
+def _count(x: Any, y: Any, number: Any, ground: Any, cells: Any, space: Any) -> int:
     """The cell of each pixel, and all that are not empty: their number."""
     n, wide, bits, count = cells, ground.wide, ground.bits, 0
     for i in range(len(x)):
         at = ((np.int64(y[i]) >> bits) + 1) * wide + (np.int64(x[i]) >> bits) + 1
-        room.place[i] = at
+        space.place[i] = at
         if n[at] == 0:
-            room.filled[count] = at
+            space.filled[count] = at
             count += 1
         n[at] += number[i]
     return count
 
 
 @lean_part
-def _significant(filled: int, ground: Any, cells: Any, room: Any) -> int:
+def _significant(filled: int, ground: Any, cells: Any, space: Any) -> int:
     """Cells that are not empty whose 3x3 hold more events than background gives: their number."""
     n, wide, g = cells, ground.wide, 1 << ground.bits
     # Fewer events are no evidence even where the background is darkest.
     few = 1
     while few < MOST_FEW and nats(few, ground.darkest) <= ground.enough * ground.least:
         few += 1
-    many, some, count = room.hit, 0, 0
+    many, some, count = space.hit, 0, 0
     for i in range(filled):
-        if _sum_around(n, room.filled[i], wide) >= few:
-            many[some] = room.filled[i]
+        if _sum_around(n, space.filled[i], wide) >= few:
+            many[some] = space.filled[i]
             some += 1
     for i in range(some):
         cell = many[i]
@@ -185,14 +185,14 @@ def _sum_around(n: Any, cell: int, wide: int) -> Any:
 
 
 @lean_part
-def _label(events: int, hits: int, wide: int, labels: Any, room: Any) -> int:
+def _label(events: int, hits: int, wide: int, labels: Any, space: Any) -> int:
     """The blob of each event, and how many there are: neighbours, also across corners."""
-    waiting = room.waiting
+    waiting = space.waiting
     for i in range(hits):
-        labels[room.hit[i]] = -1
+        labels[space.hit[i]] = -1
     number = 0
     for i in range(hits):
-        cell = room.hit[i]
+        cell = space.hit[i]
         if labels[cell] > 0:
             continue
         number += 1
@@ -208,9 +208,9 @@ def _label(events: int, hits: int, wide: int, labels: Any, room: Any) -> int:
                         waiting[count] = near
                         count += 1
     for i in range(events):
-        room.labels[i] = labels[room.place[i]]
+        space.labels[i] = labels[space.place[i]]
     for i in range(hits):
-        labels[room.hit[i]] = 0
+        labels[space.hit[i]] = 0
     return number
 
 

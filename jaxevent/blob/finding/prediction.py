@@ -10,8 +10,8 @@ from jaxevent.blob.finding.background import Background
 from jaxevent.blob.finding.detection import (
     CONTACT,
     Blobs,
-    Room,
     Scale,
+    Space,
     blank_cells,
     blob_moments,
     find_blobs,
@@ -94,7 +94,7 @@ def predict(
         for table, g in zip(_TABLES, BINS, strict=True)
     )
     strips = size[0] // STRIP + 1
-    space = _Space.of(max(len(first), len(second)), len(scored.x), strips)
+    space = _PredictionSpace.of(max(len(first), len(second)), len(scored.x), strips)
     densities = np.zeros((len(scales), len(scored.x), 1 + KERNELS))
     sums = np.zeros((len(scales), 3))
     for scale, density, told in zip(scales, densities, sums, strict=True):
@@ -108,10 +108,10 @@ def predict(
     ]
 
 
-class _Space(NamedTuple):
+class _PredictionSpace(NamedTuple):
     """Where `_predict` keeps what it needs of windows of so many pixels."""
 
-    room: Room
+    blobs: Space
     before: Blobs
     last: Blobs
     p: NDArray[np.float64]  # (pixels, 2) px, where the blobs' next events are expected,
@@ -124,9 +124,9 @@ class _Space(NamedTuple):
     strips: NDArray[np.int64]  # (2, strips + 1): where each begins, and is filled
 
     @classmethod
-    def of(cls, pixels: int, scored: int, strips: int) -> "_Space":
+    def of(cls, pixels: int, scored: int, strips: int) -> "_PredictionSpace":
         return cls(
-            Room.of(pixels), Blobs.of(pixels), Blobs.of(pixels), *Blobs.of(pixels)[1:],
+            Space.of(pixels), Blobs.of(pixels), Blobs.of(pixels), *Blobs.of(pixels)[1:],
             np.empty((2, pixels)), np.empty(pixels, np.int32), np.empty(pixels),
             np.empty(pixels, bool), np.empty(scored, np.int64), np.empty((2, strips + 1), np.int64),
         )  # fmt: skip
@@ -189,10 +189,10 @@ def _predict(
     first: Any, second: Any, x: Any, y: Any, ground: Any, cells: Any, bins: Any, tables: Any,
     space: Any, density: Any, told: Any,
 ) -> None:  # fmt: skip
-    labels = space.room.labels
-    earlier = find_blobs(first.x, first.y, first.n, ground, cells, space.room)
+    labels = space.blobs.labels
+    earlier = find_blobs(first.x, first.y, first.n, ground, cells, space.blobs)
     blob_moments(first.x, first.y, first.n, labels, earlier, space.before)
-    number = find_blobs(second.x, second.y, second.n, ground, cells, space.room)
+    number = find_blobs(second.x, second.y, second.n, ground, cells, space.blobs)
     blob_moments(second.x, second.y, second.n, labels, number, space.last)
     if len(x) and number:
         _extrapolate(earlier, number, space)
@@ -275,7 +275,7 @@ def _move(pixels: Any, space: Any) -> int:
     """Pixels of blobs, moved as these, and their events: how many they are."""
     moved, p, last, m = space.moved, space.p, space.last.p, 0
     for i in range(len(pixels.x)):
-        k = space.room.labels[i] - 1
+        k = space.blobs.labels[i] - 1
         if k >= 0:
             moved[0, m] = pixels.x[i] + (p[k, 0] - last[k, 0])
             moved[1, m] = pixels.y[i] + (p[k, 1] - last[k, 1])

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -97,6 +97,57 @@ class TargetProgram(Program):
     graph: Graph
 
 
+class _Target(NamedTuple):
+    """What becomes of one target, by names: functions of parameters and its numbers."""
+
+    filter: Filter
+    single: bool  # whether a step has one event
+
+    def begin(self, params: Any, own: Any, xi: Any, size: Any) -> Any:
+        return self.filter.start(own_params(params, own), xi, size)
+
+    def start(self, params: Any, slot: Any, xi: Any, size: Any) -> dict[str, Any]:
+        gate = start_gate(params, size).astype(xi.dtype)
+        return {"slot.state": self.begin(params, slot.own, xi, size), "slot.gate": gate}
+
+    def slot(self, params: Any, own: Any, xi: Any, size: Any, time: Any, known: Any) -> Slots:
+        state = self.begin(params, own, xi, size)
+        return Slots(state, size, size, time, time, time, time, time, known, own)
+
+    def ahead(self, params, slot, limit, time, batch, valid, owner):
+        batch = _aged(batch, self.single)
+        return {"ahead": look_ahead(self.filter, params, slot, limit, time, batch, valid, owner)}
+
+    def update(self, params, slot, ahead, time, batch, weight):
+        batch = _aged(batch, self.single)
+        return {"slot": update_slot(self.filter, params, slot, ahead, time, batch, weight)}
+
+    def solo(self, params, slot, limit, time, batch, valid, owner):
+        """A step of one event and of the one target that is alive."""
+        batch = _aged(batch, self.single)
+        seen = look_ahead(self.filter, params, slot, limit, time, batch, valid, owner)
+        shares = jax.vmap(functools.partial(self.filter.share, params), 1, 1)
+        weight = shares(seen.inside[None], seen.density[None])[0]
+        return {
+            "slot": update_slot(self.filter, params, slot, seen, time, batch, weight),
+            "ahead.near": seen.near,
+            "touched": (weight > 0).any(),
+        }
+
+    def limit(self, params, slot):
+        return {"limit": silence_limits(params, slot)}
+
+    def expected(self, params, slot, stop):
+        now = expect(self.filter, params, slot, stop)
+        return {"now": now, "p": now.p, "long": now.size.max()}
+
+    def verdict(self, params, frame, slot, now, inside, found, stop):
+        return {"verdict": judge(params, frame, slot, now, inside, found, stop)}
+
+    def shared(self, params, held, density):
+        return {"weight": self.filter.share(params, held, density)}
+
+
 def program_of(
     filter: Filter, params: TrackerParams, own: dict[str, Any], owned: bool, dtype: np.dtype
 ) -> TargetProgram:
@@ -105,7 +156,7 @@ def program_of(
     `own` are a target's own numbers, `owned` says whether events have owners.
     """
     single = params.events_per_step == 1
-    host, graph = HostProgram(), Graph()
+    host, graph, target = HostProgram(), Graph(), _Target(filter, single)
     for leaf in jax.tree.leaves(params):
         host.add_input(np.asarray(leaf))
 
@@ -113,74 +164,29 @@ def program_of(
         return jax.ShapeDtypeStruct(size, kind)
 
     owns = {name: shape() for name in own}
-
-    def begin(params: Any, own: Any, xi: Any, size: Any) -> Any:
-        return filter.start(own_params(params, own), xi, size)
-
-    def start(params: Any, slot: Any, xi: Any, size: Any) -> dict[str, Any]:
-        gate = start_gate(params, size).astype(xi.dtype)
-        return {"slot.state": begin(params, slot.own, xi, size), "slot.gate": gate}
-
-    def slot_of(params: Any, own: Any, xi: Any, size: Any, time: Any, known: Any) -> Slots:
-        state = begin(params, own, xi, size)
-        return Slots(state, size, size, time, time, time, time, time, known, own)
-
     times, flag = shape(kind=np.int32), shape(kind=bool)
-    slot = jax.eval_shape(slot_of, params, owns, shape(2), shape(), times, flag)
+    slot = jax.eval_shape(target.slot, params, owns, shape(2), shape(), times, flag)
     events = MARK if not single else 1
     batch = jax.eval_shape(Batch, shape(events, 2), shape(events), shape(events))
-
-    def ahead(params, slot, limit, time, batch, valid, owner):
-        seen = look_ahead(filter, params, slot, limit, time, _aged(batch, single), valid, owner)
-        return {"ahead": seen}
-
-    def update(params, slot, ahead, time, batch, weight):
-        slot = update_slot(filter, params, slot, ahead, time, _aged(batch, single), weight)
-        return {"slot": slot}
-
-    def solo(params, slot, limit, time, batch, valid, owner):
-        """A step of one event and of the one target that is alive."""
-        batch = _aged(batch, single)
-        seen = look_ahead(filter, params, slot, limit, time, batch, valid, owner)
-        shares = jax.vmap(functools.partial(filter.share, params), 1, 1)
-        weight = shares(seen.inside[None], seen.density[None])[0]
-        return {
-            "slot": update_slot(filter, params, slot, seen, time, batch, weight),
-            "ahead.near": seen.near,
-            "touched": (weight > 0).any(),
-        }
-
-    def limit(params, slot):
-        return {"limit": silence_limits(params, slot)}
-
-    def expected(params, slot, stop):
-        now = expect(filter, params, slot, stop)
-        return {"now": now, "p": now.p, "long": now.size.max()}
-
-    def verdict(params, frame, slot, now, inside, found, stop):
-        return {"verdict": judge(params, frame, slot, now, inside, found, stop)}
-
-    def shared(params, held, density):
-        return {"weight": filter.share(params, held, density)}
-
     owner = shape(events, 2, kind=np.int32) if owned else None
     valid = shape(events, kind=bool)
     given = {"slot": slot, "time": times, "batch": batch}
     seen = {**given, "limit": times, "valid": valid, "owner": owner}
-    looked = jax.eval_shape(lambda p, v: ahead(p, **v)["ahead"], params, seen)
-    now = jax.eval_shape(lambda p, v: expected(p, **v)["now"], params,
+    looked = jax.eval_shape(lambda p, v: target.ahead(p, **v)["ahead"], params, seen)
+    now = jax.eval_shape(lambda p, v: target.expected(p, **v)["now"], params,
         {"slot": slot, "stop": times})  # fmt: skip
+    shared = {"held": shape(MARK, kind=bool), "density": shape(MARK)}
     functions = {
-        "start": (start, {"slot": slot, "xi": shape(2), "size": shape()}, True),
-        "solo": (solo, seen, single),
-        "ahead": (ahead, seen, single),
-        "alone": (shared, {"held": shape(MARK, kind=bool), "density": shape(MARK)}, True),
-        "share": (shared, {"held": shape(MARK, kind=bool), "density": shape(MARK)}, False),
-        "update": (update, {**given, "ahead": looked, "weight": shape(events)}, single),
-        "limit": (limit, {"slot": slot}, True),
-        "expected": (expected, {"slot": slot, "stop": times}, True),
+        "start": (target.start, {"slot": slot, "xi": shape(2), "size": shape()}, True),
+        "solo": (target.solo, seen, single),
+        "ahead": (target.ahead, seen, single),
+        "alone": (target.shared, shared, True),
+        "share": (target.shared, shared, False),
+        "update": (target.update, {**given, "ahead": looked, "weight": shape(events)}, single),
+        "limit": (target.limit, {"slot": slot}, True),
+        "expected": (target.expected, {"slot": slot, "stop": times}, True),
         "verdict": (
-            verdict,
+            target.verdict,
             {"frame": shape(2), "slot": slot, "now": now, "inside": flag, "found": flag,
              "stop": times},
             True,
