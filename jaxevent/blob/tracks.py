@@ -64,10 +64,14 @@ def _read(
 
 
 class _Following(NamedTuple):
-    """What later events say at the start of the chunk that follows, and its us since this one's."""
+    """What later events say at the start of the chunk that follows, and its us since this one's.
+
+    And the chunk smoothed with it, where that is kept.
+    """
 
     later: Later
     elapsed: Any
+    smoothed: Smoothed | None = None
 
 
 @functools.partial(jax.jit, static_argnames="filter")
@@ -106,6 +110,11 @@ def _path_of(
     events = *events, None if f.owner is None else f.owner[chunk]
     _, steps = scan_steps(filter, params, "states", f.frame, before, events)
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), before, steps.slots)
+
+
+def _numbers_in(tree: Any) -> int:
+    """How many numbers its arrays hold."""
+    return sum(leaf.size for leaf in jax.tree.leaves(tree))
 
 
 def _joined(parts: Sequence[TrackStates]) -> TrackStates:
@@ -355,8 +364,10 @@ class Tracks(Shown):
         if following is None:
             read = functools.partial(_read, *parts, features, slots, np.int32(chunk))
         else:
-            at = np.int32(chunk), following[chunk]
-            smoothed, _ = _smooth(*parts, features, slots, *at)
+            smoothed = following[chunk].smoothed
+            if smoothed is None:
+                at = np.int32(chunk), following[chunk]
+                smoothed, _ = _smooth(*parts, features, slots, *at)
             read = functools.partial(_read_smoothed, *parts, smoothed)
         for first in range(0, len(times), READS):
             part = slice(first, first + READS)
@@ -414,21 +425,26 @@ class Tracks(Shown):
         return known[-1]
 
     def _look_back(
-        self, stretch: Stretch, begins: Slots, known: Mapping[Mark, Later]
+        self, stretch: Stretch, begins: Slots, known: Mapping[Mark, Later], room: int = 0
     ) -> tuple[list[_Following], Later]:
         """What later events say after each chunk of a stretch, and at the stretch's start.
 
-        `known` is what they say at the start of the next one.
+        `known` is what they say at the start of the next one. Smoothed chunks are kept if all are
+        at most `room` numbers.
         """
         later, elapsed = _nothing_later(begins), 0
         if stretch.next is not None:
             later, elapsed = known[stretch.next], stretch.next.start - stretch.next.previous
         features, found = jax.device_put(stretch.features), []
         used = int((stretch.start < NEVER).sum())
+        moment = _numbers_in(later) + _numbers_in(begins) // len(stretch.start)
+        keep = used * (stretch.features.t.shape[1] + 1) * moment <= room
         for chunk in reversed(range(used)):
-            found.append(_Following(later, np.int32(elapsed)))
-            at = np.int32(chunk), found[-1]
-            _, later = _smooth(self._filter, self.params, features, begins, *at)
+            at = _Following(later, np.int32(elapsed))
+            smoothed, later = _smooth(
+                self._filter, self.params, features, begins, np.int32(chunk), at
+            )
+            found.append(at._replace(smoothed=smoothed) if keep else at)
             elapsed = stretch.features.elapsed[chunk]
         return found[::-1], later
 
@@ -446,9 +462,9 @@ class Tracks(Shown):
                 stretch = self._packing.pack(mark)
                 _, told = self._run(state, stretch.features)
                 assert told.slots is not None
-                following, first = self._look_back(stretch, told.slots, found)
+                following, first = self._look_back(stretch, told.slots, found, room)
                 found[mark] = jax.device_get(first)
-                room -= len(following) * sum(leaf.size for leaf in jax.tree.leaves(found[mark]))
+                room -= _numbers_in(following)
                 if room >= 0:
                     self._following[mark] = following
                 shown.update(int(np.count_nonzero(stretch.features.valid)))
