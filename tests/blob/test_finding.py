@@ -14,6 +14,7 @@ from jaxevent import blob
 from jaxevent.blob.finding.agility import GRID, _log_likelihood, fit_agility
 from jaxevent.blob.finding.background import evidence, find_hot_pixels, measure_background
 from jaxevent.blob.finding.found import Found, most_events
+from jaxevent.blob.finding.lamps import without_lamps
 from jaxevent.blob.finding.parts import join_parts
 from jaxevent.blob.finding.paths import NOBODY, candidates, join
 from jaxevent.blob.finding.paths import Path as TargetPath
@@ -237,6 +238,67 @@ def test_hot_pixels_stand_alone():
     expected = np.zeros(counts.shape, bool)
     expected[10, 20] = expected[0, 7] = expected[39, 49] = True
     np.testing.assert_array_equal(find_hot_pixels(counts), expected)
+
+
+def lamp(rng, at, hertz, seconds, number, late=1e-3):
+    """Events of a square of 12 px: ON as its light begins, OFF as it ends, exponentially late."""
+    half = rng.integers(0, int(2 * hertz * seconds), number)
+    t = half / (2 * hertz) + rng.exponential(late, number)
+    return t, at + rng.uniform(-6, 6, (number, 2)), half % 2 == 0
+
+
+@pytest.mark.parametrize(
+    ("hertz", "way", "late", "left_out"),
+    [
+        (100.0, 0, 1e-3, True),
+        (119.6, 0, 1e-3, True),  # of a weak net
+        (100.0, 60, 1e-3, False),  # it travels: a lamp that is carried
+        (110.0, 0, 1e-3, False),  # of no mains
+        (100.0, 0, 5e-3, False),  # hardly in time: its share is .09
+    ],
+)
+def test_lamps_are_told_by_their_flicker(hertz, way, late, left_out):
+    """Beside a light that stands still too, and sends as many events whenever it likes."""
+    rng, seconds, number = np.random.default_rng(3), 2.0, 1500
+    t, xi, on = lamp(rng, [40.0, 40.0], hertz, seconds, number, late)
+    xi[:, 0] += way * t / seconds
+    t, on = np.r_[t, rng.uniform(0, seconds, number)], np.r_[on, rng.random(number) < 0.5]
+    x, y = np.rint(np.r_[xi, [100.0, 60.0] + rng.normal(size=(number, 2)) * 4]).T.astype(np.uint16)
+    order = np.argsort(t)
+    us = np.rint(1e6 * t).astype(np.int64)
+    events = Events(us[order], x[order], y[order], on[order])
+    recording = Recording("lamps", *SMALL, events)
+    at = np.arange(10_000, 2_000_000, 20_000)
+    paths = [
+        TargetPath(
+            at,
+            place + np.c_[moves * at / 2e6, 0 * at],
+            np.zeros((len(at), 2)),
+            np.tile(12.0 * np.eye(2), (len(at), 1, 1)),
+            np.full(len(at), 15.0),
+            20_000,
+            1.0,
+        )
+        for place, moves in (([40.0, 40.0], way), ([100.0, 60.0], 0))
+    ]
+    kept, number = without_lamps(paths, recording, np.zeros(SMALL[::-1], bool))
+    assert number == left_out and kept == paths[left_out:]
+
+
+@pytest.mark.slow
+def test_a_lamp_behind_a_target_is_no_target():
+    recording, truth = scene([Target(Circle((64, 48), 30, 5.0, 0.0, size=(3.0, 2.5)), 1e4)], 1.0)
+    t, xi, on = lamp(np.random.default_rng(1), [94.0, 48.0], 100.0, 1.0, 4000)
+    x, y = np.rint(xi).T.astype(np.uint16)
+    e, us = recording.events, np.rint(1e6 * t).astype(np.int64)
+    parts = (e.t, us), (e.x, x), (e.y, y), (e.p, on)
+    us, x, y, p = (np.concatenate(part) for part in parts)
+    order = np.argsort(us, kind="stable")
+    both = dataclasses.replace(recording, events=Events(*(a[order] for a in (us, x, y, p))))
+    found = blob.find(both[0.0:1.0], progress=False)
+    assert len(found) == 1 and found.lamps == 1 and "1 lamp left out" in found.summary()
+    apart = np.linalg.norm(found.paths[0].p - truth(found.paths[0].t)[:, 0, :2], axis=1)
+    assert np.median(apart) < 1.5
 
 
 def test_background_is_that_without_the_targets():

@@ -41,6 +41,7 @@ class Found:
         background: Events of no target, per s, of the whole sensor.
         recording: Whose events these are.
         camera_moves: Whether the background was taken for a scene that moves past the camera.
+        lamps: How many things that flicker with the mains were left out.
     """
 
     paths: tuple[Path, ...]
@@ -49,6 +50,7 @@ class Found:
     background: float
     recording: Recording
     camera_moves: bool = False
+    lamps: int = 0
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -62,6 +64,8 @@ class Found:
         text = f"{count}, background of {self.background:,.0f} events/s"
         if self.hot_pixels:
             text += f", {self.hot_pixels} hot pixel{'s' * (self.hot_pixels != 1)} left out"
+        if self.lamps:
+            text += f", {self.lamps} lamp{'s' * (self.lamps != 1)} left out"
         if self.camera_moves:
             text += ", the camera moves"
         if not len(self):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from jaxevent.blob.finding.background import Background, evidence, measure_background
 from jaxevent.blob.finding.detection import CONTACT, Scale, touching
 from jaxevent.blob.finding.found import Found, Pass
+from jaxevent.blob.finding.lamps import without_lamps
 from jaxevent.blob.finding.links import Links
 from jaxevent.blob.finding.moving import find_moving_background, goes_own_way
 from jaxevent.blob.finding.parts import join_parts
@@ -74,9 +75,11 @@ def find(
     found, passes = _search(stream, background, choice, progress)
     rate = background.mean * stream.width * stream.height
     moves = background.scene is not None
+    found, lamps = without_lamps(found, recording, stream.hot)
     found = prefer_sharper(found, recording, stream.hot)
     found.sort(key=lambda path: (path.begin, path.p[0].tolist()))
-    return Found(tuple(found), tuple(passes), int(stream.hot.sum()), rate, recording, moves)
+    hot = int(stream.hot.sum())
+    return Found(tuple(found), tuple(passes), hot, rate, recording, moves, lamps)
 
 
 def _search(
