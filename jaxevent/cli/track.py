@@ -183,6 +183,6 @@ def run(
     how = ", ".join(written.files) + f" in {out}" if not out.suffix else str(out)
     slow = "" if written.slow is None else f"; the video plays at {written.slow:.3g} of real time"
     print(
-        f"\n{how}: {len(tracks):,} tracks, {count:,} events in {seconds:.2f} s, "
-        f"{count / seconds:,.0f} events/s{slow}"
+        f"\n{how}: {len(tracks):,} track{'s' * (len(tracks) != 1)}, {count:,} events in "
+        f"{seconds:.2f} s, {count / seconds:,.0f} events/s{slow}"
     )

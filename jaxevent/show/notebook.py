@@ -70,7 +70,8 @@ def _(tracks: Tracks) -> str:
     if len(tracks) > len(order):
         rows.append(("", f"and {len(tracks) - len(order)} shorter ones"))
     picture = (lambda: plot_tracks(tracks)) if len(tracks.recording.events) <= MOST else None
-    return _block(f"{len(tracks)} tracks of {tracks.recording.name}", rows, picture)
+    number = f"{len(tracks)} track{'s' * (len(tracks) != 1)}"
+    return _block(f"{number} of {tracks.recording.name}", rows, picture)
 
 
 @as_html.register

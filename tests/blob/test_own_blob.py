@@ -107,6 +107,6 @@ def test_its_own_number_is_fitted(folder, capsys):
     mine.write_text("".join(f"{k} = {json.dumps(v)}\n" for k, v in table.items()))
     argv = ["track", folder / "a.h5", "--method", METHOD, "--params", mine, "--seed=20,20,4"]
     assert cli.main([*map(str, argv), "--out", str(folder / "a.tracks.csv")]) == 0
-    assert "1 tracks" in capsys.readouterr().out
+    assert "1 track, " in capsys.readouterr().out
     x = np.genfromtxt(folder / "a.tracks.csv", delimiter=",", names=True)["x"]
     assert abs(x[-1] - 29.5) < 1
