@@ -47,6 +47,35 @@ def add(commands: Any) -> None:
         help="TOML file of name = value lines, e.g. particles = 400, or params.toml of a fit",
     )
     one.add_argument("--seed", metavar="N", type=int, default=0, help="of all that is random")
+    _add_known(one)
+    one.add_argument(
+        "--rate", metavar="HZ", type=float, default=1000.0, help="rows per second; default: 1000"
+    )
+    one.add_argument(
+        "--centred",
+        action="store_true",
+        help="take every estimate for the time that what it saw shows, some ms earlier",
+    )
+    one.add_argument(
+        "--smooth", action="store_true", help="use the events that come later too, with voting"
+    )
+    one.add_argument("--start", metavar="S", type=float, help="on the recording's clock")
+    one.add_argument("--stop", metavar="S", type=float, help="its end")
+    one.add_argument(
+        "--flow", action="store_true", help="write the optical flow of each event too: flow.h5"
+    )
+    one.add_argument(
+        "--focal",
+        metavar="PX",
+        type=float,
+        help="focal length, for a recording without calibration; the centre is the sensor's",
+    )
+    arguments.add_size(one)
+    arguments.add_output(one, "--out", metavar="DIR", required=True, help="folder to write")
+
+
+def _add_known(one: Any) -> None:
+    """What else tells the motion: a table, poses, the gyro."""
     one.add_argument(
         "--truth",
         metavar="CSV",
@@ -82,30 +111,6 @@ def add(commands: Any) -> None:
         type=arguments.span,
         help="from when to when the camera is still: what its gyro shows then is its bias",
     )
-    one.add_argument(
-        "--rate", metavar="HZ", type=float, default=1000.0, help="rows per second; default: 1000"
-    )
-    one.add_argument(
-        "--centred",
-        action="store_true",
-        help="take every estimate for the time that what it saw shows, some ms earlier",
-    )
-    one.add_argument(
-        "--smooth", action="store_true", help="use the events that come later too, with voting"
-    )
-    one.add_argument("--start", metavar="S", type=float, help="on the recording's clock")
-    one.add_argument("--stop", metavar="S", type=float, help="its end")
-    one.add_argument(
-        "--flow", action="store_true", help="write the optical flow of each event too: flow.h5"
-    )
-    one.add_argument(
-        "--focal",
-        metavar="PX",
-        type=float,
-        help="focal length, for a recording without calibration; the centre is the sensor's",
-    )
-    arguments.add_size(one)
-    arguments.add_output(one, "--out", metavar="DIR", required=True, help="folder to write")
 
 
 def run(
@@ -156,12 +161,7 @@ def run(
     bias = None
     if recording.imu is not None and still is not None:
         bias = gyro_bias(recording.imu, *still)
-    whole = recording
-    if start is not None or stop is not None:
-        kept = {"poses": recording.poses, "imu": recording.imu}
-        recording = dataclasses.replace(recording[start:stop], **kept)
-        if not len(recording.events):
-            raise InputError(f"{path}: holds no events from --start to --stop; choose other times")
+    whole, recording = recording, _stretch(recording, start, stop)
     if kind is None:
         choice = choose(recording)
         print("\n".join(choice.lines))
@@ -204,6 +204,19 @@ def _check(estimator: Any, kind: Any, imu: bool, smooth: bool) -> None:
                 f"--{name} is not for the method {estimator.name}; leave it out or use "
                 f"{' or '.join(others)}"
             )
+
+
+def _stretch(recording: Any, start: float | int | None, stop: float | int | None) -> Any:
+    """The events of some time, with the poses and the IMU of all."""
+    if start is None and stop is None:
+        return recording
+    kept = {"poses": recording.poses, "imu": recording.imu}
+    part = dataclasses.replace(recording[start:stop], **kept)
+    if not len(part.events):
+        raise InputError(
+            f"{recording.name}: holds no events from --start to --stop; choose other times"
+        )
+    return part
 
 
 def _with_camera(recording: Any, focal: float | int | None) -> Any:
