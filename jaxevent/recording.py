@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.camera import PinholeCamera, Response, TableResponse, UnknownResponse
 from jaxevent.errors import InputError
-from jaxevent.shown import Shown
+from jaxevent.shown import Shown, plural
 
 if TYPE_CHECKING:
     import pandas
@@ -56,10 +56,10 @@ def check_times(times: Times, start: int, stop: int, name: str) -> None:
         )
 
 
-def _span(what: str, count: int, t: Any) -> str:
+def _span(what: str, number: int, t: Any) -> str:
     """As in "2 events from 0.1 to 0.2 s"."""
-    text = f"{count:,} {what}{'s' * (count != 1)}"
-    return f"{text} from {t[0] / 1e6:g} to {t[-1] / 1e6:g} s" if count else text
+    text = f"{number:,} {plural(what, number)}"
+    return f"{text} from {t[0] / 1e6:g} to {t[-1] / 1e6:g} s" if number else text
 
 
 @runtime_checkable

@@ -1,4 +1,4 @@
-"""What notebooks show."""
+"""What notebooks show, and words for it."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,3 +11,8 @@ class Shown:
 
     def _repr_html_(self) -> str:
         return as_html(self)
+
+
+def plural(what: str, number: int) -> str:
+    """The word for so many: one track, two tracks."""
+    return what if number == 1 else what + "s"

@@ -8,6 +8,7 @@ from typing import Any
 from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command, show_progress
 from jaxevent.errors import InputError
+from jaxevent.shown import plural
 
 
 def add(commands: Any) -> None:
@@ -183,6 +184,6 @@ def run(
     how = ", ".join(written.files) + f" in {out}" if not out.suffix else str(out)
     slow = "" if written.slow is None else f"; the video plays at {written.slow:.3g} of real time"
     print(
-        f"\n{how}: {len(tracks):,} track{'s' * (len(tracks) != 1)}, {count:,} events in "
+        f"\n{how}: {len(tracks):,} {plural('track', len(tracks))}, {count:,} events in "
         f"{seconds:.2f} s, {count / seconds:,.0f} events/s{slow}"
     )

@@ -34,6 +34,7 @@ from jaxevent.show.motion_pictures import (
     span_of,
     window_of,
 )
+from jaxevent.shown import plural
 
 
 def write_motion_table(
@@ -333,7 +334,7 @@ class Written:
     def _count(self) -> str:
         """Of estimates, without those that are held."""
         number = len(self.motion) - self.motion.held
-        return f"{number:,} estimate{'s' * (number != 1)}"
+        return f"{number:,} {plural('estimate', number)}"
 
     def _found(self) -> list[str]:
         lost = ~self.told.valid

@@ -18,6 +18,7 @@ from jaxevent.errors import InputError
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Recording
 from jaxevent.show.figures import plot_events, plot_image, plot_motion, plot_tracks
+from jaxevent.shown import plural
 
 MOST = 1_000_000  # events that a reconstruction passes over for its picture
 LINES = 12  # of a table of tracks
@@ -70,8 +71,8 @@ def _(tracks: Tracks) -> str:
     if len(tracks) > len(order):
         rows.append(("", f"and {len(tracks) - len(order)} shorter ones"))
     picture = (lambda: plot_tracks(tracks)) if len(tracks.recording.events) <= MOST else None
-    number = f"{len(tracks)} track{'s' * (len(tracks) != 1)}"
-    return _block(f"{number} of {tracks.recording.name}", rows, picture)
+    title = f"{len(tracks)} {plural('track', len(tracks))} of {tracks.recording.name}"
+    return _block(title, rows, picture)
 
 
 @as_html.register

@@ -189,14 +189,14 @@ def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
 
 def measure_background(stream: Stream) -> Background:
     """The background of a stream; hot pixels are marked in the stream."""
-    counts, all = np.zeros((1, stream.height, stream.width), np.int32), np.array([0])
-    stream.add_cells(np.array([[0, stream.duration]]), UNMOVED[None], 1, counts, all)
+    counts, whole = np.zeros((1, stream.height, stream.width), np.int32), np.array([0])
+    stream.add_cells(np.array([[0, stream.duration]]), UNMOVED[None], 1, counts, whole)
     stream.hot = find_hot_pixels(counts[0])
     fine = -(-stream.height // CELL) * CELL // FINE, -(-stream.width // CELL) * CELL // FINE
     cells = np.zeros((SLICES, *fine), np.int32)
     edges = np.linspace(0, stream.duration, SLICES + 1)
-    spans, places = np.stack([edges[:-1], edges[1:]], 1), np.tile(UNMOVED, (SLICES, 1, 1))
-    stream.add_cells(spans, places, FINE, cells, np.arange(SLICES))
+    spans, places, into = in_steps(np.stack([edges[:-1], edges[1:]], 1), None, (0, 0))
+    stream.add_cells(spans, places, FINE, cells, into)
     return _of_counts(cells, stream.duration)
 
 

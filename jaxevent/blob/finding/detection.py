@@ -240,20 +240,31 @@ def blob_moments(x: Any, y: Any, events: Any, labels: Any, number: int, blobs: A
     for i in range(len(x)):
         k = labels[i] - 1
         if k >= 0:
-            m, at_x, at_y = float(events[i]), float(x[i]), float(y[i])
-            n[k] += m
-            p[k, 0] += m * at_x
-            p[k, 1] += m * at_y
-            C[k, 0, 0] += m * at_x * at_x
-            C[k, 0, 1] += m * at_x * at_y
-            C[k, 1, 1] += m * at_y * at_y
+            add_moments(n, p, C, k, float(events[i]), float(x[i]), float(y[i]))
+    finish_moments(n, p, C, number)
+
+
+@lean_part
+def add_moments(n: Any, p: Any, C: Any, k: int, weight: float, x: float, y: float) -> None:
+    """Add a place to the sums of one of several blobs."""
+    n[k] += weight
+    p[k, 0] += weight * x
+    p[k, 1] += weight * y
+    C[k, 0, 0] += weight * x * x
+    C[k, 0, 1] += weight * x * y
+    C[k, 1, 1] += weight * y * y
+
+
+@lean_part
+def finish_moments(n: Any, p: Any, C: Any, number: int) -> None:
+    """Means and covariances, with that of a pixel, from the sums of the first `number`."""
     for k in range(number):
-        over = 1 / max(n[k], 1.0)
-        mx, my = p[k, 0] * over, p[k, 1] * over
-        p[k, 0], p[k, 1] = mx, my
-        C[k, 0, 0] = C[k, 0, 0] * over - mx * mx + 1 / 12
-        C[k, 0, 1] = C[k, 1, 0] = C[k, 0, 1] * over - mx * my
-        C[k, 1, 1] = C[k, 1, 1] * over - my * my + 1 / 12
+        over = 1 / max(n[k], 1e-9)
+        p[k, 0] *= over
+        p[k, 1] *= over
+        C[k, 0, 0] = C[k, 0, 0] * over - p[k, 0] * p[k, 0] + 1 / 12
+        C[k, 0, 1] = C[k, 1, 0] = C[k, 0, 1] * over - p[k, 0] * p[k, 1]
+        C[k, 1, 1] = C[k, 1, 1] * over - p[k, 1] * p[k, 1] + 1 / 12
 
 
 def touching(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> Any:

@@ -12,6 +12,7 @@ from jaxevent.blob.finding.scale import Choice
 from jaxevent.blob.params import TrackerParams
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording
+from jaxevent.shown import plural
 
 P = TypeVar("P", bound=TrackerParams)
 
@@ -60,12 +61,12 @@ class Found:
 
     def summary(self) -> str:
         """One line of what was found."""
-        count = f"{len(self)} target{'s' * (len(self) != 1)}"
-        text = f"{count}, background of {self.background:,.0f} events/s"
+        text = f"{len(self)} {plural('target', len(self))}, "
+        text += f"background of {self.background:,.0f} events/s"
         if self.hot_pixels:
-            text += f", {self.hot_pixels} hot pixel{'s' * (self.hot_pixels != 1)} left out"
+            text += f", {self.hot_pixels} {plural('hot pixel', self.hot_pixels)} left out"
         if self.lamps:
-            text += f", {self.lamps} lamp{'s' * (self.lamps != 1)} left out"
+            text += f", {self.lamps} {plural('lamp', self.lamps)} left out"
         if self.camera_moves:
             text += ", the camera moves"
         if not len(self):

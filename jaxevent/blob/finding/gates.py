@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.finding.detection import CONTACT, touching
+from jaxevent.blob.finding.detection import CONTACT, add_moments, finish_moments, touching
 from jaxevent.blob.finding.stream import Part
 from jaxevent.blob.finding.targets import GATE, REACH, Live
 from jaxevent.kernels import lean, lean_part
@@ -175,22 +175,11 @@ def _moments(
                     _add(n, z, C, soft[j], share[j] / total, x[i], y[i], late, gates)
         elif owner[i] >= 0:
             _add(n, z, C, owner[i], 1.0, x[i], y[i], late, gates)
-    for k in range(len(n)):
-        over = 1 / max(n[k], 1e-9)
-        z[k, 0] *= over
-        z[k, 1] *= over
-        C[k, 0, 0] = C[k, 0, 0] * over - z[k, 0] ** 2 + 1 / 12
-        C[k, 0, 1] = C[k, 1, 0] = C[k, 0, 1] * over - z[k, 0] * z[k, 1]
-        C[k, 1, 1] = C[k, 1, 1] * over - z[k, 1] ** 2 + 1 / 12
+    finish_moments(n, z, C, len(n))
 
 
 @lean_part
 def _add(n: Any, z: Any, C: Any, k: int, w: float, x: Any, y: Any, late: float, gates: Any) -> None:
     """Add an event's residual to a target's sums."""
     ex, ey = _residual(gates, k, x, y, late)
-    n[k] += w
-    z[k, 0] += w * ex
-    z[k, 1] += w * ey
-    C[k, 0, 0] += w * ex * ex
-    C[k, 0, 1] += w * ex * ey
-    C[k, 1, 1] += w * ey * ey
+    add_moments(n, z, C, k, w, ex, ey)

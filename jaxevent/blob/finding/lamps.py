@@ -13,8 +13,8 @@ hertz exactly, and targets pass before lamps.
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.finding.paths import Path, candidates, join
-from jaxevent.blob.finding.stream import BATCH
+from jaxevent.blob.finding.paths import NOBODY, Path, join
+from jaxevent.blob.finding.stream import near_paths
 from jaxevent.blob.finding.targets import GATE
 from jaxevent.recording import Recording
 
@@ -49,16 +49,14 @@ def _in_time(
     paths: list[Path], recording: Recording, hot: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """The share of paths' events that comes in time with the mains; 0 where it may be chance."""
-    joined, events = join(paths), recording.events
-    begin = min(path.begin for path in paths)
-    first, last = events.index(begin), events.index(max(path.end for path in paths))
-    pieces = (max(path.end for path in paths) - begin) // PIECE + 1
+    joined = join(paths)
+    begin = joined.begins.min()
+    pieces = (joined.ends.max() - begin) // PIECE + 1
     n = np.zeros((len(paths), pieces))
     z = np.zeros((len(MAINS), len(paths) * pieces), complex)
-    for row in range(first, last, BATCH):
-        part = events[row : min(row + BATCH, last)]
-        whose = candidates(part, joined, GATE)[:, 0]
-        seen = (whose >= 0) & ~hot[part.y, part.x]
+    for _, part, near in near_paths(recording.events, joined, GATE):
+        whose = near[:, 0]
+        seen = (whose != NOBODY) & ~hot[part.y, part.x]
         t = part.t[seen] - begin
         place = whose[seen] * pieces + t // PIECE
         n += np.bincount(place, minlength=n.size).reshape(n.shape)
@@ -69,6 +67,9 @@ def _in_time(
     power = np.abs(z.reshape(len(MAINS), *n.shape)) ** 2 - n
     best = power.sum(2).argmax(0)
     power = np.take_along_axis(power, best[None, :, None], 0)[0]
-    chance = SIGMAS * np.sqrt((n**2).sum(1))
-    share = np.where(n > 1, power / np.maximum(n**2 - n, 1), np.nan)
-    return np.where(power.sum(1) > chance, np.nanmedian(share, 1), 0)
+    # Then some piece has more than one event.
+    sure = power.sum(1) > SIGMAS * np.sqrt((n**2).sum(1))
+    each = np.where(n > 1, power / np.maximum(n**2 - n, 1), np.nan)
+    share = np.zeros(len(paths))
+    share[sure] = np.nanmedian(each[sure], 1)
+    return share

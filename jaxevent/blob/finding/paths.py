@@ -74,6 +74,16 @@ class Joined(NamedTuple):
     p: NDArray[np.float64]
     S: NDArray[np.float64]  # (rows, 3): of events about p, xx, xy, yy
 
+    @property
+    def begins(self) -> NDArray[np.int64]:
+        """(paths,) us, as `Path.begin`."""
+        return self.t[self.first[:-1]] - self.window // 2
+
+    @property
+    def ends(self) -> NDArray[np.int64]:
+        """(paths,) us, as `Path.end`."""
+        return self.t[self.first[1:] - 1] + self.window // 2
+
 
 def join(paths: Sequence[Path]) -> Joined:
     """The paths' rows."""
@@ -97,10 +107,9 @@ def candidates(events: Events, joined: Joined, sigmas: float | int) -> NDArray[n
     Of a path are events of its polarity within `sigmas` standard deviations while it is seen; of
     more than two paths an event is of the likeliest two.
     """
-    t, half = events.t, joined.window // 2
+    t = events.t
     whose, far = np.full((len(events), 2), NOBODY, np.int32), np.empty((len(events), 2))
-    begins, ends = joined.t[joined.first[:-1]] - half, joined.t[joined.first[1:] - 1] + half
-    rows = np.stack([np.searchsorted(t, begins), np.searchsorted(t, ends)])
+    rows = np.stack([np.searchsorted(t, us) for us in (joined.begins, joined.ends)])
     _candidates(t, events.x, events.y, events.p, joined, rows, float(sigmas) ** 2, whose, far)
     return whose
 

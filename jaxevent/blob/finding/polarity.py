@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob.finding.agility import fit_agility
-from jaxevent.blob.finding.paths import Path, candidates, join
-from jaxevent.blob.finding.stream import BATCH
+from jaxevent.blob.finding.paths import Path, join
+from jaxevent.blob.finding.stream import near_paths
 from jaxevent.blob.finding.targets import GATE
 from jaxevent.kernels import lean
 from jaxevent.recording import Recording
@@ -30,13 +30,10 @@ def prefer_sharper(paths: list[Path], recording: Recording, hot: NDArray[np.bool
     """
     if not paths:
         return paths
-    joined, events = join(paths), recording.events
+    joined = join(paths)
     sums = np.zeros((len(joined.t), 2, 6))
-    first = events.index(min(path.begin for path in paths))
-    last = events.index(max(path.end for path in paths))
-    for row in range(first, last, BATCH):
-        part = events[row : min(row + BATCH, last)]
-        near, now = candidates(part, joined, GATE), joined.first[:-1].copy()
+    for _, part, near in near_paths(recording.events, joined, GATE):
+        now = joined.first[:-1].copy()
         _add(part.t, part.x, part.y, part.p, near, joined, hot, now, sums)
     ends = zip(joined.first[:-1], joined.first[1:], strict=True)
     return [_sharper(path, sums[a:b]) for path, (a, b) in zip(paths, ends, strict=True)]

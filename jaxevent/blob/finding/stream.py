@@ -1,14 +1,15 @@
 """The events that the search for targets looks at, window by window."""
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.finding.paths import NOBODY, Path, candidates, join
+from jaxevent.blob.finding.paths import NOBODY, Joined, Path, candidates, join
 from jaxevent.kernels import Blank, lean, lean_part
-from jaxevent.recording import Events, Recording
+from jaxevent.recording import Events, EventSource, Recording
 
 _counts = Blank(np.int32)
 BATCH = 1 << 20  # events read at a time
@@ -65,15 +66,12 @@ class Stream:
 
     def without(self, paths: Sequence[Path], sigmas: float | int) -> "Stream":
         """The same without events within `sigmas` standard deviations of some paths."""
-        stream = Stream(self.recording, self.start, self.stop)
-        first, last = self._first, self._last
+        stream, first = copy.copy(self), self._first
         kept = np.ones(len(self), bool) if self._kept is None else self._kept.copy()
-        joined = join(paths)
-        for row in range(first, last, BATCH):
-            events = self.recording.events[row : min(row + BATCH, last)]
-            near = candidates(events, joined, sigmas)[:, 0] != NOBODY
-            kept[row - first : row - first + len(near)] &= ~near
-        stream.hot, stream._kept = self.hot, kept
+        rows = first, self._last
+        for row, _, whose in near_paths(self.recording.events, join(paths), sigmas, rows):
+            kept[row - first : row - first + len(whose)] &= whose[:, 0] == NOBODY
+        stream._kept = kept
         return stream
 
     def window(self, begin: float | int, end: float | int) -> Part:
@@ -189,6 +187,23 @@ def cell_at(A: Any, x: Any, y: Any, cell: int, shape: Any) -> tuple[int, int]:
     row = int(A[1, 0] * x + A[1, 1] * y + A[1, 2]) // cell
     column = int(A[0, 0] * x + A[0, 1] * y + A[0, 2]) // cell
     return min(max(row, 0), shape[0] - 1), min(max(column, 0), shape[1] - 1)
+
+
+def near_paths(
+    events: EventSource,
+    joined: Joined,
+    sigmas: float | int,
+    rows: tuple[int, int] | None = None,
+) -> Iterator[tuple[int, Events, NDArray[np.int32]]]:
+    """Events of some rows, by default while some path is, a part after another.
+
+    The first row of each part, its events, and whose they are (`candidates`).
+    """
+    if rows is None:
+        rows = events.index(int(joined.begins.min())), events.index(int(joined.ends.max()))
+    for row in range(*rows, BATCH):
+        part = events[row : min(row + BATCH, rows[1])]
+        yield row, part, candidates(part, joined, sigmas)
 
 
 @lean
