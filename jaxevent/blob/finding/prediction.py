@@ -152,8 +152,8 @@ def score(told: list[Told]) -> Score:
     expected, large, split = (
         np.array([getattr(one, name) for one in told]) for name in ("expected", "large", "split")
     )
-    gains = np.zeros(len(told))
-    _gains(density, b, weight, ends, gains)
+    gains, shares = np.zeros(len(told)), np.full((2, 1 + KERNELS), 1 / (1 + KERNELS))
+    _gains(density, b, weight, ends, shares, gains)
     parts = (gains - expected) / number
     raw = float(parts.sum())
     lost = SPLIT * abs(raw) * float(split.sum()) / max(float(large.sum()), 1e-9)
@@ -161,26 +161,31 @@ def score(told: list[Told]) -> Score:
 
 
 @lean
-def _gains(density: Any, b: Any, weight: Any, ends: Any, nats: Any) -> None:
+def _gains(density: Any, b: Any, weight: Any, ends: Any, shares: Any, nats: Any) -> None:
     """Log likelihood ratios of windows with the likeliest shares of ellipses and kernels."""
-    e = f = g = h = 1 / (1 + KERNELS)
+    share, new = shares[0], shares[1]
     for _ in range(ROUNDS):
-        to_e = to_f = to_g = to_h = 0.0
+        for j in range(1 + KERNELS):
+            new[j] = 0.0
         for k in range(len(weight)):
             for i in range(ends[k], ends[k + 1]):
-                one = density[i]
-                part = weight[k] / (b[i] + one[0] * e + one[1] * f + one[2] * g + one[3] * h)
-                to_e += part * one[0]
-                to_f += part * one[1]
-                to_g += part * one[2]
-                to_h += part * one[3]
-        e, f, g, h = e * to_e + 1e-12, f * to_f + 1e-12, g * to_g + 1e-12, h * to_h + 1e-12
-        total = e + f + g + h
-        e, f, g, h = e / total, f / total, g / total, h / total
+                total = b[i]
+                for j in range(1 + KERNELS):
+                    total += density[i, j] * share[j]
+                part = weight[k] / total
+                for j in range(1 + KERNELS):
+                    new[j] += part * density[i, j]
+        total = 0.0
+        for j in range(1 + KERNELS):
+            share[j] = share[j] * new[j] + 1e-12
+            total += share[j]
+        for j in range(1 + KERNELS):
+            share[j] /= total
     for k in range(len(weight)):
         for i in range(ends[k], ends[k + 1]):
-            one = density[i]
-            total = one[0] * e + one[1] * f + one[2] * g + one[3] * h
+            total = 0.0
+            for j in range(1 + KERNELS):
+                total += density[i, j] * share[j]
             nats[k] += weight[k] * np.log(total / b[i] + 1)
 
 

@@ -14,6 +14,7 @@ import dataclasses
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from jaxevent.blob.finding.background import Background, measure_dispersion
 from jaxevent.blob.finding.detection import CONTACT, Scale, detect, measure_blobs, touching
@@ -176,17 +177,6 @@ class _Gaps:
         large = large[blobs.n[large] >= LARGE]
         p, C = blobs.p[large], blobs.C[large]
         cluster = np.full(number + 1, -1, np.int32)
-        first = _connected(touching(p[:, None], C[:, None], p, C) < CONTACT)
-        clusters, cluster[large + 1] = np.unique(first, return_inverse=True)
-        return pixels, cluster[labels], len(clusters)
-
-
-def _connected(touch: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """The first of all that each is connected with, of which two touch (n, n)."""
-    first = np.arange(len(touch))
-    while len(first):
-        nearer = np.where(touch, first, len(touch)).min(1)
-        if (nearer == first).all():
-            break
-        first = nearer
-    return first
+        clusters, of_large = connected_components(touching(p[:, None], C[:, None], p, C) < CONTACT)
+        cluster[large + 1] = of_large
+        return pixels, cluster[labels], clusters
