@@ -790,12 +790,9 @@ def balanced():
 def test_equations_are_those_of_the_steps():
     p, (L, V, s, _), numbers = jax.tree.map(np.asarray, balanced())
     near = np.exp(-2 * s**2).astype(np.float32)
-    N, b = np.empty((5, 5, 10), np.float32), np.empty((5, 5, 4), np.float32)
-    edge = np.empty((5, 5), np.float32)
     images = trajectories.pack(L, V)
     floor, nu = float(numbers.floor), float(numbers.robust)
-    points, M = trajectories.fetch(images, s, near, p, floor, nu)
-    trajectories._linearise(0, 5, points, s, M, N, b, edge)
+    N, b, edge = trajectories.linearise(*trajectories.fetch(images, s, near, p, floor, nu), s)
     found = jax.jit(implicit.equations)(*balanced())
     softened = trajectories.soften(N)
     upper = [found.N[..., i, j] for i in range(4) for j in range(i, 4)]

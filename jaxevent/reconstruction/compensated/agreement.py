@@ -196,7 +196,7 @@ class _Settings(NamedTuple):
 
 
 @lean_part
-def _across(row, taps, padded, out):
+def across(row, taps, padded, out):
     """`row` blurred along x; the image's border goes on."""
     w, reach = len(row), len(taps) // 2
     for x in range(reach):
@@ -212,7 +212,7 @@ def _across(row, taps, padded, out):
 
 
 @lean_part
-def _down(image, y, taps, out):
+def down(image, y, taps, out):
     """The row y of an image that is blurred along y."""
     h, w = image.shape
     for x in range(w):
@@ -292,13 +292,13 @@ def _divide(a, b, out):
 def _blur_across(begin, end, image, taps, room, out):
     padded = room[begin]
     for y in range(begin, end):
-        _across(image[y], taps, padded, out[y])
+        across(image[y], taps, padded, out[y])
 
 
 @lean
 def _blur_down(begin, end, image, taps, out):
     for y in range(begin, end):
-        _down(image, y, taps, out[y])
+        down(image, y, taps, out[y])
 
 
 @lean
@@ -316,7 +316,7 @@ def _find_mean(begin, end, along, near, misfits, M, steep, settings, own, turn, 
             if turn == 0:
                 seen[:] = near[k]
             else:
-                _down(misfits[k], y, taps, misfit)
+                down(misfits[k], y, taps, misfit)
                 most = np.float32(1 if turn == 1 and k == own else np.inf)
                 _see(misfit, settings.tolerance, most, seen)
             _variance(along.V[k, y], along.inside[k, y], slope, settings, k == own, variance)
@@ -334,7 +334,7 @@ def _find_misfits(begin, end, along, M, steep, settings, own, taps, room, padded
             here = k == own
             _variance(along.V[k, y], along.inside[k, y], steep[y], settings, here, variance)
             _differ(along.L[k, y], M[y], variance, ratio)
-            _across(ratio, taps, padded[begin], misfits[k, y])
+            across(ratio, taps, padded[begin], misfits[k, y])
 
 
 @lean_part
@@ -395,7 +395,7 @@ def _finish(begin, end, L, along, misfits, steep, settings, place, taps, room, o
         excess[y], weight[y], out.activity[y] = np.float32(0), np.float32(0), np.float32(0)
         for k in range(count):
             here = k == own
-            _down(misfits[k], y, taps, misfit[k])
+            down(misfits[k], y, taps, misfit[k])
             _see(misfit[k], settings.tolerance, np.float32(np.inf), seen)
             _variance(along.V[k, y], along.inside[k, y], steep[y], settings, here, variance[k])
             _gather(along, y, k, seen, variance[k], settings, place, sums)
@@ -422,10 +422,10 @@ def _finish(begin, end, L, along, misfits, steep, settings, place, taps, room, o
 def blurred(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
     """`blur` of an image (h, w), in loops."""
     taps = taps_of(sigma)
-    across, out = np.empty_like(image), np.empty_like(image)
+    half, out = np.empty_like(image), np.empty_like(image)
     room = room_over(len(image), image.shape[1] + len(taps))
-    over_rows(_blur_across, len(image), image, taps, room, across)
-    over_rows(_blur_down, len(image), across, taps, out)
+    over_rows(_blur_across, len(image), image, taps, room, half)
+    over_rows(_blur_down, len(image), half, taps, out)
     return out
 
 

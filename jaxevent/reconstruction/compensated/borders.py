@@ -11,18 +11,21 @@ Steps go on from such paths: near borders more of them are right then, so more p
 take.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import fast, fast_part, over_rows, room_over
-from jaxevent.reconstruction.compensated.agreement import blurred
+from jaxevent.kernels import lean, lean_part, over_rows, room_over
+from jaxevent.reconstruction.compensated.agreement import across, down, taps_of
 from jaxevent.reconstruction.compensated.trajectories import (
-    OUTSIDE,
+    Row,
     Smoothness,
-    around,
-    robust_mean,
+    locate,
+    robust_means,
     spread,
     step,
+    weigh,
 )
 
 # Every how many pixels are compared, how far away those are whose paths are tried, and the
@@ -32,7 +35,8 @@ TURNS = ((2, 4, 1.0), (1, 3, 1.0))
 # Between steps, at nodes. All turns there take a further 3 % off the error of such objects and
 # nothing off that of slider_depth; an image takes 7 % longer.
 BETWEEN = TURNS[:1]
-DIRECTIONS = np.array([(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)])
+# A pixel's own path, and those around it.
+OFFSETS = np.array([(0, 0), (-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
 # By how much for every instant. By less, pixels of one surface take what noise prefers: with 0 so
 # do three of four in slow HDR pans, and well-exposed ones have 1.7 times the error. Chosen on the
 # scenes that HDR parameters are fitted to, and on the same objects and frames.
@@ -40,66 +44,154 @@ CLEARLY = np.float32(0.1)
 APART = np.float32(0.5)  # px at the farthest instant, by which paths differ that are compared
 
 
-@fast_part
-def _cost(images, s, near, y, x, path, floor, nu, level, W, R):
-    """How badly images (K, h, w, 4) agree along a path of the pixel y, x: robust squares."""
-    count, h, w, _ = images.shape
+class _Room(NamedTuple):
+    """Room for each row that kernels begin with."""
+
+    row: Row
+    values: NDArray[np.float32]  # (rows, 3, K, w), log intensity, information, weights
+    lines: NDArray[np.float32]  # (rows, 6, w), sums (2), means, costs of points, of pixels (2)
+    logs: NDArray[np.float64]  # (rows, 2, w), sums of logarithms, and of what products
+    which: NDArray[np.int32]  # (rows, w), pixels of a row
+    padded: NDArray[np.float32]  # (rows, w + taps)
+
+    @classmethod
+    def over(cls, rows: int, columns: int, instants: int, taps: int) -> "_Room":
+        """For `over_rows`."""
+        return cls(
+            Row.over(rows, columns),
+            room_over(rows, 3, instants, columns),
+            room_over(rows, 6, columns),
+            np.empty((rows, 2, columns)),
+            np.empty((rows, columns), np.int32),
+            room_over(rows, columns + taps),
+        )
+
+
+@lean_part
+def _read(image, pixel, part, level, V):
+    """Log intensity and variance of a packed image at points, bilinear."""
+    h, w, _ = image.shape
     one = np.float32(1)
-    for k in range(count):
-        X = np.float32(x) + (path[0] + path[2] * s[k]) * s[k]
-        Y = np.float32(y) + (path[1] + path[3] * s[k]) * s[k]
-        inside, x0, y0, x1, y1, fx, fy = around(X, Y, h, w)
+    for i in range(len(level)):
+        x0, y0, fx, fy = pixel[0, i], pixel[1, i], part[0, i], part[1, i]
+        x1 = min(x0 + 1, w - 1)
+        upper, lower = image[y0], image[min(y0 + 1, h - 1)]
         a, b = (one - fy) * (one - fx), (one - fy) * fx
         c, d = fy * (one - fx), fy * fx
-        upper, lower = images[k, y0], images[k, y1]
-        level[k] = a * upper[x0, 0] + b * upper[x1, 0] + c * lower[x0, 0] + d * lower[x1, 0]
-        V = a * upper[x0, 1] + b * upper[x1, 1] + c * lower[x0, 1] + d * lower[x1, 1]
-        W[k] = one / (V + floor) if inside else OUTSIDE
-    m = robust_mean(level, W, near, nu, R)
-    cost, product = 0.0, 1.0
-    for k in range(count):
-        e = level[k] - m
-        product *= 1.0 + e * e * W[k] / nu
-        if k % 16 == 15:  # one logarithm for many takes less time; nor is this too large for it
-            cost, product = cost + np.log(product), 1.0
-    return nu * np.float32(cost + np.log(product))
+        level[i] = a * upper[x0, 0] + b * upper[x1, 0] + c * lower[x0, 0] + d * lower[x1, 0]
+        V[i] = a * upper[x0, 1] + b * upper[x1, 1] + c * lower[x0, 1] + d * lower[x1, 1]
 
 
-@fast_part
+@lean_part
+def _cost(count, begin, images, s, near, y, floor, nu, room):
+    """How badly images (K, h, w, 4) agree along the paths of a row's first points.
+
+    Robust squares, `room.lines[begin, 3]`; paths and places at the target stand in `room.row`.
+    """
+    h, w = images.shape[1:3]
+    path, pixel, part = room.row.path[begin], room.row.pixel[begin], room.row.part[begin]
+    x, inside = room.row.x[begin, :count], room.row.inside[begin]
+    level, W, R = room.values[begin, 0], room.values[begin, 1], room.values[begin, 2]
+    sums, means, costs = room.lines[begin, :2], room.lines[begin, 2, :count], room.lines[begin, 3]
+    total, product = room.logs[begin, 0], room.logs[begin, 1]
+    for k in range(len(s)):
+        locate(path, x, y, s[k], (h, w), pixel, part, inside)
+        _read(images[k], pixel, part, level[k, :count], W[k])
+        weigh(W[k, :count], inside, floor, W[k])
+    robust_means(level, W, near, nu, R, sums, means)
+    for i in range(count):
+        total[i], product[i] = 0.0, 1.0
+    for k in range(len(s)):
+        for i in range(count):
+            e = level[k, i] - means[i]
+            product[i] *= 1.0 + e * e * W[k, i] / nu
+        # One logarithm for many takes less time; nor is this too large for it.
+        if k % 16 == 15 or k + 1 == len(s):
+            for i in range(count):
+                total[i] += np.log(product[i])
+                product[i] = 1.0
+    for i in range(count):
+        costs[i] = nu * np.float32(total[i])
+
+
+@lean_part
 def _apart(own, other):
     """By how many px at the farthest instant two paths differ, at most."""
     x = abs(other[0] - own[0]) + abs(other[2] - own[2])
     return max(x, abs(other[1] - own[1]) + abs(other[3] - own[3]))
 
 
-@fast
-def _try(begin, end, images, s, near, step, paths, offsets, floor, nu, room, out):
-    """Costs (1 + n, h, w) of every `step`-th pixel along both axes: of its path and others'.
-
-    Only differences between them count, so they are 0 where no path differs.
-    """
+@lean_part
+def _alike(paths, y, x, offsets):
+    """Whether no path nearby differs from a pixel's own."""
     h, w, _ = paths.shape
-    level, W, R = room[begin, 0], room[begin, 1], room[begin, 2]
+    for n in range(1, len(offsets)):
+        i = min(max(y + offsets[n, 0], 0), h - 1)
+        j = min(max(x + offsets[n, 1], 0), w - 1)
+        if _apart(paths[y, x], paths[i, j]) >= APART:
+            return False
+    return True
+
+
+@lean_part
+def _list(y, n, step, paths, offsets, enough, begin, room):
+    """Write down the pixels of a row to compare along the `n`th path, with it; how many."""
+    h, w, _ = paths.shape
+    own, row, count = room.lines[begin, 4], room.row, 0
+    i = min(max(y + offsets[n, 0], 0), h - 1)
+    for x in range(w):
+        j = min(max(x + offsets[n, 1], 0), w - 1)
+        if n == 0:
+            wanted = not _alike(paths, y, x, offsets)
+        else:  # of a path that is good no other is clearly better
+            wanted = own[x] >= enough and _apart(paths[y, x], paths[i, j]) >= APART
+        if wanted:
+            room.which[begin, count], row.x[begin, count] = x, np.float32(x * step)
+            for c in range(4):
+                row.path[begin, c, count] = paths[i, j, c]
+            count += 1
+    return count
+
+
+@lean
+def _try(begin, end, images, s, near, step, paths, offsets, floor, nu, taps, room, out):
+    """Costs (n, h, w) of every `step`-th pixel along both axes: of the paths at offsets (n, 2).
+
+    The first is its own. They are blurred along x. Only differences between them count, so they are
+    0 where no path differs, and those of its own where another is not compared.
+    """
+    which, found, padded = room.which[begin], room.lines[begin, 3], room.padded[begin]
+    own, other = room.lines[begin, 4], room.lines[begin, 5]
     for y in range(begin, end):
-        for x in range(w):
-            at, own, alike = (y * step, x * step), paths[y, x], True
-            for n in range(len(offsets)):
-                i = min(max(y + offsets[n, 0], 0), h - 1)
-                j = min(max(x + offsets[n, 1], 0), w - 1)
-                alike = alike and _apart(own, paths[i, j]) < APART
-            out[0, y, x] = np.float32(0)
-            if not alike:
-                out[0, y, x] = _cost(images, s, near, *at, own, floor, nu, level, W, R)
-            good = out[0, y, x] < CLEARLY * len(s)  # no other path is clearly better
-            for n in range(len(offsets)):
-                i = min(max(y + offsets[n, 0], 0), h - 1)
-                j = min(max(x + offsets[n, 1], 0), w - 1)
-                if good or _apart(own, paths[i, j]) < APART:
-                    out[1 + n, y, x] = out[0, y, x]
-                else:
-                    out[1 + n, y, x] = _cost(
-                        images, s, near, *at, paths[i, j], floor, nu, level, W, R
-                    )
+        own[:] = np.float32(0)
+        for n in range(len(offsets)):
+            count = _list(y, n, step, paths, offsets, CLEARLY * len(s), begin, room)
+            _cost(count, begin, images, s, near, np.float32(y * step), floor, nu, room)
+            for x in range(len(own)):
+                other[x] = own[x]
+            for m in range(count):
+                other[which[m]] = found[m]
+                if n == 0:
+                    own[which[m]] = found[m]
+            across(other, taps, padded, out[n, y])
+
+
+@lean
+def _take(begin, end, costs, moves, every, margin, taps, whose, lines, out):
+    """Whose path each pixel takes by costs that are blurred along x; `whose` are those so far."""
+    h, w = whose.shape
+    cost, least, best = lines[begin, 0], lines[begin, 1], lines[begin, 2]
+    for row in range(begin, end):
+        for n in range(len(costs)):
+            down(costs[n], row, taps, cost)
+            more = margin if n else np.float32(0)
+            for i in range(len(cost)):
+                if n == 0 or cost[i] + more < least[i]:
+                    least[i], best[i] = cost[i] + more, np.float32(n)
+        for y in range(row * every, min((row + 1) * every, h)):
+            for x in range(w):
+                move = moves[int(best[x // every])]
+                out[y, x] = whose[min(max(y + move[0], 0), h - 1), min(max(x + move[1], 0), w - 1)]
 
 
 def choose(
@@ -121,21 +213,19 @@ def choose(
         turns: As `TURNS`.
     """
     h, w, _ = paths.shape
-    near = np.exp(-2 * s**2).astype(np.float32)
+    near, margin = np.exp(-2 * s**2).astype(np.float32), np.float32(CLEARLY * len(s))
+    rules = np.float32(floor), np.float32(nu)
     whose = np.arange(h * w, dtype=np.int32).reshape(h, w)
-    row, column = np.mgrid[:h, :w]
     for every, far, sigma in turns:
-        some = paths.reshape(-1, 4)[whose[::every, ::every]]
+        some, taps = paths.reshape(-1, 4)[whose[::every, ::every]], taps_of(sigma)
         rows, columns, _ = some.shape
-        costs = np.empty((1 + len(DIRECTIONS), rows, columns), np.float32)
-        given = (images, s, near, every, some, DIRECTIONS * far, np.float32(floor), np.float32(nu))
-        over_rows(_try, rows, *given, room_over(rows, 3, len(s)), costs)
-        found = np.stack([blurred(one, sigma) for one in costs])
-        found[1:] += CLEARLY * len(s)
-        best = found.argmin(0)
-        moves = every * far * np.concatenate([[(0, 0)], DIRECTIONS])[best]
-        dy, dx = moves[row // every, column // every].transpose(2, 0, 1)
-        whose = whose[(row + dy).clip(0, h - 1), (column + dx).clip(0, w - 1)]
+        costs = np.empty((len(OFFSETS), rows, columns), np.float32)
+        room = _Room.over(rows, columns, len(s), len(taps))
+        given = (images, s, near, every, some, OFFSETS * far, *rules, taps, room)
+        over_rows(_try, rows, *given, costs)
+        given = (costs, OFFSETS * every * far, every, margin, taps, whose, room.lines)
+        whose = np.empty_like(whose)
+        over_rows(_take, rows, *given, whose)
     return whose
 
 

@@ -126,116 +126,186 @@ def around(X, Y, h, w):
     return inside, x0, y0, x1, y1, X - np.float32(x0), Y - np.float32(y0)
 
 
-@lean_part
-def robust_mean(values, W, near, nu, R):
-    """The mean of values with information W, and their weights R in it.
+class Row(NamedTuple):
+    """Room for points of a row, for each row that kernels begin with."""
 
-    The near instants decide first what the target looks like; then robustly all of them.
+    path: NDArray[np.float32]  # (rows, 4, points)
+    x: NDArray[np.float32]  # (rows, points), px, at the target
+    pixel: NDArray[np.int32]  # (rows, 2, points), x and y of the pixel before each point
+    part: NDArray[np.float32]  # (rows, 2, points), of a pixel beyond that
+    inside: NDArray[np.float32]  # (rows, points), 1, or 0 beyond the image's border
+
+    @classmethod
+    def over(cls, rows: int, points: int) -> "Row":
+        """For `over_rows`."""
+        path, part = room_over(rows, 4, points), room_over(rows, 2, points)
+        x, inside = room_over(rows, points), room_over(rows, points)
+        return cls(path, x, np.empty((rows, 2, points), np.int32), part, inside)
+
+
+@lean_part
+def locate(path, x, y, s, size, pixel, part, inside):
+    """Where points of a row are at an instant; arguments are as the parts of a `Row`."""
+    h, w = size
+    one, zero, half = np.float32(1), np.float32(0), np.float32(0.5)
+    right, bottom = np.float32(w - 1), np.float32(h - 1)
+    last_x, last_y = np.int32(max(w - 2, 0)), np.int32(max(h - 2, 0))
+    for i in range(len(x)):
+        X = x[i] + (path[0, i] + path[2, i] * s) * s
+        Y = y + (path[1, i] + path[3, i] * s) * s
+        here = (X >= -half) & (X <= right + half) & (Y >= -half) & (Y <= bottom + half)
+        inside[i] = one if here else zero
+        X, Y = min(max(X, zero), right), min(max(Y, zero), bottom)
+        x0, y0 = min(np.int32(X), last_x), min(np.int32(Y), last_y)
+        pixel[0, i], pixel[1, i] = x0, y0
+        part[0, i], part[1, i] = X - np.float32(x0), Y - np.float32(y0)
+
+
+@lean_part
+def weigh(V, inside, floor, W):
+    """The information of values of these variances."""
+    one = np.float32(1)
+    for i in range(len(V)):
+        W[i] = one / (V[i] + floor) if inside[i] > 0 else OUTSIDE
+
+
+@lean_part
+def robust_means(values, W, near, nu, R, sums, means):
+    """Means of values (K, points) with information W, and their weights R in it.
+
+    The near instants decide first what the target looks like; then robustly all of them. `sums`
+    (2, points) is room.
     """
-    one, total, mean = np.float32(1), np.float32(0), np.float32(0)
-    for k in range(len(values)):
-        R[k] = W[k] * near[k]
-        total += R[k]
-        mean += R[k] * values[k]
-    m = mean / total
-    for _ in range(2):
-        total, mean = np.float32(0), np.float32(0)
+    one, total, mean = np.float32(1), sums[0], sums[1]
+    for turn in range(3):
+        for i in range(len(means)):
+            total[i], mean[i] = np.float32(0), np.float32(0)
         for k in range(len(values)):
-            e = values[k] - m
-            R[k] = W[k] / (one + e * e * W[k] / nu)
-            total += R[k]
-            mean += R[k] * values[k]
-        m = mean / total
-    return m
+            level, info, weight, early = values[k], W[k], R[k], near[k]
+            if turn == 0:
+                for i in range(len(means)):
+                    weight[i] = info[i] * early
+            else:
+                for i in range(len(means)):
+                    e = level[i] - means[i]
+                    weight[i] = info[i] / (one + e * e * info[i] / nu)
+            for i in range(len(means)):
+                total[i] += weight[i]
+                mean[i] += weight[i] * level[i]
+        for i in range(len(means)):
+            means[i] = mean[i] / total[i]
+
+
+@lean_part
+def _read(image, pixel, part, k, points):
+    """An image's channels at points, bilinear: (4, K, points)."""
+    h, w, _ = image.shape
+    one = np.float32(1)
+    for i in range(pixel.shape[1]):
+        x0, y0, fx, fy = pixel[0, i], pixel[1, i], part[0, i], part[1, i]
+        x1 = min(x0 + 1, w - 1)
+        upper, lower = image[y0], image[min(y0 + 1, h - 1)]
+        a, b = (one - fy) * (one - fx), (one - fy) * fx
+        c, d = fy * (one - fx), fy * fx
+        for q in range(4):
+            points[q, k, i] = (
+                a * upper[x0, q] + b * upper[x1, q] + c * lower[x0, q] + d * lower[x1, q]
+            )
 
 
 @lean
-def _fetch(begin, end, images, s, near, p, floor, nu, room, points, M):
-    """Images along trajectories of some rows, (h, w, K, 4): L, weight R, gradient; their mean."""
+def _fetch(begin, end, images, s, near, p, floor, nu, row, W, sums, points, M):
+    """Images along trajectories of some rows, (h, 4, K, w): L, weight R, gradient; their mean."""
     count, h, w, _ = images.shape
-    one = np.float32(1)
-    at, W = room[begin, :4], room[begin, 4:]
+    path, pixel, part, inside = (
+        row.path[begin],
+        row.pixel[begin],
+        row.part[begin],
+        row.inside[begin],
+    )
+    at, info = row.x[begin], W[begin]
+    for x in range(w):
+        at[x] = np.float32(x)
     for y in range(begin, end):
         for x in range(w):
-            between(p, y, x, at)
-            vx, vy, ax, ay = at[0], at[1], at[2], at[3]
-            for k in range(count):
-                X = np.float32(x) + (vx + ax * s[k]) * s[k]
-                Y = np.float32(y) + (vy + ay * s[k]) * s[k]
-                inside, x0, y0, x1, y1, fx, fy = around(X, Y, h, w)
-                a, b = (one - fy) * (one - fx), (one - fy) * fx
-                c, d = fy * (one - fx), fy * fx
-                for q in range(4):
-                    points[y, x, k, q] = (
-                        a * images[k, y0, x0, q]
-                        + b * images[k, y0, x1, q]
-                        + c * images[k, y1, x0, q]
-                        + d * images[k, y1, x1, q]
-                    )
-                W[k] = one / (points[y, x, k, 1] + floor) if inside else OUTSIDE
-            M[y, x] = robust_mean(points[y, x, :, 0], W, near, nu, points[y, x, :, 1])
+            between(p, y, x, path[:, x])
+        for k in range(count):
+            locate(path, at, np.float32(y), s[k], (h, w), pixel, part, inside)
+            _read(images[k], pixel, part, k, points[y])
+            weigh(points[y, 1, k], inside, floor, info[k])
+        robust_means(points[y, 0], info, near, nu, points[y, 1], sums[begin], M[y])
+
+
+@lean_part
+def _add_product(a, b, out):
+    for i in range(len(out)):
+        out[i] += a[i] * b[i]
+
+
+@lean_part
+def _add_equations(points, s, M, slope, room, sums):
+    """Add those of each pixel of a row to sums (14, w): N (10) and b (4).
+
+    How values change with a path's four numbers is J = g (s, s^2), where the gradient g along
+    trajectories and that of the mean, `slope` (2, w), are both that of the scene; the mean of the
+    two has less noise. M, the mean of the values by R, is eliminated: J is J - sum R J / sum R.
+    """
+    J, total, means, r = room[:4], room[4], room[5:9], room[9]
+    total[:] = np.float32(0)
+    means[:] = np.float32(0)
+    for k in range(len(s)):
+        R = points[1, k]
+        for c in range(2):
+            for i in range(len(M)):
+                J[c, i] = (points[2 + c, k, i] + slope[c, i]) * np.float32(0.5) * s[k]
+            for i in range(len(M)):
+                J[2 + c, i] = J[c, i] * s[k]
+        for i in range(len(M)):
+            total[i] += R[i]
+        at = 0
+        for c in range(4):
+            for i in range(len(M)):
+                r[i] = R[i] * J[c, i]
+                means[c, i] += r[i]
+                sums[10 + c, i] -= r[i] * (points[0, k, i] - M[i])
+            for e in range(c, 4):
+                _add_product(r, J[e], sums[at])
+                at += 1
+    at = 0
+    for c in range(4):
+        for i in range(len(M)):
+            r[i] = -means[c, i] / total[i]
+        for e in range(c, 4):
+            _add_product(r, means[e], sums[at])
+            at += 1
 
 
 @lean
-def _linearise(begin, end, points, s, M, N, b, edge):
-    """Normal equations of the nodes of some rows: N (10 entries), b (4); and |grad M|.
-
-    M is eliminated: J_k - sum R J / sum R. Its gradient and that of L_k are both that of the scene;
-    their mean has less noise.
-    """
-    h, w, count, _ = points.shape
-    one, zero = np.float32(1), np.float32(0)
+def _linearise(begin, end, points, s, M, room, N, b, edge):
+    """Normal equations of the nodes of some rows: N (10 entries), b (4); and |grad M|."""
+    h, w = M.shape
+    own, slope, sums = room[begin, :10], room[begin, 10:12], room[begin, 12:]
     for i in range(begin, end):
+        sums[:] = np.float32(0)
+        below = min(2 * i + 2, h)
+        for y in range(2 * i, below):
+            for x in range(w):
+                gx, gy = _gradient(M, y, x)
+                slope[0, x], slope[1, x] = gx, gy
+                sums[14, x] += np.sqrt(gx * gx + gy * gy)
+            _add_equations(points[y], s, M[y], slope, own, sums)
         for j in range(N.shape[1]):
-            for c in range(10):
-                N[i, j, c] = zero
-            for c in range(4):
-                b[i, j, c] = zero
-            slope, pixels = zero, 0
-            for y in range(2 * i, min(2 * i + 2, h)):
-                for x in range(2 * j, min(2 * j + 2, w)):
-                    mx, my = _gradient(M, y, x)
-                    m = M[y, x]
-                    total, m0, m1, m2, m3 = zero, zero, zero, zero, zero
-                    for k in range(count):
-                        R = points[y, x, k, 1]
-                        J0 = (points[y, x, k, 2] + mx) * np.float32(0.5) * s[k]
-                        J1 = (points[y, x, k, 3] + my) * np.float32(0.5) * s[k]
-                        total += R
-                        m0 += R * J0
-                        m1 += R * J1
-                        m2 += R * J0 * s[k]
-                        m3 += R * J1 * s[k]
-                    m0, m1, m2, m3 = m0 / total, m1 / total, m2 / total, m3 / total
-                    for k in range(count):
-                        R, e = points[y, x, k, 1], points[y, x, k, 0] - m
-                        J0 = (points[y, x, k, 2] + mx) * np.float32(0.5) * s[k]
-                        J1 = (points[y, x, k, 3] + my) * np.float32(0.5) * s[k]
-                        J2, J3 = J0 * s[k] - m2, J1 * s[k] - m3
-                        J0, J1 = J0 - m0, J1 - m1
-                        r0, r1, r2, r3 = R * J0, R * J1, R * J2, R * J3
-                        N[i, j, 0] += r0 * J0
-                        N[i, j, 1] += r0 * J1
-                        N[i, j, 2] += r0 * J2
-                        N[i, j, 3] += r0 * J3
-                        N[i, j, 4] += r1 * J1
-                        N[i, j, 5] += r1 * J2
-                        N[i, j, 6] += r1 * J3
-                        N[i, j, 7] += r2 * J2
-                        N[i, j, 8] += r2 * J3
-                        N[i, j, 9] += r3 * J3
-                        b[i, j, 0] -= r0 * e
-                        b[i, j, 1] -= r1 * e
-                        b[i, j, 2] -= r2 * e
-                        b[i, j, 3] -= r3 * e
-                    slope += np.sqrt(mx * mx + my * my)
-                    pixels += 1
-            share = one / np.float32(pixels)
-            for c in range(10):
-                N[i, j, c] *= share
-            for c in range(4):
-                b[i, j, c] *= share
-            edge[i, j] = slope * share
+            left, right = 2 * j, min(2 * j + 1, w - 1)
+            both = np.float32(right - left)  # 0 or 1
+            share = np.float32(1) / (np.float32(below - 2 * i) * (np.float32(1) + both))
+            for c in range(15):
+                mean = (sums[c, left] + both * sums[c, right]) * share
+                if c < 10:
+                    N[i, j, c] = mean
+                elif c < 14:
+                    b[i, j, c - 10] = mean
+                else:
+                    edge[i, j] = mean
 
 
 def soften(values: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -284,33 +354,52 @@ def _weigh_differences(p, edge, reach, smoothness, across, down):
                     down[i, j] = weight
 
 
-@lean
-def _move(p, d, reach, moved, window, out):
-    """p + d, no longer than `FARTHEST` at the horizon, then the median of 3 x 3 nodes.
+@lean_part
+def _median(a, b, c):
+    return max(min(a, b), min(max(a, b), c))
 
-    `moved`, like `p`, and `window` [9] are room.
+
+@lean
+def _move(p, d, farthest, moved, sorted_rows, out):
+    """p + d, each channel of d no longer than `farthest`, then the median of 3 x 3 nodes.
+
+    All are (rows, columns * channels). `moved` is room, and so is `sorted_rows`, which is longer by
+    a node at both ends.
     """
+    rows, width = p.shape
+    channels = len(farthest)
+    for i in range(rows):
+        for c in range(channels):
+            for j in range(c, width, channels):
+                moved[i, j] = p[i, j] + min(max(d[i, j], -farthest[c]), farthest[c])
+    low, middle, high = sorted_rows[0], sorted_rows[1], sorted_rows[2]
+    for i in range(rows):
+        up, here, down = moved[max(i - 1, 0)], moved[i], moved[min(i + 1, rows - 1)]
+        for j in range(width):
+            low[channels + j] = min(min(up[j], here[j]), down[j])
+            middle[channels + j] = _median(up[j], here[j], down[j])
+            high[channels + j] = max(max(up[j], here[j]), down[j])
+        for line in (low, middle, high):
+            for c in range(channels):
+                line[c], line[channels + width + c] = line[channels + c], line[width + c]
+        # The median of nine lies between the largest of the smallest and the smallest of the
+        # largest of three columns.
+        for j in range(width):
+            k, m = j + channels, j + 2 * channels
+            least = max(max(low[j], low[k]), low[m])
+            most = min(min(high[j], high[k]), high[m])
+            out[i, j] = _median(least, _median(middle[j], middle[k], middle[m]), most)
+
+
+def _moved(p: NDArray[np.float32], d: NDArray[np.float32], reach: np.float32) -> NDArray:
+    """Nodes after a step d, which at the horizon is no longer than `FARTHEST`."""
     rows, columns, channels = p.shape
-    for i in range(rows):
-        for j in range(columns):
-            for c in range(channels):
-                scale = reach if c < 2 else reach * reach * np.float32(0.25)
-                far = min(max(d[i, j, c] * scale, -FARTHEST), FARTHEST)
-                moved[i, j, c] = p[i, j, c] + far / scale
-    for i in range(rows):
-        for j in range(columns):
-            for c in range(channels):
-                n = 0
-                for k in range(i - 1, i + 2):
-                    for m in range(j - 1, j + 2):
-                        value = moved[min(max(k, 0), rows - 1), min(max(m, 0), columns - 1), c]
-                        place = n
-                        while place > 0 and window[place - 1] > value:
-                            window[place] = window[place - 1]
-                            place -= 1
-                        window[place] = value
-                        n += 1
-                out[i, j, c] = window[4]
+    out, flat = np.empty_like(p), (rows, columns * channels)
+    farthest = FARTHEST / np.repeat([reach, reach * reach / 4], 2).astype(np.float32)
+    sorted_rows = np.empty((3, flat[1] + 2 * channels), np.float32)
+    moved = np.empty(flat, np.float32)
+    _move(p.reshape(flat), d.reshape(flat), farthest, moved, sorted_rows, out.reshape(flat))
+    return out
 
 
 def step(
@@ -323,14 +412,10 @@ def step(
     iterations: int = 12,
 ) -> NDArray[np.float32]:
     """One Gauss-Newton step of p (rows, columns, 4) on packed images (K, h, w, 4) at s (K,)."""
-    shape = p.shape[:2]
     reach = np.float32(max(float(np.abs(s).max()), 1e-3))
     near = np.exp(-2 * (s / reach) ** 2).astype(np.float32)
-    N, b = np.empty((*shape, 10), np.float32), np.empty((*shape, 4), np.float32)
-    edge = np.empty(shape, np.float32)
-    points, M = fetch(images, s, near, p, floor, nu)
-    over_rows(_linearise, shape[0], points, s, M, N, b, edge)
-    across, down = (np.zeros(shape, np.float32) for _ in range(2))
+    N, b, edge = linearise(*fetch(images, s, near, p, floor, nu), s)
+    across, down = (np.zeros(edge.shape, np.float32) for _ in range(2))
     _weigh_differences(p, edge, reach, smoothness, across, down)
     reach2 = reach * reach
     smooth = np.float32(smoothness.weight) * reach2 * np.array([1, 1, reach2, reach2], np.float32)
@@ -338,9 +423,7 @@ def step(
     tiny = np.float32(1e-5) * smooth[0]
     ridge = np.array([tiny, tiny, bend, bend], np.float32)
     d = solve(soften(N), soften(b), p, across, down, smooth, ridge, iterations)
-    out = np.empty_like(p)
-    _move(p, d, reach, np.empty_like(p), np.empty(9, np.float32), out)
-    return out
+    return _moved(p, d, reach)
 
 
 def fetch(
@@ -353,10 +436,22 @@ def fetch(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """What `_fetch` writes: of every pixel its instants' points, and their mean."""
     count, h, w, _ = images.shape
-    points, M = np.empty((h, w, count, 4), np.float32), np.empty((h, w), np.float32)
-    room = room_over(h, 4 + count)
-    over_rows(_fetch, h, images, s, near, p, np.float32(floor), np.float32(nu), room, points, M)
+    points, M = np.empty((h, 4, count, w), np.float32), np.empty((h, w), np.float32)
+    room = Row.over(h, w), room_over(h, count, w), room_over(h, 2, w)
+    over_rows(_fetch, h, images, s, near, p, np.float32(floor), np.float32(nu), *room, points, M)
     return points, M
+
+
+def linearise(
+    points: NDArray[np.float32], M: NDArray[np.float32], s: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """What `_linearise` writes of what `fetch` returns: N, b and |grad M| of nodes."""
+    h, w = M.shape
+    shape = -(-h // 2), -(-w // 2)
+    N, b = np.empty((*shape, 10), np.float32), np.empty((*shape, 4), np.float32)
+    edge, room = np.empty(shape, np.float32), room_over(shape[0], 12 + 15, w)
+    over_rows(_linearise, shape[0], points, s, M, room, N, b, edge)
+    return N, b, edge
 
 
 def misfit(
@@ -368,7 +463,7 @@ def misfit(
 ) -> float:
     """How badly packed images (K, h, w, 4) agree along trajectories: robust squares, a mean."""
     points, M = fetch(images, s, np.exp(-2 * s**2).astype(np.float32), p, floor, nu)
-    return float(((points[..., 0] - M[..., None]) ** 2 * points[..., 1]).mean())
+    return float(((points[:, 0] - M[:, None]) ** 2 * points[:, 1]).mean())
 
 
 def by_clock(

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.kernels import lean, lean_part, over_rows, room_over
-from jaxevent.reconstruction.compensated.trajectories import around
+from jaxevent.reconstruction.compensated.trajectories import Row, locate
 from jaxevent.reconstruction.features import Numeric
 
 CUBIC = -0.75  # slope of the cubic kernel at 1, as OpenCV's; the sharper of the usual two
@@ -24,58 +24,77 @@ class Along(NamedTuple):
 
 
 @lean_part
-def _cubic(f, out):
+def _cubic(part, out):
+    """The weights (4, points) of the four pixels around each point."""
     a, one, two, three = np.float32(CUBIC), np.float32(1), np.float32(2), np.float32(3)
-    far = one + f
-    out[0] = ((a * far - np.float32(5) * a) * far + np.float32(8) * a) * far - np.float32(4) * a
-    out[1] = ((a + two) * f - (a + three)) * f * f + one
-    rest = one - f
-    out[2] = ((a + two) * rest - (a + three)) * rest * rest + one
-    out[3] = one - out[0] - out[1] - out[2]
+    for i in range(len(part)):
+        f = part[i]
+        far, rest = one + f, one - f
+        first = ((a * far - np.float32(5) * a) * far + np.float32(8) * a) * far
+        out[0, i] = first - np.float32(4) * a
+        out[1, i] = ((a + two) * f - (a + three)) * f * f + one
+        out[2, i] = ((a + two) * rest - (a + three)) * rest * rest + one
+        out[3, i] = one - out[0, i] - out[1, i] - out[2, i]
+
+
+@lean_part
+def _read_bilinear(image, pixel, part, out):
+    h, w = image.shape
+    one = np.float32(1)
+    for i in range(len(out)):
+        x0, y0, fx, fy = pixel[0, i], pixel[1, i], part[0, i], part[1, i]
+        x1 = min(x0 + 1, w - 1)
+        upper, lower = image[y0], image[min(y0 + 1, h - 1)]
+        a, b = (one - fy) * (one - fx), (one - fy) * fx
+        c, d = fy * (one - fx), fy * fx
+        out[i] = a * upper[x0] + b * upper[x1] + c * lower[x0] + d * lower[x1]
+
+
+@lean_part
+def _read_bicubic(image, pixel, across, down, out):
+    h, w = image.shape
+    for i in range(len(out)):
+        x, y, total = int(pixel[0, i]) - 1, int(pixel[1, i]) - 1, np.float32(0)
+        if 0 <= x < w - 3 and 0 <= y < h - 3:
+            for n in range(4):
+                row = image[y + n]
+                part = across[0, i] * row[x] + across[1, i] * row[x + 1]
+                part = part + across[2, i] * row[x + 2] + across[3, i] * row[x + 3]
+                total += down[n, i] * part
+        else:  # the image's border goes on
+            for n in range(4):
+                row, part = image[min(max(y + n, 0), h - 1)], np.float32(0)
+                for m in range(4):
+                    part += across[m, i] * row[min(max(x + m, 0), w - 1)]
+                total += down[n, i] * part
+        out[i] = total
 
 
 @lean
-def _warp(begin, end, L, V, clear, s, paths, room, out_L, out_V, out_clear, inside):
+def _warp(begin, end, L, V, clear, s, paths, row, weights, out):
     count, h, w = L.shape
-    one, zero = np.float32(1), np.float32(0)
-    across, down = room[begin, :4], room[begin, 4:]
+    path, pixel, part, at = row.path[begin], row.pixel[begin], row.part[begin], row.x[begin]
+    across, down = weights[begin, :4], weights[begin, 4:]
+    for x in range(w):
+        at[x] = np.float32(x)
     for y in range(begin, end):
         for x in range(w):
-            path = paths[y, x]
-            vx, vy, ax, ay = path[0], path[1], path[2], path[3]
-            for k in range(count):
-                X = np.float32(x) + (vx + ax * s[k]) * s[k]
-                Y = np.float32(y) + (vy + ay * s[k]) * s[k]
-                here, x0, y0, x1, y1, fx, fy = around(X, Y, h, w)
-                inside[k, y, x] = one if here else zero
-                a, b = (one - fy) * (one - fx), (one - fy) * fx
-                c, d = fy * (one - fx), fy * fx
-                out_V[k, y, x] = (
-                    a * V[k, y0, x0] + b * V[k, y0, x1] + c * V[k, y1, x0] + d * V[k, y1, x1]
-                )
-                out_clear[k, y, x] = (
-                    a * clear[k, y0, x0]
-                    + b * clear[k, y0, x1]
-                    + c * clear[k, y1, x0]
-                    + d * clear[k, y1, x1]
-                )
-                _cubic(fx, across)
-                _cubic(fy, down)
-                total = zero
-                for i in range(4):
-                    row = min(max(y0 + i - 1, 0), h - 1)
-                    part = zero
-                    for j in range(4):
-                        part += across[j] * L[k, row, min(max(x0 + j - 1, 0), w - 1)]
-                    total += down[i] * part
-                out_L[k, y, x] = total
+            for c in range(4):
+                path[c, x] = paths[y, x, c]
+        for k in range(count):
+            locate(path, at, np.float32(y), s[k], (h, w), pixel, part, out.inside[k, y])
+            _cubic(part[0], across)
+            _cubic(part[1], down)
+            _read_bicubic(L[k], pixel, across, down, out.L[k, y])
+            _read_bilinear(V[k], pixel, part, out.V[k, y])
+            _read_bilinear(clear[k], pixel, part, out.clear[k, y])
 
 
 def warp(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, paths: NDArray) -> Along:
     """Images (K, h, w) float32 at instants s (K,) along the paths of pixels, (h, w, 4)."""
+    _, h, w = L.shape
     out = Along(*(np.empty(L.shape, np.float32) for _ in range(4)))
-    rows = L.shape[1]
-    over_rows(_warp, rows, L, V, clear, s, paths, room_over(rows, 8), *out)
+    over_rows(_warp, h, L, V, clear, s, paths, Row.over(h, w), room_over(h, 8, w), out)
     return out
 
 
