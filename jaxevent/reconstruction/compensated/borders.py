@@ -30,10 +30,10 @@ from jaxevent.reconstruction.compensated.trajectories import (
 
 # Every how many pixels are compared, how far away those are whose paths are tried, and the
 # Gaussian, both in units of that: turn by turn. Chosen on objects of other seeds and the first half
-# of slider_depth: three turns of all pixels (8, 4 and 2 px) are as good and take 1.8 times as long.
+# of slider_depth: three turns of all pixels (8, 4 and 2 px) are as good and take longer.
 TURNS = ((2, 4, 1.0), (1, 3, 1.0))
 # Between steps, at nodes. All turns there take a further 3 % off the error of such objects and
-# nothing off that of slider_depth; an image takes 7 % longer.
+# nothing off that of slider_depth, and take longer.
 BETWEEN = TURNS[:1]
 # A pixel's own path, and those around it.
 OFFSETS = np.array([(0, 0), (-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
