@@ -155,7 +155,9 @@ def locate(path, x, y, s, size, pixel, part, inside):
         Y = y + (path[1, i] + path[3, i] * s) * s
         here = (X >= -half) & (X <= right + half) & (Y >= -half) & (Y <= bottom + half)
         inside[i] = one if here else zero
-        X, Y = min(max(X, zero), right), min(max(Y, zero), bottom)
+        # So that what is no number becomes 0, too: it must not point outside.
+        X, Y = X if X > zero else zero, Y if Y > zero else zero
+        X, Y = min(X, right), min(Y, bottom)
         x0, y0 = min(np.int32(X), last_x), min(np.int32(Y), last_y)
         pixel[0, i], pixel[1, i] = x0, y0
         part[0, i], part[1, i] = X - np.float32(x0), Y - np.float32(y0)
