@@ -43,10 +43,10 @@ def run(
 ) -> tuple[State, Told]:
     """Track through chunks. Pure; differentiable with the memory of one chunk and of its starts.
 
-    `state` is what the run before returned; None: the recording starts here. `wanted` adds to the
-    births and deaths that are always told: "begins" the targets at each chunk's start, "states"
-    also those after each step, "associations" whose each event is, "path" positions, "associated"
-    and "all" the negative log-likelihood of events.
+    `state` is what the run before returned; None: the recording starts here. Births and deaths are
+    always told, and of `wanted` "states" the targets at each chunk's start and after each step,
+    "path" their positions, "associated" and "all" the negative log-likelihood of events, None the
+    targets at each chunk's start and whose each event is.
     """
     features = jax.tree.map(jnp.asarray, features)
     if state is None:
@@ -93,12 +93,11 @@ def _run_chunk(
         state,
     )
     told: dict[str, Any] = {}
-    if wanted == "begins":
+    if not wanted:
         told["slots"] = before
+        told["association"] = Association(steps.target, steps.weight)
     elif wanted == "states":
         told["slots"] = jax.tree.map(_put_first, before, steps.slots)
-    elif wanted == "associations":
-        told["association"] = Association(steps.target, steps.weight)
     elif wanted == "path":
         told["path"] = jax.tree.map(_put_first, place(filter, params, before), steps.path)
     elif wanted in ("associated", "all"):

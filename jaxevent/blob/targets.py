@@ -287,12 +287,12 @@ def step(
         slots = jax.vmap(update, (0, 0, None, None, 0))(slots, ahead, time, batch, weight)
 
     told: dict[str, Any] = {}
-    if wanted == "states":
-        told["slots"] = slots
-    elif wanted == "associations":
+    if not wanted:
         best = jnp.argmax(weight, axis=0)
         top = weight.max(0)
         told["target"], told["weight"] = jnp.where(top > 0, slots.id[best], -1), top
+    elif wanted == "states":
+        told["slots"] = slots
     elif wanted == "path":
         told["path"] = place(filter, params, slots)
     elif wanted in ("associated", "all"):

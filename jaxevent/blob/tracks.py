@@ -302,12 +302,10 @@ class Tracks(Shown):
         while mark is not None and mark.start < t1:
             stretch = self._packing.pack(mark)
             mark = stretch.next
-            wanted = "associations" if mark is None or mark.start > t0 else "begins"
-            state, told = run_compiled(
-                self._filter, self.params, state, stretch.features, wanted=wanted
-            )
-            if told.association is None:
+            state, told = run_compiled(self._filter, self.params, state, stretch.features)
+            if mark is not None and mark.start <= t0:
                 continue
+            assert told.association is not None
             valid = np.asarray(stretch.features.valid)
             t = (stretch.start[:, None, None] + stretch.features.t)[valid]
             serial = np.asarray(told.association.id)[valid]
@@ -418,7 +416,7 @@ class Tracks(Shown):
         """Track through a stretch, by the kernel if there is one."""
         if self._fused is not None:
             return self._fused(state, features, begins)
-        return run_compiled(self._filter, self.params, state, features, wanted="begins")
+        return run_compiled(self._filter, self.params, state, features)
 
     def _begin_of(self, time: int) -> tuple[Mark | None, Any]:
         known = [(mark, state) for mark, _, state in self._begins if mark.start <= time]

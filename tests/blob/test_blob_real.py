@@ -84,7 +84,7 @@ def test_tail_of_the_dot_begins_no_track(real, dot, float32):
         mark, state = packing.first, None
         while mark is not None:  # in the program of `follow`
             stretch = packing.pack(mark)
-            state, _ = run_compiled(moment.filter, params, state, stretch.features, wanted="begins")
+            state, _ = run_compiled(moment.filter, params, state, stretch.features)
             mark = stretch.next
         begun[surround] = int(state.next_id)
     assert begun[2.0] == 1 < begun[1.0]

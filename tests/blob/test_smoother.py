@@ -142,11 +142,11 @@ DETECTED = {
 @pytest.mark.slow
 def test_stretches_chunks_and_births_do_not_matter(three):
     """One long stretch, and many short ones of which only some beginnings are kept."""
-    rec, _ = three
-    params = blob.moment.Params(**DETECTED)
+    (rec, _), tracker = three, blob.constant_velocity
+    params = tracker.Params(**DETECTED)
     times = np.linspace(rec.start, rec.stop, 41).astype(np.int64)
-    tracks = follow(rec, params, None, blob.moment, steps=64, chunks=64)
-    short = follow(rec, params, None, blob.moment, steps=4, chunks=3)
+    tracks = follow(rec, params, None, tracker, steps=64, chunks=64)
+    short = follow(rec, params, None, tracker, steps=4, chunks=3)
     assert len(tracks) >= 3 and (tracks.death < tracks.stop).any()
     assert len(short._later) > len(short._begins) > 8
     for one, other in zip(tracks(times), short(times), strict=True):
@@ -191,28 +191,25 @@ def test_smoothed_states_are_nearer_and_know_it(three):
 @pytest.mark.slow
 def test_pure_functions_agree_and_have_gradients(walk):
     tracker, seeds = blob.constant_velocity, [(58.0, 62.0, 4.0)]
-    params = params_of(tracker, events_per_step=4, t_still=STILL)
+    params = params_of(tracker, events_per_step=4, t_still=STILL, cycle=1.0)
     times = np.arange(1000, 139_000, 9000)
     features, out = tracker.prepare(walk, times, params, seeds=seeds)
 
-    @jax.jit
-    def read(raw):
+    def loss(raw):
         own = params.with_raw({**params.raw, **raw})
         trajectory, _ = tracker.run(own, features)
-        return tracker.read(own, tracker.smooth(own, features, trajectory), out)
+        read = tracker.read(own, tracker.smooth(own, features, trajectory), out)
+        return jnp.sum(jnp.sin(read.mean[:, 0, :4] * jnp.array([1, 1, 0.01, 0.01]))), read
 
+    # Compiling a gradient takes seconds: one program tells all.
+    loss = jax.jit(jax.value_and_grad(loss, has_aux=True))
     raw = {name: params.raw[name] for name in ("Q_v", "Q_p", "P0_p")}
-    told = tracker.estimate(walk, params, seeds=seeds, smooth=True, progress=False)(times)
-    for one, other in zip(read(raw), told, strict=True):
+    (_, read), slopes = loss(raw)
+    for one, other in zip(read, follow(walk, params, seeds, tracker)(times), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
-
-    def loss(raw):
-        return jnp.sum(jnp.sin(read(raw).mean[:, 0, :4] * jnp.array([1, 1, 0.01, 0.01])))
-
-    value, slopes = jax.value_and_grad(loss)(raw)
     h = 1e-5
     for name in raw:
-        up, down = (loss({**raw, name: raw[name] + s}) for s in (h, -h))
+        up, down = (loss({**raw, name: raw[name] + s})[0][0] for s in (h, -h))
         assert slopes[name] == pytest.approx(float(up - down) / (2 * h), rel=2e-4, abs=1e-7)
         assert slopes[name] != 0
 
@@ -230,7 +227,7 @@ def test_filters_without_a_transition_are_not_smoothed(walk):
 @pytest.mark.slow
 def test_single_precision(walk, float32):
     tracker = blob.constant_velocity
-    params = params_of(tracker, events_per_step=4, t_still=STILL)
+    params = params_of(tracker, events_per_step=4, t_still=STILL, cycle=1.0)
     times, seeds = np.arange(1000, 139_000, 9000), [(58.0, 62.0, 4.0)]
     told = follow(walk, params, seeds, tracker)(times)
     with jax.enable_x64(True):
