@@ -142,7 +142,7 @@ def computed(folder: Path, out: Path) -> dict[str, Any]:
 
 
 def started(argv: list[Any], flags: str = "") -> subprocess.Popen:
-    # Not with the older code generator of the other tests: it rounds otherwise on two devices.
+    flags = f"{os.environ['XLA_FLAGS']} {flags}"
     usual = {"JAX_ENABLE_X64": "1", "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
     return subprocess.Popen(
         [sys.executable, *map(str, argv)],
