@@ -236,7 +236,7 @@ def test_batches_of_windows_are_mapped():
     part = drawn()
     windows = [events.to_device(part[a : a + 90], 100, size=(WIDTH, HEIGHT)) for a in (0, 90)]
     batch = jax.tree.map(lambda *one: np.stack(one), *windows)
-    grids = jax.vmap(lambda e: events.voxel_grid(e, 3))(batch)
+    grids = jax.jit(jax.vmap(lambda e: events.voxel_grid(e, 3)))(batch)
     for grid, a in zip(grids, (0, 90), strict=True):
         alone = events.voxel_grid(part[a : a + 90], 3, size=(WIDTH, HEIGHT))
         np.testing.assert_allclose(grid, alone, atol=1e-5)

@@ -201,37 +201,33 @@ class TrackGoal(Goal):
         """Of every window: for each target x, y, size (0: lambda0) and time; NaN: not there."""
         if self.targets.seeds is None and known is None:
             return [None] * len(begins)
-        first = int(begins[0])
+        given = [
+            (s[0], s[1], s[2], int(begins[0]) if len(s) < 4 else round(s[3] * 1e6))
+            for s in self.targets.seeds or ()
+        ]
         if known is not None:
-            sizes = (
-                [0.0] * known.xi.shape[1]
-                if self.targets.seeds is None
-                else [s[2] for s in self.targets.seeds]
-            )
+            sizes = [s[2] for s in given] or [0.0] * known.xi.shape[1]
             cuts = [
                 [seed_at(known, k, int(begin), size) for k, size in enumerate(sizes)]
                 for begin in begins
             ]
+        elif all(s[3] >= begins[-1] for s in given):  # none begins before a window
+            return [given for _ in begins]
         else:
-            assert self.targets.seeds is not None
             tracks = self.tracker.estimate(
-                recording, self.start, seeds=list(self.targets.seeds), smooth=False, progress=False
+                recording, self.start, seeds=self.targets.seeds, smooth=False, progress=False
             )
             means = tracks(begins).mean.tolist()
             cuts = [
                 [(x, y, size, int(begin)) for x, y, _, _, size, *_ in rows]
                 for begin, rows in zip(begins, means, strict=True)
             ]
-        if self.targets.seeds is not None:
-            given = [
-                (s[0], s[1], s[2], first if len(s) < 4 else round(s[3] * 1e6))
-                for s in self.targets.seeds
-            ]
-            cuts = [
-                [g if g[3] >= begin else s for g, s in zip(given, cut, strict=True)]
-                for begin, cut in zip(begins, cuts, strict=True)
-            ]
-        return cuts
+        if not given:
+            return cuts
+        return [
+            [g if g[3] >= begin else s for g, s in zip(given, cut, strict=True)]
+            for begin, cut in zip(begins, cuts, strict=True)
+        ]
 
     def _packed(self, found: Sequence[Part], params: TrackerParams, loss: str) -> list[Batch]:
         """Batches of one shape, so that one program serves all."""

@@ -431,7 +431,8 @@ def test_the_covariance_is_that_of_repeated_fits():
         noisy = dataclasses.replace(tracks, tau=tau)
         scene, _ = adjust(noisy, scene_of(fit), prior, 0.2, 1, 8)
         rows.append(np.concatenate([part[0] for part in scene.path.twist(0.0)]))
-        told.append(np.diag(compute_covariance(noisy, scene, prior, sigma=0.2)))
+        if len(told) < 3:  # they are alike
+            told.append(np.diag(compute_covariance(noisy, scene, prior, sigma=0.2)))
     ratio = np.var(rows, 0, ddof=1).sum() / np.mean(told, 0).sum()
     assert 0.5**2 < ratio < 2**2, ratio
 
@@ -444,7 +445,7 @@ def test_steps_never_cost_more():
     depths = np.log(0.6) + 0.1 * rng.normal(size=tracks.nodes[0] * tracks.nodes[1])
     scene = Scene(true_path(depths), np.zeros(tracks.shape), 0.0)
     scene, first = adjust(tracks, scene, prior, 0.1, 3, 3)
-    costs = [adjust(tracks, scene, prior, 0.1, 0, steps)[1].cost for steps in (1, 2, 4, 8, 16, 32)]
+    costs = [adjust(tracks, scene, prior, 0.1, 0, steps)[1].cost for steps in (1, 2, 4, 8, 16)]
     assert costs[-1] < 0.1 * first.cost
     assert (np.diff(costs) <= 1e-3 * np.array(costs[:-1])).all()
 

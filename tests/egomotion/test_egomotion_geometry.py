@@ -1,3 +1,6 @@
+import inspect
+import types
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -6,14 +9,17 @@ import scipy.linalg
 from scipy.spatial.transform import Rotation
 
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion import geometry as geo
-from jaxevent.egomotion import scores
+from jaxevent.egomotion import geometry, scores
 from jaxevent.egomotion.twists import from_gyro, from_poses, gyro_bias
 from jaxevent.errors import InputError
 from jaxevent.recording import Imu, Poses
 
 pytestmark = pytest.mark.slow
 
+# Each a program, in place of one for each of its operations.
+geo = types.SimpleNamespace(
+    **{name: jax.jit(one) for name, one in inspect.getmembers(geometry, inspect.isfunction)}
+)
 F = 200.0
 RNG = np.random.default_rng(5)
 X, Y = RNG.uniform(-120, 120, (2, 40))
@@ -148,7 +154,7 @@ def test_single_precision(float32, twists):
 def test_undistorted_inverts_the_distortion():
     camera = PinholeCamera(199.1, 202.4, 132.2, 110.7, (-0.368, 0.151, -3e-4, -2.8e-4, 0.0))
     x, y = (RNG.integers(0, size, 300).astype(np.uint16) for size in (240, 180))
-    points, f = geo.undistorted(camera, x, y)
+    points, f = geometry.undistorted(camera, x, y)
     assert f == np.sqrt(camera.fx * camera.fy)
     # The published formula, forwards.
     a, b = points.T / f
@@ -159,13 +165,13 @@ def test_undistorted_inverts_the_distortion():
     back_y = b * radial + p1 * (r + 2 * b**2) + 2 * p2 * a * b
     np.testing.assert_allclose(camera.fx * back_x + camera.cx, x, atol=1e-9)
     np.testing.assert_allclose(camera.fy * back_y + camera.cy, y, atol=1e-9)
-    plain, f = geo.undistorted(PinholeCamera(100.0, 100.0, 20.0, 10.0), [25, 20], [10, 7])
+    plain, f = geometry.undistorted(PinholeCamera(100.0, 100.0, 20.0, 10.0), [25, 20], [10, 7])
     np.testing.assert_allclose(plain, [[5, 0], [0, -3]], atol=1e-12)
     folding = PinholeCamera(100.0, 100.0, 120.0, 90.0, (-0.8, 0.0, 0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="no inverse at pixel"):
-        geo.undistorted(folding, x, y)
+        geometry.undistorted(folding, x, y)
     with pytest.raises(InputError, match="focal lengths"):
-        geo.undistorted(PinholeCamera(0.0, 1.0, 0.0, 0.0), x, y)
+        geometry.undistorted(PinholeCamera(0.0, 1.0, 0.0, 0.0), x, y)
 
 
 def poses_of(xi, t, start=None):

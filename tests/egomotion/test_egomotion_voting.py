@@ -323,8 +323,9 @@ SCORE = eqx.filter_jit(score)
 
 def test_systematic_resampling_is_unbiased():
     w = np.random.default_rng(0).dirichlet(np.full(20, 0.3))
-    u = (jnp.arange(2000) + 0.5) / 2000
-    ancestor, renewed = jax.vmap(filtering.resample, (None, 0))(jnp.log(w), u)
+    u = (np.arange(2000) + 0.5) / 2000
+    each = jax.jit(jax.vmap(filtering.resample, (None, 0)))
+    ancestor, renewed = each(np.log(w), u)
     counts = (np.asarray(ancestor)[..., None] == np.arange(20)).sum(1)
     np.testing.assert_allclose(counts.mean(0), 20 * w, atol=2e-3)
     assert (np.abs(counts - 20 * w) < 1 + 1e-9).all()  # at most one more or less than its share
@@ -333,8 +334,9 @@ def test_systematic_resampling_is_unbiased():
 
 def test_resampling_carries_the_score():
     w = np.random.default_rng(0).dirichlet(np.full(20, 0.3))
-    ancestor, _ = filtering.resample(jnp.log(w), jnp.asarray(0.3))
-    jacobian = jax.jacobian(lambda lw: filtering.resample(lw, jnp.asarray(0.3))[1])(jnp.log(w))
+    resample = jax.jit(filtering.resample)
+    ancestor, _ = resample(np.log(w), 0.3)
+    jacobian = jax.jit(jax.jacobian(lambda lw: resample(lw, 0.3)[1]))(np.log(w))
     np.testing.assert_allclose(jacobian, np.eye(20)[ancestor])
 
 
@@ -543,23 +545,24 @@ def test_general_particles():
     params = voting.Params.of({"preset": "general"})
     kind = General(100.0)
     noise = filtering.draw(jax.random.key(0), 1, params, kind)
-    particles = filtering.begin(params, kind, noise).particles
+    particles = jax.jit(filtering.begin, static_argnums=1)(params, kind, noise).particles
+    particles = np.asarray(particles)
     np.testing.assert_allclose(np.linalg.norm(particles[:, :3], axis=1), 1)
     # All over the sphere: second moments of directions are 1 / 3.
     T = particles[:, :3]
     np.testing.assert_allclose(T.T @ T / 500, np.eye(3) / 3, atol=0.06)
-    steps = 0.01 * noise.normal[0]
-    after = jax.vmap(kind.moved)(particles, steps)
+    steps, moved = 0.01 * np.asarray(noise.normal[0]), jax.jit(jax.vmap(kind.moved))
+    after = np.asarray(moved(particles, steps))
     np.testing.assert_allclose(np.linalg.norm(after[:, :3], axis=1), 1)
     across = steps[:, :3] - particles[:, :3] * (steps[:, :3] * particles[:, :3]).sum(1)[:, None]
     np.testing.assert_allclose(after[:, :3] - particles[:, :3], across, atol=2e-3)
-    around = jnp.concatenate([jnp.array([[0.6, 0.0, 0.8]] * 500), particles[:, 3:]], 1)
-    cloud = jax.vmap(kind.moved)(around, 0.05 * noise.normal[0])
-    mean = kind.mean(cloud, jnp.full(500, 1 / 500))
+    around = np.concatenate([np.tile([0.6, 0.0, 0.8], (500, 1)), particles[:, 3:]], 1)
+    cloud = moved(around, 5 * steps)
+    mean = np.asarray(jax.jit(kind.mean)(cloud, np.full(500, 1 / 500)))
     np.testing.assert_allclose(mean[:3], [0.6, 0, 0.8], atol=0.02)
-    apart = jax.vmap(kind.apart, (0, None))(cloud, mean)
+    apart = np.asarray(jax.jit(jax.vmap(kind.apart, (0, None)))(cloud, mean))
     np.testing.assert_allclose(apart[:, :3] @ mean[:3], 0, atol=1e-12)
-    covariance = np.asarray(apart.T @ apart / 500)
+    covariance = apart.T @ apart / 500
     np.testing.assert_allclose(np.linalg.eigvalsh(covariance[:3, :3])[1:], 0.05**2, rtol=0.2)
 
 

@@ -192,7 +192,7 @@ def warped_case():
 def test_images_along_trajectories():
     L, V, clear, s, paths = warped_case()
     quick = warping.warp(L, V, clear, s, paths)
-    pure = warping.warp_purely(*map(jnp.asarray, (L, V, clear, s, paths)))
+    pure = jax.jit(warping.warp_purely)(L, V, clear, s, paths)
     for one, other in zip(quick, pure, strict=True):
         np.testing.assert_allclose(one, other, atol=2e-5)
     Y, X = (np.asarray(v) for v in warping.places(jnp.asarray(paths), jnp.asarray(s)))
@@ -228,12 +228,12 @@ def test_agreement_is_that_of_the_pure_function():
     along = warping.warp(L, V, clear, s, paths)
     L[0, 4:9, 5:12] += 1.0  # a thing in front
     # Activity is what changes between frames; where none follows, or is before, up to the target.
+    purely = jax.jit(agreement.agree_purely)
     activity = ((3, 1, 0, 2), 0), ((3, 2, 0, 0), L[2] - L[1]), ((3, 0, 2, 2), L[1] - L[0])
     for numbers, change in activity:
         at = place(*numbers)
         one = agreement.agree(Params(), L, along, at)
-        given = jax.tree.map(jnp.asarray, (along, at))
-        other = agreement.agree_purely(Params(), jnp.asarray(L), *given)
+        other = purely(Params(), L, along, at)
         for name, quick, pure in zip(agreement.Agreement._fields, one, other, strict=True):
             np.testing.assert_allclose(quick, pure, rtol=3e-5, atol=3e-5, err_msg=name)
         np.testing.assert_allclose(one.activity, np.broadcast_to(change, L[0].shape) ** 2, 1e-6)
@@ -452,8 +452,9 @@ def held(params, L, P, case, samples):
 def test_an_exposure_is_the_mean_along_trajectories():
     L, taken, shots, paths = exposed()
     I0 = float(Params().I0)
-    D = exposures._shifts(taken, jnp.asarray(paths), 15)
-    B, shares = exposures.smeared(jnp.asarray(L), D)
+    smeared = jax.jit(exposures.smeared)
+    D = jax.jit(exposures._shifts, static_argnums=2)(taken, paths, 15)
+    B, shares = smeared(L, D)
     np.testing.assert_allclose(shares.sum(1), 1, atol=1e-5)
     Y, X = (np.asarray(v) for v in warping.places(jnp.asarray(paths), jnp.asarray(taken.s)))
     for k in range(2):
@@ -466,7 +467,7 @@ def test_an_exposure_is_the_mean_along_trajectories():
     q, dL = np.zeros((2, 18, 23), np.float32), np.zeros((18, 23), np.float32)
     q[:, 7:11, 8:14], dL[5:13, 6:16] = rng.normal(size=(2, 4, 6)), rng.normal(size=(8, 10))
     back = exposures._quickly_returned(q, np.asarray(shares), np.asarray(D))
-    slope = jax.jvp(lambda L: exposures.smeared(L, D)[0], (jnp.asarray(L),), (jnp.asarray(dL),))[1]
+    slope = jax.jvp(lambda L: smeared(L, D)[0], (jnp.asarray(L),), (jnp.asarray(dL),))[1]
     np.testing.assert_allclose((back * dL).sum(), (q * slope).sum(), rtol=0.1)
 
 
@@ -870,4 +871,5 @@ def test_tiny_sensors_and_single_frames(size):
 def test_blurring_is_scipys():
     image = np.random.default_rng(5).normal(size=(20, 25)).astype(np.float32)
     expected = gaussian_filter(image, 1.5, mode="nearest", truncate=3.34)
-    np.testing.assert_allclose(agreement.blur(jnp.asarray(image), 1.5), expected, atol=1e-5)
+    blurred = jax.jit(agreement.blur, static_argnums=1)(image, 1.5)
+    np.testing.assert_allclose(blurred, expected, atol=1e-5)

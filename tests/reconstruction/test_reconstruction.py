@@ -401,7 +401,7 @@ def test_step_reproduces_the_authors_program(name, golden):
         rows["polarity"].astype(int),
         Observation(rows["LA_used"], rows["Rinv_used"]),
     )
-    after = jax.vmap(lambda s, e: jaxevent.akf.step(params, s, e))(state, event)
+    after = jax.jit(jax.vmap(jaxevent.akf.step, (None, 0, 0)))(params, state, event)
     np.testing.assert_allclose(after.L, rows["L_after"], rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(after.P, rows["P_after"], rtol=1e-12)
 
@@ -456,10 +456,10 @@ def test_step_maps_over_pixels():
     L, P, dt, near, u, rate = rng.uniform(0.1, 1, (6, 5))
     polarity = np.array([1, -1, 1, 0, -1])
     pixels, events = State(L, P), Event(dt, near, polarity, Observation(u, rate))
-    mapped = jax.vmap(jaxevent.akf.step, (None, 0, 0))(params, pixels, events)
+    mapped = jax.jit(jax.vmap(jaxevent.akf.step, (None, 0, 0)))(params, pixels, events)
+    alone = jax.jit(jaxevent.akf.step)
     for i in range(5):
-        state, event = jax.tree.map(lambda v: jnp.asarray(v[i]), (pixels, events))  # noqa: B023
-        one = jaxevent.akf.step(params, state, event)
+        one = alone(params, *jax.tree.map(lambda v: v[i], (pixels, events)))  # noqa: B023
         np.testing.assert_allclose([mapped.L[i], mapped.P[i]], [one.L, one.P], rtol=1e-14)
 
 

@@ -101,11 +101,12 @@ def test_adam_by_hand():
     def loss(r):
         return toy(Toy(a=jnp.exp(r)), ONE)
 
+    value_and_slope = jax.jit(jax.value_and_grad(loss))
     for rate in (0.1, 0.05):
         adam = optax.adam(optax.cosine_decay_schedule(rate, 4, 0.1))
         memory = adam.init(raw)
         for _ in range(4):
-            value, slope = jax.value_and_grad(loss)(raw)
+            value, slope = value_and_slope(raw)
             expected.append(float(value))
             step, memory = adam.update(slope, memory)
             raw = optax.apply_updates(raw, step)
@@ -411,13 +412,13 @@ def test_the_loss_bounds_the_evaluated_error():
     recording = moving()
     problem = Problem(Objective(METHODS["blend"]), parts(recording, "held-out"))
     params = METHODS["blend"].Params(clock_offset=0.002)
-    value = float(problem.objective(params, problem(params)[0][0]))
+    value = float(jax.jit(problem.objective)(params, problem(params)[0][0]))
     row = score(recording, METHODS["blend"], params)
     assert value == pytest.approx(row["mse"], rel=1e-6)
     edi = METHODS["edi"]
     params = edi.Params(c_on=0.5, c_off=0.3)
     problem = Problem(Objective(edi), parts(recording, "held-out"))
-    value = float(problem.objective(params, problem(params)[0][0]))
+    value = float(jax.jit(problem.objective)(params, problem(params)[0][0]))
     assert value > 1.01 * score(recording, edi, params)["mse"]
 
 
@@ -447,11 +448,12 @@ def test_batches_of_windows_weigh_their_images():
     use = interleave([2, 1, 1], row["frames"])
     # With a margin that holds the next frames, a blend does not see that it was cut.
     problem = Problem(Objective(blend), parts(recording, "held-out", (2, 1, 1), 0.2, 0.1))
+    objective = jax.jit(problem.objective)
     for split, batches in enumerate(problem(params)):
         assert len(batches) == 3 and len({batch.truth.shape for batch in batches}) == 1
         weights = [float(batch.weight) for batch in batches]
         assert sum(weights) == (use == split).sum() * WIDTH * HEIGHT
-        losses = [float(problem.objective(params, batch)) for batch in batches]
+        losses = [float(objective(params, batch)) for batch in batches]
         expected = np.mean(np.array(row["per_frame"]["mse"])[use == split])
         assert np.average(losses, weights=weights) == pytest.approx(expected, rel=1e-6)
     assert problem(params) is problem(params)
