@@ -229,14 +229,14 @@ class Killed(BaseException):
 @pytest.mark.slow
 def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
     monkeypatch.setattr(jaxevent.runs.fit, "PERIOD", 0.0)
-    text = CONFIG.replace("iterations = 12", "iterations = 5").replace("every = 4", "every = 2")
+    text = CONFIG.replace("iterations = 12", "iterations = 3").replace("every = 4", "every = 1")
     config, out = write(folder, text), folder / "out"
     fit(config, folder / "whole")
     save, count = jaxevent.runs.fit.save, 0
 
     def dying(*arguments):
         nonlocal count
-        if count == 3:
+        if count == 2:
             raise Killed
         count += 1
         save(*arguments)
