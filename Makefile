@@ -16,7 +16,7 @@ install := $(bin)/python -m pip install --quiet --no-compile --disable-pip-versi
 demo: .venv/demo.stamp
 	$(bin)/jaxevent demo
 
-# The types take one core for most of a minute: beside the tests they cost half of it.
+# Lint, 9 s of CPU that nearly all go to the types, is done beside the tests.
 test: .venv/test.stamp
 	@$(MAKE) --no-print-directory -j 2 suite lint
 
@@ -33,7 +33,7 @@ lint: .venv/test.stamp
 	$(bin)/ruff check
 	$(bin)/ruff format --check
 	$(bin)/lint-imports --no-cache
-	$(bin)/pyright --pythonpath $(bin)/python
+	$(bin)/ty check --python $(bin)/python
 
 docs: .venv/docs.stamp
 	NO_MKDOCS_2_WARNING=1 $(bin)/mkdocs build --strict

@@ -12,6 +12,7 @@ import argparse
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import ahdr
 
@@ -36,7 +37,8 @@ def main() -> None:
         params = jaxevent.akf.Params.of({"preset": "hdr", **known})
         (out / "fitted").mkdir(exist_ok=True)
         (out / "fitted" / "params.toml").write_text(f"[akf]\n{toml.parameters(params)}\n")
-    rows = [{**row, "seed": 0} for row in evaluate(CONFIG, out / "ablations", progress=True)]
+    scored = evaluate(CONFIG, out / "ablations", progress=True)
+    rows: list[dict[str, Any]] = [{**row, "seed": 0} for row in scored]
     labels = list(dict.fromkeys(row["method"] for row in rows))
 
     def means(label: str) -> list[float]:

@@ -342,7 +342,7 @@ def files_bench(recording: Recording) -> tuple[dict[str, float], dict[str, float
 
 def accumulator_seconds(recording: Recording) -> float:
     """dv-processing's Accumulator at 100 Hz on the same events, which it has in memory."""
-    import dv_processing as dv  # type: ignore[import-not-found]
+    import dv_processing as dv
 
     e = recording.events
     assert isinstance(e, Events)

@@ -240,11 +240,11 @@ def find_cars(images: NDArray, least: int = 60, level: float = 25.0) -> list[Car
         mask = ndimage.binary_closing(mask, iterations=2)
         found: Any = ndimage.label(mask, np.ones((3, 3)))
         labels, count = found
-        here = []
+        here: list[tuple[float, ...]] = []
         for number in range(1, count + 1):
             y, x = np.argwhere(labels == number).T
             if len(x) >= least:
-                here.append((k, x.mean(), y.mean(), np.ptp(x) + 1))
+                here.append((k, x.mean(), y.mean(), float(np.ptp(x)) + 1))
         free = set(range(len(here)))
         for car in seen:
             last, before = np.array(car[-1]), np.array(car[max(0, len(car) - 6)])
@@ -325,7 +325,10 @@ def street(recording: Recording, out: Path) -> tuple[dict, str]:
         "|---|---|" + "---:|" * 7 + "---|",
     ]
     results: dict[str, Any] = {}
-    rows = {"detection, from t = 0": {}, "without prefilter": {"prefilter": False}}
+    rows: dict[str, dict[str, Any]] = {
+        "detection, from t = 0": {},
+        "without prefilter": {"prefilter": False},
+    }
     shown = None
     for label, values in rows.items():
         params = moment.Params(**{**STREET, **values})
@@ -545,7 +548,7 @@ def sky(recording: Recording, out: Path) -> tuple[dict, str]:
 
     for part, span in SKY_PARTS.items():
         cut = recording[span[0] : span[1]]
-        plain = {"preset": "slow", "events_per_step": 16, "max_targets": 128}
+        plain: dict[str, Any] = {"preset": "slow", "events_per_step": 16, "max_targets": 128}
         rows = {"for stars": SKY} | ({"slow preset": plain} if part == "reported" else {})
         for label, values in rows.items():
             tracks = moment.estimate(cut, moment.Params(**values), smooth=False)

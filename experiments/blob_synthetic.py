@@ -336,7 +336,7 @@ def consistency(seeds: Sequence[int]) -> dict[str, Any]:
     walk: dict[str, Any] = {"Q_p": 0.0, "Q_v": 1e6, "Q_lambda": 10.0, "Q_theta": 0.1, "Q_q": 50.0}
     scene = lambda s: blob_scene("walk", s, walk_seed=s, **walk)  # noqa: E731
     rows: dict[str, Any] = {}
-    wide = {"gate": 6.0, "gate_max": 200.0, **walk}
+    wide: dict[str, Any] = {"gate": 6.0, "gate_max": 200.0, **walk}
     for n in (5, 10, 20):
         for method in ("chi2, target 2n", "chi2, target 2n+4", "chi2_split")[: 3 if n == 10 else 2]:
             (row,) = over_seeds(scene, [method], seeds, n=n, **wide).values()
@@ -517,8 +517,8 @@ def main() -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     kept = arguments.out / "results.json"
-    about = {"machine": machine(), "seeds": [seeds[0], seeds[-1]]}
-    results = json.loads(kept.read_text()) if kept.exists() else {}
+    about: dict[str, Any] = {"machine": machine(), "seeds": [seeds[0], seeds[-1]]}
+    results: dict[str, Any] = json.loads(kept.read_text()) if kept.exists() else {}
     if results and results["seeds"] != about["seeds"]:
         raise SystemExit(f"{kept} is of seeds {results['seeds']}; give another folder or remove it")
     results = {**results, **about}

@@ -85,7 +85,7 @@ def tuned(
     names = list(next(iter(starts.values())))
     tried: list[tuple[str, TrackerParams, float]] = []
     for label, factors in starts.items():
-        wrong = {name: float(getattr(base, name)) * factor for name, factor in factors.items()}
+        wrong: dict[str, Any] = {n: float(getattr(base, n)) * factors[n] for n in factors}
         start = moment.Params(**{**STEP, **wrong})
         begin = time.perf_counter()
         loss = functools.partial(negative_log_likelihood, moment)
@@ -93,7 +93,7 @@ def tuned(
         tried += [(f"{label}: start", start, 0.0)]
         tried += [("fitted", found.params, time.perf_counter() - begin)]
     for point in itertools.product(*grid.values()):
-        values = dict(zip(grid, point, strict=True))
+        values: dict[str, Any] = dict(zip(grid, point, strict=True))
         tried.append(("best of the grid", moment.Params(**{**STEP, **values}), 0.0))
     raw = {n: jnp.stack([p.raw[n] for _, p, _ in tried]) for n in {**dict.fromkeys(names), **grid}}
     errors = rmse(base, raw, test)

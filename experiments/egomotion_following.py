@@ -50,12 +50,12 @@ def begun(windows: batch.Windows, rate: float) -> batch.Rival:
 def exact(windows: batch.Windows, rate: float) -> None:
     """Where the turn goes by solutions that are stopped early, and by others."""
     (equations.SOLVE, left), half = EARLY, float(windows.params.half_window)
-    photometric.solve = functools.partial(equations.solve, left=left)
+    photometric.solve = functools.partial(equations.solve, left=left)  # ty: ignore[invalid-assignment]
     scene, _ = begun(windows, rate)
     tracks = windows.tracks(TURNED, half, windows.params.events)
     problem, weight = photometric.begin(tracks, scene, windows.prior(TURNED, half), SIGMA, False)
     for equations.SOLVE, left in (EARLY, EXACT):
-        photometric.solve = functools.partial(equations.solve, left=left)
+        photometric.solve = functools.partial(equations.solve, left=left)  # ty: ignore[invalid-assignment]
         kept = equations.look(problem, scene, weight)
         told = [kept]
         for _ in range(STEPS):

@@ -48,10 +48,10 @@ def objective(params: Params, flow: tuple[float, float], seed: int) -> NDArray[n
     weights = jnp.asarray(near / near.sum())
     total, count = np.zeros(len(grid)), 0
 
+    @jax.jit
     def add(batch):
         return score(params, model, batch, jnp.asarray(grid), weights, False).log_likelihood.sum(0)
 
-    add = jax.jit(add)
     for k in range(len(made.elapsed)):
         batch = jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf[k]), made)
         total -= np.asarray(add(batch), np.float64)

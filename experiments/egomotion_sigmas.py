@@ -26,13 +26,18 @@ import pandas as pd
 import jaxevent
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import contrast, planes, voting
+from jaxevent.egomotion.estimator import MotionEstimator
 from jaxevent.egomotion.motion import Motion
 from jaxevent.show.motion import fitted_velocity
 from jaxevent.simulate import motion_scene
 
 SETTLE = 200_000  # us, of voting
 CUT = 0.2, 0.3  # s, a single window of contrast
-METHODS = {"voting": voting, "contrast": contrast, "planes": planes}
+METHODS: dict[str, MotionEstimator[Any]] = {
+    "voting": voting,
+    "contrast": contrast,
+    "planes": planes,
+}
 
 
 def shown(motion: Motion, first: int, last: int) -> np.ndarray:

@@ -34,6 +34,7 @@ from bench import machine
 import jaxevent
 from jaxevent.egomotion import batch, contrast, find_model, frames, planes, voting
 from jaxevent.egomotion.comparison import FIGURES, compare
+from jaxevent.egomotion.estimator import MotionEstimator
 from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.truth import Known
 from jaxevent.errors import InputError
@@ -122,7 +123,7 @@ def real(data: Path) -> Iterator[Sequence]:
         yield Sequence(f"tubrip {name}", "rotation", "real", functools.partial(tubrip, name))
 
 
-METHODS = {
+METHODS: dict[str, tuple[MotionEstimator[Any], dict[str, Any] | None]] = {
     "voting": (voting, None),
     "voting, literal": (voting, LITERAL),
     "contrast": (contrast, None),

@@ -22,7 +22,7 @@ import numpy as np
 import jaxevent
 from jaxevent.recording import Events, Recording
 
-RECORD = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "?")])
+RECORD: np.dtype = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "?")])
 MOST = 4000  # events in a datagram: 52,000 bytes
 EVERY = 20_000  # us between images
 

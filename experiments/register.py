@@ -79,6 +79,7 @@ class View:
     duration: float | int
     rotation: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.eye(3))
     translation: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.zeros(3))
+    _ray: NDArray[np.float64] = dataclasses.field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         y, x = np.mgrid[: self.size[1], : self.size[0]].reshape(2, -1)
@@ -89,8 +90,7 @@ class View:
     def intensity(self, t: float | int) -> NDArray[np.float64]:
         pose = self.motion.pose(np.array([float(t)]))[0]
         centre = pose[:3, 3] - pose[:3, :3] @ self.rotation.T @ self.translation
-        ray: Any = self._ray  # type: ignore[attr-defined]
-        level, _ = self.world.seen(centre, ray @ pose[:3, :3].T, 1 / self.camera.fx)
+        level, _ = self.world.seen(centre, self._ray @ pose[:3, :3].T, 1 / self.camera.fx)
         return np.exp(level).reshape(self.size[::-1]) / 3  # even ground is a third of white
 
 

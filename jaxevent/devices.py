@@ -58,7 +58,7 @@ def local() -> list[Any]:
 
     `jax.default_device` so confines what runs under it to one.
     """
-    chosen = jax.config.jax_default_device  # type: ignore[reportAttributeAccessIssue]
+    chosen = jax.config.jax_default_device  # ty: ignore[missing-attribute]
     if chosen is None:
         return list(jax.local_devices())
     return jax.local_devices(backend=chosen)[:1] if isinstance(chosen, str) else [chosen]
@@ -235,7 +235,8 @@ def in_step(compute: Callable[[], T]) -> T:
     """What each process computes for itself; an `InputError` of one is one of all."""
     if jax.process_count() == 1:
         return compute()
-    value, error = None, None
+    value: Any = None
+    error = None
     try:
         value = compute()
     except InputError as raised:
@@ -243,7 +244,7 @@ def in_step(compute: Callable[[], T]) -> T:
     for other in gathered(error):
         if other is not None:
             raise InputError(other)
-    return value  # type: ignore[return-value]
+    return value
 
 
 class Places:

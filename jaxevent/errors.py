@@ -5,6 +5,7 @@ import json
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
@@ -41,7 +42,8 @@ def install_command(extra: str) -> str:
     (packaging.python.org, "Recording the Direct URL Origin of installed distributions").
     """
     try:
-        origin = json.loads(metadata.distribution("jaxevent").read_text("direct_url.json") or "{}")
+        told = metadata.distribution("jaxevent").read_text("direct_url.json")
+        origin: dict[str, Any] = json.loads(told or "{}")
     except metadata.PackageNotFoundError:
         # Not installed: Python finds a checkout on its path.
         checkout = Path(__file__).resolve().parents[1]

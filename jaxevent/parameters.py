@@ -222,6 +222,16 @@ else:
     _Module = eqx.Module
 
 
+def _inherited(base: Any, owner: str) -> Any:
+    """An `__init__` of a class's own that does what its base's does."""
+
+    def init(self, *, preset: str | None = None, **values: Any):
+        base.__init__(self, preset=preset, **values)
+
+    init.__name__, init.__qualname__ = "__init__", f"{owner}.__init__"
+    return init
+
+
 class Parameters(_Module):
     """Base of every estimator's `Params`: `Params(sigma_iso=0.1)`, `params.sigma_iso`.
 
@@ -247,13 +257,7 @@ class Parameters(_Module):
         base: Any = next(kind for kind in cls.__mro__[1:] if "__init__" in vars(kind))
         init: Any = vars(cls).get("__init__")
         if init is None:
-
-            def inherited(self, *, preset: str | None = None, **values: Any):
-                base.__init__(self, preset=preset, **values)
-
-            init = inherited
-            init.__name__, init.__qualname__ = "__init__", f"{cls.__qualname__}.__init__"
-            cls.__init__ = init
+            init = cls.__init__ = _inherited(base, cls.__qualname__)
         keyword = inspect.Parameter.KEYWORD_ONLY
         init.__signature__ = inspect.Signature(
             [

@@ -25,7 +25,7 @@ _open: list[weakref.ref["Bar"]] = []  # the last one has the line
 _over = threading.Event()
 
 
-class Bar(tqdm):
+class Bar(tqdm):  # ty: ignore[unsupported-base]
     """A bar of tqdm on a line that all share, and a rate that holds from its first step on.
 
     The first step often compiles what all others use; a rate with it would promise too long a time.

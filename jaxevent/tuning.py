@@ -435,7 +435,7 @@ class Prepared:
     ) -> "Prepared":
         """From what `optimise` is given."""
         if callable(batches):
-            return cls(batches, batch)
+            return cls(batches, batch)  # ty: ignore[invalid-argument-type]
         shares = devices.shared_out(batches), devices.shared_out(validation)
         return cls(lambda _: shares, batch)
 

@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -107,7 +108,7 @@ def evt3_decoded(words):
 
     As in OpenEB, a high time sets the low one to 0: the camera sends the low one after it.
     """
-    state = {"high": None, "low": 0, "y": None, "x": None, "p": 0}
+    state: dict[str, Any] = {**dict.fromkeys(("high", "y", "x")), "low": 0, "p": 0}
     wraps, out = 0, []
     for word in words:
         kind, data = int(word) >> 12, int(word) & 0xFFF

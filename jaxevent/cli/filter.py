@@ -1,5 +1,6 @@
 """The command `jaxevent filter`."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -82,11 +83,12 @@ def run(
     from jaxevent import events
     from jaxevent.errors import InputError
     from jaxevent.io import load, save
+    from jaxevent.recording import Recording
 
     recording = load(source, size, in_memory=False, progress=show_progress(), stream=stream)
     name = recording.name
     recording = dataclasses.replace(recording, name=str(source))  # for messages
-    steps = []
+    steps: list[tuple[str, Callable[[Recording], Recording]]] = []
     if start is not None or stop is not None:
         steps.append(("cut in time", lambda r: r[start:stop]))
     if hot_pixels:

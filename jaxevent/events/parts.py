@@ -63,7 +63,7 @@ def rewrite(part: Part, step: Callable[[Events], Events]) -> Part:
     events = Events(*(np.concatenate([getattr(e, name) for e in done]) for name in "txyp"))
     if isinstance(part, Recording):
         return dataclasses.replace(part, events=events)
-    return events
+    return events  # ty: ignore[invalid-explicit-return]
 
 
 def select(part: Part, keep: Callable[[Events], NDArray[np.bool_]]) -> Part:

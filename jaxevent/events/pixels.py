@@ -94,7 +94,7 @@ def crop(part: Part, x: int, y: int, width: int, height: int, *, size: Size | No
     if camera is not None:
         camera = dataclasses.replace(camera, cx=camera.cx - x, cy=camera.cy - y)
     window = np.s_[:, y : y + height, x : x + width]
-    return _seen(part, _held(new), (width, height), lambda i: i[window], camera)
+    return _seen(part, _held(new), (width, height), lambda i: i[window], camera)  # ty: ignore[invalid-explicit-return]
 
 
 def downsample(
@@ -140,7 +140,7 @@ def downsample(
         shape = (len(images), height, factor, width, factor, *images.shape[3:])
         return _typed(images.reshape(shape).mean((2, 4), dtype=np.float64), images.dtype)
 
-    return _seen(part, _held(new), (width, height), mean, camera)
+    return _seen(part, _held(new), (width, height), mean, camera)  # ty: ignore[invalid-explicit-return]
 
 
 @compiled

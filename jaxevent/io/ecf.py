@@ -28,7 +28,7 @@ from jaxevent.kernels import compiled, part
 
 FILTER = 36559
 MOST = 65535  # events of a chunk
-RECORD = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
+RECORD: np.dtype = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
 
 
 class Records:

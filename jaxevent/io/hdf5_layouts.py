@@ -238,11 +238,12 @@ def _columns(file: Any, name: str, source: str) -> dict[str, Column]:
     fields = _fields(file, name)
     if fields is None:
         raise InputError(f"{source}: {name} has no t, x, y and p; add them")
+    columns: dict[str, Column]
     if isinstance(found, h5py.Dataset):
         whole: Any = dataset(file, name, source, undone=[ecf.FILTER])
         if filters_of(whole) == [ecf.FILTER]:
             whole = ecf.Records(whole, f"{source}: {name}")
-        columns: dict[str, Column] = {key: _Part(whole, fields[key]) for key in "txyp"}
+        columns = {key: _Part(whole, fields[key]) for key in "txyp"}
     else:
         columns = {key: dataset(file, f"{name}/{fields[key]}", source) for key in "txyp"}
     if columns["t"].dtype.kind == "f":

@@ -132,11 +132,11 @@ def _frames(path: Path, bag: Bag, topic: str | None, in_memory: bool) -> tuple[F
         kept = np.stack(colours) if coloured and differ else None
         return Frames(t, np.stack(images), np.zeros_like(t)), kept
 
+    name: str = topic
+
     def decoded_images(of: Callable[[NDArray], NDArray], *channels: int) -> DecodedImages:
         return DecodedImages(
-            lambda row: (
-                of(_image(path, topic, one)) for _, one in bag.decoded(topic, places[row])
-            ),
+            lambda row: (of(_image(path, name, one)) for _, one in bag.decoded(name, places[row])),
             (len(times), *shape[0], *channels),
             shape[1],
             str(path),

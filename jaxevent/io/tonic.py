@@ -21,7 +21,7 @@ from jaxevent.io import checked_events, times
 from jaxevent.io.columns import of_records
 from jaxevent.recording import Recording
 
-EVENTS = np.dtype([("x", np.int16), ("y", np.int16), ("t", np.int64), ("p", bool)])
+EVENTS: np.dtype = np.dtype([("x", np.int16), ("y", np.int16), ("t", np.int64), ("p", bool)])
 
 
 def from_dataset(dataset: Any, size: tuple[int, ...] | None = None) -> Iterator[Recording]:

@@ -59,7 +59,7 @@ ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "copy_p": lambda x: x,
 }
 # Of what is made of constants alone.
-COMPUTED = {
+COMPUTED: dict[str, Callable[..., Any]] = {
     **ELEMENTWISE,
     "div": lambda a, b: np.float64(a) / b,
     "to_f": float,

@@ -91,7 +91,7 @@ class LoopTranslation(Translation):
         if not self.single:
             out = np.empty(array.shape, object)
             for place in np.ndindex(*array.shape):
-                out[place] = self._gather(name, array[place])  # pyright: ignore
+                out[place] = self._gather(name, array[place])
             array = out
         elif name == "argmax":
             array = np.full(array.shape, self.graph.constant(0), object)
@@ -108,7 +108,7 @@ class LoopTranslation(Translation):
             return product
         out = np.empty(product.shape, object)
         for place in np.ndindex(*product.shape):
-            out[place] = self._gather("reduce_sum", product[place])  # pyright: ignore
+            out[place] = self._gather("reduce_sum", product[place])
         return out
 
     def _gather(self, name: str, node: Node) -> Node:
@@ -439,7 +439,7 @@ class Kernels:
     """
 
     def __init__(
-        self, functions: type, write: Callable[[Any], tuple[str, Numbers]], most: int
+        self, functions: Any, write: Callable[[Any], tuple[str, Numbers]], most: int
     ) -> None:
         self.functions, self.write, self.most = functions, write, most
         self._made: dict[Any, Programs] = {}

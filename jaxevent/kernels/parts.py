@@ -59,7 +59,7 @@ def part_of_others(function: Callable, **options: Any) -> Any:
     It may neither make arrays nor print, nor raise with anything but constants.
     """
     bare = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "pipeline_class": _Compiler}
-    made: Any = numba.njit(**bare, **options)(inspect.unwrap(function))
+    made: Any = numba.njit(**bare, **options)(inspect.unwrap(function))  # ty: ignore[no-matching-overload]
     made._insert, made._compile_for_args = _ignore, _refuse
     return made
 

@@ -36,7 +36,7 @@ class Warped:
         """`images` is (frames, h, w) or (frames, h, w, 3), in memory or an `ImageSource`."""
         self._images, self._grid, self._fill = images, grid, fill
         self._how = _convolution(grid, images.shape[1:3]) if _how is None else _how
-        self.dtype = np.dtype(images.dtype)
+        self.dtype: np.dtype = np.dtype(images.dtype)
         self.shape = (images.shape[0], *grid.shape[:2], *images.shape[3:])
 
     def __len__(self) -> int:

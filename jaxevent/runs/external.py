@@ -146,7 +146,7 @@ def fit_brightness(image: NDArray, truth: NDArray) -> NDArray[np.float64]:
     found = least_squares(
         lambda ab: ab[0] * x + ab[1] - wanted,
         (spread, float(np.median(wanted))),
-        jac=lambda ab: np.stack([x, np.ones_like(x)], axis=1),  # type: ignore[arg-type]
+        jac=lambda ab: np.stack([x, np.ones_like(x)], axis=1),
         bounds=([0, -np.inf], [np.inf, np.inf]),
         loss="huber",
         f_scale=HUBER,

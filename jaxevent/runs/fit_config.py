@@ -162,7 +162,7 @@ def read_plan(config: Path, recordings: Sequence[str | Path] | None = None) -> P
     `recordings` take the place of those that it names, written like them but relative to the
     working directory.
     """
-    table = read_toml(config)
+    table: dict[str, Any] = read_toml(config)
     try:
         families = {name: find_family(name) for name in HOMES}
         further = {k: v for one in families.values() for k, v in one.fit_settings.items()}

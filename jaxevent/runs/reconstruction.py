@@ -122,7 +122,7 @@ class Objective:
 
     def _of_frames(self, params: FrameParams, batch: Window) -> Array:
         """-ln p of the frames given, per frame and pixel."""
-        return -self.method.log_likelihood(params, batch.features) / batch.weight  # type: ignore[reportAttributeAccessIssue]
+        return -self.method.log_likelihood(params, batch.features) / batch.weight  # ty: ignore[missing-attribute]
 
     def _counted(self, params: FrameParams, batch: Images) -> tuple[Array, int]:
         """Weighted errors (times, pixels), and how many pixels share a weight."""

@@ -422,7 +422,7 @@ def lay_out(table: Sequence[Sequence[str]], left: Collection[int]) -> str:
     """
     cells = [[" ".join(cell.split()).replace("|", r"\|") for cell in line] for line in table]
     widths = [max(3, *map(len, column)) for column in zip(*cells, strict=True)]
-    rule = ["-" * w if i in left else "-" * (w - 1) + ":" for i, w in enumerate(widths)]
+    rule: list[str] = ["-" * w if i in left else "-" * (w - 1) + ":" for i, w in enumerate(widths)]
     cells.insert(1, rule)
     lines = (
         [cell.ljust(w) if i in left else cell.rjust(w) for i, (cell, w) in pairs]

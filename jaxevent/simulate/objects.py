@@ -75,7 +75,7 @@ class Surface(NamedTuple):
         px, py = self.place(t)
         return self.distance(x - px, y - py, self.radius) < 0
 
-    def intensity(self, x: NDArray, y: NDArray) -> NDArray[np.floating]:
+    def intensity(self, x: NDArray, y: NDArray) -> NDArray[np.float64]:
         """Of points by their offsets from its place."""
         at = np.broadcast_arrays(y, x)
         grain = map_coordinates(self.spline, at, order=3, mode="grid-wrap", prefilter=False)

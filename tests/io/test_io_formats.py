@@ -31,7 +31,7 @@ SIZE = (40, 30)
 
 # Packages that are extras; CI has them.
 NEEDS = {"evt3": "evt3", "aedat4": "aedat", "bag": "rosbags"}
-WRITERS = {
+WRITERS: dict[str, Any] = {
     "evt2": formats.evt2,
     "evt21": formats.evt21,
     "evt21-legacy": lambda events, size: formats.evt21(events, size, legacy=True),

@@ -4,6 +4,7 @@ from typing import Any
 import numba
 import numpy as np
 from numba.core import types
+from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
 from jaxevent.kernels.blocks import block
@@ -62,7 +63,7 @@ def pointer(context, array):
     return types.CPointer(array.dtype)(array), take
 
 
-address: Any = numba.extending.intrinsic(pointer)
+address: Any = intrinsic(pointer)
 
 
 def test_a_block_computes_what_its_lines_say():

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ def texture_at(share: float) -> NDArray:
     return map_coordinates(smooth, [y - share * STEP[0], x - share * STEP[1]], mode="grid-wrap")
 
 
-def translated(kind: type = np.uint8, scale: float = 1.0, **extra) -> Recording:
+def translated(kind: Any = np.uint8, scale: float = 1.0, **extra) -> Recording:
     """The texture in four frames, a step apart, and two events."""
     images = np.stack([texture_at(k) for k in range(len(STAMPS))]) * scale
     if np.issubdtype(kind, np.integer):

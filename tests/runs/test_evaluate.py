@@ -32,7 +32,7 @@ def folder(tmp_path: Path) -> Path:
 
 def blended_by_hand() -> tuple[NDArray, NDArray]:
     """The hidden frames, and what lies linearly between the given ones; the last one is held."""
-    grey = small().frames.images / 255  # type: ignore[reportOptionalMemberAccess]
+    grey = np.asarray(small().frames.images) / 255
     u, v = 9 / 21, 9 / 20
     between = [(1 - u) * grey[0] + u * grey[2], (1 - v) * grey[2] + v * grey[4], grey[4]]
     return grey[1::2], np.array(between)

@@ -89,7 +89,7 @@ def test_a_task_that_another_run_has_finished_is_read(tmp_path):
 @pytest.mark.slow
 def test_a_dead_worker_loses_nothing_and_blames_only_its_task(tmp_path):
     some = tasks_of(tmp_path, a="", b="die", c="", d="die", e="")
-    some[3].arguments["times"] = 9  # type: ignore[index]
+    some[3].arguments["times"] = 9
     outcomes = run(errand, some, None, Place(workers=2), retries=1)
     assert [outcome.error is None for outcome in outcomes] == [True, True, True, False, True]
     assert outcomes[3].error == "d: its process died (exit code -9)"

@@ -61,7 +61,7 @@ class Path:
         """Whether a window in which it was seen holds the times."""
         after = np.clip(np.searchsorted(self.t, t), 0, len(self.t) - 1)
         before = np.maximum(after - 1, 0)
-        return np.minimum(abs(self.t[after] - t), abs(self.t[before] - t)) <= self.window / 2
+        return np.minimum(np.abs(self.t[after] - t), np.abs(self.t[before] - t)) <= self.window / 2
 
 
 class Joined(NamedTuple):

@@ -64,14 +64,15 @@ class FusedRun:
             *(np.empty((chunks, targets), kind) for kind in kinds),
         )
         owner = np.empty((0, 0, 0, 0), np.int32) if features.owner is None else features.owner
-        given = Chunks(*(
+        parts: list[NDArray] = [
             np.asarray(part)
             for part in (
                 features.t, features.xi, features.polarity, features.valid, owner,
                 features.elapsed, features.stop, features.cycle, features.seed, features.seed_xi,
                 features.seed_size,
             )
-        ))  # fmt: skip
+        ]  # fmt: skip
+        given = Chunks(*parts)
         rows, columns = memory.sums.shape[1:]
         space = Space(
             np.zeros((TARGETS + ROWS * targets, events), self.dtype),

@@ -80,10 +80,10 @@ def offset(recording: Recording) -> int:
         return 0
     lasts, begins = np.diff(frames.t), [recording.events.index(int(t)) for t in frames.t]
     most = min(FARTHEST, int(lasts.min()) // 2) // APART * APART
-    pairs = []
+    pairs: list[tuple[NDArray, NDArray, NDArray]] = []
     for k in np.argsort(-np.diff(begins), kind="stable")[:PAIRS]:
         level, told = _levels(frames[slice(int(k), int(k) + 2)].intensity.astype(np.float64))
-        pairs.append((frames.t[k : k + 2], level, told.all(0)))
+        pairs.append((frames.t[k : k + 2], level, np.all(told, axis=0)))
     tried = np.arange(-most, most + 1, APART)
     agree = np.array([_agreement(recording, pairs, int(late)) for late in tried])
     best = int(np.argmax(agree))
@@ -115,7 +115,7 @@ def _change(
     quiet = told & (np.bincount(pixel[:between], minlength=pixels) == 0)
     if not quiet.any():
         return None
-    number = np.bincount(pixel[:between], p[:between], pixels)
+    number: NDArray = np.bincount(pixel[:between], p[:between], pixels)
     for sign, begin in ((-1, 0), (1, between)) if following else ():
         next_one = np.zeros(pixels)
         next_one[pixel[begin:][::-1]] = p[begin:][::-1]  # what is written last is the first

@@ -74,7 +74,10 @@ FINAL = Stage(0.05, 20, 10), Stage(0.02, 20, 3)
 # Sigma (C) and steps by which the map first takes the frames' brightness, some 10 C from 0.
 BRIGHTNESS = (20.0, 4), (5.0, 3)
 # Of a path that is about right: all of the above takes 1.6 times as long and ends no nearer.
-FOLLOWING = (Stage(0.5, 6), Stage(0.1, 8)), (Stage(0.05, 10, 10),)
+FOLLOWING: tuple[tuple[Stage, ...], tuple[Stage, ...]] = (
+    (Stage(0.5, 6), Stage(0.1, 8)),
+    (Stage(0.05, 10, 10),),
+)
 # Rivals remain whose cost is so many times the least, and so much more (C^2): depths that were just
 # looked for leave up to 0.03 C.
 CLOSE = 1.75, 5e-4

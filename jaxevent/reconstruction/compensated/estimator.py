@@ -70,7 +70,7 @@ from jaxevent.recording import Recording, Times, microseconds
 PROBES = 6  # instants at which the speed of the image is measured
 KEPT = 96  # images of instants that a video remembers
 FADE = 0.35  # of variances from one resolution to the half of it
-APART = 8  # steps of the schedule between anchors
+APART: int = 8  # steps of the schedule between anchors
 ANCHORS = 2  # whose motion is remembered
 STEPS = 2  # with which a target's motion is found at half resolution
 CLEARLY = 0.97  # of the misfit by time, where the course tells more than noise

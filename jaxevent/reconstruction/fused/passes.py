@@ -243,10 +243,10 @@ class Passes:
 
     def room(self, times: int, pixels: int) -> Images:
         """Where images go, and derivatives of those that have any."""
-        kinds, source = (self.dtype, self.dtype, np.dtype(np.uint8)), self.kernel.source
-        slopes = np.empty((times, pixels, len(source.outputs), source.lanes), self.dtype)
-        mean, variance, valid = (np.empty((times, pixels), kind) for kind in kinds)
-        return Images(mean, variance, valid, slopes)
+        shape, source = (times, pixels), self.kernel.source
+        slopes = np.empty((*shape, len(source.outputs), source.lanes), self.dtype)
+        mean, variance = np.empty(shape, self.dtype), np.empty(shape, self.dtype)
+        return Images(mean, variance, np.empty(shape, np.uint8), slopes)
 
     def begin(self, window: Window) -> None:
         """Enter the recording's first window: the state at the start."""

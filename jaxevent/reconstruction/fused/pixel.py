@@ -154,7 +154,8 @@ def traced(
             names = ("segment_cell", "share", "edge", "segment_on", "segment_off")
             segments = Segments(*(v[name] for name in names))
         given: dict[str, Any] = {f.name: v.get(f.name) for f in dataclasses.fields(FrameFeatures)}
-        return FrameFeatures(**{**given, "segments": segments, "width": NO_WIDTH})
+        given |= {"segments": segments, "width": NO_WIDTH}
+        return FrameFeatures(**given)
 
     def scalar(leaf: Any) -> Any:
         return jnp.broadcast_to(leaf, (1, 1))[0, 0]

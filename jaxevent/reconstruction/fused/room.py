@@ -25,10 +25,11 @@ class ImageRoom:
     def take(self, times: int) -> Images:
         """Room for some images, which their holder alone reads from then on."""
         free = [arrays for arrays in self._sets if _references(arrays) == _ALONE]
+        arrays: tuple[NDArray, ...]
         if free:
             arrays = free[0]
         else:
-            kinds = self._dtype, self._dtype, np.dtype(np.uint8)
+            kinds: tuple[np.dtype, ...] = self._dtype, self._dtype, np.dtype(np.uint8)
             arrays = tuple(np.empty((self.times, self._pixels), kind) for kind in kinds)
             self._sets = [*self._sets, arrays][-_SETS:]
         mean, variance, valid = (array[:times] for array in arrays)
