@@ -236,6 +236,7 @@ def compared(targets: Iterator[tuple]) -> Iterator[dict[str, Any]]:
             "usual": np.asarray(told.usual),
             "beyond": np.asarray(told.beyond),
             "rest": np.asarray(told.rest),
+            "stays": np.asarray(told.stays),
             "truth": truth.astype(np.float32),
             "I0": float(video.params.I0),
             "hdr": hdr,
@@ -362,6 +363,7 @@ def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:
             jnp.asarray(r["usual"]),
             jnp.asarray(r["beyond"]),
             jnp.asarray(r["rest"]),
+            jnp.asarray(r["stays"]),
         )
         fused = decide(params, told)
         line = []

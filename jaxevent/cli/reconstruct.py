@@ -78,7 +78,7 @@ def add(commands: Any) -> None:
     arguments.add_stream(one)
 
 
-_MC = 7e-6  # s of a core that `mc` takes for a pixel of an image: 0.3 for 240x180
+_MC = 5e-6  # s of a core that `mc` takes for a pixel of an image: 0.2 for 240x180
 _PATIENCE = 600.0  # s
 
 

@@ -508,8 +508,8 @@ def test_reconstruct_to_hdf5(folder, capsys):
 
 
 def test_the_usual_method(folder, capsys, monkeypatch):
-    assert reconstruct._usual(True, 2000 * 240 * 180) == "aks"  # ten minutes of a core
-    assert reconstruct._usual(True, 1900 * 240 * 180) == "mc"
+    assert reconstruct._usual(True, 2800 * 240 * 180) == "aks"  # ten minutes of a core
+    assert reconstruct._usual(True, 2700 * 240 * 180) == "mc"
     capsys.readouterr()
     bare = folder / "bare.h5"
     jaxevent.save(small(frames=None), bare)

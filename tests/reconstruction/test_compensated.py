@@ -302,6 +302,23 @@ def test_a_scene_at_rest_is_as_its_last_frame():
     np.testing.assert_allclose(found[1][9:12, 11:14], L[8, 9:12, 11:14], atol=1e-2)
 
 
+def test_a_point_that_stays_is_as_its_smoother_says():
+    L = np.repeat(moved((0, 0), (0, 0), [0], 20, 24), 9, 0)
+    L[[1, 5]] += 0.02  # the frames; between them nothing happens but at one pixel
+    L[4, 10, 12] += 0.5
+    at, V = place(9, 2, 1, 5), np.full_like(L, 0.01)
+    moving, staying, far = (
+        np.asarray(fuse(only("none"), L, V, still(L), at, np.full((20, 24), px**2, np.float32)).L)
+        for px in (2.0, 0.02, np.inf)
+    )
+    np.testing.assert_allclose(moving, far, atol=1e-4)
+    assert np.abs(far - L[2])[:, :6].min() > 1e-3
+    np.testing.assert_allclose(staying[:, :6], L[2, :, :6], atol=1e-4)
+    np.testing.assert_allclose(staying[10, 12], far[10, 12], rtol=1e-2)
+    frames_move = np.float32([1.0, -2.0, 0.5, 0])  # to 1.5, -2 px at s = 1
+    assert warping.reach(np.broadcast_to(frames_move, (2, 3, 4))).tolist() == [[6.25] * 3] * 2
+
+
 @pytest.mark.slow
 def test_instants_that_fill_up_change_nothing():
     L = moved((3.0, 1.0), (0, 0), np.linspace(-1, 1, 9), 20, 24)

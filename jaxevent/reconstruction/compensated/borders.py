@@ -242,8 +242,7 @@ def refine(
     Nodes take the paths of others between the steps. Arguments are as those of `trajectories.step`.
     """
     size = images.shape[1:3]
-    paths = spread(step(images, s, p, floor, nu, smoothness), size)
-    whose = choose(images, s, paths, floor, nu, BETWEEN)
-    nodes = paths.reshape(-1, paths.shape[-1])[whose[::2, ::2]]
-    p = step(images, s, nodes, floor, nu, smoothness)
+    p = step(images, s, p, floor, nu, smoothness)
+    y, x = np.divmod(choose(images, s, spread(p, size), floor, nu, BETWEEN)[::2, ::2], size[1])
+    p = step(images, s, p[y // 2, x // 2], floor, nu, smoothness)
     return p, choose(images, s, spread(p, size), floor, nu)

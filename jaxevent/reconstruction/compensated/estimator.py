@@ -55,6 +55,7 @@ from jaxevent.reconstruction.compensated.steadiness import (
 from jaxevent.reconstruction.compensated.thresholds import learn
 from jaxevent.reconstruction.compensated.warping import (
     places,
+    reach,
     sample,
     spread_purely,
     warp,
@@ -399,9 +400,10 @@ def _decide(params: Params, told: Agreement, seen: Views) -> Fused:
 def look(params: Params, target: Followed) -> tuple[Agreement, Views]:
     """What `fusion.compare` looks at, of a target's images along trajectories."""
     instants, L, V, clear, *_ = target
-    along = warp(L, V, np.asarray(clear, np.float32), instants.s, target.paths)
+    paths = target.paths
+    along = warp(L, V, np.asarray(clear, np.float32), instants.s, paths)
     place = place_of(instants, clear, len(instants))
-    return agree(params, L, along, place), views(L, V, along, place)
+    return agree(params, L, along, place), views(L, V, along, place, reach(paths))
 
 
 def fuse_images(params: Params, target: Followed) -> Fused:
@@ -650,7 +652,7 @@ class MotionCompensated(ImageEstimator[Params]):
                 p = self._moved(params, images, place, p)
             paths = spread_purely(p, *whose.shape).reshape(-1, 4)[whose]
             along = warp_purely(*images, place.s, paths)
-            fused = fuse(params, images[0], images[1], along, place)
+            fused = fuse(params, images[0], images[1], along, place, reach(paths))
             if out.samples is not None:
                 at = taken.frame
                 seen = (frames.grey[at], frames.intensity[at], frames.response, frames.gain[at])

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxevent.estimator import Described
@@ -30,6 +31,7 @@ TINY = 1e-4  # (ln I)^2, below which signs do not tell differences
 # mean along trajectories: a clipped pixel is known by what was clear elsewhere. Of 0.04, 0.1 and
 # 0.25 chosen on cut recordings of the scenes that HDR parameters are fitted to.
 UNKNOWN = 0.1
+STAYS = 0.25  # px, within which a point stays in its place
 
 
 class Views(NamedTuple):
@@ -49,10 +51,11 @@ class Views(NamedTuple):
     weight: Numeric  # (), of the frame after in the blend of the two
     beyond: Numeric  # (), 1 where frames are on one side of the target alone, else 0
     rest: Numeric  # (), `Instants.rest`
+    reach: Numeric | float  # `warping.reach`
 
 
-def views(L: Numeric, V: Numeric, along: Along, place: Place) -> Views:
-    """Those of images (K, h, w)."""
+def views(L: Numeric, V: Numeric, along: Along, place: Place, reach: Numeric | float = np.inf) -> Views:
+    """Those of images (K, h, w); `reach` is that of `warping`."""
     a, b = place.before, place.after
     # Where frames are on one side alone, that of the other side shows nothing.
     beyond = jnp.where(a == b, jnp.float32(1), 0)
@@ -62,7 +65,8 @@ def views(L: Numeric, V: Numeric, along: Along, place: Place) -> Views:
     images = (L[a], other, along.L[a], along.L[b], before, after)
     weight = weight_after(place)
     blended = (1 - weight) ** 2 * V[a] + weight**2 * V[b]
-    return Views(L[place.own], V[place.own], blended, *images, weight, beyond, place.rest)
+    sides = (weight, beyond, place.rest)
+    return Views(L[place.own], V[place.own], blended, *images, *sides, reach)
 
 
 def weight_after(place: Place) -> Numeric:
@@ -92,6 +96,7 @@ class Comparison(Described):
     usual: Float[Array, "h w"]  # the variance of single images along trajectories
     beyond: Float[Array, ""]  # as in `Views`
     rest: Float[Array, ""]
+    stays: Float[Array, "..."]  # how far points stay in their places, 0..1
 
 
 SOURCES = ("before", "after", "events", *OTHERS)
@@ -131,7 +136,8 @@ def compare(told: Agreement, seen: Views) -> Comparison:
     ingredients = jnp.stack([M, smoothed, blend])
     known = 1 / (1 + (seen.blended / UNKNOWN) ** 2)
     sides = (jnp.asarray(seen.beyond), jnp.asarray(seen.rest, jnp.float32))
-    return Comparison(ingredients, known, X, told.parts, visible, told.usual, *sides)
+    stays = 1 / (1 + (jnp.asarray(seen.reach, jnp.float32) / STAYS**2) ** 2)
+    return Comparison(ingredients, known, X, told.parts, visible, told.usual, *sides, stays)
 
 
 def decide(params: Params, comparison: Comparison) -> Fused:
@@ -144,9 +150,11 @@ def decide(params: Params, comparison: Comparison) -> Fused:
     weights = jnp.where(beyond, params.choice_beyond, params.choice)
     choice = jnp.tensordot(weights.reshape(len(OTHERS), -1), X, 1) + jnp.log(comparison.known)
     q = jax.nn.softmax(jnp.concatenate([jnp.zeros_like(choice[:1]), choice]), axis=0)
-    # Where neither the scene nor a pixel's surroundings changed, it is as the frame shows it.
-    still = comparison.rest * TINY / jnp.exp(X[SIGNS.index("activity")])
-    q = (1 - still) * q + still * jnp.array([0.0, 0, 1])[:, None, None]
+    quiet = TINY / jnp.exp(X[SIGNS.index("activity")])
+    # A point that stays where nothing happens is in its pixel's smoother with all frames, not only
+    # with those around the target. At rest it is as the frame shows it.
+    for part, one in ((comparison.stays * comparison.known, 1), (comparison.rest, 2)):
+        q = (1 - part * quiet) * q + part * quiet * jnp.eye(3)[one][:, None, None]
     P = jnp.exp(jnp.tensordot(jnp.where(beyond, params.doubt_beyond, params.doubt), X, 1))
     # Where frames are clipped all instants rest on the same events; more of them tell no more.
     P = jnp.maximum(P, params.common * comparison.usual)
@@ -154,9 +162,19 @@ def decide(params: Params, comparison: Comparison) -> Fused:
     return Fused((q * ingredients).sum(0), P, sources, comparison.visible)
 
 
-def fuse(params: Params, L: Numeric, V: Numeric, along: Along, place: Place) -> Fused:
-    """Images L with variances V (K, h, w), and the same along trajectories, in one image; pure."""
+def fuse(
+    params: Params,
+    L: Numeric,
+    V: Numeric,
+    along: Along,
+    place: Place,
+    reach: Numeric | float = np.inf,
+) -> Fused:
+    """Images L with variances V (K, h, w), and the same along trajectories, in one image; pure.
+
+    `reach` is that of `warping`, of the trajectories.
+    """
     L, V = jnp.asarray(L), jnp.asarray(V)
     along, place = jax.tree.map(jnp.asarray, (along, place))
     told = agree_purely(params, L, along, place)
-    return decide(params, compare(told, views(L, V, along, place)))
+    return decide(params, compare(told, views(L, V, along, place, reach)))

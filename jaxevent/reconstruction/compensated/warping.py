@@ -121,6 +121,11 @@ def displaced(paths: Array, s: Array) -> Array:
     return (paths[..., :2] + paths[..., 2:] * s) * s
 
 
+def reach(paths: Numeric) -> Numeric:
+    """How far points of paths (h, w, 4) go, squared (px^2): at least as far as they do."""
+    return ((abs(paths[..., :2]) + abs(paths[..., 2:])) ** 2).sum(-1)
+
+
 def places(paths: Array, s: Array) -> tuple[Array, Array]:
     """Where points are at instants: y and x, (K, h, w)."""
     height, width, _ = paths.shape
