@@ -54,7 +54,9 @@ class Views(NamedTuple):
     reach: Numeric | float  # `warping.reach`
 
 
-def views(L: Numeric, V: Numeric, along: Along, place: Place, reach: Numeric | float = np.inf) -> Views:
+def views(
+    L: Numeric, V: Numeric, along: Along, place: Place, reach: Numeric | float = np.inf
+) -> Views:
     """Those of images (K, h, w); `reach` is that of `warping`."""
     a, b = place.before, place.after
     # Where frames are on one side alone, that of the other side shows nothing.
