@@ -171,7 +171,7 @@ def tracker_bench() -> tuple[dict[str, float], dict[str, float]]:
         state = begin_state(moment.filter, params, stretch.features)
         kernel = FusedRun(moment.filter, params, packing)
         name = f"tracker, M = {M}, loop over packed events"
-        tasks[name] = functools.partial(kernel, state, stretch.features)
+        tasks[name] = functools.partial(kernel.follow, state, stretch.features)
         events[name] = int(np.count_nonzero(stretch.features.valid))
         for compiler in ("numba", "xla"):
             name = f"tracker, M = {M}, `estimate` by {compiler}"

@@ -236,9 +236,8 @@ class LiveTracks:
 
     def _run(self, state: State, stretch: Stretch) -> tuple[State, Log]:
         if self._fused is not None:
-            state, told = self._fused(state, stretch.features)
-        else:
-            state, told = run_compiled(self._filter, self.params, state, stretch.features)
+            return self._fused.follow(state, stretch.features)
+        state, told = run_compiled(self._filter, self.params, state, stretch.features)
         return state, told.log
 
     def _settle(self) -> None:

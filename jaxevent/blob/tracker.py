@@ -29,7 +29,6 @@ from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.recording import Recording, Times, microseconds
 
 P = TypeVar("P", bound=TrackerParams)
-KERNEL_STEPS = 200_000  # from which on a kernel is compiled
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -177,10 +176,9 @@ class Tracker(Estimator[P]):
                 that are near them only.
             smooth: Whether states rest on all events, those after a time included. False: on those
                 up to it, as they are known while events come. None: on all, where the filter can.
-            compiler: "numba" follows targets by a kernel made of the filter's own functions, "xla"
-                by the `run` that is differentiated; both to rounding the same. None: on CPUs, in
-                single precision and from 200,000 steps on, numba, where it has a kernel; fewer are
-                done before one is compiled. What is read of tracks is compiled by XLA.
+            compiler: "numba" follows and reads targets by kernels made of the filter's own
+                functions, "xla" by the `run` that is differentiated; both to rounding the same.
+                None: on CPUs numba, where it has a kernel.
             progress: Whether a bar is shown; None: where somebody looks on.
 
         Raises:
@@ -197,8 +195,7 @@ class Tracker(Estimator[P]):
         if params is None:
             params = self.Params(**found.settings()) if found is not None else self.Params()
         packing = Packing(recording, params, seeds, start, stop, detect, found=found)
-        steps = (packing.rows[1] - packing.rows[0]) // packing.events
-        fused = self._fused(params, compiler, steps, packing)
+        fused = self._fused(params, compiler, packing)
         if fused is not None:
             packing.lengthen()
         return Tracks(self.filter, packing, params, progress, smooth, fused)
@@ -225,15 +222,14 @@ class Tracker(Estimator[P]):
                 event.
             detect: Whether tracks are born where events belong to none; by default only without
                 seeds.
-            compiler: As of `estimate`; None: numba on CPUs in single precision, where it has a
-                kernel.
+            compiler: As of `estimate`; what is read is compiled by XLA.
 
         Raises:
             InputError: A seed is outside the sensor, or numba is asked for and has no kernel.
         """
         self._check_compiler(compiler)
         params = self.Params() if params is None else params
-        kernel = functools.partial(self._fused, params, compiler, KERNEL_STEPS)
+        kernel = functools.partial(self._fused, params, compiler)
         return LiveTracks(
             self.filter, params, size, seeds=seeds, start=start, detect=detect, kernel=kernel
         )
@@ -249,12 +245,9 @@ class Tracker(Estimator[P]):
         if compiler not in (None, "numba", "xla"):
             raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
 
-    def _fused(
-        self, params: P, compiler: str | None, steps: int, packing: Packing
-    ) -> FusedRun | None:
+    def _fused(self, params: P, compiler: str | None, packing: Packing) -> FusedRun | None:
         """The kernel that follows targets; None where XLA does."""
-        on_host = jnp.result_type(float) == np.float32 and jax.default_backend() == "cpu"
-        if compiler == "xla" or (compiler is None and not (on_host and steps >= KERNEL_STEPS)):
+        if compiler == "xla" or (compiler is None and jax.default_backend() != "cpu"):
             return None
         try:
             return FusedRun(self.filter, params, packing)

@@ -9,112 +9,23 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 from numpy.typing import NDArray
 
 from jaxevent.blob.fused.tracking import FusedRun
-from jaxevent.blob.lifecycle import ENDS, Log, begin
+from jaxevent.blob.lifecycle import ENDS, Log
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.prepare import NEVER, Features, Mark, Packing, Stretch, count_steps
-from jaxevent.blob.run import Told, run_compiled
-from jaxevent.blob.smoother import (
-    Later,
-    Smoothed,
-    at_end,
-    look_back,
-    nothing_later,
-    tell_smoothed,
-)
-from jaxevent.blob.states import TrackStates, tell
+from jaxevent.blob.prepare import Mark, Packing, Stretch
+from jaxevent.blob.scan import ScanRun, numbers_in
+from jaxevent.blob.states import TrackStates
 from jaxevent.blob.steps import Filter
-from jaxevent.blob.targets import Slots, scan_steps
 from jaxevent.errors import InputError
 from jaxevent.progress import bar
 from jaxevent.recording import Times, microseconds
 from jaxevent.shown import Shown
 
 BEGINS = 32  # stretches from which tracking can be taken up again
-READS = 64  # times read per call
 TOGETHER = 2**12  # states that are told of at once
 KEPT = 2**24  # numbers of what later events say that are kept between readings
-
-_begin = jax.jit(begin, static_argnames="filter")
-_nothing_later = jax.jit(lambda begins: nothing_later(jax.tree.map(lambda a: a[-1], begins)))
-
-
-@functools.partial(jax.jit, static_argnames="filter")
-def _read(
-    filter: Filter,
-    params: TrackerParams,
-    features: Features,
-    begins: Slots,
-    chunk: Array,
-    step: Array,
-    time: Array,
-    slot: Array,
-) -> tuple[Array, Array, Array]:
-    """Mean, covariance and seconds without events, (times, tracks, ...), of some slots.
-
-    The chunk is run again from the targets at its start; a time is after `step` of its steps.
-    """
-    path = _path_of(filter, params, features, begins, chunk)
-    slots = jax.tree.map(lambda a: a[step[:, None], slot], path)
-    of_one = functools.partial(tell, filter, params)
-    return jax.vmap(jax.vmap(of_one, (0, None)))(slots, time)
-
-
-class _Following(NamedTuple):
-    """What later events say at the start of the chunk that follows, and its us since this one's.
-
-    And the chunk smoothed with it, where that is kept.
-    """
-
-    later: Later
-    elapsed: Any
-    smoothed: Smoothed | None = None
-
-
-@functools.partial(jax.jit, static_argnames="filter")
-def _smooth(
-    filter: Filter,
-    params: TrackerParams,
-    features: Features,
-    begins: Slots,
-    chunk: Array,
-    following: _Following,
-) -> tuple[Smoothed, Later]:
-    """A chunk's path, run again, with what later events say; and what they say at its start."""
-    path = _path_of(filter, params, features, begins, chunk)
-    end = jax.tree.map(lambda a: a[-1], path)
-    later = look_back(filter, params, path, at_end(following.later, end, following.elapsed))
-    return Smoothed(path, later), jax.tree.map(lambda a: a[0], later)
-
-
-@functools.partial(jax.jit, static_argnames="filter")
-def _read_smoothed(
-    filter: Filter, params: TrackerParams, smoothed: Smoothed, step: Array, time: Array, slot: Array
-) -> tuple[Array, Array, Array]:
-    """As `_read`, of a chunk that is smoothed."""
-    now = jax.tree.map(lambda a: a[step[:, None], slot], smoothed)
-    of_one = functools.partial(tell_smoothed, filter, params)
-    return jax.vmap(jax.vmap(of_one, (0, 0, None)))(now.slots, now.later, time)
-
-
-def _path_of(
-    filter: Filter, params: TrackerParams, features: Features, begins: Slots, chunk: Array
-) -> Slots:
-    """All targets (steps + 1, targets) of a chunk: at its start and after each of its steps."""
-    f = features
-    before = jax.tree.map(lambda a: a[chunk], begins)
-    events = f.t[chunk], f.xi[chunk], f.polarity[chunk], f.valid[chunk]
-    events = *events, None if f.owner is None else f.owner[chunk]
-    _, steps = scan_steps(filter, params, "states", f.frame, before, events)
-    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), before, steps.slots)
-
-
-def _numbers_in(tree: Any) -> int:
-    """How many numbers its arrays hold."""
-    return sum(leaf.size for leaf in jax.tree.leaves(tree))
 
 
 def _joined(parts: Sequence[TrackStates]) -> TrackStates:
@@ -186,11 +97,11 @@ class Tracks(Shown):
         fused: FusedRun | None = None,
     ):
         self.recording, self.params, self.smooth = packing.recording, params, smooth
-        self._fused = fused
+        self._runner: Any = ScanRun(filter, params) if fused is None else fused
         self.start, self.stop = packing.start, packing.stop
-        self._filter, self._packing, self._progress = filter, packing, progress
+        self._packing, self._progress = packing, progress
         self._begins: list[tuple[Mark, int, Any]] = []
-        self._following: dict[Mark, list[_Following]] = {}  # of the last stretches, up to `KEPT`
+        self._following: dict[Mark, Any] = {}  # of the last stretches, up to `KEPT`
         self._number(self._follow())
 
     def __len__(self) -> int:
@@ -253,7 +164,7 @@ class Tracks(Shown):
     def _pieces(
         self, times: Times, ids: Sequence[int] | NDArray[np.integer] | None, extrapolate: bool
     ) -> Iterator[tuple[NDArray[np.int64], TrackStates]]:
-        """The same, chunk by chunk."""
+        """The same, in pieces of one stretch each."""
         times = np.atleast_1d(microseconds(times))
         if (times[1:] < times[:-1]).any():
             raise InputError("times must be sorted to be read in batches; sort them")
@@ -266,22 +177,15 @@ class Tracks(Shown):
         if not len(self) and end > first:
             yield times[first:end], self._nothing(times[first:end], chosen)
             first = end
-        for stretch, slots, following in self._again(times[first:end]):
-            features, id = jax.device_put(stretch.features), np.asarray(slots.id)
+        at_once = max(TOGETHER // max(len(chosen), 1), 1)
+        for stretch, begins, following in self._again(times[first:end]):
             upto = end
             if stretch.next is not None:
                 upto = int(np.searchsorted(times[:end], stretch.next.start))
             while first < upto:
-                chunk = int(np.searchsorted(stretch.start, times[first], "right")) - 1
-                stop = upto
-                if chunk + 1 < len(stretch.start):
-                    stop = min(stop, int(np.searchsorted(times, stretch.start[chunk + 1])))
-                batch = times[first:stop]
-                yield (
-                    batch,
-                    self._in_chunk(stretch, features, slots, following, id, chunk, batch, chosen),
-                )
-                first = stop
+                batch = times[first : min(first + at_once, upto)]
+                yield batch, self._in_stretch(stretch, begins, following, batch, chosen)
+                first += len(batch)
         if first < len(times):
             yield times[first:], self._nothing(times[first:], chosen)
 
@@ -302,17 +206,16 @@ class Tracks(Shown):
         while mark is not None and mark.start < t1:
             stretch = self._packing.pack(mark)
             mark = stretch.next
-            state, told = run_compiled(self._filter, self.params, state, stretch.features)
             if mark is not None and mark.start <= t0:
+                state, _ = self._runner.follow(state, stretch.features)
                 continue
-            assert told.association is not None
+            state, serial, weight = self._runner.owners(state, stretch.features)
             valid = np.asarray(stretch.features.valid)
             t = (stretch.start[:, None, None] + stretch.features.t)[valid]
-            serial = np.asarray(told.association.id)[valid]
             now = (t >= t0) & (t < t1)
             yield Events(
-                stretch.row[valid][now], t[now], self._id_of[serial[now]],
-                np.asarray(told.association.weight)[valid][now],
+                stretch.row[valid][now], t[now], self._id_of[serial[valid][now]],
+                weight[valid][now],
             )  # fmt: skip
 
     def _chosen(self, ids: Sequence[int] | NDArray[np.integer] | None) -> NDArray[np.int64]:
@@ -337,52 +240,27 @@ class Tracks(Shown):
             self.id[chosen],
         )
 
-    def _in_chunk(
+    def _in_stretch(
         self,
         stretch: Stretch,
-        features: Features,
-        slots: Slots,
-        following: list[_Following] | None,
-        id: NDArray,
-        chunk: int,
+        begins: Any,
+        following: Any,
         times: NDArray[np.int64],
         chosen: NDArray[np.int64],
     ) -> TrackStates:
         states = self._nothing(times, chosen)
         alive = (self.birth[chosen] <= times[:, None]) & (times[:, None] < self.death[chosen])
         some = np.flatnonzero(alive.any(0))
-        if not len(some):
-            return states
-        slot = np.argmax(id[chunk] == self._serial[chosen[some]][:, None], axis=1)
-        slot = np.pad(slot, (0, -len(slot) % 8))
-        since = times - stretch.start[chunk]
-        step = count_steps(stretch.features, np.full(len(times), chunk), since)
-        mask = alive[:, some]
-        parts = self._filter, self.params
-        if following is None:
-            read = functools.partial(_read, *parts, features, slots, np.int32(chunk))
-        else:
-            smoothed = following[chunk].smoothed
-            if smoothed is None:
-                at = np.int32(chunk), following[chunk]
-                smoothed, _ = _smooth(*parts, features, slots, *at)
-            read = functools.partial(_read_smoothed, *parts, smoothed)
-        for first in range(0, len(times), READS):
-            part = slice(first, first + READS)
-            fill = (0, READS - len(times[part]))
-            padded = np.pad(step[part], fill), np.pad(since[part], fill).astype(np.int32)
-            told = read(*padded, slot)
-            now = mask[part]
-            for out, value in zip((states.mean, states.covariance, states.idle), told, strict=True):
-                value = np.asarray(value)[: len(now), : len(some)]
-                seen = now.reshape(*now.shape, *[1] * (value.ndim - 2))
-                out[part, some] = np.where(seen, value, np.nan)
+        if len(some):
+            serial, wanted = self._serial[chosen[some]], alive[:, some]
+            told = self._runner.read(stretch, begins, following, times, serial, wanted)
+            outs = states.mean, states.covariance, states.idle
+            for out, value in zip(outs, told, strict=True):
+                out[:, some] = value
         states.valid[:] = alive
         return states
 
-    def _again(
-        self, times: NDArray[np.int64]
-    ) -> Iterator[tuple[Stretch, Any, list[_Following] | None]]:
+    def _again(self, times: NDArray[np.int64]) -> Iterator[tuple[Stretch, Any, Any]]:
         """The stretches that hold some of the sorted times, with the targets at chunks' starts.
 
         Smoothed, also what later events say after each chunk.
@@ -396,90 +274,75 @@ class Tracks(Shown):
             now, stretch = mark, self._packing.pack(mark)
             mark = stretch.next
             upto = len(times) if mark is None else int(np.searchsorted(times, mark.start))
-            state, told = self._run(state, stretch.features)
+            state, begins = self._runner.play(state, stretch.features)
             if upto > done:
                 following = None
                 if self.smooth:
-                    assert told.slots is not None
                     later = self._later  # fills what is kept
                     following = self._following.get(now)
                     if following is None:
-                        following, _ = self._look_back(stretch, told.slots, later)
-                yield stretch, told.slots, following
+                        following, _ = self._look_back(stretch, begins, later)
+                yield stretch, begins, following
             done = upto
             if done < len(times) and mark is not None:
                 later, known = self._begin_of(int(times[done]))
                 if later is not None and later.start > mark.start:
                     mark, state = later, known
 
-    def _run(self, state: Any, features: Features, begins: bool = True) -> tuple[Any, Told]:
-        """Track through a stretch, by the kernel if there is one."""
-        if self._fused is not None:
-            return self._fused(state, features, begins)
-        return run_compiled(self._filter, self.params, state, features)
-
     def _begin_of(self, time: int) -> tuple[Mark | None, Any]:
         known = [(mark, state) for mark, _, state in self._begins if mark.start <= time]
         return known[-1]
 
     def _look_back(
-        self, stretch: Stretch, begins: Slots, known: Mapping[Mark, Later], room: int = 0
-    ) -> tuple[list[_Following], Later]:
+        self, stretch: Stretch, begins: Any, known: Mapping[Mark, Any], room: int = 0
+    ) -> tuple[Any, Any]:
         """What later events say after each chunk of a stretch, and at the stretch's start.
 
         `known` is what they say at the start of the next one. Smoothed chunks are kept if all are
         at most `room` numbers.
         """
-        later, elapsed = _nothing_later(begins), 0
+        later, elapsed = None, 0
         if stretch.next is not None:
             later, elapsed = known[stretch.next], stretch.next.start - stretch.next.previous
-        features, found = jax.device_put(stretch.features), []
-        used = int((stretch.start < NEVER).sum())
-        moment = _numbers_in(later) + _numbers_in(begins) // len(stretch.start)
-        keep = used * (stretch.features.t.shape[1] + 1) * moment <= room
-        for chunk in reversed(range(used)):
-            at = _Following(later, np.int32(elapsed))
-            smoothed, later = _smooth(
-                self._filter, self.params, features, begins, np.int32(chunk), at
-            )
-            found.append(at._replace(smoothed=smoothed) if keep else at)
-            elapsed = stretch.features.elapsed[chunk]
-        return found[::-1], later
+        return self._runner.look_back(stretch, begins, later, elapsed, room)
 
     @functools.cached_property
-    def _later(self) -> dict[Mark, Later]:
+    def _later(self) -> dict[Mark, Any]:
         """What later events say at the starts of all stretches, found from the last one on."""
-        found: dict[Mark, Later] = {}
+        found: dict[Mark, Any] = {}
         room = KEPT
         rows = self._packing.rows
         with bar(
             total=rows[1] - rows[0], unit="event", unit_scale=True, desc="smooth",
             progress=self._progress,
         ) as shown:  # fmt: skip
-            for mark, state in self._backwards():
-                stretch = self._packing.pack(mark)
-                _, told = self._run(state, stretch.features)
-                assert told.slots is not None
-                following, first = self._look_back(stretch, told.slots, found, room)
-                found[mark] = jax.device_get(first)
-                room -= _numbers_in(following)
+            for mark, state, packed in self._backwards():
+                stretch = self._packing.pack(mark) if packed is None else packed
+                _, begins = self._runner.play(state, stretch.features)
+                following, found[mark] = self._look_back(stretch, begins, found, room)
+                room -= numbers_in(following)
                 if room >= 0:
                     self._following[mark] = following
                 shown.update(int(np.count_nonzero(stretch.features.valid)))
         return found
 
-    def _backwards(self) -> Iterator[tuple[Mark, Any]]:
-        """All stretches with the targets at their starts, from the last one to the first."""
+    def _backwards(self) -> Iterator[tuple[Mark, Any, Stretch | None]]:
+        """All stretches, from the last to the first, with the targets at their starts.
+
+        A stretch that is packed is given too.
+        """
         end = None
         for first, _, state in reversed(self._begins):
-            mark, starts = first, []
+            mark, starts, stretch = first, [], None
             while mark is not None and mark != end:
                 starts.append((mark, state))
                 stretch = self._packing.pack(mark)
                 mark = stretch.next
                 if mark is not None and mark != end:
-                    state, _ = self._run(state, stretch.features, begins=False)
-            yield from reversed(starts)
+                    state, _ = self._runner.follow(state, stretch.features)
+            for mark, state in reversed(starts):
+                yield mark, state, stretch
+                stretch = None
             end = first
 
     def _follow(self) -> _History:
@@ -501,14 +364,14 @@ class Tracks(Shown):
             while mark is not None:
                 stretch = self._packing.pack(mark)
                 if state is None:
-                    state = _begin(self._filter, self.params, stretch.features)
+                    state = self._runner.begin(stretch.features)
                 if number % every == 0:
                     self._begins.append((mark, number, state))
                     if len(self._begins) > BEGINS:
                         every *= 2
                         self._begins = [one for one in self._begins if one[1] % every == 0]
-                state, told = self._run(state, stretch.features, begins=False)
-                logs.append((stretch, told.log))
+                state, told = self._runner.follow(state, stretch.features)
+                logs.append((stretch, told))
                 if len(logs) > 1:  # while this stretch is on the device
                     history.add(*logs.pop(0))
                 shown.update(int(np.count_nonzero(stretch.features.valid)))

@@ -63,6 +63,12 @@ def rearranged(eqn: Any, values: list[Any]) -> NDArray | None:
         return np.concatenate([np.asarray(v) for v in values], p["dimension"])
     if name == "stack":
         return np.stack([np.asarray(v) for v in values], p["axis"])
+    if name == "pad" and all(size >= 0 for sizes in p["padding_config"] for size in sizes):
+        out = np.full(eqn.outvars[0].aval.shape, np.asarray(values[1]).item(), x.dtype)
+        steps = zip(p["padding_config"], x.shape, strict=True)
+        within = (slice(low, low + n + max(n - 1, 0) * gap, gap + 1) for (low, _, gap), n in steps)
+        out[tuple(within)] = x
+        return out
     if name == "dynamic_slice":
         starts = [
             int(np.clip(int(start), 0, n - size))

@@ -1,6 +1,7 @@
 """Trackers' kernels, which numba compiles, against `run`, which XLA compiles."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,8 @@ from jaxevent.blob.association import share
 from jaxevent.blob.fused.tracking import FusedRun
 from jaxevent.blob.lifecycle import begin
 from jaxevent.blob.prepare import Packing
-from jaxevent.blob.run import run_compiled
+from jaxevent.blob.run import Told, run_compiled
+from jaxevent.blob.states import tell
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
 
@@ -53,14 +55,16 @@ CASES = {
 }  # fmt: skip
 
 
+FEW = {"n_birth": 8.0, "n_confirm": 20.0, "lambda0": 4.0, "gate_min": 4.0, "t_coast": 0.004}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_kernel_equals_run(case):
     """States, births and deaths of seeds, of targets that are born and of those that end."""
     values = CASES[case]
     tracker = getattr(blob, case, blob.moment)
-    few = {"n_birth": 8.0, "n_confirm": 20.0, "lambda0": 4.0, "gate_min": 4.0, "t_coast": 0.004}
-    params = tracker.Params(**few, **values, max_targets=3)
+    params = tracker.Params(**FEW, **values, max_targets=3)
     seeds = [(25.0, 22.0, 4.0), (70.0, 24.0, 4.0, 0.001)]
     rec = crossing(np.random.default_rng(7))
     packing = Packing(rec, params, seeds, detect=True, steps=16, chunks=40)
@@ -71,7 +75,9 @@ def test_kernel_equals_run(case):
         mark, number = stretch.next, number + 1
         if state is None:
             state = begin(tracker.filter, params, stretch.features)
-        got = kernel(state, stretch.features, True)
+        end, log = kernel.follow(state, stretch.features)
+        got = end, Told(log, kernel.slots(kernel.play(state, stretch.features)[1]))
+        before = state
         state, told = run_compiled(tracker.filter, params, state, stretch.features)
         expected = state, dataclasses.replace(told, association=None)
         paths = jax.tree_util.tree_flatten_with_path(expected)[0]
@@ -79,22 +85,46 @@ def test_kernel_equals_run(case):
             name = f"{jax.tree_util.keystr(path)} of stretch {number}"
             assert other.dtype == one.dtype, name
             np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9, err_msg=name)
+    # Of the last stretch also what is read, filtered, as the first chunk with a pause begins.
+    _, updates = kernel.play(before, stretch.features)
+    ends = np.asarray(stretch.features.t)[:, 0, -1]  # of the chunks' first steps
+    chunk = int(np.flatnonzero((ends > 1) & (np.asarray(told.slots.id) >= 0).any(1))[0])
+    slots = jax.tree.map(lambda a: a[chunk], told.slots)
+    read = jax.jit(jax.vmap(functools.partial(tell, tracker.filter, params), (0, None)))
+    wanted, id = np.asarray(slots.id)[None] >= 0, np.asarray(slots.id, np.int64)
+    times = stretch.start[[chunk]] + ends[chunk] - 1
+    got = kernel.read(stretch, updates, None, times, id, wanted)
+    for one, other in zip(got, read(slots, ends[chunk] - 1), strict=True):
+        np.testing.assert_allclose(one[wanted], other[wanted[0]], rtol=1e-9, atol=1e-9)
     log = np.asarray(told.log.ended)
     assert log.shape == (40, 5) and (np.asarray(state.next_id) > 2)
 
 
 @pytest.mark.slow
-def test_tracks_of_both_compilers(float32):
-    rec, seeds = crossing(np.random.default_rng(1)), [(25.0, 22.0, 4.0)]
-    params = blob.moment.Params(events_per_step=8, lambda0=4.0)
-    times = np.arange(500, 25_000, 700)
-    one, other = (
-        blob.moment.estimate(rec, params, seeds=seeds, compiler=compiler, progress=False)(times)
+def test_tracks_of_both_compilers():
+    """Smoothed states, with pauses in which targets stand still, and whose the events are."""
+    rec, seeds = crossing(np.random.default_rng(7)), [(25.0, 22.0, 4.0), (70.0, 24.0, 4.0, 0.001)]
+    tracker, options = blob.constant_velocity, {**FEW, **CASES["constant_velocity"]}
+    params = tracker.Params(**options, t_still=1e-3, max_targets=3)
+    fused, scanned = (
+        tracker.estimate(rec, params, seeds=seeds, detect=True, compiler=compiler, progress=False)
         for compiler in ("numba", "xla")
     )
-    assert one.valid.any()
-    np.testing.assert_array_equal(one.valid, other.valid)
-    np.testing.assert_allclose(one.mean, other.mean, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal([fused.birth, fused.death], [scanned.birth, scanned.death])
+    times = np.arange(rec.start, rec.stop, 173)
+    told = fused(times)
+    assert told.valid.any(0).all() and not told.valid.all()
+    for one, other in zip(told, scanned(times), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8)
+    for one, other in zip(fused.events(), scanned.events(), strict=True):
+        for x, y in zip(one, other, strict=True):
+            np.testing.assert_allclose(x, y, rtol=0, atol=1e-9)
+
+    # Numbers that do not depend on each other may as well be taken together.
+    fused._runner._reading = fused._runner._reading._replace(blocks=np.array([0, 8]))
+    del fused._later
+    fused._following.clear()
+    np.testing.assert_allclose(fused(times).mean, told.mean, rtol=1e-9, atol=1e-9)
 
 
 def test_a_filter_without_kernel_is_scanned():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxevent import blob
+from jaxevent.blob.fused.tracking import FusedRun
 from jaxevent.blob.prepare import Packing
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
@@ -38,7 +39,8 @@ def walk():
 
 def follow(recording, params, seeds, tracker, steps=64, chunks=32, **options):
     packing = Packing(recording, params, seeds, steps=steps, chunks=chunks, **options)
-    return Tracks(tracker.filter, packing, params, smooth=True)
+    kernel = FusedRun(tracker.filter, params, packing)
+    return Tracks(tracker.filter, packing, params, smooth=True, fused=kernel)
 
 
 def all_at_once(recording, M, size, start, times):

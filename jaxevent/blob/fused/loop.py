@@ -26,10 +26,10 @@ GATE, HITS, P, _, LONG, XI, _, SIZE, FRAME, _ = range(10)
 WHOLE = (
     "slot.last.0", "slot.heard.0", "slot.born.0", "slot.apart.0", "slot.id.0", "slot.confirmed.0",
     "limit.0", "time.0", "stop.0", "inside.0", "found.0", "verdict.confirmed.0", "verdict.ended.0",
-    "verdict.death.0", "verdict.apart.0",
+    "verdict.death.0", "verdict.apart.0", "touched.0",
 )  # fmt: skip
 LAST, HEARD, BORN, APART, ID, CONFIRMED, LIMIT, TIME, STOP, INSIDE = range(10)
-FOUND, NOW_CONFIRMED, ENDED, DEATH, NOW_APART = range(10, 15)
+FOUND, NOW_CONFIRMED, ENDED, DEATH, NOW_APART, TOUCHED = range(10, 16)
 
 # Rows of a step's `work`: the events', then four for each target that is alive.
 X, Y, AGE, POLARITY, VALID, TARGETS = range(6)
@@ -87,15 +87,31 @@ class Memory(NamedTuple):
 
 
 class Told(NamedTuple):
-    """What a run tells of each chunk: targets before its first step, births and deaths."""
+    """What a run tells of each chunk; whose events are only where there is room."""
 
-    cells: NDArray
-    whole: NDArray[np.int64]
+    owner: NDArray[np.int32]  # [chunks, steps, events], serial numbers; -1: nobody's
+    weight: NDArray  # how much of the event is the owner's
     before: NDArray[np.int32]
     after: NDArray[np.int32]
     confirmed: NDArray[np.bool_]
     ended: NDArray[np.int32]
     death: NDArray[np.int32]
+
+
+class Updates(NamedTuple):
+    """Rows: of each chunk all targets at its start, then each after each of its updates.
+
+    `count` goes on beyond the rows that there is room for. Without any nothing is counted.
+    """
+
+    cells: NDArray  # [rows, ...]
+    whole: NDArray[np.int64]  # [rows, ...]
+    target: NDArray[np.int64]  # of each row
+    before: NDArray[np.int64]  # the row before of the same target in the chunk; -1: none
+    step: NDArray[np.int64]  # steps of the chunk done by then
+    begin: NDArray[np.int64]  # the first row of each chunk, and their number
+    latest: NDArray[np.int64]  # the last row of each target
+    count: NDArray[np.int64]  # [1]
 
 
 class Space(NamedTuple):
@@ -109,37 +125,28 @@ class Space(NamedTuple):
 
 
 @lean
-def run(functions, numbers, settings, chunks, memory, told, space):
-    """Track through chunks; the memory is that at their end.
-
-    Targets at chunks' starts are told of only where `told` has room for them.
-    """
+def run(functions, numbers, settings, chunks, memory, told, space, updates):
+    """Track through chunks; the memory is that at their end."""
     cells, whole = memory.cells, memory.whole
     given = (
         cells.ctypes, whole.ctypes, space.work.ctypes, space.marks.ctypes, numbers.ctypes,
     )  # fmt: skip
     for chunk in range(len(chunks.t)):
         _begin_chunk(functions, given, settings, chunks, memory, chunk)
-        if len(told.cells):
-            _copy(cells, told.cells[chunk])
-            _copy(whole, told.whole[chunk])
+        updates.begin[chunk] = updates.count[0]
         for k in range(len(cells)):
             functions.limit(*given, k, 0, 0, 1)
-        _run_steps(functions, given, settings, chunks, memory, chunk, space)
+            updates.latest[k] = -1
+            if len(updates.target):
+                _note(updates, cells, whole, k, -1)
+        _run_steps(functions, given, settings, chunks, memory, chunk, told, space, updates)
         for k in range(len(cells)):
             told.before[chunk, k] = told.after[chunk, k] = whole[k, ID]
             told.confirmed[chunk, k] = whole[k, CONFIRMED] != 0
             told.ended[chunk, k] = told.death[chunk, k] = 0
         if chunks.cycle[chunk]:
             _end_cycle(functions, given, settings, chunks, memory, chunk, told, space)
-
-
-@lean_part
-def _copy(table, out):
-    """Copy numbers one by one: numba takes over a second to compile the copy of an array."""
-    for k in range(table.shape[0]):
-        for field in range(table.shape[1]):
-            out[k, field] = table[k, field]
+    updates.begin[len(chunks.t)] = updates.count[0]
 
 
 @lean_part
@@ -169,7 +176,7 @@ def _begin_track(functions, given, cells, whole, k, x, y, size, time, serial, co
 
 
 @lean_part
-def _run_steps(functions, given, settings, chunks, memory, chunk, space):
+def _run_steps(functions, given, settings, chunks, memory, chunk, told, space, updates):
     """The steps of a chunk; the grid counts the events that are near no target."""
     cells, whole, sums = memory.cells, memory.whole, memory.sums
     work, marks, targets = space.work, space.marks, space.targets
@@ -177,7 +184,8 @@ def _run_steps(functions, given, settings, chunks, memory, chunk, space):
     valid = chunks.valid[chunk]
     steps, room = t.shape
     owned, micro = len(chunks.owner) > 0, work.dtype.type(1e-6)
-    stop, faded = np.int64(chunks.stop[chunk]), False
+    asked, noted = len(told.owner) > 0, len(updates.target) > 0
+    stop, faded, none = np.int64(chunks.stop[chunk]), valid[0, 0] & False, np.int64(0)
     for step in range(steps):
         if not valid[step, 0]:
             break  # the rest fills up
@@ -192,15 +200,18 @@ def _run_steps(functions, given, settings, chunks, memory, chunk, space):
             for i in range(room):
                 marks[i] = chunks.owner[chunk, step, i, 0]
                 marks[room + i] = chunks.owner[chunk, step, i, 1]
-        alive = 0
+        alive = none
         for k in range(len(cells)):
             if time - whole[k, HEARD] <= whole[k, LIMIT]:
                 targets[alive] = k
                 whole[k, TIME] = time
                 alive += 1
-        if alive == 1:
-            wanted = room if room > 1 or settings.births else 0
-            functions.solo(*given, targets[0], TARGETS, room, wanted)
+        if alive == 1 and not asked:
+            wanted, k = room if room > 1 or settings.births else 0, targets[0]
+            whole[k, TOUCHED] = 0
+            functions.solo(*given, k, TARGETS, room, wanted)
+            if noted and whole[k, TOUCHED] != 0:
+                _note(updates, cells, whole, k, step)
         elif alive > 0:
             for a in range(alive):
                 functions.ahead(*given, targets[a], TARGETS + ROWS * a, room, room)
@@ -212,8 +223,40 @@ def _run_steps(functions, given, settings, chunks, memory, chunk, space):
                     some |= work[row + WEIGHT, i] > 0
                 if some:
                     functions.update(*given, k, row, room, room)
+                if some and noted:
+                    _note(updates, cells, whole, k, step)
+        if asked:
+            _tell_owners(work, whole, targets, alive, told.owner[chunk, step],
+                told.weight[chunk, step])  # fmt: skip
         if settings.births:
             faded = _count_strays(settings, sums, memory.at, t[step], stop, alive, work, faded)
+
+
+@lean_part
+def _note(updates, cells, whole, k, step):
+    """Note a target after its update in a step."""
+    row = updates.count[0]
+    updates.count[0] = row + 1
+    if row >= len(updates.target):
+        return
+    for field in range(cells.shape[1]):
+        updates.cells[row, field] = cells[k, field]
+    for field in range(whole.shape[1]):
+        updates.whole[row, field] = whole[k, field]
+    updates.target[row], updates.before[row] = k, updates.latest[k]
+    updates.step[row] = step + 1
+    updates.latest[k] = row
+
+
+@lean_part
+def _tell_owners(work, whole, targets, alive, owner, weight):
+    """Whose the events of a step are, and how much of them."""
+    for i in range(len(owner)):
+        owner[i], weight[i] = -1, 0
+        for a in range(alive):
+            share = work[TARGETS + ROWS * a + WEIGHT, i]
+            if share > weight[i]:
+                owner[i], weight[i] = whole[targets[a], ID], share
 
 
 @lean_part

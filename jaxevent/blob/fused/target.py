@@ -264,6 +264,8 @@ def _branches(
     for line, value in (("if {}:", True), ("else:", False)):
         case = program.graph.suppose(function.results, truth, value)
         changed = {k: n for k, n in case.items() if k.startswith("slot") and n.args != (k,)}
+        if value:
+            changed["touched.0"] = program.graph.constant(True)
         if changed:
             cases.append((line, changed))
     cases.append(("if count:", {"ahead.near.0": function.results["ahead.near.0"]}))

@@ -1,5 +1,6 @@
-"""Runs of chunks by a kernel, with what `jaxevent.blob.run` takes and returns."""
+"""Runs of chunks by a kernel: what `jaxevent.blob.scan` does by XLA."""
 
+import functools
 from typing import Any
 
 import jax
@@ -7,24 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.fused.loop import (
-    FRAME,
-    ROWS,
-    TARGETS,
-    Chunks,
-    Memory,
-    Settings,
-    Space,
-    Told,
-    run,
-)
+from jaxevent.blob.fused import loop
+from jaxevent.blob.fused.loop import FRAME, ROWS, TARGETS, Chunks, Memory, Settings, Space, Updates
+from jaxevent.blob.fused.reading import functions_of
+from jaxevent.blob.fused.replay import LATER, MATRICES, NUMBERS, Asked, Kernel, Room, States, read
 from jaxevent.blob.fused.target import kernel_of, shares_apart
-from jaxevent.blob.lifecycle import Log, State
+from jaxevent.blob.lifecycle import Log, State, begin
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.prepare import Features, Packing
-from jaxevent.blob.run import Told as Telling
+from jaxevent.blob.prepare import NEVER, Features, Packing, Stretch, count_steps
 from jaxevent.blob.steps import Filter
 from jaxevent.blob.targets import Slots
+from jaxevent.kernels.host import run as run_on_host
 from jaxevent.kernels.loops import leaves_of, numbers_of
 
 
@@ -33,6 +27,7 @@ class FusedRun:
 
     def __init__(self, filter: Filter, params: TrackerParams, packing: Packing):
         self.dtype = np.dtype(jnp.result_type(float))
+        self._filter, self._params = filter, params
         own = packing.own if len(packing.seeds.t) else {}
         owned = packing.joined is not None
         self._kernel = kernel_of(filter, params, own, owned, self.dtype)
@@ -49,38 +44,116 @@ class FusedRun:
             columns = np.array([places[number] for number in names], np.int64)
             self._columns.append((real, columns, leaf.shape, leaf.dtype))
 
-    def __call__(
-        self, state: State, features: Features, begins: bool = False
-    ) -> tuple[State, Telling]:
-        """The state at the end, births and deaths, and, if asked for, targets at chunks' starts."""
-        state = jax.device_get(state)
-        memory = self._memory_of(state, features)
-        chunks, events = len(features.t), features.t.shape[2]
-        targets = len(memory.whole)
-        kinds = np.int32, np.int32, bool, np.int32, np.int32
-        told = Told(
-            np.empty((chunks if begins else 0, *memory.cells.shape), self.dtype),
-            np.empty((chunks if begins else 0, *memory.whole.shape), np.int64),
-            *(np.empty((chunks, targets), kind) for kind in kinds),
-        )
-        owner = np.empty((0, 0, 0, 0), np.int32) if features.owner is None else features.owner
-        parts: list[NDArray] = [
-            np.asarray(part)
-            for part in (
-                features.t, features.xi, features.polarity, features.valid, owner,
-                features.elapsed, features.stop, features.cycle, features.seed, features.seed_xi,
-                features.seed_size,
-            )
-        ]  # fmt: skip
-        given = Chunks(*parts)
-        rows, columns = memory.sums.shape[1:]
-        space = Space(
-            np.zeros((TARGETS + ROWS * targets, events), self.dtype),
-            np.zeros(2 * events, np.int64), np.empty(targets, np.int64),
-            np.empty((rows, columns), self.dtype), np.empty(columns + 2, self.dtype),
+    def begin(self, features: Features) -> State:
+        """No track yet."""
+        start = functools.partial(begin, self._filter)
+        closed, shape = jax.make_jaxpr(start, return_shape=True)(self._params, features)
+        given = [np.asarray(leaf) for leaf in jax.tree.leaves((self._params, features))]
+        return jax.tree.unflatten(jax.tree.structure(shape), run_on_host(closed, given))
+
+    def follow(self, state: State, features: Features) -> tuple[State, Log]:
+        """The state at the end, with births and deaths."""
+        return self._run(state, features)[:2]
+
+    def play(self, state: State, features: Features) -> tuple[State, Updates]:
+        """The state at the end, and all updates, to be read."""
+        chunks, steps, _ = features.t.shape
+        rows = (chunks + steps) * len(state.slots.id) + chunks * steps
+        while True:
+            end, _, _, updates = self._run(state, features, rows)
+            if updates.count[0] <= rows:
+                return end, updates
+            rows = int(updates.count[0])
+
+    def owners(self, state: State, features: Features) -> tuple[State, NDArray[np.int32], NDArray]:
+        """The state at the end, serial numbers of the likeliest targets of events, and weights."""
+        state, _, told, _ = self._run(state, features, owners=True)
+        return state, told.owner, told.weight
+
+    def look_back(
+        self,
+        stretch: Stretch,
+        updates: Updates,
+        later: NDArray[np.float64] | None,
+        elapsed: int,
+        room: int = 0,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What later events say of all updates, and at the stretch's start.
+
+        `later` is that at the start of the next one, `elapsed` us after this one's last chunk.
+        """
+        later = np.zeros((len(updates.latest), LATER)) if later is None else later.copy()
+        used = int((stretch.start < NEVER).sum())
+        following = np.append(stretch.features.elapsed[1:used], elapsed).astype(np.int64)
+        rows = np.empty((int(updates.count[0]), LATER))
+        none = np.empty(0, np.int64)
+        nothing = Asked(none, none, none, none, np.empty((0, 0), bool))
+        self._read(updates, following, later, rows, nothing)
+        return rows, later
+
+    def read(
+        self,
+        stretch: Stretch,
+        updates: Updates,
+        rows: NDArray[np.float64] | None,
+        times: NDArray[np.int64],
+        serial: NDArray[np.int64],
+        wanted: NDArray[np.bool_],
+    ) -> States:
+        """States of tracks at sorted times of a stretch where they are `wanted`; NaN elsewhere.
+
+        Smoothed with what `look_back` said, `rows`; None: filtered.
+        """
+        chunk = np.searchsorted(stretch.start, times, "right") - 1
+        since = times - stretch.start[chunk]
+        step = count_steps(stretch.features, chunk, since).astype(np.int64)
+        rows = np.empty((0, LATER)) if rows is None else rows
+        asked = Asked(chunk, step, since, serial, wanted)
+        return self._read(updates, np.empty(0, np.int64), np.empty((0, LATER)), rows, asked)
+
+    def slots(self, updates: Updates) -> Slots:
+        """The targets at chunks' starts as `run` tells them."""
+        at = updates.begin[:-1, None] + np.arange(len(updates.latest))
+        return self._slots(self._kernel.slot, updates.cells[at], updates.whole[at])
+
+    def _read(
+        self,
+        updates: Updates,
+        following: NDArray[np.int64],
+        later: NDArray[np.float64],
+        rows: NDArray[np.float64],
+        asked: Asked,
+    ) -> States:
+        shape = asked.wanted.shape
+        out = States(*(
+            np.full((*shape, *size), np.nan, self.dtype) for size in ((8,), (8, 8), ())
+        ))  # fmt: skip
+        room = Room(
+            np.empty((MATRICES, 8, 8)), np.empty((2, 8)), np.empty(NUMBERS, self.dtype),
+            np.empty(1, np.int64),
         )  # fmt: skip
-        kernel = self._kernel
-        run(kernel.functions, kernel.numbers, self._settings, given, memory, told, space)
+        read(self._reading, updates, following, later, rows, asked, room, out)
+        return out
+
+    @functools.cached_property
+    def _reading(self) -> Kernel:
+        found = functions_of(self._filter, self._params, self._kernel, self.dtype)
+        return Kernel(*found, 4 * float(np.finfo(self.dtype).eps))
+
+    def _run(
+        self, state: State, features: Features, rows: int = 0, owners: bool = False
+    ) -> tuple[State, Log, loop.Told, Updates]:
+        state = jax.device_get(state)
+        memory, chunks, kernel = (
+            self._memory_of(state, features),
+            _chunks_of(features),
+            self._kernel,
+        )
+        told, space = self._told(chunks, memory, owners), self._space(chunks, memory)
+        updates = self._updates(chunks, memory, rows)
+        loop.run(
+            kernel.functions, kernel.numbers, self._settings, chunks, memory, told, space, updates
+        )
         rest = [np.asarray(one, np.int32) for one in memory.at]
         if state.grid is not None:
             rest.insert(0, memory.sums)
@@ -89,9 +162,34 @@ class FusedRun:
         leaves = [*jax.tree.leaves(self._slots(state.slots, memory.cells, memory.whole)), *rest]
         end = jax.tree.unflatten(jax.tree.structure(state), leaves)
         log = Log(told.before, told.after, told.confirmed, told.ended, told.death)
-        return end, Telling(
-            log, self._slots(state.slots, told.cells, told.whole) if begins else None
-        )
+        return end, log, told, updates
+
+    def _told(self, chunks: Chunks, memory: Memory, owners: bool) -> loop.Told:
+        events = chunks.t.shape if owners else (0, 0, 0)
+        shape, kinds = (len(chunks.t), len(memory.whole)), (np.int32, np.int32, bool)
+        return loop.Told(
+            np.empty(events, np.int32), np.empty(events, self.dtype),
+            *(np.empty(shape, kind) for kind in (*kinds, np.int32, np.int32)),
+        )  # fmt: skip
+
+    def _updates(self, chunks: Chunks, memory: Memory, rows: int) -> Updates:
+        whole = np.int64
+        return Updates(
+            np.empty((rows, memory.cells.shape[1]), self.dtype),
+            np.empty((rows, memory.whole.shape[1]), whole),
+            *(np.empty(rows, whole) for _ in range(3)),
+            np.empty(len(chunks.t) + 1, whole), np.empty(len(memory.whole), whole),
+            np.zeros(1, whole),
+        )  # fmt: skip
+
+    def _space(self, chunks: Chunks, memory: Memory) -> Space:
+        targets, events = len(memory.whole), chunks.t.shape[2]
+        rows, columns = memory.sums.shape[1:]
+        return Space(
+            np.zeros((TARGETS + ROWS * targets, events), self.dtype),
+            np.zeros(2 * events, np.int64), np.empty(targets, np.int64),
+            np.empty((rows, columns), self.dtype), np.empty(columns + 2, self.dtype),
+        )  # fmt: skip
 
     def _memory_of(self, state: State, features: Features) -> Memory:
         layout, targets = self._kernel.layout, len(state.slots.id)
@@ -114,3 +212,15 @@ class FusedRun:
             part = (cells if real else whole)[..., columns].astype(kind)
             leaves.append(part.reshape(*part.shape[:-1], *shape))
         return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+def _chunks_of(features: Features) -> Chunks:
+    owner = np.empty((0, 0, 0, 0), np.int32) if features.owner is None else features.owner
+    parts: list[NDArray] = [
+        np.asarray(part)
+        for part in (
+            features.t, features.xi, features.polarity, features.valid, owner, features.elapsed,
+            features.stop, features.cycle, features.seed, features.seed_xi, features.seed_size,
+        )
+    ]  # fmt: skip
+    return Chunks(*parts)
