@@ -24,7 +24,7 @@ import numpy as np
 from jaxevent.egomotion import voting
 from jaxevent.egomotion.batch_fit import photometric
 from jaxevent.egomotion.batch_fit import windows as batch
-from jaxevent.egomotion.batch_fit.equations import FREE, Unknowns, linearise, look
+from jaxevent.egomotion.batch_fit.equations import FREE, Unknowns, linearise
 from jaxevent.egomotion.batch_fit.path import Path, advanced
 from jaxevent.egomotion.batch_fit.placing import POWERS
 from jaxevent.egomotion.batch_fit.tracks import Scene
@@ -229,8 +229,7 @@ def normal_bench() -> tuple[dict[str, float], dict[str, float]]:
     depths = np.full(math.prod(tracks.nodes), np.log(np.linalg.norm(T)), real)
     path = Path.constant(T / np.linalg.norm(T), Omega, depths)
     scene = Scene(path, rng.normal(size=tracks.shape).astype(real), 0.0)
-    problem, weight = photometric.begin(tracks, scene, prior, 1.0, plane=False)
-    made = linearise(problem, look(problem, scene, weight), settling=False)
+    made = linearise(*photometric.begin(tracks, scene, prior, 1.0, plane=False), settling=False)
     slopes, weight = made.slopes, made.seen.weight
     E, n = len(weight), FREE + len(slopes.more)
     v = rng.normal(size=tracks.shape), rng.normal(size=n), rng.normal(size=len(depths))

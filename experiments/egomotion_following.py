@@ -53,11 +53,11 @@ def exact(windows: batch.Windows, rate: float) -> None:
     photometric.solve = functools.partial(equations.solve, left=left)  # ty: ignore[invalid-assignment]
     scene, _ = begun(windows, rate)
     tracks = windows.tracks(TURNED, half, windows.params.events)
-    problem, weight = photometric.begin(tracks, scene, windows.prior(TURNED, half), SIGMA, False)
+    prior = windows.prior(TURNED, half)
+    problem, begun_with = photometric.begin(tracks, scene, prior, SIGMA, False)
     for equations.SOLVE, left in (EARLY, EXACT):
         photometric.solve = functools.partial(equations.solve, left=left)  # ty: ignore[invalid-assignment]
-        kept = equations.look(problem, scene, weight)
-        told = [kept]
+        kept, told = begun_with, [begun_with]
         for _ in range(STEPS):
             kept = equations.look(problem, photometric.step(problem, kept, 0.0, False), kept.weight)
             told.append(kept)

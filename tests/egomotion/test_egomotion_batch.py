@@ -402,7 +402,8 @@ def test_frames_tell_motion_where_events_are_few():
         path = true_path(np.full(math.prod(tracks.nodes), np.log(np.linalg.norm(T) / 1.5)))
         path.D[0] += np.array([0.1, 0, 0])
         stages = tuple(batch.Stage(sigma, 12) for sigma in (0.3, 0.2, 0.05))
-        (scene, _) = batch._begun(tracks, normalised(path), prior, stages)
+        blank = batch.blank(tracks, normalised(path), prior)
+        (scene, _) = batch._begun(tracks, blank, prior, stages)
         off.append(np.degrees(np.arccos(scene.path.D[0] @ T / np.linalg.norm(T))))
     assert off[0] < 4 and off[0] < 0.5 * off[1], off
 

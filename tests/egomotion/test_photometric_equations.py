@@ -1,12 +1,15 @@
 """The photometric fit's equations: slopes against differences, pieces against the dense matrix."""
 
 import functools
+import math
 
 import numpy as np
 import pytest
+import scipy.linalg
+import scipy.ndimage
 
+from jaxevent.egomotion.batch_fit import coarse, solving
 from jaxevent.egomotion.batch_fit import equations as fit
-from jaxevent.egomotion.batch_fit import solving
 from jaxevent.egomotion.batch_fit.path import ROWS, SEGMENTS, Path, Prior
 from jaxevent.egomotion.batch_fit.rows import with_rows
 from jaxevent.egomotion.batch_fit.tracks import Scene, Tracks, read
@@ -221,6 +224,15 @@ def matrix(damping: float) -> np.ndarray:
     return np.array([joined(times(system, apart(v, equations)), size[1]) for v in eye]).T
 
 
+def between_coarse(equations: fit.Equations) -> np.ndarray:
+    """The nodes' depths by those of coarse nodes, (nodes, coarse nodes)."""
+    rows, columns = equations.problem.tracks.nodes
+    wide = coarse.coarse_shape(rows, columns)
+    at = np.indices((rows, columns)).reshape(2, -1) / coarse.SPAN
+    each = np.eye(math.prod(wide)).reshape(-1, *wide)
+    return np.stack([scipy.ndimage.map_coordinates(one, at, order=1) for one in each], 1)
+
+
 def test_the_matrix_is_that_of_least_squares():
     """J' W J of misfits less their means; what is kept of it are its blocks."""
     seen, equations = linearised()
@@ -237,26 +249,30 @@ def test_the_matrix_is_that_of_least_squares():
     np.testing.assert_allclose(H, H.T, atol=1e-9 * abs(H).max())
     upper = equations.upper[:free, :free]
     np.testing.assert_allclose(upper, H[n:m, n:m], rtol=1e-9, atol=1e-6)
-    np.testing.assert_allclose(equations.mixed[:, :free], H[m:, n:m], atol=1e-9)
+    P, of_events = between_coarse(equations), H - priors
+    np.testing.assert_allclose(equations.mixed[:, :free], P.T @ H[m:, n:m], atol=1e-9)
+    np.testing.assert_allclose(equations.smooth, P.T @ of_events[m:, m:] @ P, atol=1e-9)
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.5])
-def test_the_preconditioner_is_exact_where_the_matrix_is_of_blocks(damping):
-    """A diagonal for the map, and path with depths that do not pull on each other."""
+def test_the_preconditioner_is_exact_for_path_and_smooth_depths(damping):
+    """Beside diagonals for map and depths, of these with all that a node pulls on."""
     _, equations = linearised()
-    system, (_, free, nodes) = fit.system_of(equations, damping), size_of(equations)
+    system, (n, free, nodes) = fit.system_of(equations, damping), size_of(equations)
     eased = []
     for v in np.eye(free + nodes):
         depth = v[free:].reshape(system.hold.shape)
         out = np.empty_like(depth)
         t = np.empty(free)
-        solving.ease_rest(system, v[:free].copy(), depth.copy(), t, out)
+        own = system.lower, system.ease_nodes, v[:free].copy(), depth.copy(), system.side
+        coarse.ease_rest(*own, t, out)
         eased.append(np.append(t, out))
-    upper, mixed = equations.upper[:free, :free], equations.mixed[:, :free]
-    stiff = (damping + 1e-3) * np.diag(equations.stiff[:free])
-    lumped = (1 + damping) * np.diag(equations.lumped)
-    rest = np.block([[upper + stiff, mixed.T], [mixed, lumped]])
-    np.testing.assert_allclose(eased @ rest, np.eye(len(rest)), atol=1e-7)
+    P = np.asarray(scipy.linalg.block_diag(np.eye(free), between_coarse(equations)))
+    H = P.T @ matrix(damping)[n:, n:] @ P
+    H += np.diag(1e-5 * np.diag(H) + 1e-3)
+    single = np.append(np.zeros(free), 1 / ((1 + damping) * equations.lumped))
+    expected = np.diag(single) + P @ np.linalg.solve(H, P.T)
+    np.testing.assert_allclose(eased, expected, atol=1e-9 * abs(expected).max())
     map_ = (1 + damping) * equations.diagonal
     np.testing.assert_allclose(system.ease_map, 1 / map_, rtol=1e-12)
 

@@ -4,12 +4,13 @@ Unknowns are (map, path's rows with skew and plane, depths at nodes).
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.egomotion.batch_fit import together
+from jaxevent.egomotion.batch_fit.coarse import coarse_shape, factored
 from jaxevent.egomotion.batch_fit.gauss_newton import bonds
 from jaxevent.egomotion.batch_fit.path import ROWS, Path, Prior, normalised
 from jaxevent.egomotion.batch_fit.placing import POWERS
@@ -22,14 +23,15 @@ from jaxevent.egomotion.batch_fit.rows import (
     units_of_rows,
 )
 from jaxevent.egomotion.batch_fit.slopes import (
+    BlockRoom,
     Free,
     Slopes,
     back,
     blocks,
-    chained,
+    depth_blocks,
     differentiate,
     forward,
-    weighed_squares,
+    squares,
 )
 from jaxevent.egomotion.batch_fit.solving import System, conjugate_gradients
 from jaxevent.egomotion.batch_fit.tracks import Places, Scene, Tracks, read
@@ -105,13 +107,17 @@ def laplacian(image: NDArray) -> NDArray:
     return found
 
 
-def look(problem: Problem, scene: Scene, weight: NDArray) -> Seen:
-    """The scene with |C1| = 1, what it costs, and the weights of events, from those before."""
+def look(problem: Problem, scene: Scene, weight: NDArray, before: Seen | None = None) -> Seen:
+    """The scene with |C1| = 1, what it costs, and the weights of events, from those before.
+
+    Where the path is that of what was seen `before`, events stay where they were.
+    """
     tracks, prior, sigma, plane, usual = problem
     most = SKEWED / math.sqrt(float(prior.skew_weight))
     skew = min(max(float(scene.skew), prior.skew - most), prior.skew + most)
-    scene = Scene(normalised(scene.path), scene.map, skew)
-    places = read(scene, tracks)
+    stays = before is not None and before.scene.path is scene.path
+    scene = Scene(scene.path if stays else normalised(scene.path), scene.map, skew)
+    places = read(scene, tracks, before.places if before and stays else None)
     e = places.value - tracks.level - tracks.x.dtype.type(scene.skew) * tracks.number
     weight = weight.copy()
     of_places, cost = weigh(
@@ -147,8 +153,9 @@ class Equations(NamedTuple):
     side: NDArray[np.float64]  # and what they pull to: known @ now - side is their gradient
     held: NDArray[np.float64]  # what keeps it regular
     upper: NDArray[np.float64]  # the path's block
-    mixed: NDArray[np.float64]  # (nodes, n), path with depths
-    lumped: NDArray[np.float64]  # (nodes,) the depths' block, each row's sum
+    mixed: NDArray[np.float64]  # (coarse nodes, n), path with depths
+    smooth: NDArray[np.float64]  # (coarse nodes, coarse nodes), depths without priors
+    lumped: NDArray[np.float64]  # (rows, columns) the depths' block, each row's sum
     across: NDArray[np.float64]  # bonds to the columns before
     down: NDArray[np.float64]
 
@@ -196,14 +203,15 @@ def linearise(problem: Problem, seen: Seen, settling: bool) -> Equations:
     left = seen.e.copy()
     subtract_mean(left, weight, tracks.begin)
 
-    nodes, grids = math.prod(tracks.nodes), tracks.grids
+    grids, coarse = tracks.grids, math.prod(coarse_shape(*tracks.nodes))
     raw, diagonal = np.zeros((n, n)), np.zeros(tracks.shape, real)
-    raw_mixed, lumped = np.zeros((nodes, n), real), np.zeros(nodes)
-    rows = np.empty((int(np.diff(tracks.begin).max(initial=0)) + 1, n), real)
-    blocks(
-        slopes, weight, tracks.begin, grids.width, grids.columns, rows, raw, raw_mixed, lumped,
-        diagonal.reshape(-1),
-    )  # fmt: skip
+    mixed, smooth = np.zeros((coarse, n)), np.zeros((coarse, coarse))
+    lumped = np.zeros(tracks.nodes)
+    squares(slopes, weight, grids.width, diagonal.reshape(-1))
+    if not settling:
+        blocks(slopes, weight, tracks.begin, grids.columns, BlockRoom.of(n, real), raw, mixed)
+        room = np.empty(coarse), np.empty(coarse, np.int64), np.empty(coarse, np.int64)
+        depth_blocks(slopes, weight, tracks.begin, grids.columns, room, smooth, lumped.reshape(-1))
     whole = np.zeros((n, FREE + 4))
     whole[:FREE, :FREE], whole[FREE:, FREE:n] = by, np.eye(n - FREE)
     information = problem.information
@@ -220,15 +228,13 @@ def linearise(problem: Problem, seen: Seen, settling: bool) -> Equations:
     stiff = across + down
     stiff[:, :-1] += across[:, 1:]
     stiff[:-1] += down[1:]
-    lumped += 2 * stiff.ravel()
-
-    mixed = np.empty((nodes, FREE + 4), real)
-    chained(raw_mixed, (information * whole).astype(real), mixed)
-
+    lumped += 2 * stiff
     return Equations(
         problem, seen, slopes, by, unit, now, left,
         0.7 * information * diagonal + 4 * float(prior.flat) + TINY, known, side, held, upper,
-        mixed, lumped, across, down,
+        # By einsum: larger products wake BLAS's threads, which spin then.
+        np.einsum("ki,ij->kj", mixed, information * whole), information * smooth, lumped,
+        across, down,
     )  # fmt: skip
 
 
@@ -252,46 +258,45 @@ def gradient_of(equations: Equations) -> Unknowns:
 
 
 def slopes_of(problem: Problem, seen: Seen, free: bool) -> Slopes:
-    """The slopes of misfits, before their means are taken."""
+    """The slopes of misfits, before their means are taken; unless `free` by the map alone."""
     tracks, plane = problem.tracks, problem.plane
     path, there, real = seen.scene.path, seen.places, tracks.x.dtype
     E, depth = len(tracks.x), np.ascontiguousarray(path.log_rho)
+    room = np.empty if free else np.zeros
     slopes = Slopes(
-        there.first, there.u, there.v, np.empty((6, E), real), np.empty(E, real),
-        np.empty((4 if plane else 1, E), real), np.empty(E, np.int32), np.empty(E, real),
-        np.empty(E, real), np.empty(E, real),
+        there.first, there.u, there.v, room((6, E), real), room(E, real),
+        room((4 if plane else 1, E), real), room(E, np.int32), room(E, real),
+        room(E, real), room(E, real),
     )  # fmt: skip
-    usual = float(np.exp(np.median(depth)))
-    differentiate(
-        tracks.points, tracks.number, there, path.motion(tracks.f), tracks.half, depth,
-        seen.scene.map.ravel(), Free(free, plane, float(problem.prior.moves), usual),
-        tracks.grids, slopes,
-    )  # fmt: skip
+    if free:
+        usual = float(np.exp(np.median(depth)))
+        differentiate(
+            tracks.points, tracks.number, there, path.motion(tracks.f), tracks.half, depth,
+            seen.scene.map.ravel(), Free(plane, float(problem.prior.moves), usual),
+            tracks.grids, slopes,
+        )  # fmt: skip
     return slopes
 
 
 def system_of(equations: Equations, damping: float) -> System:
-    """H damped, and about H^-1: for the map a diagonal, path with lumped depths exactly."""
+    """H damped, and about H^-1: diagonals, and path with smooth depths exactly (`coarse`)."""
     tracks, real = equations.problem.tracks, equations.seen.e.dtype
     n = FREE + len(equations.slopes.more)
-    stiff = equations.stiff[:n]
-    eased_by, lumped = 1 + damping, equations.lumped
-    mixed, of_depths = np.ascontiguousarray(equations.mixed[:, :n]), np.empty((n, n))
-    weighed_squares(mixed, 1 / (eased_by * lumped), of_depths)
-    small = equations.upper[:n, :n] + damping * np.diag(stiff) - of_depths
-    small = (small + small.T) / 2 + 1e-3 * np.diag(stiff)
-    known = (equations.known + equations.held)[:n, :n] + damping * np.diag(stiff)
+    damped = damping * np.diag(equations.stiff[:n])
+    known = (equations.known + equations.held)[:n, :n] + damped
+    hold, across, down = 1e-3 + damping * equations.lumped, equations.across, equations.down
+    upper, mixed = equations.upper[:n, :n] + damped, equations.mixed[:, :n]
+    lower = factored(upper, mixed, equations.smooth, hold, across, down)
 
-    def on(values: NDArray, shape: Any = None) -> NDArray:
-        return np.ascontiguousarray(values.astype(real).reshape(shape or values.shape))
+    def on(values: NDArray) -> NDArray:
+        return np.ascontiguousarray(values.astype(real))
 
     return System(
         equations.slopes, equations.seen.weight, equations.problem.information, tracks.begin,
         equations.chain, known, float(equations.problem.prior.flat), TINY,
-        on(damping * equations.diagonal), on(1e-3 + damping * lumped, tracks.nodes),
-        on(equations.across), on(equations.down), on(1 / (eased_by * equations.diagonal)),
-        on(1 / (eased_by * lumped)), on(mixed), np.linalg.inv(small).astype(np.float64),
-        np.empty((6, POWERS), real), np.empty(n - FREE, real), np.empty(n),
+        on(damping * equations.diagonal), on(hold), on(across), on(down),
+        on(1 / ((1 + damping) * equations.diagonal)), on(1 / ((1 + damping) * equations.lumped)),
+        lower, np.empty((6, POWERS), real), np.empty(n - FREE, real), np.empty(len(lower)),
     )  # fmt: skip
 
 

@@ -12,10 +12,10 @@ differences, robustly (Geman & McClure, 3 sigma), with weak priors on difference
 depth between neighbours and on changes of the twist. L is a quadratic B-spline of 1 px: with
 bilinear interpolation the cost at the true motion is higher. b_u is
 eliminated exactly (differences less their mean over the pixel's events), all else is one linear
-system a step, solved by conjugate gradients, without the matrix: the map's diagonal, and path with
-lumped depths exactly, precondition it. Steps extrapolate (Nesterov): reweighting alone is slow. A
-step that costs more is taken back and damped (Levenberg & Marquardt): beside sharp edges misfits
-are linear within a fraction of a pixel only, and the cost would grow.
+system a step, solved by conjugate gradients, without the matrix: diagonals of map and depths, and
+path with smooth depths exactly, precondition it (`coarse`). Steps extrapolate (Nesterov):
+reweighting alone is slow. A step that costs more is taken back and damped (Levenberg & Marquardt):
+beside sharp edges misfits are linear within a fraction of a pixel only, and the cost would grow.
 Where an outline passes before another, their crossing moves as neither and the levels beside them
 change, so that events there mislead. Single misfits do not stand out there, but all of them are
 larger: where misfits are large on average, within `PLACE`, all events count less.
@@ -86,35 +86,29 @@ def adjust(
     are a `plane`'s remain one's: rho = n . (x, y, f) / f, of which n is unknown, instead of any at
     nodes.
     """
-    problem, weight = begin(tracks, scene, prior, float(sigma), plane)
-    last, kept, now = scene, None, Acceptance(0, 0.0)
-    for n in range(steps + 1):
-        ahead = extrapolate(scene, last, now.ahead, plane)
-        tried = look(problem, ahead, weight if kept is None else kept.weight)
-        energy = math.inf if kept is None else kept.energy
-        better = n <= settle or tried.energy <= energy
-        gain = energy - tried.energy if n > settle else math.inf
-        if better or kept is None:
-            last, kept = scene, tried
-        else:
-            last = kept.scene
+    problem, kept = begin(tracks, scene, prior, float(sigma), plane)
+    last, now = scene, Acceptance(0 if settle else 1, 0.0)
+    for n in range(1, steps + 1):
+        scene = step(problem, kept, now.damping, n <= settle)
+        tried = look(problem, extrapolate(scene, last, now.ahead, plane), kept.weight, kept)
+        better = n <= settle or tried.energy <= kept.energy
+        gain = kept.energy - tried.energy if n > settle else math.inf
+        last, kept = (scene, tried) if better else (kept.scene, kept)
         now = accept(now, better, gain, kept.energy, n >= settle)
         if not now.goes_on:
             break
-        if n < steps:
-            scene = step(problem, kept, now.damping, n < settle)
-    assert kept is not None
     return kept.scene, report(problem, kept)
 
 
 def begin(
     tracks: Tracks, scene: Scene, prior: Prior, sigma: float, plane: bool
-) -> tuple[Problem, NDArray]:
-    """What steps have in common, and weights to begin with."""
+) -> tuple[Problem, Seen]:
+    """What steps have in common, and what is seen to begin with."""
     weight = np.ones_like(tracks.x)
     problem = Problem(tracks, prior, sigma, plane, math.inf)
-    usual = max(look(problem, scene, weight).cost, 1e-3 * problem.limit)
-    return problem._replace(usual=usual), weight
+    first = look(problem, scene, weight)
+    problem = problem._replace(usual=max(first.cost, 1e-3 * problem.limit))
+    return problem, look(problem, first.scene, weight, first)
 
 
 def extrapolate(scene: Scene, last: Scene, ahead: float, plane: bool) -> Scene:
@@ -190,8 +184,7 @@ def compute_covariance(
     tracks: Tracks, scene: Scene, prior: Prior, *, sigma: float | int, plane: bool = False
 ) -> NDArray[np.float64]:
     """The covariance (6, 6) of C1 and O0 of a scene that was fitted with these settings."""
-    problem, weight = begin(tracks, scene, prior, float(sigma), plane)
-    seen = look(problem, scene, weight)
+    problem, seen = begin(tracks, scene, prior, float(sigma), plane)
     return spread(linearise(problem, seen, settling=False))
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.egomotion.batch_fit.coarse import SPAN, share_of
 from jaxevent.egomotion.batch_fit.placing import (
     FOLD,
     POWERS,
@@ -17,13 +18,14 @@ from jaxevent.egomotion.batch_fit.placing import (
     ray_of,
 )
 from jaxevent.egomotion.batch_fit.weighing import spline, spline_slope
-from jaxevent.kernels import fast
+from jaxevent.kernels import fast, fast_part
+
+WIDE, ROWS = 8, 64  # numbers side by side, and rows whose squares single precision adds up
 
 
 class Free(NamedTuple):
-    """What may move beside the map."""
+    """What may move beside the map and the path."""
 
-    path: bool
     plane: bool  # depths are a plane's
     depths: float  # 1, or 0: translation and depths are held
     usual: float  # 1/m in units of 1/|T|, the usual inverse depth
@@ -75,7 +77,7 @@ def differentiate(points, number, places, motion, half, depth, image, free, grid
         dx, dy = rho * dx, rho * dy
         slope = (gx * dx + gy * dy) / max(1 - lx * dx - ly * dy, FOLD)
         hx, hy = gx + slope * lx, gy + slope * ly
-        here = places.inside[e] if free.path else 0.0
+        here = places.inside[e]
         by = by_coefficients(motion, t, rx, ry, rho, here * hx, here * hy)
         for n in range(6):
             slopes.base[n, e] = by[n]
@@ -178,82 +180,147 @@ def back(slopes, z, width, columns, image, coefficients, more, depth):
         more[n] = s
 
 
-@fast
-def blocks(slopes, weight, begin, width, columns, rows, upper, mixed, lumped, diagonal):
-    """Write blocks of J' W J: of coefficients and more, these with depths, and two diagonals.
+class BlockRoom(NamedTuple):
+    """Room for `blocks`: of some rows, their weights and a mean, and of their squares."""
 
-    Coefficients come as `base` counts them, one after another, each with its powers. Of the depths'
-    block `lumped` is each row's sum, of the map's `diagonal` counts events apart. `rows` is room,
-    of one more than the most events of a track.
+    rows: NDArray  # (ROWS, about n)
+    weight: NDArray  # (ROWS,)
+    mean: NDArray  # (about n,)
+    part: NDArray  # (about n, about n)
+
+    @classmethod
+    def of(cls, n: int, real: np.dtype) -> "BlockRoom":
+        wide = -(-n // WIDE) * WIDE
+        rows, part = np.zeros((ROWS, wide), real), np.zeros((n, wide), real)
+        return cls(rows, np.zeros(ROWS, real), np.zeros(wide, real), part)
+
+
+@fast_part
+def _write_row(slopes, e, row):
+    """How an event's misfit changes by coefficients, those of each axis by powers, and by more."""
+    t = slopes.tau[e]
+    for axis in range(6):
+        value = slopes.base[axis, e]
+        for k in range(POWERS):
+            value *= t
+            row[axis * POWERS + k] = value
+    for k in range(len(slopes.more)):
+        row[6 * POWERS + k] = slopes.more[k, e]
+
+
+@fast_part
+def _add_squares(room, number, upper):
+    """Add rows' diag(weight) rows of so many rows, on and below the diagonal."""
+    rows, weight, _, part = room
+    part[:] = 0
+    for r in range(number, (number + 3) // 4 * 4):
+        weight[r] = 0
+    for r in range(0, number, 4):
+        p, q, s, t = rows[r], rows[r + 1], rows[r + 2], rows[r + 3]
+        f, g, h, o = weight[r], weight[r + 1], weight[r + 2], weight[r + 3]
+        for i in range(len(upper)):
+            a, b, c, d = f * p[i], g * q[i], h * s[i], o * t[i]
+            to = part[i]
+            for k in range(i // WIDE * WIDE + WIDE):
+                to[k] += a * p[k] + b * q[k] + c * s[k] + d * t[k]
+    for i in range(len(upper)):
+        for k in range(i + 1):
+            upper[i, k] += part[i, k]
+
+
+@fast_part
+def _coarse_place(slopes, e, columns):
+    """The first of the four coarse nodes about an event, and where between them it is."""
+    row = slopes.node[e] // columns
+    x, y = slopes.node[e] - row * columns + slopes.across[e], row + slopes.down[e]
+    i, j = int(x / SPAN), int(y / SPAN)
+    return j * ((columns - 1) // SPAN + 2) + i, x / SPAN - i, y / SPAN - j
+
+
+@fast
+def blocks(slopes, weight, begin, columns, room, upper, mixed):
+    """Write blocks of J' W J: of coefficients and more, and coarse nodes with these.
+
+    Coefficients come as `base` counts them, one after another, each with its powers.
     """
-    n, m = len(upper), 6 * POWERS
-    mean = rows[len(rows) - 1]
+    wide = (columns - 1) // SPAN + 2
+    rows, weights, mean, _ = room
+    n, filled, tracks = len(upper), 0, len(begin) - 1
     upper[:] = 0
     mixed[:] = 0
-    lumped[:] = 0
-    diagonal[:] = 0
-    for track in range(len(begin) - 1):
+    for track in range(tracks):
         start, stop = begin[track], begin[track + 1]
-        total = 0.0
+        total, row = 0.0, rows[filled]
         mean[:] = 0
         for e in range(start, stop):
-            row, t = rows[e - start], slopes.tau[e]
-            for axis in range(6):
-                value = slopes.base[axis, e]
-                for k in range(POWERS):
-                    value *= t
-                    row[axis * POWERS + k] = value
-            for k in range(m, n):
-                row[k] = slopes.more[k - m, e]
+            _write_row(slopes, e, row)
             total += weight[e]
             for k in range(n):
                 mean[k] += weight[e] * row[k]
-        total = max(total, 1e-3)
-        for k in range(n):
-            mean[k] /= total
+        less = mean.dtype.type(1 / max(total, 1e-3))
         for e in range(start, stop):
-            row, w = rows[e - start], weight[e]
+            row = rows[filled]
+            _write_row(slopes, e, row)
             for k in range(n):
-                row[k] -= mean[k]
-            for i in range(n):
-                scaled = w * row[i]
+                row[k] -= less * mean[k]
+            weights[filled] = weight[e]
+            at, u, v = _coarse_place(slopes, e, columns)
+            for p in range(4):
+                to = mixed[at + p % 2 + p // 2 * wide]
+                scale = weight.dtype.type(weight[e] * slopes.by_depth[e] * share_of(u, v, p))
                 for k in range(n):
-                    upper[i, k] += scaled * row[k]
-            a, b, at = slopes.across[e], slopes.down[e], slopes.node[e]
-            by = w * slopes.by_depth[e]
-            for corner in range(4):
-                share = (a if corner % 2 else 1 - a) * (b if corner > 1 else 1 - b)
-                node = at + corner % 2 + corner // 2 * columns
-                lumped[node] += share * by * slopes.by_depth[e]
-                part = mixed[node]
-                scale = weight.dtype.type(share * by)
-                for k in range(n):
-                    part[k] += scale * row[k]
-            k = slopes.first[e]
-            for i in range(3):
-                for j in range(3):
-                    share = spline(i, slopes.v[e]) * spline(j, slopes.u[e])
-                    diagonal[k + i * width + j] += w * share * share
+                    to[k] += scale * row[k]
+            filled += 1
+            if filled == len(rows) or (track == tracks - 1 and e == stop - 1):
+                _add_squares(room, filled, upper)
+                filled = 0
+    for i in range(n):
+        for k in range(i):
+            upper[k, i] = upper[i, k]
 
 
 @fast
-def chained(rows, by, out):
-    """Write rows @ by. NumPy would wake BLAS's threads, which then spin: twice the time in all."""
-    for k in range(len(rows)):
-        own, to = rows[k], out[k]
-        to[:] = 0
-        for i in range(len(own)):
-            for j in range(len(to)):
-                to[j] += own[i] * by[i, j]
+def depth_blocks(slopes, weight, begin, columns, room, smooth, lumped):
+    """Write blocks of J' W J: of coarse nodes, and of nodes each row's sum of single events.
+
+    Room is for a mean, which coarse nodes are in it, and the last track of each.
+    """
+    wide = (columns - 1) // SPAN + 2
+    mean, touched, latest = room
+    latest[:] = -1
+    smooth[:] = 0
+    lumped[:] = 0
+    for track in range(len(begin) - 1):
+        total, number = 0.0, 0
+        for e in range(begin[track], begin[track + 1]):
+            w, by = weight[e], slopes.by_depth[e]
+            total += w
+            for p in range(4):
+                share = share_of(slopes.across[e], slopes.down[e], p)
+                lumped[slopes.node[e] + p % 2 + p // 2 * columns] += w * by * by * share
+            at, u, v = _coarse_place(slopes, e, columns)
+            for p in range(4):
+                k, value = at + p % 2 + p // 2 * wide, w * by * share_of(u, v, p)
+                if latest[k] != track:
+                    latest[k], touched[number], mean[k] = track, k, 0
+                    number += 1
+                mean[k] += value
+                for q in range(4):
+                    smooth[k, at + q % 2 + q // 2 * wide] += value * by * share_of(u, v, q)
+        total = max(total, 1e-3)
+        for p in range(number):
+            k = touched[p]
+            for q in range(number):
+                smooth[k, touched[q]] -= mean[k] * mean[touched[q]] / total
 
 
 @fast
-def weighed_squares(rows, weight, out):
-    """Write rows' diag(weight) rows, for the same reason."""
-    out[:] = 0
-    for k in range(len(rows)):
-        row = rows[k]
-        for i in range(len(row)):
-            scaled = weight[k] * row[i]
-            for j in range(len(row)):
-                out[i, j] += scaled * row[j]
+def squares(slopes, weight, width, diagonal):
+    """Write the diagonal of the map's block of J' W J, which counts events apart."""
+    diagonal[:] = 0
+    for e in range(len(weight)):
+        k, w = slopes.first[e], weight[e]
+        for i in range(3):
+            for j in range(3):
+                share = spline(i, slopes.v[e]) * spline(j, slopes.u[e])
+                diagonal[k + i * width + j] += w * share * share

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.egomotion.batch_fit.coarse import ease_rest
 from jaxevent.egomotion.batch_fit.placing import POWERS
 from jaxevent.egomotion.batch_fit.slopes import Slopes, back, forward
 from jaxevent.egomotion.batch_fit.weighing import subtract_mean
@@ -59,12 +60,11 @@ class System(NamedTuple):
     across: NDArray  # (rows, columns)
     down: NDArray
     ease_map: NDArray  # (height, width)
-    ease_nodes: NDArray  # (rows * columns,)
-    mixed: NDArray  # (rows * columns, n)
-    inverse: NDArray[np.float64]  # (n, n)
+    ease_nodes: NDArray  # (rows, columns)
+    lower: NDArray[np.float64]  # (m, m), of path and coarse depths (`coarse`)
     coefficients: NDArray  # (6, POWERS), room
     more: NDArray  # (n - 6 POWERS,), room
-    side: NDArray[np.float64]  # (n,), room
+    side: NDArray[np.float64]  # (m,), room
 
 
 @fast
@@ -102,28 +102,6 @@ def multiply(system, map_, t, depth, value, out, out_t, out_depth):
         map_, depth, real(system.flat), real(system.tiny), system.damp, system.hold,
         system.across, system.down, out, out_depth,
     )  # fmt: skip
-
-
-@fast
-def ease_rest(system, t, depth, out_t, out_depth):
-    """Write about H^-1 of path and depths, these lumped."""
-    n, nodes, to, side = len(t), depth.reshape(-1), out_depth.reshape(-1), system.side
-    for i in range(n):
-        side[i] = t[i]
-    for k in range(len(nodes)):
-        to[k] = nodes[k] * system.ease_nodes[k]
-        row = system.mixed[k]
-        for i in range(n):
-            side[i] -= to[k] * row[i]
-    for i in range(n):
-        out_t[i] = 0.0
-        for k in range(n):
-            out_t[i] += system.inverse[i, k] * side[k]
-    for k in range(len(nodes)):
-        s, row = 0.0, system.mixed[k]
-        for i in range(n):
-            s += row[i] * out_t[i]
-        to[k] -= s * system.ease_nodes[k]
 
 
 @fast_part
@@ -184,7 +162,7 @@ def _conjugate_gradients(system, parts, steps, enough, value):
     )  # fmt: skip
     for i in range(len(p)):
         d[i] = q[i] * ease[i]
-    ease_rest(system, left_t, left_depth, way_t, way_depth)
+    ease_rest(system.lower, system.ease_nodes, left_t, left_depth, system.side, way_t, way_depth)
     size = _dot(q, d) + _dot(left_t, way_t) + _dot(b, c)
     first, done = size, 0
     while done < steps and size > enough * enough * first:
@@ -204,7 +182,9 @@ def _conjugate_gradients(system, parts, steps, enough, value):
         for i in range(len(a)):
             a[i] += step * c[i]
             b[i] -= step * g[i]
-        ease_rest(system, left_t, left_depth, better_t, better)
+        ease_rest(
+            system.lower, system.ease_nodes, left_t, left_depth, system.side, better_t, better
+        )
         new += _dot(left_t, better_t) + _dot(b, h)
         share = new / max(size, 1e-30)
         more = out.dtype.type(share)

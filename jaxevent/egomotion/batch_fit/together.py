@@ -1,10 +1,9 @@
 """Several right-hand sides of the photometric fit's equations at once.
 
 Conjugate gradients that search in the span of all sides' directions (O'Leary, "The block conjugate
-gradient algorithm and related methods", 1980). What is hardly told, as a turn with depths that are
-all nearer or farther and a map that makes both good, is a direction that one side alone comes to
-after hundreds of steps: on slider_depth sigma of w_y was a tenth of its size after 40, less than a
-half after 300.
+gradient algorithm and related methods", 1980). What is hardly told is a direction that one side
+alone comes to last. Sigma of w_y on slider_depth is within 5 % after 40 steps at 0.1 C, after 120
+where path and smooth depths are not solved beforehand (`coarse`).
 """
 
 from typing import NamedTuple
@@ -12,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.egomotion.batch_fit.solving import System, ease_rest, multiply
+from jaxevent.egomotion.batch_fit.coarse import ease_rest
+from jaxevent.egomotion.batch_fit.solving import System, multiply
 from jaxevent.kernels import fast
 
 # Steps at most, and by what part the sides' own unknowns may still grow in so many steps.
@@ -87,7 +87,9 @@ def solve(system: System, sides: NDArray[np.float64]) -> Columns:
         for k in range(number):
             (image, depth), (to_image, to_depth) = halves(given.rest[k]), halves(out.rest[k])
             np.multiply(image, system.ease_map, out=to_image)
-            ease_rest(system, given.t[k], depth, out.t[k], to_depth)
+            ease_rest(
+                system.lower, system.ease_nodes, given.t[k], depth, system.side, out.t[k], to_depth
+            )
 
     found, left, better, image = (blank() for _ in range(4))
     left.t[:] = sides
@@ -106,8 +108,10 @@ def solve(system: System, sides: NDArray[np.float64]) -> Columns:
         ease(left, better)
         share = -inverse @ product(image, better)
         advance(better, share, way)
-        # Each of about size 1, that they neither vanish nor overflow.
-        scale = 1 / np.maximum(np.abs(better.t).max(1), 1e-30)
+        # Each of about size 1, that they neither vanish nor overflow. Of what is about solved
+        # hardly any path is left beside map and depths.
+        sizes = np.maximum(np.abs(better.t).max(1), [np.abs(row).max() for row in better.rest])
+        scale = 1 / np.maximum(sizes, 1e-30)
         np.multiply(better.t, scale[:, None], out=way.t)
         np.multiply(better.rest, scale[:, None].astype(real), out=way.rest)
         if step % EVERY == 0:

@@ -98,9 +98,9 @@ def placed(path: Path, tracks: Tracks) -> tuple[NDArray, NDArray]:
     return X, Y
 
 
-def read(scene: Scene, tracks: Tracks) -> Places:
-    """What the scene shows where it puts the events."""
-    X, Y = placed(scene.path, tracks)
+def read(scene: Scene, tracks: Tracks, at: Places | None = None) -> Places:
+    """What the scene shows where it puts the events, which may be known already."""
+    X, Y = placed(scene.path, tracks) if at is None else (at.X, at.Y)
     u, v, inside, value = (np.empty_like(X) for _ in range(4))
     first = np.empty(len(X), np.int32)
     read_map(scene.map.ravel(), X, Y, tracks.grids, first, u, v, inside, value)

@@ -27,7 +27,7 @@ from jaxevent.egomotion.batch_fit.depths import depths
 from jaxevent.egomotion.batch_fit.frames import FramePixels, look_at, offset, with_frames
 from jaxevent.egomotion.batch_fit.path import SEGMENTS, Path, Prior
 from jaxevent.egomotion.batch_fit.photometric import Report, adjust, compute_covariance
-from jaxevent.egomotion.batch_fit.rivals import SIGMA, Trial
+from jaxevent.egomotion.batch_fit.rivals import SIGMA, TELLING, Trial
 from jaxevent.egomotion.batch_fit.starts import (
     Plane,
     before_a_plane,
@@ -72,7 +72,7 @@ class Stage(NamedTuple):
 ROUNDS = Stage(1.0, 6), Stage(0.5, 6), Stage(0.2, 10), Stage(0.1, 10)  # after a trial of depths
 FINAL = Stage(0.05, 20, 10), Stage(0.02, 20, 3)
 # Sigma (C) and steps by which the map first takes the frames' brightness, some 10 C from 0.
-BRIGHTNESS = (20.0, 4), (5.0, 3)
+BRIGHTNESS = (20.0, 1), (5.0, 1)
 # Of a path that is about right: all of the above takes 1.6 times as long and ends no nearer.
 FOLLOWING: tuple[tuple[Stage, ...], tuple[Stage, ...]] = (
     (Stage(0.5, 6), Stage(0.1, 8)),
@@ -102,7 +102,6 @@ NOISY, NOISE = 0.5, 0.1  # C: the stage's sigma, the noise
 # thresholds have 0.70, whichever motion; ideal ones 0.97.
 AGREED = 0.8
 HARDLY = -3.0  # added to log inverse depths where translation is not told
-TELLING = 3.0  # z, from which there is a translation
 # Rivals whose cost is so many times the least in the end are compared on pixels left out: fitted
 # events tell the motion from its mirror image by 3 % of the cost, or the other way round. Only what
 # these pixels refute gives way: outlines before nothing else tell more where they are fitted.
@@ -411,8 +410,9 @@ class Windows:
             tracks, prior = self.tracks(centre, half, events), self.prior(centre, half)
             if not paths:
                 paths = [plane.path(*tracks.places, self.f, self.real) for plane in planes]
+            scenes = [blank(tracks, path, prior) for path in paths]
             follow = functools.partial(_begun, tracks, prior=prior, stages=stages, plane=True)
-            found = [one for one in side_by_side(follow, paths) if one[1].cost < most]
+            found = [one for one in side_by_side(follow, scenes) if one[1].cost < most]
             # The first is too coarse to choose among motions that are alike.
             found = self.ranked(found) if row else found
             paths = [scene.path for scene, _ in found]
@@ -442,15 +442,17 @@ class Windows:
         """Paths through the first stages, depths looked for before each of them."""
         prior = self.prior(centre, float(self.params.half_window))
         found: list[Rival] = []
+        scenes = [blank(tracks, path, prior) for path in paths]
         self.least[centre] = 0.0
         for stage in stages:
 
-            def follow(path: Path, stage: Stage = stage) -> Rival:
-                path = Path(path.O, path.D, depths(path, tracks))
-                return _begun(tracks, path, prior, (stage,), least=self.least[centre])
+            def follow(scene: Scene, stage: Stage = stage) -> Rival:
+                path = Path(scene.path.O, scene.path.D, depths(scene.path, tracks))
+                scene = Scene(path, scene.map, prior.skew)
+                return _begun(tracks, scene, prior, (stage,), least=self.least[centre])
 
-            found = side_by_side(follow, paths)
-            paths = [scene.path for scene, _ in found]
+            found = side_by_side(follow, scenes)
+            scenes = [scene for scene, _ in found]
             if stage.sigma == NOISY and found:
                 noise = min(report.noise for _, report in found)
                 self.least[centre] = noise if noise > NOISE else 0.0
@@ -497,7 +499,7 @@ class Windows:
         if trial and few:
             others = [(one.path, fit) for (one, _), fit in zip(close, fits, strict=True)]
             best = others.pop(chosen)[1]
-            still = trial.rotation(scene.path, self.rotation(centre))
+            still = trial.rotation(scene.path, self.rotation(centre), best)
             path, covariance = _with_rivals(trial, scene.path, still, best, others, covariance)
             scene = scene._replace(path=path)
         return Fit(
@@ -593,17 +595,21 @@ def _apart(ranked: list[Any], path: Callable[[Any], Path]) -> list[Any]:
     return best
 
 
+def blank(tracks: Tracks, path: Path, prior: Prior) -> Scene:
+    """The scene of a path alone."""
+    return Scene(path, np.zeros(tracks.shape, tracks.x.dtype), prior.skew)
+
+
 def _begun(
     tracks: Tracks,
-    path: Path,
+    scene: Scene,
     prior: Prior,
     stages: tuple[Stage, ...],
     plane: bool = False,
     least: float = 0.0,
 ) -> Rival:
-    """Through stages, from a path alone: first the map is made."""
-    scene = Scene(path, np.zeros(tracks.shape, tracks.x.dtype), prior.skew)
-    if len(tracks.x) > tracks.events:
+    """Through stages; first the map settles, or is made if it is blank."""
+    if len(tracks.x) > tracks.events and not scene.map.any():
         for sigma, steps in BRIGHTNESS:
             scene, _ = adjust(
                 tracks, scene, prior, sigma=sigma, settle=steps, steps=steps, plane=plane
