@@ -170,7 +170,7 @@ def test_the_motion_before_a_wall_is_found():
     """The homography has two, the true one costs less with a plane's depths."""
     recording = seen(ROOF[:1], 5.0)
     few = batch.Windows(recording, PARAMS, CAMERA)
-    windows = batch.Windows(recording, batch.Params.of({**GIVEN, "events": 15_000}), CAMERA)
+    windows = batch.Windows(recording, batch.Params.of({**GIVEN, "events": 10_000}), CAMERA)
     normal = np.array(ROOF[0][0]) / ROOF[0][1]
     exact = np.cross(np.eye(3), OMEGA) + np.outer(T, normal)
     exact -= np.trace(exact) / 3 * np.eye(3)
