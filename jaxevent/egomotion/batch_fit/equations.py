@@ -40,8 +40,8 @@ from jaxevent.egomotion.batch_fit.weighing import Room, subtract_mean, weigh
 BEND = 0.1  # a larger difference of log depth between nodes is an edge
 FREE = 6 * ROWS  # numbers of a path's rows; after them come the skew and the plane's normal
 # Of conjugate gradients: steps at most, and the part of the first residual that is left at the end.
-# With 0.05 left what is told last, the path, comes too slowly: a window of textures, started 65
-# degrees off, ended 9 to 20 degrees off, with 0.01 left 0.2. It costs a tenth more time.
+# Where the path was told last, by diagonals alone, a window of textures that started 65 degrees off
+# ended 9 to 20 degrees off with 0.05 left, 0.2 with 0.01.
 SOLVE, LEFT = 40, 0.01
 TINY = 1e-5  # weight of the map's squares
 # Standard deviations of its prior that the skew may be off. On slider_depth it goes else from 0.2,
