@@ -73,8 +73,8 @@ def number_of(name: str) -> str:
     return FITTED.get(name, {"blob": "Q_v"}.get(METHODS[name].family, "c_on"))
 
 
-# Fits of these have tests of their own: test_fit, test_compensated, test_fit_blob, test_fit_motion.
-ELSEWHERE = ("akf", "aks", "mc", "moment", "voting")
+# Fits of these have tests of their own: test_fit, test_fit_blob, test_fit_motion.
+ELSEWHERE = ("akf", "aks", "moment", "voting")
 GRADIENT = [name for name in names() if METHODS[name].differentiable]
 HOST = list(SEARCHED)
 

@@ -45,7 +45,13 @@ from jaxevent.reconstruction.compensated.fusion import (
     weight_after,
 )
 from jaxevent.reconstruction.compensated.implicit import Numbers, Seen, depending
-from jaxevent.reconstruction.compensated.instants import ROOM, Instants, Schedule, speed_of
+from jaxevent.reconstruction.compensated.instants import (
+    Instants,
+    Schedule,
+    all_instants,
+    room_for,
+    speed_of,
+)
 from jaxevent.reconstruction.compensated.parameters import Params
 from jaxevent.reconstruction.compensated.steadiness import (
     Steadiness,
@@ -387,11 +393,6 @@ class Follower:
         return Followed(instants, L, V, clear, p, whose, smooth)
 
 
-def room_for(number: int) -> int:
-    """The number up to which instants are filled."""
-    return -(-number // ROOM) * ROOM
-
-
 @jax.jit
 def _decide(params: Params, told: Agreement, seen: Views) -> Fused:
     return decide(params, compare(told, seen))
@@ -605,7 +606,7 @@ class MotionCompensated(ImageEstimator[Params]):
         follow = follower_of(recording, params, WINDOW_EVENTS)
         chosen = [follow.schedule(t) for t in wanted.tolist()]
         room = room_for(max(len(one) for one in chosen))
-        every = np.unique(np.concatenate([one.t for one in chosen]))
+        every = all_instants(chosen)
         features, instants = prepare(recording, every, Timing.of(params), filtering=False)
         factors = follow.images.factors
         if factors is not None:
@@ -629,8 +630,7 @@ class MotionCompensated(ImageEstimator[Params]):
             jax.tree.map(lambda *leaves: np.stack(leaves), *parts) for parts in (places, taken)
         )
         each = (rows, place, p, whose, taken, steady, doubt)
-        targets = Targets(instants, *each, samples=follow.shutter.samples)
-        return features, jax.device_put(targets)
+        return features, jax.device_put(Targets(instants, *each, samples=follow.shutter.samples))
 
     def run(self, params: Params, features: Features, state: Any = None) -> tuple[Any, Any]:
         """Smooth each pixel; pure. `state` is what the window before returned."""

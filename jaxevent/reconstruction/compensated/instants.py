@@ -1,7 +1,7 @@
 """At which instants around a target time images are compared."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,3 +154,17 @@ def speed_of(
 def _blocks(images: NDArray) -> NDArray:
     h, w = (size // 4 * 4 for size in images.shape[1:])
     return images[:, :h, :w].reshape(len(images), h // 4, 4, w // 4, 4).mean((2, 4))
+
+
+def room_for(number: int) -> int:
+    """The number up to which a target's instants are filled."""
+    return -(-number // ROOM) * ROOM
+
+
+def all_instants(targets: Sequence[Instants]) -> NDArray[np.int64]:
+    """Those of all targets (us), sorted; the last one fills them up to a power of two.
+
+    So windows of a fit share their programs, each of which takes 15 s to compile.
+    """
+    t = np.unique(np.concatenate([one.t for one in targets]))
+    return np.pad(t, (0, (1 << (len(t) - 1).bit_length()) - len(t)), mode="edge")
