@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from jaxevent.blob.fused.tracking import FusedRun
 from jaxevent.blob.lifecycle import Log, State, begin
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.prepare import NEVER, Numeric, Packing, Stretch, count_steps
-from jaxevent.blob.run import run_compiled
+from jaxevent.blob.prepare import NEVER, Features, Numeric, Packing
+from jaxevent.blob.scan import ScanRun
 from jaxevent.blob.seeds import Seeds, read_seeds
 from jaxevent.blob.states import TrackStates, is_alive, tell
 from jaxevent.blob.steps import Filter
@@ -156,7 +156,7 @@ class LiveTracks:
             self._recording, self.params, [], start, NEVER - 1, self._detect,
             steps=STEPS, chunks=CHUNKS, as_stored=True,
         )  # fmt: skip
-        self._fused = self._kernel(packing)
+        self._runner: Any = self._kernel(packing) or ScanRun(self._filter, self.params)
         self._mark = packing.first
         self._state = self._nobody()
         for name, seeds in enumerate(self._waiting):
@@ -234,12 +234,6 @@ class LiveTracks:
         slots = dataclasses.replace(slots, id=jnp.asarray(serial))
         self._state = State(slots, *jax.tree.map(jnp.asarray, (state.grid, state.next_id)))
 
-    def _run(self, state: State, stretch: Stretch) -> tuple[State, Log]:
-        if self._fused is not None:
-            return self._fused.follow(state, stretch.features)
-        state, told = run_compiled(self._filter, self.params, state, stretch.features)
-        return state, told.log
-
     def _settle(self) -> None:
         """Track through the chunks that no event to come can change, and forget their events."""
         packing = self._opened()
@@ -247,12 +241,11 @@ class LiveTracks:
         while True:
             stretch = packing.pack(self._mark, more=True)
             assert stretch.next is not None
-            used = int((stretch.start < NEVER).sum())
             self._mark = stretch.next
-            if used:
-                self._state, log = self._run(self._state, stretch)
+            if stretch.used:
+                self._state, log = self._runner.follow(self._state, stretch.features)
                 self._name(jax.tree.map(np.asarray, log))
-            if used < CHUNKS:
+            if stretch.used < CHUNKS:
                 break
         needed = self._mark.row
         if packing.prefilter:
@@ -280,10 +273,9 @@ class LiveTracks:
             stretch = packing.pack(mark)
             if stretch.next is None or stretch.next.start > time:
                 break
-            mark, (state, _) = stretch.next, self._run(state, stretch)
-        chunk = int(np.searchsorted(stretch.start, time, "right")) - 1
-        since = time - int(stretch.start[chunk])
-        state, _ = self._run(state, _cut(stretch, chunk, since))
+            mark, (state, _) = stretch.next, self._runner.follow(state, stretch.features)
+        chunk, done, since = (int(one[0]) for one in stretch.find_steps(np.array([time])))
+        state, _ = self._runner.follow(state, _cut(stretch.features, chunk, done))
         told = _read(self._filter, self.params, state.slots, np.int32(since))
         mean, covariance, idle, alive = (np.asarray(part) for part in told)
         serial = np.asarray(state.slots.id)
@@ -292,14 +284,11 @@ class LiveTracks:
         return np.array(names)[told_of], mean[told_of], covariance[told_of], idle[told_of]
 
 
-def _cut(stretch: Stretch, chunk: int, since: int) -> Stretch:
-    """A stretch without what is after a time (us since the start of a chunk)."""
-    f = stretch.features
-    done = int(count_steps(f, np.array([chunk]), np.array([since]))[0])
+def _cut(f: Features, chunk: int, done: int) -> Features:
+    """Chunks without what comes after so many steps of one."""
     valid, elapsed, cycle, seed = (np.array(p) for p in (f.valid, f.elapsed, f.cycle, f.seed))
     valid[chunk, done:], valid[chunk + 1 :] = False, False
     elapsed[chunk + 1 :] = 0
     cycle[chunk:] = False
     seed[seed > chunk] = -1
-    features = dataclasses.replace(f, valid=valid, elapsed=elapsed, cycle=cycle, seed=seed)
-    return dataclasses.replace(stretch, features=features)
+    return dataclasses.replace(f, valid=valid, elapsed=elapsed, cycle=cycle, seed=seed)

@@ -88,6 +88,15 @@ class Stretch:
     row: NDArray[np.int64]  # (chunks, steps, M), -1 where not valid
     next: Mark | None
 
+    @property
+    def used(self) -> int:
+        """The number of chunks, but for those that fill up."""
+        return int((self.start < NEVER).sum())
+
+    def find_steps(self, us: NDArray[np.int64]) -> tuple[NDArray, NDArray[np.int32], NDArray]:
+        """The chunk of each time (us), its steps done by then, and the time since its start."""
+        return find_steps(self.features, self.start, us)
+
 
 class Packing:
     """The chunks of a recording between two times, one stretch after another.
@@ -244,7 +253,7 @@ class Packing:
         while mark is not None:
             stretches.append(self.pack(mark))
             mark = stretches[-1].next
-        used = sum(int((w.start < NEVER).sum()) for w in stretches)
+        used = sum(w.used for w in stretches)
         used = -(-used // 32) * 32  # so that few shapes occur
         fields = {}
         names = ("t", "xi", "polarity", "valid", "elapsed", "stop", "cycle")
@@ -263,13 +272,11 @@ class Packing:
         us = np.where(inside, us, self.start)
         used = int(np.flatnonzero(features.cycle)[-1]) + 1  # the others fill up
         begins = self.start + np.cumsum(features.elapsed[:used], dtype=np.int64)
-        chunk = np.searchsorted(begins, us, "right") - 1
-        step = count_steps(features, chunk, us - begins[chunk])
-        time = (us - begins[chunk]).astype(np.int32)
+        chunk, step, time = find_steps(features, begins, us)
         ended = np.zeros((len(us), len(self.seeds.t)), bool)
         if self.ends is not None:
             ended = us[:, None] >= self.ends
-        return ReadOut(chunk, step, time, inside, self.seeds.given, ended)
+        return ReadOut(chunk, step, time.astype(np.int32), inside, self.seeds.given, ended)
 
     def check_times(self, times: Times) -> None:
         """Raise `InputError` for times outside the recording and outside what is tracked."""
@@ -301,12 +308,16 @@ def packing_key(params: TrackerParams) -> tuple[Any, ...]:
     return *(float(getattr(params, name)) for name in names), float(params.prefilter_time)
 
 
-def count_steps(features: Features, chunk: NDArray, time: NDArray) -> NDArray[np.int32]:
-    """How many steps of a chunk were done by a time (us since its start)."""
+def find_steps(
+    features: Features, start: NDArray[np.int64], us: NDArray[np.int64]
+) -> tuple[NDArray, NDArray[np.int32], NDArray]:
+    """As `Stretch.find_steps`, of chunks that start at these times."""
+    chunk = np.searchsorted(start, us, "right") - 1
+    time = us - start[chunk]
     done = (np.asarray(features.t)[chunk, :, -1] <= time[:, None]) & np.asarray(features.valid)[
         chunk, :, 0
     ]
-    return done.sum(1, dtype=np.int32)
+    return chunk, done.sum(1, dtype=np.int32), time
 
 
 class _Given(NamedTuple):

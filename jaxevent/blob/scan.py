@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from jaxevent.blob.lifecycle import Log, State, begin
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.prepare import NEVER, Features, Stretch, count_steps
+from jaxevent.blob.prepare import Features, Stretch
 from jaxevent.blob.run import run_compiled
 from jaxevent.blob.smoother import (
     Later,
@@ -80,7 +80,7 @@ class ScanRun:
         """
         later = _nothing_later(begins) if later is None else later
         features, found = jax.device_put(stretch.features), []
-        used = int((stretch.start < NEVER).sum())
+        used = stretch.used
         moment = numbers_in(later) + numbers_in(begins) // len(stretch.start)
         keep = used * (stretch.features.t.shape[1] + 1) * moment <= room
         for chunk in reversed(range(used)):
@@ -106,9 +106,8 @@ class ScanRun:
         real, shape = np.dtype(jnp.result_type(float)), wanted.shape
         out = tuple(np.full((*shape, *size), np.nan, real) for size in ((8,), (8, 8), ()))
         features, id = jax.device_put(stretch.features), np.asarray(begins.id)
-        chunks = np.searchsorted(stretch.start, times, "right") - 1
-        since = (times - stretch.start[chunks]).astype(np.int32)
-        steps = count_steps(stretch.features, chunks, since)
+        chunks, steps, since = stretch.find_steps(times)
+        since = since.astype(np.int32)
         for chunk in np.unique(chunks):
             rows = np.flatnonzero(chunks == chunk)
             some = np.flatnonzero(wanted[rows].any(0))

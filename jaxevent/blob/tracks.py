@@ -274,8 +274,10 @@ class Tracks(Shown):
             now, stretch = mark, self._packing.pack(mark)
             mark = stretch.next
             upto = len(times) if mark is None else int(np.searchsorted(times, mark.start))
-            state, begins = self._runner.play(state, stretch.features)
-            if upto > done:
+            if upto == done:  # none of the times
+                state, _ = self._runner.follow(state, stretch.features)
+            else:
+                state, begins = self._runner.play(state, stretch.features)
                 following = None
                 if self.smooth:
                     later = self._later  # fills what is kept

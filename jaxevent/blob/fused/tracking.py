@@ -15,7 +15,7 @@ from jaxevent.blob.fused.replay import LATER, MATRICES, NUMBERS, Asked, Kernel, 
 from jaxevent.blob.fused.target import kernel_of, shares_apart
 from jaxevent.blob.lifecycle import Log, State, begin
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.prepare import NEVER, Features, Packing, Stretch, count_steps
+from jaxevent.blob.prepare import Features, Packing, Stretch
 from jaxevent.blob.steps import Filter
 from jaxevent.blob.targets import Slots
 from jaxevent.kernels.host import run as run_on_host
@@ -83,8 +83,7 @@ class FusedRun:
         `later` is that at the start of the next one, `elapsed` us after this one's last chunk.
         """
         later = np.zeros((len(updates.latest), LATER)) if later is None else later.copy()
-        used = int((stretch.start < NEVER).sum())
-        following = np.append(stretch.features.elapsed[1:used], elapsed).astype(np.int64)
+        following = np.append(stretch.features.elapsed[1 : stretch.used], elapsed).astype(np.int64)
         rows = np.empty((int(updates.count[0]), LATER))
         none = np.empty(0, np.int64)
         nothing = Asked(none, none, none, none, np.empty((0, 0), bool))
@@ -104,11 +103,9 @@ class FusedRun:
 
         Smoothed with what `look_back` said, `rows`; None: filtered.
         """
-        chunk = np.searchsorted(stretch.start, times, "right") - 1
-        since = times - stretch.start[chunk]
-        step = count_steps(stretch.features, chunk, since).astype(np.int64)
+        chunk, step, since = stretch.find_steps(times)
         rows = np.empty((0, LATER)) if rows is None else rows
-        asked = Asked(chunk, step, since, serial, wanted)
+        asked = Asked(chunk, step.astype(np.int64), since, serial, wanted)
         return self._read(updates, np.empty(0, np.int64), np.empty((0, LATER)), rows, asked)
 
     def slots(self, updates: Updates) -> Slots:
