@@ -117,7 +117,7 @@ class Events:
     def __len__(self) -> int:
         return len(self.t)
 
-    def __getitem__(self, rows: slice) -> "Events":
+    def __getitem__(self, rows: slice | NDArray) -> "Events":
         return Events(self.t[rows], self.x[rows], self.y[rows], self.p[rows])
 
     def index(self, time: int) -> int:

@@ -56,10 +56,14 @@ def background():
     )
 
 
-def test_pixels_are_those_of_the_events(stream):
-    part, pixels = stream.window(0.1, 0.3), stream.pixels(0.1, 0.3)
-    places, counts = np.unique(part.y * WIDTH + part.x, return_counts=True)
+@pytest.mark.parametrize("most", [5000, 700])
+def test_pixels_are_those_of_the_events(stream, most):
+    part = stream.window(0.1, 0.3)
+    pixels, number = stream.sample(0.1, 0.3, most)
+    some = np.linspace(0, len(part) - 1, min(len(part), most)).astype(int)
+    places, counts = np.unique((part.y * WIDTH + part.x)[some], return_counts=True)
     order = np.argsort(pixels.y * WIDTH + pixels.x)
+    assert number == len(part)
     np.testing.assert_array_equal((pixels.y * WIDTH + pixels.x)[order], places)
     np.testing.assert_array_equal(pixels.n[order], counts)
 
@@ -104,8 +108,8 @@ def test_blobs_are_neighbouring_cells_with_more_events_than_background(stream, b
 def test_what_is_predicted_is_the_sum_over_blobs_and_kernels(stream, background):
     scale, w, t = Scale(0.04, 4, np.ones((HEIGHT // CELL, WIDTH // CELL))), 0.04, 0.2
     first, second = stream.pixels(t - 2 * w, t - w), stream.pixels(t - w, t)
-    part = stream.window(t, t + w)
-    scored = choose_scored(part, background, t, w)
+    scored = choose_scored(stream, background, t, w)
+    part = scored.pixels
     (told,) = predict(first, second, scored, background, [scale], (HEIGHT, WIDTH), t)
     before = measure_blobs(first, *detect(first, background, scale, (HEIGHT, WIDTH), t))
     labels, number = detect(second, background, scale, (HEIGHT, WIDTH), t)
@@ -137,10 +141,12 @@ def test_scores_are_the_likelihood_of_the_best_shares(stream, background):
     told = []
     for t in (0.2, 0.3):
         first, second = stream.pixels(t - 0.08, t - 0.04), stream.pixels(t - 0.04, t)
-        scored = choose_scored(stream.window(t, t + 0.04), background, t, 0.04)
+        scored = choose_scored(stream, background, t, 0.04)
         told += predict(first, second, scored, background, [scale], (HEIGHT, WIDTH), t)
-    density = np.concatenate([one.density for one in told])
-    b = np.concatenate([one.background for one in told])
+    n = np.concatenate([one.scored.pixels.n for one in told])
+    assert n.sum() == sum(one.scored.number for one in told) > len(n)
+    density = np.concatenate([one.density for one in told]).repeat(n, 0)
+    b = np.concatenate([one.scored.background for one in told]).repeat(n)
     share = np.full(4, 0.25)
     for _ in range(15):
         share = share * ((1 / (density @ share + b)) @ density)
@@ -286,6 +292,12 @@ def test_where_events_of_one_polarity_lag_the_other_tells_the_place():
     assert prefer_sharper([path], recording, cold)[0] is path
 
 
+def expected_at(live, t):
+    """Positions and P of targets at t (s)."""
+    look = Look(live, Part(np.zeros(0), *np.zeros((2, 0), np.int32)), t)
+    return look.p, look.P
+
+
 def one_target(P):
     """A known target at (40, 30) that is seen anew in a window about 10 ms."""
     live = start_targets(
@@ -323,7 +335,7 @@ def test_faint_targets_that_are_known_keep_their_events_in_a_blob_with_a_large_o
 @pytest.mark.slow
 def test_a_target_is_updated_as_by_a_kalman_filter(background):
     live, t = one_target(3.0), 0.01
-    p, P = live.predict(t)
+    p, P = expected_at(live, t)
     n, z, D = np.array([16.0]), np.array([[1.5, -0.5]]), np.array([[[6.0, 1.0], [1.0, 3.0]]])
     dispersion = background.field_of(np.ones((HEIGHT // CELL, WIDTH // CELL)), CELL, t)
     expected = Expected(
@@ -364,7 +376,7 @@ def test_a_known_target_does_not_leap_to_few_events(background, n, away, hits, h
     # Of size 2, with 20 events per window: 3 of them are at most 4.0 px from where it is expected,
     # most of them at most 6.7.
     live, t = one_target(0.25)._replace(hits=np.full(1, hits)), 0.01
-    p, P = live.predict(t)
+    p, P = expected_at(live, t)
     dispersion = background.field_of(np.ones((HEIGHT // CELL, WIDTH // CELL)), CELL, t)
     expected = Expected(
         t, 0.01, p, P, np.zeros(1, bool), background.field(t, 8), dispersion, 1.0, 1.0

@@ -1,5 +1,7 @@
 """Blobs of events in one window that background does not make, at a stated false-alarm rate."""
 
+import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +17,8 @@ MOST_FEW = 1000  # events that are looked at wherever they are
 CONTACT = 2.0  # what is nearer than this many times the sum of both sizes touches
 
 
-class Scale(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Scale:
     """How finely events are looked at."""
 
     window: float | int  # s
@@ -26,7 +29,11 @@ class Scale(NamedTuple):
         """That of counts in 3x3 of the scale's cells, in which flicker adds up."""
         return self.usual + (look_up(self.dispersion, CELL, x, y) - self.usual) * self.flicker
 
-    @property
+    def as_long(self, window: float) -> "Scale":
+        """The same with another window, s."""
+        return dataclasses.replace(self, window=window)
+
+    @functools.cached_property
     def usual(self) -> float:
         """The least dispersion."""
         return float(self.dispersion.min())
@@ -274,3 +281,12 @@ def touching(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> Any:
     u = d / np.maximum(length, 1e-9)[..., None]
     reach = [np.sqrt(np.einsum("...i,...ij,...j", u, C, u)) for C in (Ca, Cb)]
     return length / np.maximum(reach[0] + reach[1], 1e-9)
+
+
+@lean_part
+def touch(p: Any, C: Any, j: int, k: int) -> bool:
+    """Whether two of some blobs touch: `touching` is below `CONTACT`."""
+    x, y, reach = p[k, 0] - p[j, 0], p[k, 1] - p[j, 1], 0.0
+    for i in (j, k):
+        reach += np.sqrt(C[i, 0, 0] * x * x + 2 * C[i, 0, 1] * x * y + C[i, 1, 1] * y * y)
+    return x * x + y * y <= CONTACT * reach

@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.finding.detection import CONTACT, add_moments, finish_moments, touching
+from jaxevent.blob.finding.detection import add_moments, finish_moments, touch
 from jaxevent.blob.finding.stream import Part
-from jaxevent.blob.finding.targets import GATE, REACH, Live
+from jaxevent.blob.finding.targets import GATE, REACH, Live, expect_one, larger_of
 from jaxevent.kernels import lean, lean_part
 
 CLAIMED, OWNS = 0.3, 0.1  # shares of a blob that is claimed, and of those who own the rest of it
@@ -29,13 +29,10 @@ class Look:
 
     def __init__(self, live: Live, part: Part, t: float | int):
         self.part, self.t = part, t
-        self.p, self.P = live.predict(t)
-        S = live.C * (1 + 2 / live.n)[:, None, None]
-        P = np.where(live.confirmed, np.minimum(self.P[:, 0], _reach(live)), self.P[:, 0])
-        S = S + (P + 0.1)[:, None, None] * np.eye(2)
-        self.soft = _in_contact(self.p, live.C, live.confirmed)
-        more = np.where(live.confirmed, 0.0, 2.0)
-        self.gates = Gates(self.p, live.v, _inverses(S), more, live.n, self.soft)
+        n = len(live.n)
+        self.p, self.P, self.soft = np.empty((n, 2)), np.empty((n, 3)), np.zeros(n, bool)
+        self.gates = Gates(self.p, live.v, np.empty((n, 4)), np.empty(n), live.n, self.soft)
+        _expect(live, t, self.P, self.gates)
 
     def share_out(self, labels: NDArray, blobs: int) -> NDArray[np.int64]:
         """Whose each event is; -1: nobody's."""
@@ -56,30 +53,26 @@ class Look:
         return told
 
 
-def _reach(live: Live) -> NDArray[np.float64]:
-    """The most that gates take of the variance of targets' places, (n,) px^2.
+@lean
+def _expect(live: Any, t: Any, P: Any, gates: Any) -> None:
+    """Fill in where targets are expected at t (s), P, and their gates.
 
-    A target that is known leaves its way by about its size in a window: what is farther is another.
+    A known target leaves its way by about its size in a window: what is farther is another. Of
+    known targets that touch, events between them are shared.
     """
-    return (REACH * live.size) ** 2
-
-
-def _in_contact(p: NDArray, C: NDArray, confirmed: NDArray) -> NDArray[np.bool_]:
-    """Confirmed targets that touch another one: events between them are shared."""
-    if len(p) < 2:
-        return np.zeros(len(p), bool)
-    near = touching(p[:, None], C[:, None], p, C) < CONTACT
-    np.fill_diagonal(near, False)
-    near &= confirmed & confirmed[:, None]
-    return np.asarray(near.any(1))
-
-
-def _inverses(S: NDArray) -> NDArray[np.float64]:
-    """(n, 4): of the inverses of S, xx, xy and yy, and the logarithms of S's determinants."""
-    a, b, c = S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]
-    determinant = a * c - b * b
-    parts = c / determinant, -b / determinant, a / determinant, np.log(determinant)
-    return np.stack(parts, 1)
+    for k in range(len(live.n)):
+        C, known = live.C[k], live.confirmed[k]
+        expect_one(live, k, t, gates.p, P)
+        variance = min(P[k, 0], REACH * REACH * larger_of(C)) if known else P[k, 0]
+        more = 1 + 2 / live.n[k]
+        a, b, c = C[0, 0] * more + variance + 0.1, C[0, 1] * more, C[1, 1] * more + variance + 0.1
+        determinant = a * c - b * b
+        inverse = gates.inverse[k]
+        inverse[0], inverse[1], inverse[2] = c / determinant, -b / determinant, a / determinant
+        inverse[3], gates.more[k] = np.log(determinant), 0.0 if known else 2.0
+        for j in range(k):
+            if known and live.confirmed[j] and touch(gates.p, live.C, j, k):
+                gates.soft[j] = gates.soft[k] = True
 
 
 class _Shares(NamedTuple):

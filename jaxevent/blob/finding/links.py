@@ -131,9 +131,9 @@ class Links:
             anywhere,
         )  # fmt: skip
         self._confirm(seen.heard, t)
-        some, now = live.keep(seen.heard), seen.heard
-        m = (look.p + seen.z)[now]
-        self.rows.append(_Row(t, some.id, some.p, some.v, some.C, seen.n[now], m, seen.R[now]))
+        now, m = seen.heard, look.p + seen.z
+        told = (live.id, live.p, live.v, live.C, seen.n, m, seen.R)
+        self.rows.append(_Row(t, *(value[now] for value in told)))
 
     def _confirm(self, heard: NDArray, t: float | int) -> None:
         live = self.live
@@ -149,14 +149,17 @@ class Links:
 
         Of parts of one object, such as both sides of an outline, the distance does not double.
         """
+        if blobs < 2:
+            self.pairs = {}
+            return
         live = self.live
         longish = larger(live.C) > LONGISH**2 * np.linalg.det(live.C) / larger(live.C)
         before, self.pairs = self.pairs, {}
         for i in np.flatnonzero(longish & live.confirmed & (live.miss == 0)):
             at = (owner == i) & (labels > 0)
             two = measure_blobs(Part(part.t[at], part.x[at], part.y[at]), labels[at], blobs)
-            a, b = np.argsort(-two.n, kind="stable")[:2] if blobs > 1 else (0, 0)
-            if a == b or two.n[b] < APART * at.sum():
+            a, b = np.argsort(-two.n, kind="stable")[:2]
+            if two.n[b] < APART * at.sum():
                 continue
             if touching(two.p[a], two.C[a], two.p[b], two.C[b]) < CONTACT:
                 continue

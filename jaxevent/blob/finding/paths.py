@@ -120,30 +120,50 @@ def _candidates(
 ) -> None:
     """Fill in whose events are; `far` are minus twice their log likelihoods, up to a constant."""
     for k in range(len(joined.window)):
-        row, last, w = joined.first[k], joined.first[k + 1] - 1, joined.window[k]
-        looked, box, wanted = -1, (0.0, 0.0, 0.0, 0.0), joined.polarity[k]
-        for i in range(rows[0, k], rows[1, k]):
-            if wanted >= 0 and wanted != p[i]:
-                continue
+        row, last, i, end = joined.first[k], joined.first[k + 1] - 1, rows[0, k], rows[1, k]
+        while i < end:
             while row < last and joined.t[row + 1] <= t[i]:
                 row += 1
-            following = min(row + 1, last)
-            if row != looked:
-                looked, box = row, _box(joined, row, following, limit)
-            if x[i] < box[0] or x[i] > box[1] or y[i] < box[2] or y[i] > box[3]:
-                continue
-            span = joined.t[following] - joined.t[row]
-            part = min(max((t[i] - joined.t[row]) / span, 0.0), 1.0) if span > 0 else 0.0
-            if span > w + w // 2 and min(part, 1 - part) * span > w / 2:
-                continue  # not seen
-            px = joined.p[row, 0] + part * (joined.p[following, 0] - joined.p[row, 0])
-            py = joined.p[row, 1] + part * (joined.p[following, 1] - joined.p[row, 1])
-            a = joined.S[row, 0] + part * (joined.S[following, 0] - joined.S[row, 0])
-            b = joined.S[row, 1] + part * (joined.S[following, 1] - joined.S[row, 1])
-            c = joined.S[row, 2] + part * (joined.S[following, 2] - joined.S[row, 2])
-            ex, ey = x[i] - px, y[i] - py
-            squared, determinant = c * ex * ex - 2 * b * ex * ey + a * ey * ey, a * c - b * b
-            if squared <= limit * determinant:
+            to = i
+            while to < end and (row == last or t[to] < joined.t[row + 1]):
+                to += 1
+            place = k, row, min(row + 1, last)
+            _between_rows(t, x, y, p, joined, place, (i, to), limit, whose, far)
+            i = to
+
+
+@lean_part
+def _between_rows(
+    t: Any, x: Any, y: Any, p: Any, joined: Any, place: Any, events: Any, limit: float | int,
+    whose: Any, far: Any,
+) -> None:  # fmt: skip
+    """The same of events (first, last) between two rows of a path: `place` is it and they."""
+    (k, row, following), w, wanted = place, joined.window[place[0]], joined.polarity[place[0]]
+    left, right, above, below = _box(joined, row, following, limit)
+    begin, span = joined.t[row], joined.t[following] - joined.t[row]
+    unseen = span > w + w // 2
+    over = 1 / span if span > 0 else 0.0
+    x0, y0 = joined.p[row, 0], joined.p[row, 1]
+    vx, vy = joined.p[following, 0] - x0, joined.p[following, 1] - y0
+    a0, b0, c0 = joined.S[row, 0], joined.S[row, 1], joined.S[row, 2]
+    da, db, dc = (
+        joined.S[following, 0] - a0, joined.S[following, 1] - b0, joined.S[following, 2] - c0,
+    )  # fmt: skip
+    for i in range(events[0], events[1]):
+        if x[i] < left or x[i] > right or y[i] < above or y[i] > below:
+            continue
+        if wanted >= 0 and wanted != p[i]:
+            continue
+        part = min(max((t[i] - begin) * over, 0.0), 1.0)
+        if unseen and min(part, 1 - part) * span > w / 2:
+            continue
+        ex, ey = x[i] - x0 - part * vx, y[i] - y0 - part * vy
+        a, b, c = a0 + part * da, b0 + part * db, c0 + part * dc
+        squared, determinant = c * ex * ex - 2 * b * ex * ey + a * ey * ey, a * c - b * b
+        if squared <= limit * determinant:
+            if len(joined.window) == 1:
+                whose[i, 0] = k
+            else:
                 _enter(whose[i], far[i], k, squared / determinant + np.log(determinant))
 
 
@@ -164,8 +184,8 @@ def _box(joined: Any, row: int, following: int, limit: Any) -> Any:
     wide = np.sqrt(limit * max(S[row, 0], S[following, 0]))
     high = np.sqrt(limit * max(S[row, 2], S[following, 2]))
     return (
-        min(p[row, 0], p[following, 0]) - wide,
-        max(p[row, 0], p[following, 0]) + wide,
-        min(p[row, 1], p[following, 1]) - high,
-        max(p[row, 1], p[following, 1]) + high,
+        np.int64(np.floor(min(p[row, 0], p[following, 0]) - wide)),
+        np.int64(np.ceil(max(p[row, 0], p[following, 0]) + wide)),
+        np.int64(np.floor(min(p[row, 1], p[following, 1]) - high)),
+        np.int64(np.ceil(max(p[row, 1], p[following, 1]) + high)),
     )

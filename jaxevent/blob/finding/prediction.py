@@ -16,8 +16,9 @@ from jaxevent.blob.finding.detection import (
     blob_moments,
     find_blobs,
     ground_of,
+    touch,
 )
-from jaxevent.blob.finding.stream import Part, Pixels
+from jaxevent.blob.finding.stream import Pixels, Stream
 from jaxevent.kernels import Blank, lean, lean_part
 
 _bins = Blank(np.int32)
@@ -36,7 +37,7 @@ def _weights(r: float, g: int) -> NDArray[np.float64]:
 
     Of bins around a pixel that is in row v and column u of its own bin, by v and u.
     """
-    reach = int(r / g + 0.5)
+    reach = int(np.ceil((r + g - 1) / g - 0.5)) - 1  # of the last bin that is nearer than r
     apart = (np.arange(-reach, reach + 1) + 0.5) * g - np.arange(g)[:, None]
     squared = apart[:, None, :, None] ** 2 + apart[None, :, None, :] ** 2
     return 3 / (np.pi * r**2) * np.maximum(1 - squared / r**2, 0) ** 2
@@ -48,32 +49,27 @@ _TABLES = tuple(_weights(r, g) for r, g in zip(WIDTHS, BINS, strict=True))
 class Scored(NamedTuple):
     """Events of a window that are scored."""
 
-    x: NDArray[np.int32]
-    y: NDArray[np.int32]
-    background: NDArray[np.float64]  # 1/px^2
+    pixels: Pixels
+    background: NDArray[np.float64]  # 1/px^2, at these
     number: int  # of all events
 
 
 class Told(NamedTuple):
     """What a scale predicts of the events of a window."""
 
-    density: NDArray[np.float64]  # (scored, 4) 1/px^2, by ellipses and by kernels
-    background: NDArray[np.float64]  # (scored,) 1/px^2
-    number: int  # of all events
+    density: NDArray[np.float64]  # (pixels, 4) 1/px^2, by ellipses and by kernels
+    scored: Scored
     expected: float  # events of the blobs
     large: float  # events in blobs of three and more,
     split: float  # and in those of them that touch another one
 
 
 def choose_scored(
-    part: Part, background: Background, t: float | int, window: float | int
+    stream: Stream, background: Background, t: float | int, window: float | int
 ) -> Scored:
-    """At most `SCORED` events of a window (s), at equal steps."""
-    x, y = part.x, part.y
-    if len(part) > SCORED:
-        some = np.linspace(0, len(part) - 1, SCORED).astype(np.int64)
-        x, y = x[some], y[some]
-    return Scored(x, y, background.at(x, y, t) * window, len(part))
+    """At most `SCORED` events of a window that begins at t (s), at equal steps."""
+    pixels, number = stream.sample(t, t + window, SCORED)
+    return Scored(pixels, background.at(pixels.x, pixels.y, t) * window, number)
 
 
 def predict(
@@ -93,18 +89,15 @@ def predict(
         _bins(*(n // g + table.shape[-1] for n in size))
         for table, g in zip(_TABLES, BINS, strict=True)
     )
-    strips = size[0] // STRIP + 1
-    space = _PredictionSpace.of(max(len(first), len(second)), len(scored.x), strips)
-    densities = np.zeros((len(scales), len(scored.x), 1 + KERNELS))
+    x, y, _ = scored.pixels
+    space = _PredictionSpace.of(max(len(first), len(second)), len(x), size[0] // STRIP + 1)
+    densities = np.zeros((len(scales), len(x), 1 + KERNELS))
     sums = np.zeros((len(scales), 3))
     for scale, density, told in zip(scales, densities, sums, strict=True):
         ground, cells = ground_of(background, scale, size, t), blank_cells(size, scale.cell)
-        _predict(
-            first, second, scored.x, scored.y, ground, cells, bins, _TABLES, space, density, told
-        )
+        _predict(first, second, x, y, ground, cells, bins, _TABLES, space, density, told)
     return [
-        Told(density, scored.background, scored.number, *told)
-        for density, told in zip(densities, sums.tolist(), strict=True)
+        Told(density, scored, *told) for density, told in zip(densities, sums.tolist(), strict=True)
     ]
 
 
@@ -120,7 +113,7 @@ class _PredictionSpace(NamedTuple):
     events: NDArray[np.int32]  # (pixels,) and their events
     reach: NDArray[np.float64]  # (pixels,) px, of blobs
     touches: NDArray[np.bool_]  # (pixels,) whether a blob touches another
-    order: NDArray[np.int64]  # scored pixels, by their strips of rows
+    order: NDArray[np.int64]  # scored pixels, by their strips of rows; then those that are near
     strips: NDArray[np.int64]  # (2, strips + 1): where each begins, and is filled
 
     @classmethod
@@ -142,18 +135,19 @@ class Score(NamedTuple):
 
 def score(told: list[Told]) -> Score:
     """Of a scale, from what it tells of some windows."""
-    number = sum(one.number for one in told)
-    ends = np.cumsum([0, *(len(one.background) for one in told)])
+    scored = [one.scored for one in told]
+    number = sum(one.number for one in scored)
+    ends = np.cumsum([0, *(len(one.pixels) for one in scored)])
     if not ends[-1]:
         return Score(0.0, 0.0, np.zeros(len(told)))
     density = np.concatenate([one.density for one in told])
-    b = np.concatenate([one.background for one in told])
-    weight = np.array([max(1.0, one.number / SCORED) for one in told])
+    b = np.concatenate([one.background for one in scored])
+    weight = np.concatenate([max(1.0, one.number / SCORED) * one.pixels.n for one in scored])
     expected, large, split = (
         np.array([getattr(one, name) for one in told]) for name in ("expected", "large", "split")
     )
     gains, shares = np.zeros(len(told)), np.full((2, 1 + KERNELS), 1 / (1 + KERNELS))
-    _gains(density, b, weight, ends, shares, gains)
+    _gains(density, b, weight, ends, np.empty(len(b), np.int64), shares, gains)
     parts = (gains - expected) / number
     raw = float(parts.sum())
     lost = SPLIT * abs(raw) * float(split.sum()) / max(float(large.sum()), 1e-9)
@@ -161,32 +155,45 @@ def score(told: list[Told]) -> Score:
 
 
 @lean
-def _gains(density: Any, b: Any, weight: Any, ends: Any, shares: Any, nats: Any) -> None:
-    """Log likelihood ratios of windows with the likeliest shares of ellipses and kernels."""
-    share, new = shares[0], shares[1]
+def _gains(density: Any, b: Any, weight: Any, ends: Any, some: Any, shares: Any, nats: Any) -> None:
+    """Log likelihood ratios of windows with the likeliest shares of ellipses and kernels.
+
+    `some` is filled with the pixels that a blob may reach.
+    """
+    share, new, number = shares[0], shares[1], 0
+    for i in range(len(b)):
+        total = 0.0
+        for j in range(1 + KERNELS):
+            total += density[i, j]
+        if total > 0:
+            some[number] = i
+            number += 1
     for _ in range(ROUNDS):
         for j in range(1 + KERNELS):
             new[j] = 0.0
-        for k in range(len(weight)):
-            for i in range(ends[k], ends[k + 1]):
-                total = b[i]
-                for j in range(1 + KERNELS):
-                    total += density[i, j] * share[j]
-                part = weight[k] / total
-                for j in range(1 + KERNELS):
-                    new[j] += part * density[i, j]
+        for k in range(number):
+            i = some[k]
+            total = b[i]
+            for j in range(1 + KERNELS):
+                total += density[i, j] * share[j]
+            part = weight[i] / total
+            for j in range(1 + KERNELS):
+                new[j] += part * density[i, j]
         total = 0.0
         for j in range(1 + KERNELS):
             share[j] = share[j] * new[j] + 1e-12
             total += share[j]
         for j in range(1 + KERNELS):
             share[j] /= total
-    for k in range(len(weight)):
-        for i in range(ends[k], ends[k + 1]):
-            total = 0.0
-            for j in range(1 + KERNELS):
-                total += density[i, j] * share[j]
-            nats[k] += weight[k] * np.log(total / b[i] + 1)
+    window = 0
+    for k in range(number):
+        i = some[k]
+        while i >= ends[window + 1]:
+            window += 1
+        total = 0.0
+        for j in range(1 + KERNELS):
+            total += density[i, j] * share[j]
+        nats[window] += weight[i] * np.log(total / b[i] + 1)
 
 
 @lean
@@ -203,8 +210,19 @@ def _predict(
         _extrapolate(earlier, number, space)
         _add_ellipses(density, x, y, number, space)
         pixels = _move(second, space)
-        for k in range(KERNELS):
-            _add_kernels(density[:, k + 1], x, y, pixels, space, tables[k], bins[k])
+        near, order = len(x), space.order
+        for j in range(near):
+            order[j] = j
+        for k in range(KERNELS - 1, -1, -1):
+            out = density[:, k + 1]
+            _add_kernels(out, x, y, order[:near], pixels, space, tables[k], bins[k])
+            # What the widest one does not reach the others do not.
+            if k == KERNELS - 1:
+                near = 0
+                for j in range(len(x)):
+                    if out[j] > 0:
+                        order[near] = j
+                        near += 1
         for k in range(number):
             told[0] += space.last.n[k]
         told[1], told[2] = _split(number, space)
@@ -291,9 +309,9 @@ def _move(pixels: Any, space: Any) -> int:
 
 @lean_part
 def _add_kernels(
-    out: Any, x: Any, y: Any, pixels: int, space: Any, table: Any, counts: Any
+    out: Any, x: Any, y: Any, some: Any, pixels: int, space: Any, table: Any, counts: Any
 ) -> None:
-    """Kernels about places, summed at pixels: of bins, `counts`, in whose middles places lie."""
+    """Kernels about places, summed at some pixels: of bins, `counts`, in whose middles they lie."""
     (rows, columns), g, reach = counts.shape, len(table), table.shape[2] // 2
     px, py, events = space.moved[0], space.moved[1], space.events
     for k in range(pixels):
@@ -302,7 +320,7 @@ def _add_kernels(
             counts[row, column] += events[k]
     # Of what may be negative numba asks at every place: that takes two fifths of the time.
     wide, side = np.uint64(2 * reach + 1), np.uint64(g)
-    for j in range(len(x)):
+    for j in some:
         at_y, at_x, total = np.uint64(y[j]), np.uint64(x[j]), 0.0
         row, column = at_y // side, at_x // side
         v, u = at_y - row * side, at_x - column * side
@@ -331,14 +349,9 @@ def _split(number: int, space: Any) -> tuple[float, float]:
             if n[k] < LARGE or n[j] < LARGE or (touches[k] and touches[j]):
                 continue
             ux, uy = p[j, 0] - p[k, 0], p[j, 1] - p[k, 1]
-            apart = np.sqrt(ux * ux + uy * uy)
-            if apart >= CONTACT * (reach[k] + reach[j]):
+            if ux * ux + uy * uy >= (CONTACT * (reach[k] + reach[j])) ** 2:
                 continue
-            along = 0.0
-            for one in (k, j):
-                square = C[one, 0, 0] * ux * ux + 2 * C[one, 0, 1] * ux * uy
-                along += np.sqrt(square + C[one, 1, 1] * uy * uy)
-            if apart * apart < CONTACT * along:
+            if touch(p, C, j, k):
                 touches[k] = touches[j] = True
     for k in range(number):
         if n[k] >= LARGE:

@@ -14,7 +14,6 @@ import dataclasses
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from jaxevent.blob.finding.background import Background, measure_dispersion
 from jaxevent.blob.finding.detection import CONTACT, Scale, detect, measure_blobs, touching
@@ -40,8 +39,13 @@ class Choice:
     score: float
 
 
-def choose_scale(stream: Stream, background: Background) -> Choice | None:
-    """The scale that predicts best; None if the recording is too short or nothing is found."""
+def choose_scale(
+    stream: Stream, background: Background, worth: float | None = None
+) -> Choice | None:
+    """The scale that predicts best; None if the recording is too short or nothing is found.
+
+    None too if some of the stretches tell that no scale is `worth` it, nats per event.
+    """
     longest = min(stream.duration / LEAST_WINDOWS, background.sharp)
     windows = np.asarray(WINDOWS[WINDOWS * 1e-6 <= longest] * 1e-6, np.float64)
     if not len(windows):
@@ -49,7 +53,9 @@ def choose_scale(stream: Stream, background: Background) -> Choice | None:
     trial = _Trial(stream, background, windows)
     first = np.arange(FIRST // 2, STRETCHES, FIRST)
     trial.look(first)
-    trial.drop()
+    most = trial.drop()
+    if worth is not None and most < worth:
+        return None
     trial.look(np.setdiff1d(np.arange(STRETCHES), first))
     raw, scores = trial.scores()
     best = scores.max()
@@ -59,11 +65,11 @@ def choose_scale(stream: Stream, background: Background) -> Choice | None:
     good = scores >= best - PLATEAU * best
     most = raw.max(0)
     sharp = raw >= most - (1 - SHARP) * abs(most)
-    longest = [trial.scale(int(np.flatnonzero(sharp[:, j]).max()), j) for j in range(len(CELLS))]
+    longest = [trial.scales[np.flatnonzero(sharp[:, j]).max()][j] for j in range(len(CELLS))]
     gaps = _Gaps(stream, background)
     for j in range(len(CELLS))[::-1]:
         for i in np.flatnonzero(good[:, j]):
-            split = gaps.split(trial.scale(int(i), j), trial.begins[:, i], longest[:j])
+            split = gaps.split(trial.scales[i][j], trial.begins[:, i], longest[:j])
             good[i, j] = split <= MERGED
         if good[:, j].any():
             column = np.where(good[:, j], scores[:, j], -np.inf)
@@ -71,7 +77,7 @@ def choose_scale(stream: Stream, background: Background) -> Choice | None:
             break
     else:
         i, j = np.unravel_index(scores.argmax(), scores.shape)
-    return Choice(trial.scale(int(i), int(j)), float(scores[i, j]))
+    return Choice(trial.scales[i][j], float(scores[i, j]))
 
 
 class _Trial:
@@ -82,12 +88,13 @@ class _Trial:
         self.begins = np.clip(
             stream.times(STRETCHES)[:, None], 2 * windows, stream.duration - windows
         )
-        self.dispersions = [measure_dispersion(stream, background, w) for w in windows]
+        dispersions = [measure_dispersion(stream, background, w) for w in windows]
+        self.scales = [
+            [Scale(float(w), cell, dispersion) for cell in CELLS]
+            for w, dispersion in zip(windows, dispersions, strict=True)
+        ]
         self.tried = np.ones((len(windows), len(CELLS)), bool)
         self.told: list[list[list[Told]]] = [[[] for _ in CELLS] for _ in windows]
-
-    def scale(self, i: int, j: int) -> Scale:
-        return Scale(float(self.windows[i]), CELLS[j], self.dispersions[i])
 
     def look(self, stretches: NDArray[np.int64]) -> None:
         """Let all scales that are tried predict in some stretches."""
@@ -95,23 +102,27 @@ class _Trial:
         size = stream.height, stream.width
         for i in np.flatnonzero(self.tried.any(1)).tolist():
             w, cells = float(self.windows[i]), np.flatnonzero(self.tried[i]).tolist()
-            scales = [self.scale(i, j) for j in cells]
+            scales = [self.scales[i][j] for j in cells]
             for t in self.begins[stretches, i].tolist():
                 before, last = (stream.pixels(t + k * w, t + (k + 1) * w) for k in (-2, -1))
-                scored = choose_scored(stream.window(t, t + w), background, t, w)
+                scored = choose_scored(stream, background, t, w)
                 told = predict(before, last, scored, background, scales, size, t)
                 for j, one in zip(cells, told, strict=True):
                     self.told[i][j].append(one)
 
-    def drop(self) -> None:
-        """Try no more the scales that are clearly worse than the best ones of equal cells."""
+    def drop(self) -> float:
+        """Try no more the scales that are clearly worse than the best ones of equal cells.
+
+        The most, in nats per event, that one of them may come to.
+        """
+        most = -np.inf
         for j in range(len(CELLS)):
             told = [score(one[j]) for one in self.told]
             best = max(told, key=lambda one: one.raw)
             for i, one in enumerate(told):
-                d = one.parts - WORSE * best.parts
-                sigma = np.sqrt(len(d)) * d.std(ddof=1)
-                self.tried[i, j] = one is best or d.sum() + SIGMAS * sigma >= 0
+                most = max(most, _most(one.parts))
+                self.tried[i, j] = one is best or _most(one.parts - WORSE * best.parts) >= 0
+        return most
 
     def scores(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(windows, cells) nats per event, and less what is split; -inf: not tried to the end."""
@@ -119,6 +130,11 @@ class _Trial:
         for i, j in zip(*np.nonzero(self.tried), strict=True):
             out[:, i, j] = score(self.told[i][j])[:2]
         return out[0], out[1]
+
+
+def _most(parts: NDArray[np.float64]) -> float:
+    """The sum of some parts, and `SIGMAS` standard deviations more."""
+    return float(parts.sum() + SIGMAS * np.sqrt(len(parts)) * parts.std(ddof=1))
 
 
 class _Gaps:
@@ -141,7 +157,7 @@ class _Gaps:
             pixels = self.stream.pixels(t - w, t)
             labels, _ = detect(pixels, self.background, scale, self.size, t)
             shares = [
-                self._apart(t, one._replace(window=max(w, min(one.window, t))), pixels, labels)
+                self._apart(t, one.as_long(max(w, min(one.window, t))), pixels, labels)
                 for one in smaller
             ]
             told += max(shares, key=lambda one: one[0], default=np.zeros(2))
@@ -177,6 +193,20 @@ class _Gaps:
         large = large[blobs.n[large] >= LARGE]
         p, C = blobs.p[large], blobs.C[large]
         cluster = np.full(number + 1, -1, np.int32)
-        clusters, of_large = connected_components(touching(p[:, None], C[:, None], p, C) < CONTACT)
-        cluster[large + 1] = of_large
+        clusters, cluster[large + 1] = _components(touching(p[:, None], C[:, None], p, C) < CONTACT)
         return pixels, cluster[labels], clusters
+
+
+def _components(near: NDArray[np.bool_]) -> tuple[int, NDArray[np.int32]]:
+    """How many sets of things there are that are near each other (n, n), and whose each (n,) is.
+
+    The search of SciPy checks its input for longer than it takes here.
+    """
+    first = np.arange(len(near))
+    while True:
+        least = np.where(near, first, len(near)).min(1, initial=len(near))
+        if (least == first).all():
+            break
+        first = least
+    sets, whose = np.unique(first, return_inverse=True)
+    return len(sets), whose.astype(np.int32)

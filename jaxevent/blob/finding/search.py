@@ -21,7 +21,7 @@ from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.polarity import prefer_sharper
 from jaxevent.blob.finding.scale import Choice, choose_scale
 from jaxevent.blob.finding.stream import Stream
-from jaxevent.blob.finding.targets import FAINT, GATE, HOLD, REACH, SEEN
+from jaxevent.blob.finding.targets import FAINT, GATE, HOLD, REACH, SEEN, larger
 from jaxevent.blob.seeds import span_of
 from jaxevent.progress import stage
 from jaxevent.recording import Recording
@@ -92,7 +92,7 @@ def _search(
     for number in range(PASSES):
         if number:
             with stage(f"find, pass {number + 1}: scale", progress):
-                choice = choose_scale(stream, background)
+                choice = choose_scale(stream, background, worth)
         if choice is None or choice.score < worth:
             break
         confirmed = Links(stream, background, choice.scale).follow(
@@ -164,7 +164,7 @@ def _look_back(path: Path, rest: Stream, background: Background, scale: Scale) -
     v, p = np.polyfit(times - times[0], path.p[:first], 1)
     C, usual = path.C[:first].mean(0), float(np.median(path.n[:first]))
     spread = C + np.eye(2) * (0.1 + np.trace(C) / 2 / max(usual, 1))
-    t, silent, rows = float(times[0]), 0, []
+    t, silent, rows, farthest = float(times[0]), 0, [], (GATE * REACH) ** 2 * larger(C[None])[0]
     while silent < HOLD and t - 1.5 * w > 0:
         t, p = t - w, p - v * w
         if not (0 <= p[0] < rest.width and 0 <= p[1] < rest.height):
@@ -181,7 +181,7 @@ def _look_back(path: Path, rest: Stream, background: Background, scale: Scale) -
             silent += 1
             continue
         z = e[near].mean(0)
-        if z @ z > (GATE * REACH) ** 2 * np.linalg.eigvalsh(C)[1]:
+        if z @ z > farthest:
             silent += 1
             continue
         p, v, silent = p + 0.5 * z, v - 0.15 * z / w / (1 + silent), 0

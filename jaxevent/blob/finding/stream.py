@@ -14,7 +14,7 @@ from jaxevent.recording import Events, EventSource, Recording
 _counts = Blank(np.int32)
 BATCH = 1 << 20  # events read at a time
 HELD = 1 << 22  # events: so many and fewer are read once
-ALL = np.ones(0, bool)  # all events are kept
+ALL, COLD = np.ones(0, bool), np.zeros((0, 0), bool)  # all events are kept, no pixel is hot
 
 
 class Part(NamedTuple):
@@ -49,10 +49,11 @@ class Stream:
     def __init__(self, recording: Recording, start: int, stop: int):
         self.recording, self.start, self.stop = recording, start, stop
         self.width, self.height = recording.width, recording.height
-        self.hot = np.zeros((recording.height, recording.width), bool)
+        self._hot = np.zeros((recording.height, recording.width), bool)
         self._first, self._last = (recording.events.index(t) for t in (start, stop))
         self._kept: NDArray[np.bool_] | None = None  # of all these rows
         few = len(self) <= HELD
+        # What is held is without what is left out.
         self._held = recording.events[self._first : self._last] if few else None
 
     @property
@@ -60,16 +61,30 @@ class Stream:
         """s."""
         return (self.stop - self.start) * 1e-6
 
+    @property
+    def hot(self) -> NDArray[np.bool_]:
+        """(rows, columns) pixels that are left out."""
+        return self._hot
+
+    @hot.setter
+    def hot(self, hot: NDArray[np.bool_]) -> None:
+        self._hot = hot
+        if self._held is not None and hot.any():
+            self._held = self._held[~hot[self._held.y, self._held.x]]
+
     def __len__(self) -> int:
         """Events in all, those left out included."""
         return self._last - self._first
 
     def without(self, paths: Sequence[Path], sigmas: float | int) -> "Stream":
         """The same without events within `sigmas` standard deviations of some paths."""
-        stream, first = copy.copy(self), self._first
+        stream, first, joined = copy.copy(self), self._first, join(paths)
+        if self._held is not None:
+            stream._held = self._held[candidates(self._held, joined, sigmas)[:, 0] == NOBODY]
+            return stream
         kept = np.ones(len(self), bool) if self._kept is None else self._kept.copy()
         rows = first, self._last
-        for row, _, whose in near_paths(self.recording.events, join(paths), sigmas, rows):
+        for row, _, whose in near_paths(self.recording.events, joined, sigmas, rows):
             kept[row - first : row - first + len(whose)] &= whose[:, 0] == NOBODY
         stream._kept = kept
         return stream
@@ -80,11 +95,15 @@ class Stream:
 
     def pixels(self, begin: float | int, end: float | int) -> Pixels:
         """The pixels of these events, by their first event."""
-        events, kept = self._of_rows(*self._span(begin, end))
+        return self.sample(begin, end, len(self))[0]
+
+    def sample(self, begin: float | int, end: float | int, most: int) -> tuple[Pixels, int]:
+        """The pixels of at most so many of these events, at equal steps; how many are in all."""
+        events, hot, kept = self._of_rows(*self._span(begin, end))
         counts = _counts(self.height, self.width)
-        x, y, n = np.empty((3, len(events)), np.int32)
-        number = _count(events.x, events.y, self.hot, kept, counts, x, y, n)
-        return Pixels(x[:number], y[:number], n[:number])
+        x, y, n = np.empty((3, min(len(events), most)), np.int32)
+        pixels, number = _count(events.x, events.y, hot, kept, most, counts, x, y, n)
+        return Pixels(x[:pixels], y[:pixels], n[:pixels]), number
 
     def add_cells(
         self,
@@ -102,18 +121,16 @@ class Stream:
         us = self.start + np.rint(1e6 * spans).astype(np.int64)
         us = np.clip(us, self.start, self.stop)
         if self._held is not None:
-            rows = np.searchsorted(self._held.t, us)
-            kept = ALL if self._kept is None else self._kept
-            x, y = self._held.x, self._held.y
-            _add_cells(x, y, self.hot, kept, rows, places, cell, counts, into)
+            rows, (x, y) = np.searchsorted(self._held.t, us), (self._held.x, self._held.y)
+            _add_cells(x, y, COLD, ALL, rows, places, cell, counts, into)
             return
         for k, (begin, end) in enumerate(us.tolist()):
             one, first, last = slice(k, k + 1), self._index(begin), self._index(end)
             for row in range(first, last, BATCH):
-                events, kept = self._of_rows(row, min(row + BATCH, last))
+                events, hot, kept = self._of_rows(row, min(row + BATCH, last))
                 rows = np.array([[0, len(events)]])
                 at = places[one], cell, counts, into[one]
-                _add_cells(events.x, events.y, self.hot, kept, rows, *at)
+                _add_cells(events.x, events.y, hot, kept, rows, *at)
 
     def times(self, number: int) -> NDArray[np.float64]:
         """Times (s) of some events that are equally many events apart."""
@@ -128,28 +145,32 @@ class Stream:
         return first, last
 
     def _index(self, us: int) -> int:
-        """The first row that is not before a time (us) of the stream."""
+        """The first row, of those held or of the recording, that is not before a time (us)."""
         if self._held is None:
             return self.recording.events.index(us)
-        return self._first + int(np.searchsorted(self._held.t, us))
+        return int(np.searchsorted(self._held.t, us))
 
-    def _of_rows(self, first: int, last: int) -> tuple[Events, NDArray[np.bool_]]:
-        """Some events, and which of them are kept, or `ALL`."""
+    def _of_rows(
+        self, first: int, last: int
+    ) -> tuple[Events, NDArray[np.bool_], NDArray[np.bool_]]:
+        """Some events, pixels that are left out, or `COLD`, and which are kept, or `ALL`."""
+        if self._held is not None:
+            return self._held[first:last], COLD, ALL
         some = slice(first - self._first, last - self._first)
         kept = ALL if self._kept is None else self._kept[some]
-        return self.recording.events[first:last] if self._held is None else self._held[some], kept
+        return self.recording.events[first:last], self.hot, kept
 
     def _rows(self, first: int, last: int) -> Part:
-        events, kept = self._of_rows(first, last)
+        events, hot, kept = self._of_rows(first, last)
         t, (x, y) = np.empty(len(events)), np.empty((2, len(events)), np.int32)
-        number = _keep(events.t, events.x, events.y, self.start, self.hot, kept, t, x, y)
+        number = _keep(events.t, events.x, events.y, self.start, hot, kept, t, x, y)
         return Part(t[:number], x[:number], y[:number])
 
 
 @lean_part
 def _stays(i: int, x: Any, y: Any, hot: Any, kept: Any) -> bool:
     """Whether an event is not left out."""
-    return (len(kept) == 0 or kept[i]) and not hot[y[i], x[i]]
+    return (len(kept) == 0 or kept[i]) and (len(hot) == 0 or not hot[y[i], x[i]])
 
 
 @lean
@@ -166,19 +187,33 @@ def _keep(
 
 
 @lean
-def _count(x: Any, y: Any, hot: Any, kept: Any, counts: Any, px: Any, py: Any, n: Any) -> int:
-    """Of the events that are not left out the pixels, and how many each has: their number."""
-    m = 0
+def _count(
+    x: Any, y: Any, hot: Any, kept: Any, most: int, counts: Any, px: Any, py: Any, n: Any
+) -> tuple[int, int]:
+    """Pixels of at most so many of the events that are not left out, and how many each has.
+
+    How many pixels there are, and how many events in all.
+    """
+    events = len(x)
+    if events > most:
+        events = 0
+        for i in range(len(x)):
+            events += _stays(i, x, y, hot, kept)
+    m = number = following = taken = 0
     for i in range(len(x)):
         if _stays(i, x, y, hot, kept):
-            if counts[y[i], x[i]] == 0:
-                px[m], py[m] = x[i], y[i]
-                m += 1
-            counts[y[i], x[i]] += 1
+            if number == following:
+                if counts[y[i], x[i]] == 0:
+                    px[m], py[m] = x[i], y[i]
+                    m += 1
+                counts[y[i], x[i]] += 1
+                taken += 1
+                following = taken * (events - 1) // (most - 1) if events > most else taken
+            number += 1
     for k in range(m):
         n[k] = counts[py[k], px[k]]
         counts[py[k], px[k]] = 0
-    return m
+    return m, number
 
 
 @lean_part
@@ -210,8 +245,17 @@ def near_paths(
 def _add_cells(
     x: Any, y: Any, hot: Any, kept: Any, rows: Any, places: Any, cell: int, counts: Any, into: Any
 ) -> None:
+    bits = 0
+    while 1 << bits < cell:
+        bits += 1
     for k in range(len(rows)):
-        own = counts[into[k]]
+        own, A = counts[into[k]], places[k]
+        moved = A[0, 0] != 1 or A[1, 1] != 1 or A[0, 1] != 0 or A[1, 0] != 0
+        moved |= A[0, 2] != 0 or A[1, 2] != 0
         for i in range(rows[k, 0], rows[k, 1]):
-            if _stays(i, x, y, hot, kept):
-                own[cell_at(places[k], x[i], y[i], cell, own.shape)] += 1
+            if not _stays(i, x, y, hot, kept):
+                continue
+            if moved:
+                own[cell_at(A, x[i], y[i], cell, own.shape)] += 1
+            else:
+                own[y[i] >> bits, x[i] >> bits] += 1

@@ -54,16 +54,18 @@ class Live(NamedTuple):
         """(n,) px, standard deviation along the longer axis."""
         return np.sqrt(larger(self.C))
 
-    @property
-    def agility(self) -> NDArray[np.float64]:
-        """Noise of the velocity, px^2/s^3."""
-        return self.q * np.clip(self.nis, 0.05, 50)
 
-    def predict(self, t: float | int) -> tuple[NDArray, NDArray]:
-        """Positions (n, 2) and P (n, 3) at t; what stands still is not driven any more."""
-        dt, (a, b, c), q = t - self.t, self.P.T, np.where(self.miss < STILL, self.agility, 0)
-        P = [a + 2 * b * dt + c * dt**2 + q * dt**3 / 3, b + c * dt + q * dt**2 / 2, c + q * dt]
-        return self.p + self.v * dt[:, None], np.stack(P, 1)
+@lean_part
+def expect_one(live: Any, k: int, t: Any, p: Any, P: Any) -> None:
+    """Position and P of a target at t (s); what stands still is not driven any more."""
+    dt, q = t - live.t[k], 0.0
+    if live.miss[k] < STILL:
+        q = live.q[k] * min(max(live.nis[k], 0.05), 50.0)
+    a, b, c = live.P[k, 0], live.P[k, 1], live.P[k, 2]
+    P[k, 0] = a + 2 * b * dt + c * dt**2 + q * dt**3 / 3
+    P[k, 1], P[k, 2] = b + c * dt + q * dt**2 / 2, c + q * dt
+    for i in range(2):
+        p[k, i] = live.p[k, i] + live.v[k, i] * dt
 
 
 def start_targets(
@@ -151,7 +153,7 @@ def _update(live: Any, expected: Any, found: Any, anywhere: Any, seen: Any) -> N
                 n, z, D = all_n, anywhere[1][k], anywhere[2][k]
         if n >= 2:
             live.top[k] = max(0.99 * live.top[k], n)
-        square = (n * _larger(D) + KNOWN * _larger(C)) / (n + KNOWN)
+        square = (n * larger_of(D) + KNOWN * larger_of(C)) / (n + KNOWN)
         means[k, 0], means[k, 1], errors[k] = z[0], z[1], square / 2 / max(n, 1.0)
         heard[k] = (
             n >= 2 and n >= FAINT * live.top[k] and _is_it(live, k, n, z, before[0] + errors[k])
@@ -171,7 +173,7 @@ def _is_it(live: Any, k: int, n: float, z: Any, variance: float) -> bool:
     it that are seen by turns. Where most of them are it may have turned, but goes no farther than
     `REACH` allows.
     """
-    square = (REACH * REACH) * _larger(live.C[k])
+    square = (REACH * REACH) * larger_of(live.C[k])
     if n >= MOST * live.n[k]:
         variance = max(variance, square)
     most = GATE * GATE * min(variance + ASIDE * ASIDE * square, 2 * square)
@@ -185,7 +187,7 @@ def _miss(live: Any, expected: Any, k: int) -> None:
     if live.miss[k] == STILL:
         # Or by its size in the time that it is held.
         fast = live.v[k, 0] ** 2 + live.v[k, 1] ** 2
-        fast += _larger(live.C[k]) / (HOLD * expected.window) ** 2
+        fast += larger_of(live.C[k]) / (HOLD * expected.window) ** 2
         live.P[k, 2] = min(live.P[k, 2], fast)
         live.v[k, 0] = live.v[k, 1] = live.P[k, 1] = 0
 
@@ -222,7 +224,7 @@ def _hear(live: Any, expected: Any, k: int, n: float, z: Any, D: Any, square: fl
 
 
 @lean_part
-def _larger(C: Any) -> Any:
+def larger_of(C: Any) -> Any:
     """As `larger`, of one."""
     half, cross = (C[0, 0] - C[1, 1]) / 2, C[0, 1]
     return (C[0, 0] + C[1, 1]) / 2 + np.sqrt(half * half + cross * cross)
