@@ -2,7 +2,8 @@
 
     python experiments/bench_track.py --data DIR [--only NAME ...] [--find]
 
-With `--find` the parts of finding alone. CPU seconds of this process and of ffmpeg, of the second
+`simulated` is a target of a million events/s for four seconds. With `--find` the parts of finding
+alone. CPU seconds of this process and of ffmpeg, of the second
 of two runs in one process, so without compilation; the video's time is what a folder with it takes
 more than one without. Makes no file.
 """
@@ -17,10 +18,13 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+from blob_scenes import drifting
+
 from jaxevent.blob import find, moment
 from jaxevent.blob.finding import search
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.io import load
+from jaxevent.recording import Recording
 from jaxevent.show.tracks import Output
 
 PARTS = {  # of finding: where they are
@@ -48,8 +52,13 @@ def timed(work: Callable[[], Any]) -> tuple[float, Any]:
     return cpu() - begin, told
 
 
-def parts_of(path: Path, folder: Path) -> list[float]:
-    recording = load(path, in_memory=False)
+def recording_of(path: Path) -> Recording:
+    if path.name == "simulated":
+        return drifting(1, 1e6, 1e3, 10, 4.0, 2e4, 5)[0]
+    return load(path, in_memory=False)
+
+
+def parts_of(recording: Recording, folder: Path) -> list[float]:
     found_in, found = timed(lambda: find(recording, progress=False))
     params = moment.Params(**found.settings())
 
@@ -63,9 +72,9 @@ def parts_of(path: Path, folder: Path) -> list[float]:
     return [found_in, followed_in, table - followed_in, video - followed_in, events]
 
 
-def parts_of_finding(path: Path) -> list[float]:
+def parts_of_finding(recording: Recording) -> list[float]:
     """CPU seconds of all, of each of `PARTS`, and M events/s."""
-    recording, spent = load(path, in_memory=False), dict.fromkeys(PARTS, 0.0)
+    spent = dict.fromkeys(PARTS, 0.0)
 
     def watched(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **options: Any) -> Any:
@@ -98,9 +107,12 @@ def main() -> None:
     print("|---|" + "---:|" * len(columns))
     for name in args.only:
         with tempfile.TemporaryDirectory() as folder:
+            recording = recording_of(args.data / name)
             for _ in range(2):
-                path = args.data / name
-                told = parts_of_finding(path) if args.find else parts_of(path, Path(folder))
+                if args.find:
+                    told = parts_of_finding(recording)
+                else:
+                    told = parts_of(recording, Path(folder))
         print(f"| {name} | " + " | ".join(f"{one:.2f}" for one in told) + " |", flush=True)
 
 

@@ -23,6 +23,7 @@ PIECE = 250_000  # us; at half a hertz beside f an eighth of a turn
 # The share in time of lamps whose light goes on and off within 0.5 and 1 ms is 0.9 and 0.7 to 0.5,
 # of targets that pass before them below 0.3; seeds 30 to 33 of the scenes with flicker.
 IN_TIME = 0.36
+ENOUGH = 1000  # events of a piece that tell its share
 SIGMAS = 5.0  # of what chance makes of the share
 TRAVELS = 6.0  # sizes between the places of its first and its last third: no lamp
 
@@ -52,9 +53,11 @@ def _in_time(
     joined = join(paths)
     begin = joined.begins.min()
     pieces = (joined.ends.max() - begin) // PIECE + 1
+    faintest = min(float(np.median(path.n)) / path.window for path in paths)
+    every = max(1, int(faintest * PIECE / ENOUGH))
     n = np.zeros((len(paths), pieces))
     z = np.zeros((len(MAINS), len(paths) * pieces), complex)
-    for _, part, near in near_paths(recording.events, joined, GATE):
+    for _, part, near in near_paths(recording.events, joined, GATE, every=every):
         whose = near[:, 0]
         seen = (whose != NOBODY) & ~hot[part.y, part.x]
         t = part.t[seen] - begin

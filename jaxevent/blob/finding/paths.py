@@ -107,8 +107,9 @@ def candidates(events: Events, joined: Joined, sigmas: float | int) -> NDArray[n
     Of a path are events of its polarity within `sigmas` standard deviations while it is seen; of
     more than two paths an event is of the likeliest two.
     """
-    t = events.t
-    whose, far = np.full((len(events), 2), NOBODY, np.int32), np.empty((len(events), 2))
+    t, alone = events.t, len(joined.window) == 1
+    whose = np.full((len(events), 2), NOBODY, np.int32)
+    far = np.empty((0 if alone else len(events), 2))
     rows = np.stack([np.searchsorted(t, us) for us in (joined.begins, joined.ends)])
     _candidates(t, events.x, events.y, events.p, joined, rows, float(sigmas) ** 2, whose, far)
     return whose
@@ -118,7 +119,10 @@ def candidates(events: Events, joined: Joined, sigmas: float | int) -> NDArray[n
 def _candidates(
     t: Any, x: Any, y: Any, p: Any, joined: Any, rows: Any, limit: float | int, whose: Any, far: Any
 ) -> None:
-    """Fill in whose events are; `far` are minus twice their log likelihoods, up to a constant."""
+    """Fill in whose events are; `far` are minus twice their log likelihoods, up to a constant.
+
+    Of one path `far` is empty: nothing is compared.
+    """
     for k in range(len(joined.window)):
         row, last, i, end = joined.first[k], joined.first[k + 1] - 1, rows[0, k], rows[1, k]
         while i < end:
@@ -161,7 +165,7 @@ def _between_rows(
         a, b, c = a0 + part * da, b0 + part * db, c0 + part * dc
         squared, determinant = c * ex * ex - 2 * b * ex * ey + a * ey * ey, a * c - b * b
         if squared <= limit * determinant:
-            if len(joined.window) == 1:
+            if len(far) == 0:
                 whose[i, 0] = k
             else:
                 _enter(whose[i], far[i], k, squared / determinant + np.log(determinant))

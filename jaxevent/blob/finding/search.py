@@ -102,8 +102,8 @@ def _search(
             passes.append(Pass(choice, 0))
             break
         with stage(f"find, pass {number + 1}: beginnings", progress):
-            rest = stream.without(confirmed, GATE)
             settled = [_settled(path) for path in confirmed]
+            rest = stream.without(confirmed, GATE, max(path.begin for path in settled))
             whole = [_look_back(path, rest, background, choice.scale) for path in settled]
         near = whole = join_parts(whole)
         if background.scene is not None:

@@ -76,14 +76,20 @@ class Stream:
         """Events in all, those left out included."""
         return self._last - self._first
 
-    def without(self, paths: Sequence[Path], sigmas: float | int) -> "Stream":
-        """The same without events within `sigmas` standard deviations of some paths."""
+    def without(
+        self, paths: Sequence[Path], sigmas: float | int, until: int | None = None
+    ) -> "Stream":
+        """The same without events within `sigmas` standard deviations of some paths.
+
+        Before `until` (us), if it is given; what is held ends there.
+        """
         stream, first, joined = copy.copy(self), self._first, join(paths)
         if self._held is not None:
-            stream._held = self._held[candidates(self._held, joined, sigmas)[:, 0] == NOBODY]
+            events = self._held if until is None else self._held[: self._index(until)]
+            stream._held = events[candidates(events, joined, sigmas)[:, 0] == NOBODY]
             return stream
         kept = np.ones(len(self), bool) if self._kept is None else self._kept.copy()
-        rows = first, self._last
+        rows = first, self._last if until is None else self._index(until)
         for row, _, whose in near_paths(self.recording.events, joined, sigmas, rows):
             kept[row - first : row - first + len(whose)] &= whose[:, 0] == NOBODY
         stream._kept = kept
@@ -229,8 +235,9 @@ def near_paths(
     joined: Joined,
     sigmas: float | int,
     rows: tuple[int, int] | None = None,
+    every: int = 1,
 ) -> Iterator[tuple[int, Events, NDArray[np.int32]]]:
-    """Events of some rows, by default while some path is, a part after another.
+    """Events of some rows, by default while some path is, a part after another; one of `every`.
 
     The first row of each part, its events, and whose they are (`candidates`).
     """
@@ -238,6 +245,7 @@ def near_paths(
         rows = events.index(int(joined.begins.min())), events.index(int(joined.ends.max()))
     for row in range(*rows, BATCH):
         part = events[row : min(row + BATCH, rows[1])]
+        part = part if every == 1 else part[::every]
         yield row, part, candidates(part, joined, sigmas)
 
 
