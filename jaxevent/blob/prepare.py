@@ -29,7 +29,7 @@ from jaxevent.recording import Recording, Times, check_times
 
 STEPS = (4, 8, 16, 32, 64, 128, 256)  # per chunk
 STRETCH_STEPS = 8192
-STRETCH_EVENTS = 65536  # at least, where a kernel follows targets
+STRETCH_EVENTS = 262144  # at least, where a kernel follows targets
 READ_ROWS = 65536  # events read from a file at a time
 TIES = 16  # more events of one time are in the order of a readout, and not of the scene
 NEAR = 3.5  # standard deviations from a found path within which events may be the target's
@@ -198,21 +198,20 @@ class Packing:
             np.zeros(self.chunks, np.int32),
             np.zeros(self.chunks, bool),
             np.full(len(self.seeds.t), -1, np.int32),
-            np.full((*shape, 2), NOBODY, np.int32),
+            np.full((*(shape if self.joined is not None else (0, 0, 0)), 2), NOBODY, np.int32),
         )
         stop = NEVER if more else self.stop
         bounds = _Bounds(self.start, stop, self.period, self.seeds.t)
-        place = _Place(0, 0, 0, mark.previous, mark.start, 0, mark.seed)
-        at, done, rows = mark.row, False, []
+        place = _Place(0, 0, 0, mark.row, mark.previous, mark.start, 0, mark.seed)
+        at, done = mark.row, False
         while not done and not (more and at == self.rows[1]):
             upto = min(at + READ_ROWS, self.rows[1])
-            given, row = self._read(at, upto)
-            rows.append(row)
+            given = self._read(at, upto)
             final = upto == self.rows[1] and not more
             done, used, place = _pack(given, at, final, bounds, place, out)
             at += used
         if place.opened:
-            at, place = _leave_open(place, out)
+            at, place = place.at, _leave_open(place, out)
         out.start[place.chunk :] = NEVER
         features = Features(
             out.t, out.xi, out.polarity, out.row >= 0, out.elapsed, out.stop, out.cycle, out.seed,
@@ -223,11 +222,10 @@ class Packing:
         )  # fmt: skip
         ended = place.previous == place.begin == stop
         following = None if ended else Mark(at, place.previous, place.begin, place.seed)
-        row = np.concatenate([*rows, np.zeros(1, np.int64)])[np.maximum(out.row - mark.row, 0)]
-        return Stretch(features, out.start, np.where(out.row >= 0, row, -1), following)
+        return Stretch(features, out.start, out.row, following)
 
-    def _read(self, at: int, upto: int) -> tuple["_Given", NDArray[np.int64]]:
-        """Events of some places in the order in which they are taken, and their rows.
+    def _read(self, at: int, upto: int) -> "_Given":
+        """Events of some places in the order in which they are taken.
 
         Places are rows, but for many events of one time. A readout stores these line by line; here
         every step gets events of all lines, see `_spread`.
@@ -238,14 +236,14 @@ class Packing:
             first = max(events.index(begin), self.rows[0])
             last = min(events.index(end + 1), self.rows[1])
         part = events[first:last]
-        kept, owner = self._kept(part, first), np.full((len(part), 2), NOBODY, np.int32)
-        if self.joined is not None and len(part):
+        kept, owner = self._kept(part, first), np.empty((0, 2), np.int32)
+        if self.joined is not None:
             owner = candidates(part, self.joined, NEAR)
             kept &= owner[:, 0] != NOBODY
         order = np.arange(len(part))
         _spread(part.t, len(part) if self._as_stored else TIES, order)
         order = order[at - first : upto - first]
-        return _Given(part.t, part.x, part.y, part.p, kept, owner, order), order + first
+        return _Given(part.t, part.x, part.y, part.p, kept, owner, order, first)
 
     def whole(self) -> Features:
         """All chunks at once, for recordings that fit into memory."""
@@ -330,6 +328,7 @@ class _Given(NamedTuple):
     kept: NDArray  # by the prefilter
     owner: NDArray
     order: NDArray  # places of those that are packed, one after another
+    first: int  # row of the first
 
 
 class _Bounds(NamedTuple):
@@ -347,6 +346,7 @@ class _Place(NamedTuple):
     chunk: int
     opened: int  # whether that chunk is begun
     fill: int  # events in it
+    at: int  # its first event's place
     previous: int  # us, start of the chunk before
     begin: int  # us, its start
     end: int  # us
@@ -368,13 +368,13 @@ class _Chunks(NamedTuple):
     owner: NDArray
 
 
-def _leave_open(place: _Place, out: _Chunks) -> tuple[int, _Place]:
-    """Take back the chunk that is open: the row of its first event, and the place before it."""
+def _leave_open(place: _Place, out: _Chunks) -> _Place:
+    """Take back the chunk that is open: the place before it."""
     chunk = place.chunk
-    row, sown = int(out.row[chunk, 0, 0]), out.seed == chunk
+    sown = out.seed == chunk
     out.row[chunk], out.seed[sown], out.elapsed[chunk] = -1, -1, 0
     begun = place.seed - int(sown.sum())
-    return row, _Place(chunk, 0, 0, place.previous, place.begin, 0, begun)
+    return _Place(chunk, 0, 0, place.at, place.previous, place.begin, 0, begun)
 
 
 @lean
@@ -404,10 +404,11 @@ def _pack(given, first_row, final, bounds, place, out):
 
     With `final`, the end of the time closes what is open.
     """
-    chunk, opened, fill, previous, begin, end, following = place
+    chunk, opened, fill, at, previous, begin, end, following = place
     seed_t, finish = bounds.seed_t, bounds.stop
     chunks, steps, size = out.t.shape
-    i, count, order = 0, len(given.order), given.order
+    i, count, order, owned = 0, len(given.order), given.order, len(given.owner) > 0
+    step, slot = fill // size, fill % size
     while i < count + (1 if final else 0):
         k = order[i] if i < count else 0
         if i < count and not given.kept[k] and not (opened and given.t[k] >= end):
@@ -416,7 +417,7 @@ def _pack(given, first_row, final, bounds, place, out):
         now = given.t[k] if i < count else finish
         if not opened:
             if chunk == chunks:
-                return True, i, _Place(chunk, 0, 0, previous, begin, 0, following)
+                return True, i, _Place(chunk, 0, 0, at, previous, begin, 0, following)
             out.start[chunk] = begin
             out.elapsed[chunk] = begin - previous
             while following < len(seed_t) and seed_t[following] <= begin:
@@ -426,26 +427,29 @@ def _pack(given, first_row, final, bounds, place, out):
             end = min(end, begin + LONGEST)
             if following < len(seed_t):
                 end = min(end, seed_t[following])
-            opened, fill = 1, 0
+            opened, step, slot, at = 1, 0, 0, first_row + i
         over = now >= end or (i == count)
-        if over or fill == steps * size:
+        if over or step == steps:
             close = min(end, finish) if over else now
             out.stop[chunk] = close - begin
             whole = (close - bounds.start) % bounds.period == 0
             out.cycle[chunk] = over and (whole or close == finish)
+            if slot > 0:
+                out.t[chunk, step, slot:] = out.t[chunk, step, slot - 1]
             previous, begin, opened = begin, close, 0
             chunk += 1
             if i == count and close == finish:
-                return True, i, _Place(chunk, 0, 0, finish, finish, 0, following)
+                return True, i, _Place(chunk, 0, 0, at, finish, finish, 0, following)
             continue
-        step, slot = fill // size, fill % size
-        out.t[chunk, step, slot:] = now - begin
+        out.t[chunk, step, slot] = now - begin
         out.xi[chunk, step, slot, 0] = given.x[k]
         out.xi[chunk, step, slot, 1] = given.y[k]
         out.polarity[chunk, step, slot] = 1 if given.p[k] else -1
-        out.row[chunk, step, slot] = first_row + i
-        out.owner[chunk, step, slot, 0] = given.owner[k, 0]
-        out.owner[chunk, step, slot, 1] = given.owner[k, 1]
-        fill += 1
-        i += 1
-    return False, i, _Place(chunk, opened, fill, previous, begin, end, following)
+        out.row[chunk, step, slot] = given.first + k
+        if owned:
+            out.owner[chunk, step, slot, 0] = given.owner[k, 0]
+            out.owner[chunk, step, slot, 1] = given.owner[k, 1]
+        slot, i = slot + 1, i + 1
+        if slot == size:
+            step, slot = step + 1, 0
+    return False, i, _Place(chunk, opened, step * size + slot, at, previous, begin, end, following)

@@ -22,6 +22,14 @@ from jaxevent.kernels.host import run as run_on_host
 from jaxevent.kernels.loops import leaves_of, numbers_of
 
 
+@functools.lru_cache(maxsize=16)
+def _beginning(filter: Filter, tree: Any, kinds: tuple[jax.ShapeDtypeStruct, ...]) -> Any:
+    """The equations of `lifecycle.begin` for parameters and features, and what they tell."""
+    start = functools.partial(begin, filter)
+    closed, told = jax.make_jaxpr(start, return_shape=True)(*jax.tree.unflatten(tree, kinds))
+    return closed, jax.tree.structure(told)
+
+
 class FusedRun:
     """Tracks through a packing's chunks by a filter's kernel; raises `Untranslatable`."""
 
@@ -46,10 +54,11 @@ class FusedRun:
 
     def begin(self, features: Features) -> State:
         """No track yet."""
-        start = functools.partial(begin, self._filter)
-        closed, shape = jax.make_jaxpr(start, return_shape=True)(self._params, features)
-        given = [np.asarray(leaf) for leaf in jax.tree.leaves((self._params, features))]
-        return jax.tree.unflatten(jax.tree.structure(shape), run_on_host(closed, given))
+        leaves, tree = jax.tree.flatten((self._params, features))
+        given = [np.asarray(leaf) for leaf in leaves]
+        kinds = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in given)
+        closed, told = _beginning(self._filter, tree, kinds)
+        return jax.tree.unflatten(told, run_on_host(closed, given))
 
     def follow(self, state: State, features: Features) -> tuple[State, Log]:
         """The state at the end, with births and deaths."""
