@@ -274,6 +274,34 @@ def finish_moments(n: Any, p: Any, C: Any, number: int) -> None:
         C[k, 1, 1] = C[k, 1, 1] * over - p[k, 1] * p[k, 1] + 1 / 12
 
 
+def part_blob(x: NDArray, y: NDArray, C: NDArray, valley: float) -> Blobs | None:
+    """The two halves of a blob of covariance C that has a gap across its longer axis; or None.
+
+    A gap is where less than the share `valley` of its events lies within the halves' sizes of the
+    middle between them, and the halves do not touch. The half with more events comes first.
+    """
+    if len(x) < 8:
+        return None
+    p = np.stack([x, y], 1).astype(float)
+    along = p @ np.linalg.eigh(C)[1][:, 1]
+    middle = along.mean()
+    for _ in range(4):  # of two means
+        upper = along > middle
+        if upper.all() or not upper.any():
+            return None
+        middle = (along[upper].mean() + along[~upper].mean()) / 2
+    halves = sorted((upper, ~upper), key=lambda half: -half.sum())
+    between = sum(along[half].std() for half in halves) / 2
+    if (abs(along - middle) < between).mean() > valley:
+        return None
+    two = Blobs.of(2)
+    for k, half in enumerate(halves):
+        two.n[k], two.p[k] = half.sum(), p[half].mean(0)
+        two.C[k] = np.cov(p[half].T, ddof=0) + np.eye(2) / 12
+    apart = touching(two.p[0], two.C[0], two.p[1], two.C[1])
+    return two if apart >= CONTACT else None
+
+
 def touching(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> Any:
     """Distances over the sum of both ellipses' reach along the line between them."""
     d = pb - pa

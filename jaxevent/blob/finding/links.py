@@ -16,10 +16,11 @@ from jaxevent.blob.finding.background import CELL, Background
 from jaxevent.blob.finding.detection import (
     CONTACT,
     FALSE_ALARMS,
+    Blobs,
     Scale,
     detect,
     measure_blobs,
-    touching,
+    part_blob,
 )
 from jaxevent.blob.finding.gates import Look
 from jaxevent.blob.finding.parts import unite
@@ -34,7 +35,9 @@ BORN, FILL = 4, 0.5  # windows, and share of its windows, in which a confirmed t
 HOLD_NEW, HOLD_MOVING = 2, 4
 YOUNG = 3  # windows: what is in contact then may be a part, what comes in contact later is not
 PARTS = 5  # windows of common motion in contact that make two targets one
-LONGISH, APART = 3.0, 0.25  # aspect of a target, and share of its events in the smaller of two
+LONGISH, APART = 2.0, 0.15  # aspect of a target, and share of its events in the smaller of two
+GROWN, FARTHER = 1.3, 1.5  # times the least size that it had, and the distance that they had
+VALLEY = 0.05  # share of its events that lie between them, of a disc or an outline over 0.2
 FREE = 0.7  # share of a blob's events that are nobody's, where a target begins
 
 
@@ -63,7 +66,8 @@ class Links:
         self.next_id = 0
         self.rows: list[_Row] = []
         self.contacts: dict[tuple[int, int], tuple[float, NDArray, float]] = {}
-        self.pairs: dict[int, tuple[float, int]] = {}
+        self.least: dict[int, float] = {}
+        self.pairs: dict[int, tuple[float, float, int]] = {}
         self.confirmed: set[int] = set()
         self.parts: dict[int, int] = {}  # and whose
         tests = stream.width * stream.height * stream.duration / scale.window
@@ -109,7 +113,7 @@ class Links:
             look = Look(self.live, part, t)
             owner = look.share_out(labels, blobs)
             self._update(look, owner, labels > 0)
-            self._part(part, owner, labels, blobs)
+            self._part(part, t, owner, labels > 0)
             self._join_parts(t)
             self._end(self._over())
         self._begin_targets(part, t, owner, labels, blobs)
@@ -144,31 +148,37 @@ class Links:
         enough = (live.hits >= BORN) & (live.hits >= FILL * age) & (live.nats > self.enough)
         live.confirmed[heard & enough & apart] = True
 
-    def _part(self, part: Part, owner: NDArray, labels: NDArray, blobs: int) -> None:
-        """Leave a target the larger of two blobs that move apart: the other is another one.
+    def _part(self, part: Part, t: float | int, owner: NDArray, in_blob: NDArray) -> None:
+        """Make two of a target that comes apart into two that go their own ways.
 
-        Of parts of one object, such as both sides of an outline, the distance does not double.
+        Of parts of one object, such as both sides of an outline, the distance stays. How far apart
+        they are is told along its longer axis, since coarse cells see no gap.
         """
-        if blobs < 2:
-            self.pairs = {}
-            return
         live = self.live
         longish = larger(live.C) > LONGISH**2 * np.linalg.det(live.C) / larger(live.C)
-        before, self.pairs = self.pairs, {}
+        before, self.pairs, others = self.pairs, {}, []
         for i in np.flatnonzero(longish & live.confirmed & (live.miss == 0)):
-            at = (owner == i) & (labels > 0)
-            two = measure_blobs(Part(part.t[at], part.x[at], part.y[at]), labels[at], blobs)
-            a, b = np.argsort(-two.n, kind="stable")[:2]
-            if two.n[b] < APART * at.sum():
+            key, size = int(live.id[i]), float(live.size[i])
+            self.least[key] = min(self.least.get(key, size), size)
+            if size < GROWN * self.least[key]:
                 continue
-            if touching(two.p[a], two.C[a], two.p[b], two.C[b]) < CONTACT:
+            at = (owner == i) & in_blob
+            two = part_blob(part.x[at], part.y[at], live.C[i], VALLEY)
+            if two is None or two.n[1] < APART * at.sum():
                 continue
-            distance = float(np.hypot(*(two.p[a] - two.p[b])))
-            first, windows = before.get(int(live.id[i]), (distance, 0))
-            if windows >= PARTS and distance > 2 * first:
-                live.p[i], live.C[i], live.n[i] = two.p[a], two.C[a], two.n[a]
+            distance = float(np.hypot(*(two.p[0] - two.p[1])))
+            wide = float(np.sqrt(larger(two.C)).sum())
+            first, last, windows = before.get(key, (distance, distance, 0))
+            if abs(distance - last) > 0.5 * wide:
+                first, windows = distance, 0
+            if windows < PARTS or distance < max(first + wide, FARTHER * first):
+                self.pairs[key] = first, distance, windows + 1
                 continue
-            self.pairs[int(live.id[i])] = first, windows + 1
+            live.p[i], live.C[i], live.n[i] = two.p[0], two.C[0], two.n[0]
+            del self.least[key]
+            others.append(Blobs(two.n[1:], two.p[1:], two.C[1:]))
+        for other in others:
+            self._begin(t, other)
 
     def _join_parts(self, t: float | int) -> None:
         """Make one of two targets that touch and move together."""
@@ -251,9 +261,11 @@ class Links:
             return
         found = measure_blobs(Part(part.t[free], part.x[free], part.y[free]), labels[free], blobs)
         new = (found.n >= 3) & (found.n >= FREE * counts[1:])
-        number = int(new.sum())
-        ids = np.arange(self.next_id, self.next_id + number)
-        self.next_id += number
-        p, C, n = found.p[new], found.C[new], found.n[new]
+        self._begin(t, Blobs(found.n[new], found.p[new], found.C[new]))
+
+    def _begin(self, t: float | int, blobs: Blobs) -> None:
+        n, p, C = blobs
+        ids = np.arange(self.next_id, self.next_id + len(n))
+        self.next_id += len(n)
         self.live = self.live.add(start_targets(ids, t, p, C, n, self.scale.window))
         self.rows.append(_Row(t, ids, p, np.zeros_like(p), C, n, p, larger(C) / 2 / n))

@@ -16,6 +16,9 @@ TOGETHER = 0.9  # share of the shorter life at which two paths are in contact
 MOVED = 2.0  # sizes of the smaller one: least way
 EDGE = 3.0  # aspect from which a part is a piece of an edge
 NEAR = 3.0  # for `CONTACT`, of pieces of an edge: between them it may have too few events
+PIECE, REACH = 0.55, 2.5  # sizes of the larger one: of a piece of it, and half their distance,
+RIGID = 1 / 3  # which changes by less than this share of their way;
+WIDE = 4.0  # px: what is smaller is seen as one, as two stars near each other are two
 
 
 def join_parts(paths: list[Path]) -> list[Path]:
@@ -42,12 +45,19 @@ def _one_object(one: Path, other: Path) -> bool:
     apart = np.hypot(*(p - q).T)
     sizes = np.stack([np.interp(t, path.t, path.size[:, 0]) for path in (one, other)])
     edge = any(np.median(path.size[:, 0] / path.size[:, 1]) > EDGE for path in (one, other))
-    if np.quantile(apart / sizes.sum(0), TOGETHER) >= (NEAR if edge else CONTACT):
+    small, large = np.sort(np.median(sizes, 1))
+    # What an object lacks when a piece of it is a target of its own makes it smaller than it is.
+    near = np.quantile(apart / sizes.sum(0), TOGETHER) < (NEAR if edge else CONTACT)
+    piece = (
+        large > WIDE and small < PIECE * large and np.quantile(apart, TOGETHER) < 2 * REACH * large
+    )
+    if not (near or piece):
         return False
     # Pieces slide along an edge, but less far than they go with it.
-    small, large = np.sort(np.median(sizes, 1))
     far = min(float(np.ptp(path, axis=0).max()) for path in (p, q))
     changed = np.ptp(np.quantile(apart, (0.02, 0.98)))
+    if not near:
+        return bool(far > MOVED * large and changed < RIGID * far)
     return bool(far > MOVED * small and changed < max(large, far if edge else far / 2))
 
 
