@@ -72,6 +72,9 @@ def test_the_scene_goes_as_it_was_made_to():
             atol=1e-9,
         )
     assert scene.travel == pytest.approx(np.hypot(*SHIFT) * DURATION, rel=0.3)
+    # So it does where it hardly leaves its place.
+    part = blob.find(recording, 0.3, 0.4, progress=False)
+    assert part.camera_moves and not len(part)
 
 
 def test_a_moving_map_holds_the_rates_of_places():

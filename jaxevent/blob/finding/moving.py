@@ -21,10 +21,11 @@ from jaxevent.blob.finding.stream import Stream
 CALM = 0.75  # share of the slices in which a place is seen whose counts are taken
 LEAST = 0.05  # of the mean rate: that of places without events
 TILES, FILLED, FEW = 4, 9, 3  # tiles along each side; of all, those with so many events in blobs
+DARK = 0.1  # share of the places that are darker than what blobs are told from there
 BRIGHT = 1.5  # times the mean rate: what is bright is an edge if it is
 STRIP, SIDES = 16, 3  # of the sensor's width or height a side takes, and how many are reached
 LONG, LARGE = 2.5, 0.1  # so many times as long as wide, or of this share of the map's shorter side
-SCENE = 0.3  # share of the bright that is edges
+SCENE = 0.15  # share of the bright that is edges
 TOLD = 0.1  # of the stretches may be told worse by a map that moves than by one at rest
 MOVED = 2.0  # px
 OWN_WAY = 2.0  # sizes: deviation, along any axis, of a target's own way from its mean
@@ -61,8 +62,12 @@ def _filled(stream: Stream, background: Background, choice: Choice) -> float:
     """In how many tiles of the sensor blobs are seen, in the median window.
 
     None, if they do not reach three of its sides: an object may be large, but it is seen whole.
+    Blobs are what stands out from the sensor's dark places: in a short recording a scene hardly
+    leaves its place, and most of it is in the background.
     """
     w, size = choice.scale.window, (stream.height, stream.width)
+    dark = np.full_like(background.rate, np.quantile(background.rate, DARK))
+    background = dataclasses.replace(background, rate=dark)
     tiles, sides = [], []
     for t in np.maximum(stream.times(STRETCHES), w):
         part = stream.window(t - w, t)
