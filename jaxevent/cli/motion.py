@@ -20,7 +20,7 @@ def add(commands: Any) -> None:
         "Estimate how the camera moved. It writes a folder of tables (motion.csv, motion.h5), "
         "plots and an image of the events before and after they are moved back along the motion, "
         "and with --truth the errors. The camera's axes are x to the right, y down, z forward.",
-        "slider_depth.zip --model auto --out slider",
+        "slider_depth.zip --out slider",
         "spin.h5 --model rotation --truth spin.csv --flow --out spin",
         "drone.h5 --model general --imu --start 2 --stop 3 --out drone",
     )
@@ -28,10 +28,10 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--model",
         metavar="MODEL",
-        required=True,
+        default="auto",
         help="planar: image velocity vx, vy (px/s); rotation: angular velocity wx, wy, wz (rad/s); "
-        "general: heading tx, ty, tz, a unit vector, and angular velocity; auto: the simplest of "
-        "these that explains the recording; or one of your own, package.module:Class",
+        "general: heading tx, ty, tz, a unit vector, and angular velocity; auto, the default: the "
+        "simplest of these that explains the recording; or one of your own, package.module:Class",
     )
     one.add_argument(
         "--method",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion import contrast, find_model, truth, twists, voting
+from jaxevent.egomotion import batch, contrast, find_model, truth, twists, voting
 from jaxevent.egomotion.candidates import coordinates
 from jaxevent.egomotion.choice import choose, decide
 from jaxevent.egomotion.geometry import A, B, rotation_basis
@@ -59,6 +59,8 @@ def test_a_speed_is_told(speed, seconds):
     assert float(given.params.duration) == pytest.approx(0.07)  # a number that is given wins
     params = voting.suit(recording, voting.Params(), speed=found).params
     assert float(params.tau_max) * speed > float(params.baseline)
+    half = float(batch.suit(recording, batch.Params(), speed=found).params.half_window)
+    assert 20 < 2 * half * speed < 151
 
 
 def test_noise_has_no_speed():

@@ -16,7 +16,7 @@ from jaxevent.egomotion.patches import Speed
 from jaxevent.progress import bar
 
 WAYS = 24.0, 150.0  # px in a window, with which the default length is kept
-SHORTEST, LONGEST = 0.02, 0.4  # s, of half a window
+SHORTEST, LONGEST = 0.02, 2.0  # s, of half a window
 # Of how far the motion at a window's end is from that at its middle, what is not known of it. Of
 # varying motion (seeds 810, 811) squared errors of Omega 0.1 s from the middle are 40 to 180 times
 # the variance at the middle, 0.1 to 2 with this; of constant motion about 1.

@@ -19,7 +19,7 @@ from jaxevent.egomotion.batch_fit.windows import Params, Windows
 from jaxevent.recording import Recording
 
 WAY = 25.0  # px, that the image moves in a window
-SHORTEST, LONGEST = 0.01, 0.2  # s, of half a window
+SHORTEST, LONGEST = 0.01, 1.0  # s, of half a window
 PARALLAX = 0.3  # of the image's way, that a translation makes to begin with
 
 
