@@ -140,6 +140,7 @@ def test_a_small_piece_that_goes_along_is_of_the_larger_one():
         (62.0, 0, 2.0, False),  # farther than twice what the two halves of the larger one are
         (52.0, 24, 2.0, False),  # goes its own way
         (52.0, 0, 4.0, False),  # not much smaller
+        (52.0, 0, 1.2, False),  # a star beside a diffuse light
     ):
         piece = _path(t, x, y + slides * np.linspace(0, 1, len(t)), size, 10)
         assert len(join_parts([whole, piece])) == (1 if joined else 2)

@@ -19,6 +19,7 @@ NEAR = 3.0  # for `CONTACT`, of pieces of an edge: between them it may have too 
 PIECE, REACH = 0.55, 2.5  # sizes of the larger one: of a piece of it, and half their distance,
 RIGID = 1 / 3  # which changes by less than this share of their way;
 WIDE = 4.0  # px: what is smaller is seen as one, as two stars near each other are two
+POINT = 1.5  # px: what is smaller is none, as stars about a diffuse light
 
 
 def join_parts(paths: list[Path]) -> list[Path]:
@@ -48,9 +49,8 @@ def _one_object(one: Path, other: Path) -> bool:
     small, large = np.sort(np.median(sizes, 1))
     # What an object lacks when a piece of it is a target of its own makes it smaller than it is.
     near = np.quantile(apart / sizes.sum(0), TOGETHER) < (NEAR if edge else CONTACT)
-    piece = (
-        large > WIDE and small < PIECE * large and np.quantile(apart, TOGETHER) < 2 * REACH * large
-    )
+    reaches = np.quantile(apart, TOGETHER) < 2 * REACH * large
+    piece = large > WIDE and POINT < small < PIECE * large and reaches
     if not (near or piece):
         return False
     # Pieces slide along an edge, but less far than they go with it.
