@@ -31,13 +31,13 @@ def changed(
 ) -> Recording:
     """The recording with other columns of events, or some of them."""
     events = recording.events[:]
-    t, x, y = (a if b is None else b for a, b in ((events.t, t), (events.x, x), (events.y, y)))
+    t = events.t if t is None else t
+    x = events.x if x is None else x
+    y = events.y if y is None else y
     which = np.arange(len(t)) if keep is None else keep
     order = np.argsort(t[which], kind="stable")
-    columns = [column[which][order] for column in (t, x, y, events.p)]
-    return Recording(
-        recording.name, width or recording.width, height or recording.height, Events(*columns)
-    )
+    some = Events(t[which][order], x[which][order], y[which][order], events.p[which][order])
+    return Recording(recording.name, width or recording.width, height or recording.height, some)
 
 
 def noisy(recording: Recording) -> Recording:
