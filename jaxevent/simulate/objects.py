@@ -18,7 +18,6 @@ Distance = Callable[[NDArray, NDArray, float], NDArray]
 _TILE = 256  # px after which a texture repeats
 # A texture's parts: standard deviation (px) of the Gaussian that each is made of, and its weight.
 _GRAINS = ((1.5, 0.4), (4.0, 0.8), (12.0, 0.6))
-_SLOW = 0.4  # the background's speed, of the objects'
 _MARGIN = 2  # px around an object that are drawn
 
 
@@ -88,13 +87,14 @@ class Objects:
 
     A disc, a box, a triangle, a diamond and a cross swing about places of their own, sideways and
     up and down at different rates, so that they are always accelerated. The speed of each, its root
-    mean square over time, is drawn within `spread` of `speed`; the background's is 0.4 `speed`.
+    mean square over time, is drawn within `spread` of `speed`; the background's is the part
+    `background` of `speed`.
     Nearer objects hide farther ones. Edges cover pixels in part. Intensities lie between 0.1 and
     0.9, which frames show without clipping. Deterministic in `seed`.
 
     Surfaces are numbered: 0 is the background, higher ones are nearer. Flow and displacement are
     those of the surface at a pixel's middle, x before y. Raises `InputError` for fewer than 32x32
-    pixels, a negative speed or a spread outside [0, 1).
+    pixels, a negative speed or background, or a spread outside [0, 1).
     """
 
     size: tuple[int, int] = (160, 120)  # width, height
@@ -102,8 +102,14 @@ class Objects:
     speed: float | int = 90.0  # px/s
     spread: float | int = 0.6
     seed: int = 0
+    background: float | int = 0.4
 
     def __post_init__(self) -> None:
+        if not 0 <= self.background < np.inf:
+            raise InputError(
+                f"a background of {self.background} times the objects' speed is not possible; "
+                "give a number from 0"
+            )
         if min(self.size) < 32 or not 0 <= self.speed < np.inf or not 0 <= self.spread < 1:
             raise InputError(
                 f"objects of {self.speed} px/s within {self.spread} of it on {self.size[0]}x"
@@ -176,7 +182,7 @@ class Objects:
             pace = self.speed * rng.uniform(1 - self.spread, 1 + self.spread)
             middle, light, contrast = (size - 1) / 2, 0.5, 0.25
             if shape is None:
-                pace = self.speed * _SLOW
+                pace = self.speed * self.background
             else:
                 turn = np.array([np.cos(around[k - 1]), np.sin(around[k - 1])])
                 middle, light, contrast = middle + 0.22 * size * turn, lights[k - 1], 0.2

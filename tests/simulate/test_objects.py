@@ -128,6 +128,8 @@ def test_speeds_are_those_asked_for():
         assert speeds[0] == pytest.approx(20, rel=0.03)
         assert all(0.97 * 35 < speed < 1.03 * 65 for speed in speeds[1:])
         assert np.ptp(speeds[1:]) > 3
+    still = Objects(seed=2, background=0).surfaces
+    assert not still[0].velocity(0.3).any() and still[1].velocity(0.3).any()
     resting = Objects(seed=1, speed=0)
     np.testing.assert_array_equal(resting.intensity(0.0), resting.intensity(0.7))
 
@@ -154,6 +156,11 @@ def test_a_sensor_records_them():
 def test_objects_that_are_not_possible(wrong):
     with pytest.raises(jaxevent.InputError, match="objects of .* are not possible; give"):
         Objects(**wrong)
+
+
+def test_a_background_that_is_not_possible():
+    with pytest.raises(jaxevent.InputError, match="background of -1 times .* give a number"):
+        Objects(background=-1)
 
 
 @pytest.mark.slow
