@@ -18,6 +18,10 @@ Tables:
                 experiments/ahdr.py, as it scores them
     thresholds  fast pans of HDR scenes by sensors whose pixels' thresholds differ more and more:
                 MSE of ln(I + I0) of bright pixels and of all, with and without learning these
+    blurred     pans and objects at 300 px/s, exposures of 50 and 100 ms, as
+                experiments/motion_compensated.py scores them: the motion found, the true one and
+                the mean along it alone, as parts of the smoother's MSE; which part of the
+                smoother's error is that of all instants along the true trajectories
 
 Recordings are simulated into the folder. Sensors' common thresholds are given, nothing is fitted
 but with --fitted.
@@ -31,7 +35,7 @@ from pathlib import Path
 
 import ahdr
 import numpy as np
-from motion_compensated import SCORING, halfway, objects_at
+from motion_compensated import SCORING, at_and_between, blurred, halfway, objects_at
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
@@ -163,6 +167,46 @@ def objects(folder: Path) -> Iterator[str]:
         yield f"| {name} | " + " | ".join(f"{100 * v:.4f}" for v in np.mean(rows, 0)) + " |"
 
 
+def blurs(folder: Path) -> Iterator[str]:
+    """The table, line by line."""
+    params = mc.Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4)
+    names = ("`mc`", "motion found, not held", "true motion, not held", "mean along true motion")
+    yield "| scene, exposure | smoother | " + " | ".join((*names, "common")) + " |"
+    yield "|---|---:|" + "---:|" * (len(names) + 1)
+    for cell, source, recording in blurred(folder):
+        if cell["speed"] < 300 or cell["exposure_ms"] < 50:
+            continue
+        video = mc.estimate(recording, params, progress=False)
+        errors: list[list[float]] = []
+        for t in at_and_between(recording)[0].tolist():
+            truth = source.intensity(t * 1e-6).clip(0, 1)
+            target = video.follow(t)
+            instants, L, V, clear, *_ = target
+            place = place_of(instants, clear, len(instants))
+            hidden = np.zeros(L.shape, bool)
+            if isinstance(source, Pan):
+                true = truly_panned(target, source, t)
+            else:
+                assert isinstance(source, Objects)
+                true, hidden = truly_along(target, source, t)
+            found = warp(L, V, np.asarray(clear, np.float32), instants.s, target.paths)
+            images = [L[instants.own], np.log(video(np.array([t])).mean[0] + params.I0)]
+            for along in (found, true):
+                told = fusion.compare(
+                    agree(params, L, along, place), fusion.views(L, V, along, place)
+                )
+                images.append(np.asarray(fusion.decide(params, told).L))
+            images.append(np.asarray(told.ingredients[0]))
+            shown = [(np.exp(image) - float(params.I0)).clip(0, 1) for image in images]
+            wrong = true.L - np.log(truth + params.I0)
+            wrong = np.where((true.inside > 0) & ~hidden, wrong, np.nan)
+            common = np.nanmean(np.nanmean(wrong, 0) ** 2) / np.nanmean(wrong**2)
+            errors.append([*(float(((i - truth) ** 2).mean()) for i in shown), float(common)])
+        smoothed, *others, common = np.mean(errors, 0)
+        cells = [f"{100 * smoothed:.4f}", *(f"{v / smoothed:.2f}" for v in others), f"{common:.2f}"]
+        yield f"| {cell['scene']}, {cell['exposure_ms']:g} ms | " + " | ".join(cells) + " |"
+
+
 def truly_panned(target: Followed, source: Pan, t: int) -> Along:
     """A target's images along the true trajectories of a pan."""
     instants, L, V, clear, *_ = target
@@ -269,7 +313,7 @@ def thresholds(folder: Path) -> Iterator[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    tables = {"objects": objects, "pans": pans, "thresholds": thresholds}
+    tables = {"objects": objects, "pans": pans, "thresholds": thresholds, "blurred": blurs}
     parser.add_argument("--tables", nargs="+", default=list(tables), choices=tables)
     parser.add_argument("--out", type=Path, required=True, help="folder for everything made")
     parser.add_argument("--fitted", type=Path, help="params.toml of experiments/ahdr.py, for pans")

@@ -30,6 +30,9 @@ class Place(NamedTuple):
     own: Numeric  # (), the target's
     before: Numeric  # (), that of the frame before
     after: Numeric
+    # The frame that `before` is compared with: `after`, and where frames are on one side alone the
+    # next nearest; where there is none, `before`.
+    other: Numeric
     rest: Numeric = np.float32(0)  # (), `Instants.rest`
 
 
@@ -42,12 +45,15 @@ def place_of(instants: Instants, clear: NDArray, room: int) -> Place:
     near = np.zeros(count, bool)
     near[[k for k in order if k == instants.own or not framed[k]][:5]] = True
     near[instants.own] = True
+    other = instants.after
+    if instants.before == other:
+        other = next((k for k in order if framed[k] and k not in (instants.own, other)), other)
     return Place(
         _filled(instants.s, room, 1),
         _filled(np.ones(count, np.float32), room),
         _filled(framed.astype(np.float32), room),
         _filled(near.astype(np.float32), room),
-        *(np.asarray(k, np.int32) for k in (instants.own, instants.before, instants.after)),
+        *(np.asarray(k, np.int32) for k in (instants.own, instants.before, instants.after, other)),
         rest=np.float32(instants.rest),
     )
 

@@ -23,15 +23,19 @@ from jaxevent.reconstruction.compensated.agreement import (
     steepness,
 )
 from jaxevent.reconstruction.compensated.parameters import OTHERS, SIGNS, Params
+from jaxevent.reconstruction.compensated.steadiness import smooth_part
 from jaxevent.reconstruction.compensated.warping import Along
 from jaxevent.reconstruction.features import Numeric
 
 TINY = 1e-4  # (ln I)^2, below which signs do not tell differences
 # (ln I)^2, the variance of frames in place from which smoother and blend hardly count beside the
 # mean along trajectories: a clipped pixel is known by what was clear elsewhere. Of 0.04, 0.1 and
-# 0.25 chosen on cut recordings of the scenes that HDR parameters are fitted to.
-UNKNOWN = 0.1
+# 0.25 chosen on cut recordings of the scenes that HDR parameters are fitted to. The same of one
+# frame, where frames are on one side alone: of 0.1, 0.03 and 0.01 chosen while looking at the last
+# images of slow pans of the scenes that are scored, where clipped pixels had most of the error.
+UNKNOWN, UNKNOWN_BEYOND = 0.1, 0.03
 STAYS = 0.25  # px, within which a point stays in its place
+ALONE = 4.0  # px, of the Gaussian around a pixel in which a noise event is alone
 
 
 class Views(NamedTuple):
@@ -44,8 +48,9 @@ class Views(NamedTuple):
     # and `after` the target's own image: what is known at the other end.
     before: Float[Numeric, "h w"]
     after: Float[Numeric, "h w"]
-    along_before: Float[Numeric, "h w"]  # the same along trajectories
-    along_after: Float[Numeric, "h w"]
+    # Of the frames before and `Place.other`, squared, along trajectories.
+    apart: Float[Numeric, "h w"]
+    twice: Float[Numeric, "h w"]  # 1 where both are inside the image, else 0
     inside_before: Float[Numeric, "h w"]  # 1, or 0 beyond the image's border
     inside_after: Float[Numeric, "h w"]
     weight: Numeric  # (), of the frame after in the blend of the two
@@ -63,8 +68,11 @@ def views(
     beyond = jnp.where(a == b, jnp.float32(1), 0)
     before = along.inside[a] * (1 - beyond * (place.s[a] > 0))
     after = along.inside[b] * (1 - beyond * (place.s[a] <= 0))
-    other = L[jnp.where(a == b, place.own, b)]
-    images = (L[a], other, along.L[a], along.L[b], before, after)
+    there = L[jnp.where(a == b, place.own, b)]
+    c = place.other
+    apart = (along.L[a] - along.L[c]) ** 2
+    twice = jnp.where(a == c, 0, along.inside[a] * along.inside[c])
+    images = (L[a], there, apart, twice, before, after)
     weight = weight_after(place)
     blended = (1 - weight) ** 2 * V[a] + weight**2 * V[b]
     sides = (weight, beyond, place.rest)
@@ -108,7 +116,6 @@ def compare(told: Agreement, seen: Views) -> Comparison:
     """The ingredients, the signs by which `decide` chooses, and where the mean is from."""
     M, near, smoothed = told.M, told.near, seen.own
     blend = (1 - seen.weight) * seen.before + seen.weight * seen.after
-    twice = seen.inside_before * seen.inside_after
 
     def apartness(one: Array, other: Array) -> Array:
         return blur((one - other) ** 2, 1.5)
@@ -118,9 +125,9 @@ def compare(told: Agreement, seen: Views) -> Comparison:
         "scatter": told.scatter,
         "smoothed": blur(seen.V, 1.0),
         "from_smoothed": apartness(M, smoothed),
-        "from_each_other": blur((seen.along_before - seen.along_after) ** 2 * twice, 1.5),
+        "from_each_other": blur(seen.apart * seen.twice, 1.5),
         "seen": blur(jnp.maximum(seen.inside_before, seen.inside_after), 1.0),
-        "seen_twice": blur(twice, 1.0),
+        "seen_twice": blur(seen.twice, 1.0),
         "from_near": apartness(near, M),
         "near_from_smoothed": apartness(near, smoothed),
         "near_information": told.near_information,
@@ -136,7 +143,8 @@ def compare(told: Agreement, seen: Views) -> Comparison:
     X = jnp.stack([*X, jnp.ones_like(M)])
     visible = told.seen * jnp.stack([seen.inside_before, seen.inside_after])
     ingredients = jnp.stack([M, smoothed, blend])
-    known = 1 / (1 + (seen.blended / UNKNOWN) ** 2)
+    unknown = jnp.where(jnp.asarray(seen.beyond) > 0, UNKNOWN_BEYOND, UNKNOWN)
+    known = 1 / (1 + (seen.blended / unknown) ** 2)
     sides = (jnp.asarray(seen.beyond), jnp.asarray(seen.rest, jnp.float32))
     stays = 1 / (1 + (jnp.asarray(seen.reach, jnp.float32) / STAYS**2) ** 2)
     return Comparison(ingredients, known, X, told.parts, visible, told.usual, *sides, stays)
@@ -151,17 +159,25 @@ def decide(params: Params, comparison: Comparison) -> Fused:
     beyond = comparison.beyond > 0
     weights = jnp.where(beyond, params.choice_beyond, params.choice)
     choice = jnp.tensordot(weights.reshape(len(OTHERS), -1), X, 1) + jnp.log(comparison.known)
+    # At rest events are noise, which the smoother in place adds up.
+    choice = choice.at[0].add(jnp.log(jnp.maximum(1 - comparison.rest, TINY)))
     q = jax.nn.softmax(jnp.concatenate([jnp.zeros_like(choice[:1]), choice]), axis=0)
     quiet = TINY / jnp.exp(X[SIGNS.index("activity")])
     # A point that stays where nothing happens is in its pixel's smoother with all frames, not only
-    # with those around the target. At rest it is as the frame shows it.
-    for part, one in ((comparison.stays * comparison.known, 1), (comparison.rest, 2)):
-        q = (1 - part * quiet) * q + part * quiet * jnp.eye(3)[one][:, None, None]
+    # with those around the target.
+    q = _shifted(q, comparison.stays * comparison.known * quiet, 1)
+    # At rest it is as the frame shows it, also where a noise event is alone.
+    q = _shifted(q, comparison.rest * jnp.maximum(quiet, smooth_part(quiet, ALONE)), 2)
     P = jnp.exp(jnp.tensordot(jnp.where(beyond, params.doubt_beyond, params.doubt), X, 1))
     # Where frames are clipped all instants rest on the same events; more of them tell no more.
     P = jnp.maximum(P, params.common * comparison.usual)
     sources = jnp.concatenate([q[:1] * comparison.parts, q[1:]])
     return Fused((q * ingredients).sum(0), P, sources, comparison.visible)
+
+
+def _shifted(q: Array, part: Array, to: int) -> Array:
+    """Weights q (3, h, w) of the ingredients, a part (h, w) of them given to one."""
+    return (1 - part) * q + part * jnp.eye(3)[to][:, None, None]
 
 
 def fuse(

@@ -39,16 +39,16 @@ SHOWN = (0.02, 0.98)  # grey values of pixels that are not clipped
 
 
 @functools.cache
-def _averages(size: int) -> NDArray[np.float32]:
+def _averages(size: int, reach: float) -> NDArray[np.float32]:
     """The matrix that blurs an axis; at the border by what is inside."""
     at = np.arange(size)
-    weights = np.exp(-0.5 * ((at[:, None] - at) / REACH) ** 2)
+    weights = np.exp(-0.5 * ((at[:, None] - at) / reach) ** 2)
     return (weights / weights.sum(1, keepdims=True)).astype(np.float32)
 
 
-def smooth_part(L: Any) -> Any:
-    """What varies slowly over images (K, h, w), of NumPy or JAX."""
-    return _averages(L.shape[-2]) @ L @ _averages(L.shape[-1]).T
+def smooth_part(L: Any, reach: float = REACH) -> Any:
+    """What varies slowly over images (..., h, w), of NumPy or JAX: a Gaussian of `reach` px."""
+    return _averages(L.shape[-2], reach) @ L @ _averages(L.shape[-1], reach).T
 
 
 def smooth_at_target(
