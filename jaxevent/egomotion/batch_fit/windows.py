@@ -83,13 +83,13 @@ FOLLOWING: tuple[tuple[Stage, ...], tuple[Stage, ...]] = (
 CLOSE = 1.75, 5e-4
 # Of motions before a plane: the part of the window, events, stages, the most that a plane costs
 # (C^2). What is no plane costs 1.8e-2 and more after the first of these, a plane 7e-3 and less; in
-# the end 1.5e-3 and more, 5e-5 and less. Without the flatter maps of the third some fits end on the
+# the end 1.5e-3 and more, 2e-4 and less. Without the flatter maps of the third some fits end on the
 # way, 5 to 30 degrees off at 100 times the cost of the truth.
 GROWING = (
     (0.5, TRIED // 2, (Stage(2.0, 8), Stage(1.0, 8)), 1e-2),
     (0.5, TRIED, (Stage(0.3, 12, 1, 100), Stage(0.1, 6, 1, 100)), 1e-3),
     (1.0, TRIED, tuple(Stage(sigma, 20, 10) for sigma in (1.0, 0.3, 0.1, 0.05)), 1e-3),
-    (1.0, TRIED, (Stage(0.1, 10), Stage(0.05, 20)), 1e-4),
+    (1.0, TRIED, (Stage(0.1, 10), Stage(0.05, 20)), 3e-4),
 )
 RATIO, GROWTH = 2.5, 5.0  # see `inflation`
 SKEW = 0.03  # standard deviation of the thresholds' skew by counts, at least
