@@ -7,6 +7,8 @@ import numpy as np
 
 from jaxevent.kernels import fast, fast_part
 
+ORDER = 5  # of exp(M tau)
+
 
 @fast_part
 def splat(image, x, y, weight):
@@ -127,7 +129,7 @@ def contrast_and_slope(x, y, tau, p, M, basis, corner, f, blurs, image, work, te
     """Minus the sum of squares of the blurred image of events moved by exp(M tau), and its slopes.
 
     Those by factors of `basis` (n, 3, 3), which M is the sum of, are written to `slope` (n,).
-    `terms` (2, 3, 9) is room.
+    `terms` (3, ORDER + 1, 3) is room.
     """
     image[:] = 0
     for e in range(len(x)):
@@ -139,46 +141,55 @@ def contrast_and_slope(x, y, tau, p, M, basis, corner, f, blurs, image, work, te
         for i in range(image.shape[1]):
             total -= float(image[j, i]) ** 2
     blur(image, work, blurs)
-    slope[:] = 0
-    by, term = terms[0], terms[1]
+    by = terms[2]
+    by[:] = 0
     for e in range(len(x)):
-        a, b, c = x[e] / f, y[e] / f, 1.0
-        X, Y, Z, t = a, b, c, tau[e]
-        # The terms M^k x tau^k / k! one after the other, by M and by each of its nine numbers.
-        terms[:] = 0
-        for k in range(1, 6):
-            scale, old = t / k, (a, b, c)
-            for n in range(9):
-                r, q = n // 3, n % 3
-                d0, d1, d2 = term[0, n], term[1, n], term[2, n]
-                for m in range(3):
-                    term[m, n] = scale * (
-                        M[m, 0] * d0 + M[m, 1] * d1 + M[m, 2] * d2 + (old[q] if m == r else 0.0)
-                    )
-                    by[m, n] += term[m, n]
-            a = scale * (M[0, 0] * old[0] + M[0, 1] * old[1] + M[0, 2] * old[2])
-            b = scale * (M[1, 0] * old[0] + M[1, 1] * old[1] + M[1, 2] * old[2])
-            c = scale * (M[2, 0] * old[0] + M[2, 1] * old[1] + M[2, 2] * old[2])
-            X, Y, Z = X + a, Y + b, Z + c
+        # p_k = (M tau)^k (x, y, f) / f, of which sum_k p_k / k! is the place in homogeneous
+        # coordinates. By M, g in these: sum_ij q_i p_j' tau / (i + j + 1)!, q_i = (M' tau)^i g.
+        t, X, Y, Z = tau[e], x[e] / f, y[e] / f, 1.0
+        p_k, q_k = terms[0], terms[1]
+        p_k[0, 0], p_k[0, 1], p_k[0, 2] = X, Y, Z
+        share = 1.0
+        for k in range(1, ORDER + 1):
+            share /= k
+            for m in range(3):
+                p_k[k, m] = t * (
+                    M[m, 0] * p_k[k - 1, 0] + M[m, 1] * p_k[k - 1, 1] + M[m, 2] * p_k[k - 1, 2]
+                )
+            X, Y, Z = X + share * p_k[k, 0], Y + share * p_k[k, 1], Z + share * p_k[k, 2]
         px, py = f * X / Z, f * Y / Z
         gx, gy = slope_of(image, px - corner[0], py - corner[1])
         gx, gy = -2 * p[e] * gx / Z, -2 * p[e] * gy / Z
-        gz = -(gx * px + gy * py)
-        gx, gy = f * gx, f * gy
-        for n in range(len(slope)):
-            s = 0.0
-            for k in range(9):
-                s += basis[n, k // 3, k % 3] * (gx * by[0, k] + gy * by[1, k] + gz * by[2, k])
-            slope[n] += s
+        q_k[0, 0], q_k[0, 1], q_k[0, 2] = f * gx, f * gy, -(gx * px + gy * py)
+        before = t
+        for i in range(ORDER):
+            share = before / (i + 1)
+            a, b, c, before = 0.0, 0.0, 0.0, share
+            for j in range(ORDER - i):
+                a, b, c = a + share * p_k[j, 0], b + share * p_k[j, 1], c + share * p_k[j, 2]
+                share /= i + j + 2
+            for m in range(3):
+                by[m, 0] += q_k[i, m] * a
+                by[m, 1] += q_k[i, m] * b
+                by[m, 2] += q_k[i, m] * c
+                q_k[i + 1, m] = t * (
+                    M[0, m] * q_k[i, 0] + M[1, m] * q_k[i, 1] + M[2, m] * q_k[i, 2]
+                )
+    for n in range(len(slope)):
+        slope[n] = 0
+        for m in range(3):
+            slope[n] += (
+                basis[n, m, 0] * by[m, 0] + basis[n, m, 1] * by[m, 1] + basis[n, m, 2] * by[m, 2]
+            )
     return total
 
 
 @fast_part
 def moved(M, x, y, t, f):
-    """Where exp(M t) takes a point, to the fifth order."""
+    """Where exp(M t) takes a point."""
     a, b, c = x / f, y / f, 1.0
     X, Y, Z = a, b, c
-    for k in range(1, 6):
+    for k in range(1, ORDER + 1):
         s = t / k
         a, b, c = (
             s * (M[0, 0] * a + M[0, 1] * b + M[0, 2] * c),
