@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import geometry
-from jaxevent.egomotion.batch_fit import photometric, sequence, starts
+from jaxevent.egomotion.batch_fit import frames, images, photometric, sequence, starts
 from jaxevent.egomotion.batch_fit import windows as batch
 from jaxevent.egomotion.batch_fit.depths import depths as look_for_depths
 from jaxevent.egomotion.batch_fit.frames import DARK, look_at, offset
@@ -237,7 +237,8 @@ def test_events_are_placed_on_the_nearest_surface():
     depths = np.full((rows, columns), np.log(0.3))
     depths[rows // 3 : 2 * rows // 3, columns // 3 : 2 * columns // 3] = np.log(1.8)
     path = true_path(depths.ravel())
-    found = np.stack(placed(path, tracks), 1)
+    X, Y, log_rho = placed(path, tracks)
+    found = np.stack([X, Y], 1)
     lattice = [
         tracks.corner[axis] + tracks.node * np.arange(n) for axis, n in ((1, rows), (0, columns))
     ]
@@ -256,6 +257,46 @@ def test_events_are_placed_on_the_nearest_surface():
     # So many depths are looked at; surfaces that a ray only grazes lie between them.
     assert right.mean() > 0.95
     assert hidden.sum() > 20 and right[hidden].mean() > 0.7
+    # From where they lay before the motion was changed a little they are found too.
+    changed = Path(1.02 * path.O, path.D, path.log_rho)
+    searched, near = placed(changed, tracks), placed(changed, tracks, log_rho)
+    assert np.abs(searched[0] - X).max() > 0.1
+    same = np.hypot(searched[0] - near[0], searched[1] - near[1]) < 0.01
+    assert same.mean() > 0.97
+
+
+def test_contrast_changes_as_told():
+    """By each generator of a homography flow, against differences."""
+    windows, _ = fitted()
+    cut, basis = windows.cut(150_000, 0.15, 3000), np.concatenate([starts.TURNS, starts.STRAINS])
+    image, work = np.empty((2, *cut.shape), cut.x.dtype)
+    terms, slope = np.empty((3, images.ORDER + 1, 3)), np.empty(len(basis))
+
+    def contrast(values: np.ndarray) -> float:
+        M = np.tensordot(values, basis, 1)
+        return images.contrast_and_slope(
+            cut.x, cut.y, cut.tau, cut.p, M, basis, cut.corner, cut.f, 4, image, work, terms, slope
+        )
+
+    values = np.linspace(-0.4, 0.5, len(basis))
+    # Steps over which the image moves by some hundredths of a pixel.
+    step, found = 2e-3, []
+    for way in np.eye(len(basis)):
+        found.append((contrast(values + step * way) - contrast(values - step * way)) / (2 * step))
+    contrast(values)
+    np.testing.assert_allclose(slope, found, atol=0.02 * np.abs(found).max())
+
+
+def test_a_function_of_few_numbers_is_minimised():
+    """Rosenbrock's, which is least, 0, at (1, 1)."""
+
+    def rosenbrock(at: np.ndarray) -> tuple[float, np.ndarray]:
+        a, b = 1 - at[0], at[1] - at[0] ** 2
+        return a**2 + 100 * b**2, np.array([-2 * a - 400 * at[0] * b, 200 * b])
+
+    at, least = starts._least(rosenbrock, np.array([-1.2, 1.0]), 60)
+    np.testing.assert_allclose(at, 1, atol=1e-3)
+    assert 0 <= least < 1e-6
 
 
 def test_depths_of_a_known_path():
@@ -311,7 +352,7 @@ def test_the_map_is_the_least_squares_one():
     for _ in range(2):
         scene, _ = adjust(tracks, scene, prior, 1e3, 100, 8)
     left = misfits(scene, tracks)
-    X, Y = placed(scene.path, tracks)
+    X, Y, _ = placed(scene.path, tracks)
     i, j = X - tracks.corner[0], Y - tracks.corner[1]
     height, width = tracks.shape
     inside = (i >= 1) & (i < width - 2) & (j >= 1) & (j < height - 2)
@@ -389,6 +430,14 @@ def test_frames_stamps_are_held_against_the_events():
     mirrored = dataclasses.replace(recording.frames, images=recording.frames.images[:, :, ::-1])
     assert offset(dataclasses.replace(recording, frames=mirrored)) == 0
     assert offset(dataclasses.replace(recording, frames=recording.frames[:1])) == 0
+
+
+@pytest.mark.parametrize(
+    "told, expected", [((4000, 5500), 4000), ((4000, 6500), 0), ((4000, None), 0), ((None, 0), 0)]
+)
+def test_an_offset_that_depends_on_pixels_is_none(monkeypatch, told, expected):
+    monkeypatch.setattr(frames, "_agreed", lambda *given: told[frames.ACCOUNTS.index(given[-1])])
+    assert offset(stamped(0)) == expected
 
 
 def test_frames_tell_motion_where_events_are_few():

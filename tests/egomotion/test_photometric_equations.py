@@ -8,7 +8,7 @@ import pytest
 import scipy.linalg
 import scipy.ndimage
 
-from jaxevent.egomotion.batch_fit import coarse, solving
+from jaxevent.egomotion.batch_fit import coarse, solving, together
 from jaxevent.egomotion.batch_fit import equations as fit
 from jaxevent.egomotion.batch_fit.path import ROWS, SEGMENTS, Path, Prior
 from jaxevent.egomotion.batch_fit.rows import with_rows
@@ -252,6 +252,12 @@ def test_the_matrix_is_that_of_least_squares():
     P, of_events = between_coarse(equations), H - priors
     np.testing.assert_allclose(equations.mixed[:, :free], P.T @ H[m:, n:m], atol=1e-9)
     np.testing.assert_allclose(equations.smooth, P.T @ of_events[m:, m:] @ P, atol=1e-9)
+
+
+def test_what_numbers_do_not_hold_is_not_told():
+    system = fit.system_of(linearised()[1], 0.0)
+    found = together.solve(system, np.full((2, len(system.known)), np.nan))
+    assert np.isnan(found.t).all() and np.isnan(found.rest).all()
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.5])

@@ -41,8 +41,9 @@ BEND = 0.1  # a larger difference of log depth between nodes is an edge
 FREE = 6 * ROWS  # numbers of a path's rows; after them come the skew and the plane's normal
 # Of conjugate gradients: steps at most, and the part of the first residual that is left at the end.
 # Where the path was told last, by diagonals alone, a window of textures that started 65 degrees off
-# ended 9 to 20 degrees off with 0.05 left, 0.2 with 0.01.
-SOLVE, LEFT = 40, 0.01
+# ended 9 to 20 degrees off with 0.05 left, 0.2 with 0.01. After path and smooth depths 20 steps are
+# as good as 40 in each step of Gauss and Newton, whose number new weights ask for.
+SOLVE, LEFT = 20, 0.05
 TINY = 1e-5  # weight of the map's squares
 # Standard deviations of its prior that the skew may be off. On slider_depth it goes else from 0.2,
 # by counts, to 0.99, where ON events tell nothing, and a mirrored motion costs less than the true.
@@ -110,14 +111,14 @@ def laplacian(image: NDArray) -> NDArray:
 def look(problem: Problem, scene: Scene, weight: NDArray, before: Seen | None = None) -> Seen:
     """The scene with |C1| = 1, what it costs, and the weights of events, from those before.
 
-    Where the path is that of what was seen `before`, events stay where they were.
+    Where the path is that of what was seen `before`, events stay where they were, else about there.
     """
     tracks, prior, sigma, plane, usual = problem
     most = SKEWED / math.sqrt(float(prior.skew_weight))
     skew = min(max(float(scene.skew), prior.skew - most), prior.skew + most)
     stays = before is not None and before.scene.path is scene.path
     scene = Scene(scene.path if stays else normalised(scene.path), scene.map, skew)
-    places = read(scene, tracks, before.places if before and stays else None)
+    places = read(scene, tracks, before.places if before else None, stays=stays)
     e = places.value - tracks.level - tracks.x.dtype.type(scene.skew) * tracks.number
     weight = weight.copy()
     of_places, cost = weigh(

@@ -10,6 +10,7 @@ from jaxevent.kernels import fast, fast_part
 POWERS = 5  # of time, of the path's polynomials
 LOOKS = 16  # depths on a ray that are looked at, at most
 APART = 1.0  # px on the ray between them, but for those that are so many
+SETTLED = 0.01  # of log depth, that a second step of Newton from the depth before changes at most
 FOLD = 0.3  # the least slope, along the ray of an event, of log depth less that of the scene
 
 
@@ -138,39 +139,51 @@ def _newton(depth, rx, ry, dx, dy, log_rho, grids):
     return log_rho - (log_rho - there) / max(1 - rho * (lx * dx + ly * dy), FOLD)
 
 
+@fast_part
+def _first_met(depth, ray, top, bottom, grids):
+    """From near to far, the first of some depths on a ray that is not nearer than the scene's."""
+    rx, ry, dx, dy = ray
+    rho = np.exp(top)
+    value = top - depth_between(depth, rx + rho * dx, ry + rho * dy, grids)[0]
+    if value <= 0:
+        return top
+    reach = np.sqrt(dx * dx + dy * dy) * (rho - np.exp(bottom)) / APART
+    looks = min(1 + int(reach), LOOKS)
+    step, before = (bottom - top) / looks, top
+    less = np.exp(step)
+    for _ in range(looks):
+        rho *= less
+        log_rho = before + step
+        new = log_rho - depth_between(depth, rx + rho * dx, ry + rho * dy, grids)[0]
+        if new <= 0:
+            return before + step * value / max(value - new, 1e-6)
+        before, value = log_rho, new
+    return bottom
+
+
 @fast
-def place(points, motion, depth, high, low, grids, X, Y):
+def place(points, motion, depth, high, low, grids, root, X, Y):
     """Write where events are in the reference view: on the nearest surface their rays meet.
 
     On the ray of an event x = r + rho d, which the depths of the scene, rho'(x), meet where
     log rho = log rho'(r + rho d): once if they are smooth, more often beside an edge, where the
-    surface of the largest rho hides the others. `high` and `low` bound depths about nodes.
+    surface of the largest rho hides the others. `high` and `low` bound depths about nodes. `root`
+    holds log rho: those before, of a scene that is about the same, or -inf, and afterwards the new.
     """
     x, y, tau = points
     for e in range(len(x)):
-        rx, ry, dx, dy = ray_of(motion, x[e], y[e], tau[e])
-        k = corner_of(x[e], y[e], grids)[0]
-        top, bottom = high[k] + 0.02, low[k] - 0.02
-        # From near to far, the first of some depths that is not nearer than the scene's.
-        rho = np.exp(top)
-        value = top - depth_between(depth, rx + rho * dx, ry + rho * dy, grids)[0]
-        root = top
-        if value > 0:
-            reach = np.sqrt(dx * dx + dy * dy) * (rho - np.exp(bottom)) / APART
-            looks = min(1 + int(reach), LOOKS)
-            step, before, root = (bottom - top) / looks, top, bottom
-            less = np.exp(step)
-            for _ in range(looks):
-                rho *= less
-                log_rho = before + step
-                new = log_rho - depth_between(depth, rx + rho * dx, ry + rho * dy, grids)[0]
-                if new <= 0:
-                    root = before + step * value / max(value - new, 1e-6)
-                    break
-                before, value = log_rho, new
-        for _ in range(2):
-            root = _newton(depth, rx, ry, dx, dy, root, grids)
-        rho = np.exp(root)
+        ray = ray_of(motion, x[e], y[e], tau[e])
+        rx, ry, dx, dy = ray
+        here, new = root[e], np.inf
+        if here > -np.inf:
+            here = _newton(depth, rx, ry, dx, dy, here, grids)
+            new = _newton(depth, rx, ry, dx, dy, here, grids)
+        if not abs(new - here) < SETTLED:
+            k = corner_of(rx, ry, grids)[0]
+            new = _first_met(depth, ray, high[k] + 0.02, low[k] - 0.02, grids)
+            for _ in range(2):
+                new = _newton(depth, rx, ry, dx, dy, new, grids)
+        root[e], rho = new, np.exp(new)
         X[e], Y[e] = rx + rho * dx, ry + rho * dy
 
 

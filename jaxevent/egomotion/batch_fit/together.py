@@ -16,8 +16,10 @@ from jaxevent.egomotion.batch_fit.solving import System, multiply
 from jaxevent.kernels import fast
 
 # Steps at most, and by what part the sides' own unknowns may still grow in so many steps.
-MOST, EVERY, GROWS = 240, 20, 0.05
-REPEATED = 1e-11  # of the largest eigenvalue: directions that repeat others are left out
+MOST, EVERY, GROWS = 240, 10, 0.1
+# Eigenvalues by the largest, of directions that repeat others, and of ones that are all solved:
+# these are left out.
+REPEATED, NOTHING = 1e-11, 1e-30
 PART = 1024  # numbers that are in a core's own memory together, of all columns
 
 
@@ -67,7 +69,10 @@ def advance(to: Columns, by: NDArray, way: Columns) -> None:
 
 
 def solve(system: System, sides: NDArray[np.float64]) -> Columns:
-    """H^-1 of sides (S, n) of the path and the like, undamped."""
+    """H^-1 of sides (S, n) of the path and the like, undamped.
+
+    Where single precision does not hold the directions it is what was found before, or NaN.
+    """
     shape, nodes, real = system.ease_map.shape, system.across.shape, system.ease_map.dtype
     size, number = system.ease_map.size, len(sides)
     value = np.empty(len(system.weight), real)
@@ -95,12 +100,17 @@ def solve(system: System, sides: NDArray[np.float64]) -> Columns:
     left.t[:] = sides
     ease(left, better)
     way, known = Columns(better.t.copy(), better.rest.copy()), np.zeros(number)
+    before = Columns(np.full_like(found.t, np.nan), np.full_like(found.rest, np.nan))
     for step in range(1, MOST + 1):
         times(way, image)
         energy = product(way, image)
+        if not np.isfinite(energy).all():
+            return before
         # Of directions that are about one alone the part that is new.
         sizes, axes = np.linalg.eigh((energy + energy.T) / 2)
-        kept = sizes > REPEATED * sizes[-1]
+        kept = sizes > max(REPEATED * sizes[-1], NOTHING)
+        if not kept.any():
+            return found
         inverse = axes[:, kept] / sizes[kept] @ axes[:, kept].T
         length = inverse @ product(way, left)
         advance(found, length, way)
@@ -118,5 +128,5 @@ def solve(system: System, sides: NDArray[np.float64]) -> Columns:
             now = (sides * found.t).sum(1)
             if (np.abs(now - known) <= GROWS * np.abs(now)).all():
                 break
-            known = now
+            known, before = now, Columns(found.t.copy(), found.rest.copy())
     return found

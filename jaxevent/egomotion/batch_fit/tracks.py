@@ -79,6 +79,7 @@ class Places(NamedTuple):
 
     X: NDArray
     Y: NDArray
+    depth: NDArray  # log inverse depths
     first: NDArray[np.int32]
     u: NDArray
     v: NDArray
@@ -86,25 +87,36 @@ class Places(NamedTuple):
     value: NDArray
 
 
-def placed(path: Path, tracks: Tracks) -> tuple[NDArray, NDArray]:
-    """Where events are in the reference view (`placing.place`)."""
+def placed(
+    path: Path, tracks: Tracks, before: NDArray | None = None
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Where events are in the reference view and their log depths (`placing.place`).
+
+    From those `before`, of a scene that is about the same, it is quicker.
+    """
     X, Y = np.empty_like(tracks.x), np.empty_like(tracks.x)
+    root = np.full_like(tracks.x, -np.inf) if before is None else before.copy()
     # Of nodes within reach the nearest and the farthest depth.
     depth = np.ascontiguousarray(path.log_rho)
     of, size = depth.reshape(tracks.nodes), 2 * SIDE + 1
     high = scipy.ndimage.maximum_filter(of, size, mode="nearest").ravel()
     low = scipy.ndimage.minimum_filter(of, size, mode="nearest").ravel()
-    place(tracks.points, path.motion(tracks.f), depth, high, low, tracks.grids, X, Y)
-    return X, Y
+    place(tracks.points, path.motion(tracks.f), depth, high, low, tracks.grids, root, X, Y)
+    return X, Y, root
 
 
-def read(scene: Scene, tracks: Tracks, at: Places | None = None) -> Places:
-    """What the scene shows where it puts the events, which may be known already."""
-    X, Y = placed(scene.path, tracks) if at is None else (at.X, at.Y)
+def read(
+    scene: Scene, tracks: Tracks, before: Places | None = None, *, stays: bool = False
+) -> Places:
+    """What the scene shows where it puts the events: near those `before`, there if it `stays`."""
+    if before is not None and stays:
+        X, Y, depth = before.X, before.Y, before.depth
+    else:
+        X, Y, depth = placed(scene.path, tracks, None if before is None else before.depth)
     u, v, inside, value = (np.empty_like(X) for _ in range(4))
     first = np.empty(len(X), np.int32)
     read_map(scene.map.ravel(), X, Y, tracks.grids, first, u, v, inside, value)
-    return Places(X, Y, first, u, v, inside, value)
+    return Places(X, Y, depth, first, u, v, inside, value)
 
 
 def misfits(scene: Scene, tracks: Tracks) -> NDArray:
