@@ -44,6 +44,7 @@ FREE = 6 * ROWS  # numbers of a path's rows; after them come the skew and the pl
 # ended 9 to 20 degrees off with 0.05 left, 0.2 with 0.01. After path and smooth depths 20 steps are
 # as good as 40 in each step of Gauss and Newton, whose number new weights ask for.
 SOLVE, LEFT = 20, 0.05
+ALONE = 1e-3  # the same part, where a column of H^-1 is solved for by itself
 TINY = 1e-5  # weight of the map's squares
 # Standard deviations of its prior that the skew may be off. On slider_depth it goes else from 0.2,
 # by counts, to 0.99, where ON events tell nothing, and a mirrored motion costs less than the true.
@@ -306,9 +307,15 @@ def inverse_of(equations: Equations, rows: list[int]) -> list[Unknowns]:
     n = FREE + len(equations.slopes.more)
     sides = np.zeros((len(rows), n))
     sides[range(len(rows)), rows] = equations.unit[rows]
-    found = together.solve(system_of(equations, 0.0), sides)
-    shape = equations.problem.tracks.shape
-    size = math.prod(shape)
+    system, shape = system_of(equations, 0.0), equations.problem.tracks.shape
+    found, size = together.solve(system, sides), math.prod(shape)
+    # Directions that are about one are told apart by rounding; a side alone has but one.
+    for row in np.flatnonzero(~np.isfinite(found.t).all(1)):
+        none, depths = np.zeros(shape, system.ease_map.dtype), np.zeros_like(system.across)
+        image, found.t[row], depths, _ = conjugate_gradients(
+            system, none, sides[row], depths, together.MOST, ALONE
+        )
+        found.rest[row] = np.concatenate([image.ravel(), depths.ravel()])
     return [
         (rest[:size].reshape(shape), np.append(t, np.zeros(FREE + 4 - n)), rest[size:])
         for t, rest in zip(*found, strict=True)

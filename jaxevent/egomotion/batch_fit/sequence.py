@@ -151,7 +151,7 @@ def _blended(
         covariance[near] += weight[:, None, None] * (fit.covariance + off + bent)
         agreement[near] += weight * fit.agreement
         total[near] += weight
-    lost = total < 1e-6
+    lost = (total < 1e-6) | ~np.isfinite(covariance).all((1, 2))
     safe = np.where(lost, 1, total)
     size = np.linalg.norm(heading, axis=1, keepdims=True)
     heading = np.where(size > 0, heading / np.where(size > 0, size, 1), np.array([0.0, 0, 1]))
