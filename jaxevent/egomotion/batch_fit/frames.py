@@ -32,7 +32,7 @@ AGREEING = 0.5  # the least correlation of changes and events
 STEEP = 0.5  # the share of pixels, those with the steepest surroundings, that are fitted
 STEP = 1 / 512  # grey, the noise of 8 bits at least
 NOISE = 0.1  # C, of events: what is noisier counts less
-PAIRS = 10  # of frames, those with most events between them, that tell the offset
+PAIRS = 20  # of frames, those with most events between them, that tell the offset
 FARTHEST = 20_000  # us, of offsets that are tried
 # What no image of gentle slopes has (Immerkaer, 1996), 6 times the noise of a pixel.
 ROUGH = np.outer([1, -2, 1], [1, -2, 1])

@@ -15,7 +15,7 @@ DEEPEST = 0.5  # of log depth, likewise
 # A step that costs more is taken back and damped, first by so much, then by so many times more;
 # where that is too much no step helps. A step that costs less leaves so much of the damping, and is
 # the last if it gains less than such a part.
-DAMP, HARDER, STUCK, SOFTER, ENOUGH = 0.1, 5, 50, 0.5, 2e-3
+DAMP, HARDER, STUCK, SOFTER, ENOUGH = 0.1, 5, 50, 0.5, 1e-3
 
 
 class Acceptance(NamedTuple):
