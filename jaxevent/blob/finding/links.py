@@ -111,9 +111,9 @@ class Links:
         owner = np.full(len(part), -1)
         if len(self.live.id):
             look = Look(self.live, part, t)
-            owner = look.share_out(labels, blobs)
-            self._update(look, owner, labels > 0)
-            self._part(part, t, owner, labels > 0)
+            owner, in_blob = look.share_out(labels, blobs), labels > 0
+            self._update(look, owner, in_blob)
+            self._part(part, t, owner, in_blob)
             self._join_parts(t)
             self._end(self._over())
         self._begin_targets(part, t, owner, labels, blobs)
@@ -154,11 +154,11 @@ class Links:
         Of parts of one object, such as both sides of an outline, the distance stays. How far apart
         they are is told along its longer axis, since coarse cells see no gap.
         """
-        live = self.live
-        longish = larger(live.C) > LONGISH**2 * np.linalg.det(live.C) / larger(live.C)
+        live, square = self.live, larger(self.live.C)
+        longish = square > LONGISH**2 * np.linalg.det(live.C) / square
         before, self.pairs, others = self.pairs, {}, []
         for i in np.flatnonzero(longish & live.confirmed & (live.miss == 0)):
-            key, size = int(live.id[i]), float(live.size[i])
+            key, size = int(live.id[i]), float(np.sqrt(square[i]))
             self.least[key] = min(self.least.get(key, size), size)
             if size < GROWN * self.least[key]:
                 continue

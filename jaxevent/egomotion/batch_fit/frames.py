@@ -48,7 +48,7 @@ class Account(NamedTuple):
 
 # Where both do not find the same offset, so many us apart at most, it is not told: before simulated
 # walls of little contrast, whose stamps are right, they find -6 and 17 ms, and headings end 4
-# degrees off. On evbench_seq3, where changes agree with events no better, they find -7.2 and -7.7.
+# degrees off. On evbench_seq3, where changes agree with events no better, they find -7.6 and -8.2.
 ACCOUNTS = Account(50_000, False, 2000), Account(100_000, True, 4000)
 ALIKE = 2000
 
