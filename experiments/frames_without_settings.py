@@ -6,9 +6,10 @@ DIR/data holds the recordings; by default DIR is $JAXEVENT_DATA. Of each every 2
 frame is given, as `jaxevent evaluate` does it; methods have their default parameters. A few of the
 hidden frames are scored, evenly chosen: those between given frames, and apart from these those
 after the last one. MSE; MSE after the brightness of each image is fitted to the hidden frame
-(a I + b), since the frames of evbench_seq3 are not equally bright; SSIM; z2. The last column of
-`mc` is its MSE as part of the least of its ingredients, `aks` and `blend`. Makes table.md; rows
-that the folder holds are kept.
+(a I + b), since the frames of evbench_seq3 are not equally bright; SSIM; z2, and z2 of the images
+whose brightness is fitted, with the variances that were told. The last column of `mc` is its MSE as
+part of the least of its ingredients, `aks` and `blend`. Makes table.md; rows that the folder holds
+are kept.
 
 With --beyond frames of the second half are scored that lie 1, 2 and 4 frames after the last one
 given, and as far before the first: the recording is cut there at three places, its events are not.
@@ -39,7 +40,8 @@ GAPS, IMAGES = (2, 4, 8), 8
 CUTS, AWAY = (0.55, 0.7, 0.85), (1, 2, 4)  # parts of a recording's frames; frames from the cut
 COLUMNS = (
     ("MSE x 1e-2", "mse", 100, 4), ("brightness fitted", "fitted", 100, 4), ("SSIM", "ssim", 1, 3),
-    ("z2", "z2", 1, 2), ("of the best ingredient", "ratio", 1, 2),
+    ("z2", "z2", 1, 2), ("z2, brightness fitted", "z2_fitted", 1, 2),
+    ("of the best ingredient", "ratio", 1, 2),
 )  # fmt: skip
 
 
@@ -61,8 +63,10 @@ def score(method: Any, params: Any, given: Recording, truth: Frames, noise: floa
     }
     if method.has_covariance:
         I0 = float(params.I0)
-        squares = np.log((images + I0) / (true + I0)) ** 2
-        row["z2"] = float(np.nanmean(squares / (P + noise / (true + I0) ** 2)))
+        fitted = np.stack([brightness_fitted(i, t).clip(0, 1) for i, t in pairs])
+        for name, shown in (("z2", images), ("z2_fitted", fitted)):
+            squares = np.log((shown + I0) / (true + I0)) ** 2
+            row[name] = float(np.nanmean(squares / (P + noise / (true + I0) ** 2)))
     return row
 
 

@@ -94,6 +94,9 @@ def test_brightness_is_in_doubt_where_frames_differ_from_those_around():
     np.testing.assert_allclose(told.doubt(62_500), 0.75 * left_out, rtol=1e-5)
     np.testing.assert_allclose(told.doubt(250_000), left_out, rtol=1e-5)
     assert told.doubt(100_000) == 0
+    two = steady(still(wall, [3]).with_frames(slice(1, 3)))
+    doubts = [two.doubt(t) for t in (75_000, 62_500, 250_000, 0, 100_000)]
+    np.testing.assert_allclose(doubts, b**2 * np.array([0.75, 0.75**2, 1, 1, 0]), rtol=1e-5)
     # An exposure that adapts evenly leaves nothing in doubt.
     wall = np.exp(np.linspace(-1, -0.4, 5))[:, None, None] * np.ones((5, HEIGHT, WIDTH))
     told = steady(still((255 * wall - 0.3 * 255).round().astype(np.uint8), [3]))
