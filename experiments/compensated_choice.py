@@ -314,6 +314,19 @@ def weight(row: dict[str, Any], noises: dict[str, float]) -> float:
     return REAL if row["label"].split()[0] in noises else 1.0
 
 
+def _doubted(row: dict[str, Any]) -> np.ndarray:
+    """The signs by which the variance is told."""
+    given = (row["signs"], row["known"], row["beyond"] > 0)
+    return np.asarray(fusion.signs_of_doubt(*map(jnp.asarray, given)))
+
+
+def _standardised(X: jnp.ndarray) -> tuple[jnp.ndarray, jnp.ndarray, jnp.ndarray]:
+    """Signs (pixels, signs) of mean 0 and standard deviation 1, and what these were."""
+    mean, spread = X.mean(0).at[-1].set(0), X.std(0).at[-1].set(1)
+    spread = jnp.where(spread > 1e-3, spread, 1)
+    return (X - mean) / spread, mean, spread
+
+
 def fit(
     rows: list[dict],
     noises: dict[str, float],
@@ -345,11 +358,11 @@ def fit(
         )
     )
     share = share / share.sum()
+    doubted = column(lambda r: some(_doubted(r)).T)
     hdr = column(lambda r: np.full(len(some(r["truth"])), r["hdr"])) > 0
     scale = column(lambda r: np.full(len(some(r["truth"])), weight(r, noises) / difficulty(r)))
-    mean, spread = X.mean(0).at[-1].set(0), X.std(0).at[-1].set(1)
-    spread = jnp.where(spread > 1e-3, spread, 1)
-    X = (X - mean) / spread
+    X, *scales = _standardised(X)
+    doubted, *doubted_scales = _standardised(doubted)
     level = jnp.log(truth + I0)
 
     def choose(W):
@@ -361,7 +374,7 @@ def fit(
 
     def surprise(w, squares):
         # Heavy-tailed as a t distribution, so that a few lost pixels do not set all variances.
-        P = jnp.exp(X @ w) + R
+        P = jnp.exp(doubted @ w) + R
         tail = 10 * jnp.log1p(squares / P / 10)
         return 0.5 * (share * (1.1 * tail + jnp.log(P))).sum() + 1e-4 * (w[:-1] ** 2).sum()
 
@@ -374,7 +387,7 @@ def fit(
             start = optax.apply_updates(start, change)
         return start, float(found)
 
-    def plain(W):
+    def plain(W, mean, spread):
         W = W / spread
         return W.at[..., -1].add(-(W[..., :-1] * mean[:-1]).sum(-1))
 
@@ -388,12 +401,12 @@ def fit(
     places = np.cumsum([0, *(len(some(r["truth"])) for r in rows)])
     factor = 1.0
     for _ in range(5):
-        z2 = np.asarray(squares / (factor * jnp.exp(X @ w) + R))
+        z2 = np.asarray(squares / (factor * jnp.exp(doubted @ w) + R))
         means = [np.log(z2[i:j].mean()) for i, j in zip(places[:-1], places[1:], strict=True)]
         factor *= float(np.exp(np.mean([np.mean([means[k] for k in g]) for g in groups.values()])))
     w = w.at[-1].add(np.log(factor))
     print(f"loss {found:.4f}, variances times {factor:.2f}")
-    return np.asarray(plain(W)), np.asarray(plain(w))
+    return np.asarray(plain(W, *scales)), np.asarray(plain(w, *doubted_scales))
 
 
 def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:

@@ -168,11 +168,25 @@ def decide(params: Params, comparison: Comparison) -> Fused:
     q = _shifted(q, comparison.stays * comparison.known * quiet, 1)
     # At rest it is as the frame shows it, also where a noise event is alone.
     q = _shifted(q, comparison.rest * jnp.maximum(quiet, smooth_part(quiet, ALONE)), 2)
-    P = jnp.exp(jnp.tensordot(jnp.where(beyond, params.doubt_beyond, params.doubt), X, 1))
+    signs = signs_of_doubt(X, comparison.known, beyond)
+    P = jnp.exp(jnp.tensordot(jnp.where(beyond, params.doubt_beyond, params.doubt), signs, 1))
     # Where frames are clipped all instants rest on the same events; more of them tell no more.
     P = jnp.maximum(P, params.common * comparison.usual)
     sources = jnp.concatenate([q[:1] * comparison.parts, q[1:]])
     return Fused((q * ingredients).sum(0), P, sources, comparison.visible)
+
+
+def signs_of_doubt(X: Array, known: Array, beyond: Array) -> Array:
+    """Signs X (signs, h, w) by which the variance is told.
+
+    Frames on one side that are clipped differ along trajectories by what they do not show. So what
+    two such frames tell counts as far as they show the point.
+    """
+    part = jnp.where(beyond, known, 1)
+    apart, twice = (SIGNS.index(name) for name in ("from_each_other", "seen_twice"))
+    squares = jnp.exp(X[apart]) - TINY
+    X = X.at[apart].set(jnp.where(beyond, jnp.log(part * squares + TINY), X[apart]))
+    return X.at[twice].multiply(part)
 
 
 def _shifted(q: Array, part: Array, to: int) -> Array:

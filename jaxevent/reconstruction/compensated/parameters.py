@@ -26,9 +26,7 @@ OTHERS = ("smoothed", "blend")  # ingredients beside the mean along trajectories
 
 # Fitted by experiments/compensated_choice.py: a number for every sign and one more, for each of
 # `OTHERS`; and the same for the result's variance. Those called beyond, by its --beyond, are of
-# times after the last frame and before the first. `DOUBT_BEYOND` is of a fit in which the signs of
-# two frames, `from_each_other` and `seen_twice`, were 0: with them variances of clipped pixels are
-# up to 10, and one-sided evidence moves such pixels far.
+# times after the last frame and before the first.
 # fmt: off
 CHOICE = (
     0.796, 0.089, 0.222, 0.939, 0.532, -3.802, -3.169, 0.234, -0.268, -0.368, 0.687, 0.136,
@@ -45,8 +43,8 @@ CHOICE_BEYOND = (
     0.697, -0.355, -0.353, 0.142, -0.268, -0.14, -1.274, 0.169, -0.825, -9.067,
 )
 DOUBT_BEYOND = (
-    0.714, 0.263, 0.499, 0.457, 0.0, -3.924, 0.0, 0.072, -0.353, 0.198, 0.21, -0.066, 0.107,
-    -0.045, 0.056, -0.011, 6.277,
+    0.081, 0.103, 0.446, 0.272, 0.639, -2.991, -1.953, 0.422, -0.395, -0.037, 0.073, -0.092, 0.188,
+    -0.065, -0.133, -0.04, 6.897,
 )
 # fmt: on
 
