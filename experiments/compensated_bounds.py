@@ -7,15 +7,19 @@ Tables:
     objects     simulated objects, 25 Hz, halfway between frames, of the seeds that
                 experiments/motion_compensated.py scores: the motion found, the true one as means
                 of 2 x 2 pixels, the true one of pixels, and the true visibility beside it; the
-                true one of objects that reach farther than they do, by parts of a pixel; all
-                errors, and what parts of the image add to them: pixels that an edge covers in part,
-                others that are hidden in a frame next to the target, and the rest by how far away
-                surfaces meet
-    pans        fast pans of HDR scenes: MSE of ln(I + I0) of dark, well-exposed, bright pixels, of
-                the smoother, of `mc` with the motion found and the true one, of the fusion alone,
-                and with the best ingredient at every pixel; which part of the dark error of a pixel
-                is that of all instants along its true trajectory. With --fitted that of the fit of
+                true one of objects that reach farther than they do, by parts of a pixel; the same
+                of a sensor without noise, dead time or mismatch; all errors, as part of those of
+                `flow` (pip install '.[vision]'), and what parts of the image add to them: pixels
+                that an edge covers in part, others that are hidden in a frame next to the target,
+                and the rest by how far away surfaces meet
+    pans        fast pans of HDR scenes: MSE of I, and of ln(I + I0) of all, dark, well-exposed and
+                bright pixels, of the smoother, of `mc` with the motion found and the true one, of
+                the fusion alone, and with the best ingredient at every pixel; the same of sensors
+                whose pixels are alike; which part of the dark error of a pixel is that of all
+                instants along its true trajectory. With --fitted that of the fit of
                 experiments/ahdr.py, as it scores them
+    bright      pans of HDR scenes: z2 of bright pixels that were within the range of some frame,
+                and of those that never were; needs --fitted
     thresholds  fast pans of HDR scenes by sensors whose pixels' thresholds differ more and more:
                 MSE of ln(I + I0) of bright pixels and of all, with and without learning these
     blurred     pans and objects at 300 px/s, exposures of 50 and 100 ms, as
@@ -30,26 +34,41 @@ but with --fitted.
 import argparse
 import dataclasses
 import functools
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import ahdr
 import numpy as np
-from motion_compensated import SCORING, at_and_between, blurred, halfway, objects_at
+from motion_compensated import (
+    SCORING,
+    at_and_between,
+    blurred,
+    halfway,
+    objects_at,
+    recorded,
+    sensor,
+)
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 import jaxevent
-from jaxevent.reconstruction.compensated import fusion, trajectories
+from jaxevent.reconstruction.compensated import estimator, fusion, trajectories
 from jaxevent.reconstruction.compensated.agreement import agree
-from jaxevent.reconstruction.compensated.estimator import Followed, place_of
+from jaxevent.reconstruction.compensated.estimator import CompensatedVideo, Followed, place_of
 from jaxevent.reconstruction.compensated.warping import Along, warp
+from jaxevent.reconstruction.windows import WINDOW_EVENTS
 from jaxevent.simulate import TESTING, Objects, Pan, Sensor, scene, simulate
 
 RATE, IMAGES = 25.0, 6  # Hz; images per recording
 EDGES = (2.0, 4.0)  # px from where surfaces meet
 GROWN = (0.25, 0.5)  # px
 MISMATCH, SEEDS = (0.03, 0.1, 0.15), (2, 3)
+FAULTLESS: dict[str, Any] = dict(
+    mismatch=0, refractory=0, background_rate=0, hot_fraction=0, read_noise=0
+)
+SENSORS: dict[str, dict[str, Any]] = {"": {}, ", pixels alike": {"mismatch": 0}}  # by label
 mc = jaxevent.METHODS["mc"]
 
 
@@ -120,6 +139,32 @@ def regions(source: Objects, t: int, frames: NDArray[np.int64]) -> dict[str, NDA
     }
 
 
+def object_images(
+    video: CompensatedVideo, source: Objects, t: int, all_cases: bool
+) -> dict[str, NDArray[np.floating]]:
+    """Log intensities of the smoother and of `mc` with parts of it replaced by the truth."""
+    target = video.follow(t)
+    instants, L, V, clear, *_ = target
+    place = place_of(instants, clear, len(instants))
+    shown = L, V, np.asarray(clear, np.float32), instants.s
+    true, hidden = truly_along(target, source, t)
+    cases = {"`mc`, motion found": warp(*shown, target.paths)}
+    if all_cases:
+        cases["true motion, by nodes"] = warp(*shown, by_nodes(target, source, t))
+        cases["true motion"] = true
+    cases["true motion and visibility"] = true._replace(inside=true.inside * ~hidden)
+    for grown in GROWN if all_cases else ():
+        along, _ = truly_along(target, source, t, grown)
+        cases[f"true motion, objects {grown:g} px larger"] = along
+    images = {"smoother": L[instants.own]}
+    for name, along in cases.items():
+        told = fusion.compare(
+            agree(video.params, L, along, place), fusion.views(L, V, along, place)
+        )
+        images[name] = np.asarray(fusion.decide(video.params, told).L)
+    return images
+
+
 def objects(folder: Path) -> Iterator[str]:
     """The table, line by line: of each region how much of the mean over the image it adds."""
     params = mc.Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4)
@@ -127,44 +172,33 @@ def objects(folder: Path) -> Iterator[str]:
     shares, where = [], {}
     for seed in SCORING:
         source, recording = objects_at(folder, RATE, seed)
+        file = folder / "recordings" / f"objects_faultless_{seed}.h5"
+        faultless = recorded(file, source, dataclasses.replace(sensor(RATE), **FAULTLESS), seed)
         video = mc.estimate(recording, params, progress=False)
-        for t in halfway(recording, IMAGES).tolist():
+        other = mc.estimate(faultless, params.replace(rho_ref=0.0), progress=False)
+        times = halfway(recording, IMAGES)
+        flow = jaxevent.METHODS["flow"].estimate(recording, progress=False)(times).mean
+        for t, frames_alone in zip(times.tolist(), flow, strict=True):
             truth = source.intensity(t * 1e-6).clip(0, 1)
-            target = video.follow(t)
-            instants, L, V, clear, *_ = target
-            place = place_of(instants, clear, len(instants))
-            true, hidden = truly_along(target, source, t)
-            cases = {
-                "motion found": warp(L, V, np.asarray(clear, np.float32), instants.s, target.paths),
-                "true motion, by nodes": warp(
-                    L, V, np.asarray(clear, np.float32), instants.s, by_nodes(target, source, t)
-                ),
-                "true motion": true,
-                "true motion and visibility": true._replace(inside=true.inside * ~hidden),
-                **{
-                    f"true motion, objects {grown:g} px larger": truly_along(
-                        target, source, t, grown
-                    )[0]
-                    for grown in GROWN
-                },
-            }
-            images = {"smoother": L[instants.own]}
-            for name, along in cases.items():
-                told = fusion.compare(
-                    agree(params, L, along, place), fusion.views(L, V, along, place)
-                )
-                images[name] = np.asarray(fusion.decide(params, told).L)
+            images = object_images(video, source, t, True)
+            for name, image in object_images(other, source, t, False).items():
+                images[f"{name}, faultless sensor"] = image
+            instants = video.follow(t).instants
             where = regions(source, t, instants.t[[instants.before, instants.after]])
-            for name, image in images.items():
-                error = ((np.exp(image) - float(params.I0)).clip(0, 1) - truth) ** 2
+            images = {n: np.exp(image) - float(params.I0) for n, image in images.items()}
+            for name, image in {"`flow`": frames_alone, **images}.items():
+                error = (image.clip(0, 1) - truth) ** 2
                 parts = [(error * part).mean() for part in where.values()]
                 found.setdefault(name, []).append([error.mean(), *parts])
             shares.append([part.mean() for part in where.values()])
-    yield "| MSE x 1e-2 | all | " + " | ".join(where) + " |"
-    yield "|---|---:|" + "---:|" * len(where)
-    yield "| share of pixels | | " + " | ".join(f"{v:.0%}" for v in np.mean(shares, 0)) + " |"
+    yield "| MSE x 1e-2 | of `flow` | all | " + " | ".join(where) + " |"
+    yield "|---|---:|---:|" + "---:|" * len(where)
+    yield "| share of pixels | | | " + " | ".join(f"{v:.0%}" for v in np.mean(shares, 0)) + " |"
+    most = np.mean(found["`flow`"], 0)[0]
     for name, rows in found.items():
-        yield f"| {name} | " + " | ".join(f"{100 * v:.4f}" for v in np.mean(rows, 0)) + " |"
+        cells = np.mean(rows, 0)
+        text = " | ".join(f"{100 * v:.4f}" for v in cells)
+        yield f"| {name} | {cells[0] / most:.2f} | {text} |"
 
 
 def blurs(folder: Path) -> Iterator[str]:
@@ -230,16 +264,44 @@ def truly_panned(target: Followed, source: Pan, t: int) -> Along:
     return Along(*warped)
 
 
+def pan_images(
+    video: CompensatedVideo, source: Pan, t: int, level: NDArray
+) -> tuple[dict[str, NDArray[np.floating]], Along]:
+    """Log intensities of the smoother, of `mc`, and of the best ingredients; the true paths."""
+    target = video.follow(t)
+    instants, L, V, clear, *_ = target
+    place = place_of(instants, clear, len(instants))
+    true = truly_panned(target, source, t)
+    images = {"smoother": L[instants.own]}
+    found = warp(L, V, np.asarray(clear, np.float32), instants.s, target.paths)
+    for motion, along in {"found": found, "true": true}.items():
+        told = fusion.compare(
+            agree(video.params, L, along, place), fusion.views(L, V, along, place)
+        )
+        ingredients = np.asarray(told.ingredients)
+        images[f"`mc`, {motion} motion"] = np.asarray(fusion.decide(video.params, told).L)
+        images[f"fusion alone, {motion} motion"] = ingredients[0]
+        best = np.abs(ingredients - level).argmin(0)[None]
+        images[f"best ingredient, {motion} motion"] = np.take_along_axis(ingredients, best, 0)[0]
+    return images, true
+
+
+def fitted_params(fitted: Path | None) -> Any:
+    """Those of experiments/ahdr.py, or the sensor's thresholds."""
+    if fitted is None:
+        return mc.Params(preset="hdr", c_on=0.2, c_off=0.18, rho_ref=5e-4)
+    [(_, _, params)] = ahdr.choose(["mc"], fitted)
+    return params
+
+
 def pans(folder: Path, fitted: Path | None = None) -> Iterator[str]:
     """The table, line by line: geometric means over recordings."""
-    params = mc.Params(preset="hdr", c_on=0.2, c_off=0.18, rho_ref=5e-4)
-    if fitted is not None:
-        [(_, _, params)] = ahdr.choose(["mc"], fitted)
+    params = fitted_params(fitted)
     found: dict[str, list] = {}
     common = []
-    for name in TESTING:
+    for (kind, faults), name in itertools.product(SENSORS.items(), TESTING):
         source = Pan(scene(name), speed="fast", duration=0.5, seed=SEEDS[0])
-        recording = simulate(source, Sensor(), SEEDS[0], name)
+        recording = simulate(source, dataclasses.replace(Sensor(), **faults), SEEDS[0], name)
         video = mc.estimate(recording, params, progress=False)
         times, truths = recording.extra["hdr_t"], recording.extra["hdr"]
         errors: dict[str, list] = {}
@@ -247,38 +309,50 @@ def pans(folder: Path, fitted: Path | None = None) -> Iterator[str]:
             truth, t = np.asarray(truths[row]), int(times[row])
             level = np.log(truth + params.I0)
             low, high = recording.extra.get("clip", (0.01, 1.0))
-            regions = (truth < low, (truth >= low) & (truth <= high), truth > high)
-            target = video.follow(t)
-            instants, L, V, clear, *_ = target
-            place = place_of(instants, clear, len(instants))
-            true = truly_panned(target, source, t)
-            images = {"smoother": L[instants.own]}
-            found_along = warp(L, V, np.asarray(clear, np.float32), instants.s, target.paths)
-            ways = {"found": found_along, "true": true}
-            for motion, along in ways.items():
-                told = fusion.compare(
-                    agree(params, L, along, place), fusion.views(L, V, along, place)
-                )
-                ingredients = np.asarray(told.ingredients)
-                images[f"`mc`, {motion} motion"] = np.asarray(fusion.decide(params, told).L)
-                images[f"fusion alone, {motion} motion"] = ingredients[0]
-                best = np.abs(ingredients - level).argmin(0)[None]
-                images[f"best ingredient, {motion} motion"] = np.take_along_axis(
-                    ingredients, best, 0
-                )[0]
+            dark, bright = truth < low, truth > high
+            regions = (np.ones_like(dark), dark, ~dark & ~bright, bright)
+            images, true = pan_images(video, source, t, level)
             for label, image in images.items():
-                squares = (image - level) ** 2
-                errors.setdefault(label, []).append([squares[r].mean() for r in regions])
-            inside = np.where(true.inside > 0, true.L - level, np.nan)[:, regions[0]]
-            common.append(np.nanmean(np.nanmean(inside, 0) ** 2) / np.nanmean(inside**2))
+                linear = ((np.exp(image) - params.I0 - truth) ** 2).mean()
+                squares = [((image - level) ** 2)[r].mean() for r in regions]
+                errors.setdefault(label + kind, []).append([linear, *squares])
+            inside = np.where(true.inside > 0, true.L - level, np.nan)[:, dark]
+            if not kind:
+                common.append(np.nanmean(np.nanmean(inside, 0) ** 2) / np.nanmean(inside**2))
         for label, values in errors.items():
             found.setdefault(label, []).append(np.nanmean(values, 0))
-    yield "| log MSE | dark | well-exposed | bright |"
-    yield "|---|---:|---:|---:|"
-    for label, values in found.items():
-        cells = " | ".join(f"{v:.4f}" for v in np.exp(np.nanmean(np.log(values), 0)))
+    yield "| | MSE | log MSE | dark | well-exposed | bright |"
+    yield "|---|" + "---:|" * 5
+    means = {n: np.exp(np.nanmean(np.log(v), 0)) for n, v in found.items()}
+    for label, mean in means.items():
+        parts = mean / means["smoother"]
+        cells = " | ".join(f"{v:.3g} ({p:.2f})" for v, p in zip(mean, parts, strict=True))
         yield f"| {label} | {cells} |"
     yield f"\nOf the dark error {100 * np.mean(common):.0f} % is common to all instants."
+
+
+def brights(folder: Path, fitted: Path | None = None) -> Iterator[str]:
+    """The table, line by line."""
+    params = fitted_params(fitted)
+    yield "| scene | bright pixels that never were in range | z2 of others | z2 of these |"
+    yield "|---|---:|---:|---:|"
+    paths = ahdr.record(folder / "test", TESTING, range(SEEDS[0], SEEDS[0] + 1), "davis")
+    for path in sorted(paths):
+        recording = jaxevent.load(path)
+        assert recording.frames is not None
+        times, truths = recording.extra["hdr_t"], recording.extra["hdr"]
+        _, high = recording.extra.get("clip", (0.01, 1.0))
+        _, _, clear = estimator.Images(recording, params, WINDOW_EVENTS)(recording.frames.t)
+        never = ~(clear > 0).any(0)
+        rows = np.unique(np.linspace(2, len(times) - 3, 4).round().astype(int))
+        image, P, _ = mc.estimate(recording, params, progress=False)(times[rows])
+        I0, truth = float(params.I0), np.asarray(truths[rows])
+        squares = np.log((np.maximum(image, 0) + I0) / (truth + I0)) ** 2 / P
+        bright = truth > high
+        parts = [squares[bright & seen].mean() for seen in (~never, never)]
+        share = (bright & never).sum() / bright.sum()
+        name = path.stem.rpartition("_")[0].replace("_", ", ")
+        yield f"| {name} | {share:.0%} | {parts[0]:.2g} | {parts[1]:.2g} |"
 
 
 def thresholds(folder: Path) -> Iterator[str]:
@@ -313,12 +387,16 @@ def thresholds(folder: Path) -> Iterator[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    tables = {"objects": objects, "pans": pans, "thresholds": thresholds, "blurred": blurs}
+    tables = {
+        "objects": objects, "pans": pans, "bright": brights, "thresholds": thresholds,
+        "blurred": blurs,
+    }  # fmt: skip
     parser.add_argument("--tables", nargs="+", default=list(tables), choices=tables)
     parser.add_argument("--out", type=Path, required=True, help="folder for everything made")
-    parser.add_argument("--fitted", type=Path, help="params.toml of experiments/ahdr.py, for pans")
+    parser.add_argument("--fitted", type=Path, help="params.toml of experiments/ahdr.py, for HDR")
     arguments = parser.parse_args()
-    tables["pans"] = functools.partial(pans, fitted=arguments.fitted)
+    for name in ("pans", "bright"):
+        tables[name] = functools.partial(tables[name], fitted=arguments.fitted)
     out = arguments.out.absolute()
     out.mkdir(parents=True, exist_ok=True)
     for name in arguments.tables:
