@@ -55,24 +55,32 @@ def test_rotation_alone_makes_about_the_same_flow():
 
 @pytest.mark.parametrize("told", [2.9, 3.1])
 @pytest.mark.parametrize("better", [0.1, -0.1])
-def test_rotation_alone_starts_from_the_sharpest_too(monkeypatch, better, told):
+@pytest.mark.parametrize("least", ["turn", "sharpest"])
+def test_rotation_alone_starts_from_the_sharpest_too(monkeypatch, better, told, least):
     """That one is taken which events left out tell; the path's turn may be false.
 
-    Where these tell of a translation as it is, its map alone is made.
+    Where these tell of a translation as it is, its map alone is made. Both have to be refuted.
     """
     path = Path.constant(np.array([1.0, 0, 0]), np.array([0.0, 0.9, 0]), np.full(4, -1.0))
     sharpest = np.array([0.3, 0.1, -0.2])
     monkeypatch.setattr(
         rivals.Trial, "fit", lambda self, path, moves, steps=rivals.STEPS: (path, moves, steps)
     )
-    monkeypatch.setattr(
-        rivals.Trial, "z", lambda self, one, other: told if other == "moving" else better
-    )
-    found, moves, steps = inspect.unwrap(rivals.Trial.rotation)(
+    turn = rivals.without_translation(path).O[0]
+    refuted_least = turn if least == "turn" else sharpest
+
+    def z(self, one, other):
+        if other == "moving":
+            return told if np.allclose(one[0].O[0], refuted_least) else told + 0.5
+        return better
+
+    monkeypatch.setattr(rivals.Trial, "z", z)
+    (found, moves, steps), refuted = inspect.unwrap(rivals.Trial.rotation)(
         object.__new__(rivals.Trial), path, sharpest, "moving"
     )
+    assert refuted == told
     assert steps == (rivals.STEPS if told < rivals.TELLING else rivals.SETTLE)
-    expected = sharpest if better > 0 else rivals.without_translation(path).O[0]
+    expected = sharpest if better > 0 else turn
     np.testing.assert_allclose(found.O[0], expected)
     assert not moves and not found.O[1:].any() and np.exp(found.log_rho).max() < 1e-3
 

@@ -74,6 +74,21 @@ def factorise(matrix):
 
 
 @fast
+def substitute(lower, side):
+    """Solve for a side, in place, by the factor of a matrix."""
+    for i in range(len(side)):
+        row, s = lower[i], side[i]
+        for k in range(i):
+            s -= row[k] * side[k]
+        side[i] = s * row[i]
+    for i in range(len(side) - 1, -1, -1):
+        row, s = lower[i], side[i] * lower[i, i]
+        side[i] = s
+        for k in range(i):
+            side[k] -= row[k] * s
+
+
+@fast
 def ease_rest(lower, ease_nodes, t, depth, side, out_t, out_depth):
     """Write about H^-1 of path and depths; `side` is room for path and coarse depths."""
     n, (rows, columns) = len(t), depth.shape
@@ -88,16 +103,7 @@ def ease_rest(lower, ease_nodes, t, depth, side, out_t, out_depth):
             for p in range(4):
                 k, share = _corner(j, i, p, wide)
                 side[n + k] += share * depth[j, i]
-    for i in range(len(side)):
-        row, s = lower[i], side[i]
-        for k in range(i):
-            s -= row[k] * side[k]
-        side[i] = s * row[i]
-    for i in range(len(side) - 1, -1, -1):
-        row, s = lower[i], side[i] * lower[i, i]
-        side[i] = s
-        for k in range(i):
-            side[k] -= row[k] * s
+    substitute(lower, side)
     for i in range(n):
         out_t[i] = side[i]
     for j in range(rows):

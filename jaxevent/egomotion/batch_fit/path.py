@@ -47,9 +47,9 @@ class Path:
 
     def coefficients(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """O and C."""
-        constant = [self.D[0]]
+        constant, turn = [self.D[0]], crossing(self.O[0])
         for _ in self.D[1:]:
-            constant.append(np.cross(self.O[0], constant[-1]))
+            constant.append(turn @ constant[-1])
         C = np.array(constant)
         C[1:] += self.D[1:]
         return self.O, C
@@ -121,6 +121,12 @@ def normalised(path: Path) -> Path:
     return Path(path.O, path.D / size, depth)
 
 
+def crossing(v: NDArray) -> NDArray[np.float64]:
+    """The matrix (3, 3) that makes v x u of u."""
+    x, y, z = v
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]], np.float64)
+
+
 def rays_of(x: NDArray, y: NDArray, f: float) -> NDArray[np.float64]:
     """Rays (N, 3) of depth 1 through pixels that lie x, y px from the principal point."""
     return np.stack([x / f, y / f, np.ones(len(x))], 1)
@@ -143,8 +149,8 @@ def advanced(path: Path, tau: float, half: float) -> Path:
     turned = Rotation.from_rotvec(_powers(t, 1, n) @ O).apply(velocity)
     C = np.linalg.lstsq(slopes, turned, rcond=None)[0]
     # As `coefficients`, the other way.
-    D, constant = [C[0]], C[0]
+    D, constant, turn = [C[0]], C[0], crossing(O[0])
     for row in C[1:]:
-        constant = np.cross(O[0], constant)
+        constant = turn @ constant
         D.append(row - constant)
     return normalised(Path(O.astype(np.float64), np.array(D), path.log_rho))

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.egomotion.batch_fit.path import ROWS, SEGMENTS, Path, Prior
+from jaxevent.egomotion.batch_fit.path import ROWS, SEGMENTS, Path, Prior, crossing
 from jaxevent.egomotion.batch_fit.placing import POWERS
 
 
@@ -72,7 +72,7 @@ def chain(path: Path, unit: NDArray, half: float, k: int = ROWS) -> NDArray[np.f
     by = np.zeros((6, POWERS, 2, ROWS, 3))
     constant, slope = D[0], np.zeros((3, 2, ROWS, 3))
     slope[:, 1, 0] = np.eye(3)
-    turn = np.cross(np.eye(3), -O[0]).T  # turn @ v = O0 x v
+    turn = crossing(O[0])
     for m in range(ROWS):
         by[range(3), m, 0, m, range(3)] = 1
         by[3:, m] = slope
@@ -80,8 +80,8 @@ def chain(path: Path, unit: NDArray, half: float, k: int = ROWS) -> NDArray[np.f
             by[range(3, 6), m, 1, m, range(3)] += 1
         # constant = O0 x constant
         slope = np.einsum("ij,jrka->irka", turn, slope)
-        slope[:, 0, 0] += np.cross(np.eye(3), constant).T
-        constant = np.cross(O[0], constant)
+        slope[:, 0, 0] -= crossing(constant)
+        constant = turn @ constant
     powers = np.array([half**m / math.factorial(m) for m in range(1, POWERS + 1)])
     by = by[:, :, :, :k] * powers[:, None, None, None]
     return by.reshape(6 * POWERS, 6 * k) * unit

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from jaxevent.egomotion.batch_fit import images
 from jaxevent.egomotion.batch_fit.alignment import Window
-from jaxevent.egomotion.batch_fit.path import LEAST, Path, rays_of
+from jaxevent.egomotion.batch_fit.path import LEAST, Path, crossing, rays_of
 from jaxevent.egomotion.geometry import A, B
 
 DIRECTIONS = 600  # headings of a hemisphere that are tried
@@ -31,7 +31,7 @@ HOP, PATCH = 16, 24  # px between patches whose flow is measured, and their size
 # Of a search for the sharpest image: halvings of a step at most, and the share that is no gain.
 HALVED, GAINED = 12, 1e-8
 
-TURNS = np.cross(np.eye(3)[:, None], -np.eye(3))
+TURNS = np.array([crossing(axis) for axis in np.eye(3)])
 STRAINS = np.array(
     [
         [[1, 0, 0], [0, -1, 0], [0, 0, 0]],
@@ -164,7 +164,7 @@ def before_a_plane(M: NDArray) -> list[Plane]:
     found = []
     for T, normal in ((a + b, a - b), (a - b, a + b)):
         sign = 1.0 if normal[2] > 0 else -1.0
-        found.append(Plane(sign * T, sign * normal, turn - np.cross(normal, T) / 2))
+        found.append(Plane(sign * T, sign * normal, turn - crossing(normal) @ T / 2))
     return found
 
 
@@ -172,7 +172,7 @@ def _flow_maps(window: Window, Omega: NDArray, flows: NDArray) -> tuple[NDArray,
     """Contrast and number of events of all patches, (n, rows, columns), for flows (px/s)."""
     real = window.x.dtype
     X, Y = np.empty_like(window.x), np.empty_like(window.x)
-    M = np.tensordot(Omega, TURNS.astype(float), 1)
+    M = np.tensordot(Omega, TURNS, 1)
     images.turned(window.x, window.y, window.tau, M, window.f, X, Y)
     rows, columns = (max((n // 8 - 3) // 2 + 1, 0) for n in window.shape)
     S, N = np.empty((len(flows), rows, columns)), np.empty((len(flows), rows, columns))

@@ -27,7 +27,7 @@ from jaxevent.egomotion.batch_fit.depths import depths
 from jaxevent.egomotion.batch_fit.frames import FramePixels, look_at, offset, with_frames
 from jaxevent.egomotion.batch_fit.path import SEGMENTS, Path, Prior
 from jaxevent.egomotion.batch_fit.photometric import Report, adjust, compute_covariance
-from jaxevent.egomotion.batch_fit.rivals import SIGMA, TELLING, Trial
+from jaxevent.egomotion.batch_fit.rivals import SETTLE, SIGMA, STEPS, TELLING, Trial
 from jaxevent.egomotion.batch_fit.starts import (
     Plane,
     before_a_plane,
@@ -489,7 +489,9 @@ class Windows:
         limit = np.inf if few else ALIKE * self.cost(*ranked[0])
         close = [one for one in ranked if self.cost(*one) <= limit]
         trial = self.trial(centre) if few or len(close) > 1 else None
-        fits = side_by_side(lambda one: trial.fit(one[0].path), close) if trial else []
+        # What is alone is at its end: more steps than its map takes hardly change z.
+        begun = SETTLE if len(close) == 1 else STEPS
+        fits = side_by_side(lambda one: trial.fit(one[0].path, steps=begun), close) if trial else []
         chosen = trial.best(fits) if trial else 0
         scene, report = close[chosen]
         sigma = max(stages[-1].sigma, SHARP * report.noise, least)
@@ -499,8 +501,15 @@ class Windows:
         if trial and few:
             others = [(one.path, fit) for (one, _), fit in zip(close, fits, strict=True)]
             best = others.pop(chosen)[1]
-            still = trial.rotation(scene.path, self.rotation(centre), best)
-            path, covariance = _with_rivals(trial, scene.path, still, best, others, covariance)
+            still, z = trial.rotation(scene.path, self.rotation(centre), best)
+            if begun < STEPS and z < TELLING:
+                best = trial.fit(scene.path)
+                still, z = trial.rotation(scene.path, self.rotation(centre), best)
+            path = scene.path
+            if z < TELLING:
+                path, covariance = _without_heading(path, still.path, covariance)
+            else:
+                covariance = covariance + _left_open(trial, path, best, others)
             scene = scene._replace(path=path)
         return Fit(
             scene.path,
@@ -553,32 +562,33 @@ class Windows:
         return 0.5 * self.omega_weight * float((path.O[0] ** 2).sum()) / LAST
 
 
-def _with_rivals(
-    trial: Trial,
-    path: Path,
-    still: Scene,
-    best: Scene,
-    others: list[tuple[Path, Scene]],
-    covariance: NDArray[np.float64],
+def _without_heading(
+    path: Path, still: Path, covariance: NDArray[np.float64]
 ) -> tuple[Path, NDArray[np.float64]]:
-    """Path and covariance with what rivals leave open, compared on pixels left out (`rivals`).
+    """Path and covariance where rotation alone, `still`, is not refuted: nothing tells the heading.
 
-    Where `still`, rotation alone, explains these about as well nothing tells the heading. The path
-    is then the rotation's, with hardly a translation, and Omega may be either's. Else other motions
-    count by their likelihood, exp(-z^2 / 2).
+    The path is the rotation's, with hardly a translation, and Omega may be either's.
     """
-    told = covariance.copy()
-    if trial.z(still, best) < TELLING:
-        heading, turn = path.D[0], still.path.O[0] - path.O[0]
-        told[:3], told[:, :3] = 0, 0
-        told[:3, :3] = (np.pi / 2) ** 2 / 2 * (np.eye(3) - np.outer(heading, heading))
-        told[3:, 3:] += np.outer(turn, turn)
-        return Path(still.path.O, path.D, path.log_rho + HARDLY), told
+    told, heading, turn = covariance.copy(), path.D[0], still.O[0] - path.O[0]
+    told[:3], told[:, :3] = 0, 0
+    told[:3, :3] = (np.pi / 2) ** 2 / 2 * (np.eye(3) - np.outer(heading, heading))
+    told[3:, 3:] += np.outer(turn, turn)
+    return Path(still.O, path.D, path.log_rho + HARDLY), told
+
+
+def _left_open(
+    trial: Trial, path: Path, best: Scene, others: list[tuple[Path, Scene]]
+) -> NDArray[np.float64]:
+    """What other motions add to the covariance of a path, by their likelihood, exp(-z^2 / 2).
+
+    Of pixels left out (`rivals`), on which `best` is the path's scene.
+    """
+    told = np.zeros((6, 6))
     for other, scene in others:
         z = max(trial.z(scene, best), 0.0)
         apart = np.concatenate([other.D[0] - path.D[0], other.O[0] - path.O[0]])
         told += np.exp(-(z**2) / 2) * np.outer(apart, apart)
-    return path, told
+    return told
 
 
 def near_to(path: Path, other: Path) -> bool:
