@@ -12,13 +12,18 @@ from scipy import stats
 
 from jaxevent import blob
 from jaxevent.blob.finding.agility import GRID, _log_likelihood, fit_agility
-from jaxevent.blob.finding.background import evidence, find_hot_pixels, measure_background
+from jaxevent.blob.finding.background import (
+    evidence,
+    find_hot_lines,
+    find_hot_pixels,
+    measure_background,
+)
 from jaxevent.blob.finding.found import Found, most_events
 from jaxevent.blob.finding.lamps import without_lamps
 from jaxevent.blob.finding.parts import join_parts
 from jaxevent.blob.finding.paths import NOBODY, candidates, join
 from jaxevent.blob.finding.paths import Path as TargetPath
-from jaxevent.blob.finding.search import _lasting, _settled
+from jaxevent.blob.finding.search import _lasting, _settled, _stitch
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.blob.steps import Batch
 from jaxevent.blob.targets import Slots, look_ahead
@@ -203,6 +208,45 @@ def test_pieces_of_an_edge_are_one_while_each_is_seen():
     round_ones = [dataclasses.replace(one, C=16 * np.tile(np.eye(2), (len(one.t), 1, 1)))
         for one in pieces]  # fmt: skip
     assert len(join_parts(round_ones)) == 3  # as far apart, but no edges
+    for n, number in ((10, 2), (50, 1)):  # one that follows another, or is a piece of it
+        follow = [_path(t, x, 0.0, 1.0, n), _path(t, x - 18, 0.0, 1.0, 10)]
+        C = np.tile(np.diag([16.0, 0.25]), (len(t), 1, 1))
+        assert len(join_parts([dataclasses.replace(one, C=C) for one in follow])) == number
+
+
+@pytest.mark.parametrize(
+    ("radius", "turns", "wobble", "joined"),
+    [(13, 1.5, 0, True), (13, 0.8, 0, False), (13, 1.5, 0.2, False), (30, 1.5, 0, False)],
+)
+def test_what_turns_rigidly_by_a_whole_turn_is_one(radius, turns, wobble, joined):
+    t = np.arange(0, 200_000, 1000)
+    angle = 2 * np.pi * turns * t / t[-1]
+    reach = radius * (1 + wobble * np.sin(5 * angle))
+    blades = [
+        _path(t, 60 + reach * np.cos(a), 50 + reach * np.sin(a), 3.0, 10)
+        for a in (angle, angle + 2 * np.pi / 3, angle + 4 * np.pi / 3)
+    ]
+    paths = join_parts(blades)
+    assert len(paths) == (1 if joined else 3)
+    if joined:
+        np.testing.assert_allclose(paths[0].p, np.tile([60.0, 50.0], (len(t), 1)), atol=1e-9)
+
+
+def test_what_passes_behind_something_goes_on():
+    """It is seen in part before it is hidden, and after."""
+    t = np.arange(0, 30_000, 1000)
+    one, other = _path(t, 20 + 2e-3 * t, 50.0, 6.0, 30), _path(t, 164 + 2e-3 * t, 50.0, 6.0, 30)
+    in_part = np.linspace(1, 0.1, 6)
+    back = np.where(np.arange(30) < 24, 0, 9 * (1 - np.r_[np.ones(24), in_part]))
+    share = np.r_[np.ones(24), in_part]
+    C = one.C * share[:, None, None] ** 2
+    one = dataclasses.replace(one, p=one.p - back[:, None] * [1, 0], C=C, n=30 * share)
+    other = dataclasses.replace(
+        other, t=t + 72_000, p=other.p + back[::-1, None] * [1, 0], C=C[::-1], n=30 * share[::-1]
+    )
+    assert len(_stitch([one, other], (400, 100))) == 1
+    aside = dataclasses.replace(other, p=other.p + [0.0, 30.0])
+    assert len(_stitch([one, aside], (400, 100))) == 2
 
 
 @pytest.mark.slow
@@ -269,6 +313,19 @@ def test_hot_pixels_stand_alone():
     expected = np.zeros(counts.shape, bool)
     expected[10, 20] = expected[0, 7] = expected[39, 49] = True
     np.testing.assert_array_equal(find_hot_pixels(counts), expected)
+
+
+def test_hot_lines_are_hot_along_the_whole_sensor():
+    rng = np.random.default_rng(0)
+    counts = rng.poisson(1.0, (40, 50))
+    counts[:, [0, 12, 13, 49]] += rng.poisson(30, (40, 4))
+    counts[21] += rng.poisson(20, 50)
+    counts[5:20, 30] = 60  # part of a line
+    counts[:, 36:40] += 30  # something wide
+    expected = np.zeros(counts.shape, bool)
+    expected[:, [0, 12, 13, 49]] = expected[21] = True
+    np.testing.assert_array_equal(find_hot_lines(counts), expected)
+    assert not find_hot_lines(rng.poisson(100.0, (40, 50))).any()
 
 
 def lamp(rng, at, hertz, seconds, number, late=1e-3):

@@ -24,6 +24,7 @@ TILES, FILLED, FEW = 4, 9, 3  # tiles along each side; of all, those with so man
 DARK = 0.1  # share of the places that are darker than what blobs are told from there
 BRIGHT = 1.5  # times the mean rate: what is bright is an edge if it is
 STRIP, SIDES = 16, 3  # of the sensor's width or height a side takes, and how many are reached
+OFTEN = 0.25  # of the windows: of a dense scene little stands out in a strip
 LONG, LARGE = 2.5, 0.1  # so many times as long as wide, or of this share of the map's shorter side
 SCENE = 0.15  # share of the bright that is edges
 TOLD = 0.1  # of the stretches may be told worse by a map that moves than by one at rest
@@ -61,7 +62,7 @@ def find_moving_background(
 def _filled(stream: Stream, background: Background, choice: Choice) -> float:
     """In how many tiles of the sensor blobs are seen, in the median window.
 
-    None, if they do not reach three of its sides: an object may be large, but it is seen whole.
+    None, if they seldom reach three of its sides: an object may be large, but it is seen whole.
     Blobs are what stands out from the sensor's dark places: in a short recording a scene hardly
     leaves its place, and most of it is in the background.
     """
@@ -78,7 +79,7 @@ def _filled(stream: Stream, background: Background, choice: Choice) -> float:
         strips = [STRIP * v < n for v, n in ((x, size[1]), (y, size[0]))]
         strips += [STRIP * (n - 1 - v) < n for v, n in ((x, size[1]), (y, size[0]))]
         sides.append(sum(strip.sum() >= FEW for strip in strips))
-    return float(np.median(tiles)) if np.median(sides) >= SIDES else 0.0
+    return float(np.median(tiles)) if np.mean(np.array(sides) >= SIDES) >= OFTEN else 0.0
 
 
 def _of_edges(rate: NDArray[np.float64], mean: float) -> float:

@@ -38,6 +38,7 @@ PAUSE = 4 * HOLD  # windows between them at most; or, at rest,
 LAST = 8  # windows that tell how fast it went
 REST = 2.0  # times the life of the shorter of both
 LEAP = 2 * GATE * REACH  # sizes: what is farther from its way is not the target
+PART = 0.8  # of its usual size and events: a target that is seen whole has more
 EDGE = 2.0  # sizes from the sensor's edge, where others come and go
 SAME = 0.5  # share of a target's life near one of an earlier pass that makes it a part of that
 
@@ -234,7 +235,21 @@ def _gap(one: Path, other: Path, size: tuple[int, int]) -> float:
         before, after = _speed(one, slice(-LAST, None)), _speed(other, slice(0, LAST))
         ends += [(one.p[-1] + 2 * half * before, other.p[0])]
         ends += [(one.p[-1] + half * before, other.p[0] - half * after)]
-    return min(float(touching(p, one.C[-1], q, other.C[0])) for p, q in ends)
+        # Where it goes behind something and comes out it is seen in part.
+        last, first = _whole(one)[-1], _whole(other)[0]
+        half = (other.t[first] - one.t[last]) * 0.5e-6
+        before = _speed(one, slice(max(last - LAST, 0), last + 1))
+        after = _speed(other, slice(first, first + LAST + 1))
+        ends += [(one.p[last] + half * before, other.p[first] - half * after)]
+    C = [np.median(path.C, 0) for path in (one, other)]
+    return min(float(touching(p, C[0], q, C[1])) for p, q in ends)
+
+
+def _whole(path: Path) -> NDArray[np.int64]:
+    """Rows in which it has most of its usual size and events."""
+    size = path.size[:, 0]
+    told = (path.n >= PART * np.median(path.n)) & (size >= PART * np.median(size))
+    return np.flatnonzero(told)
 
 
 def _later(one: Path, other: Path) -> Path:
