@@ -30,8 +30,8 @@ CENTRES = 700_000, 1_500_000, 2_500_000  # us
 BEFORE = 100_000
 TURNED = 500_000  # us
 USUAL = 0.43  # 1/m in units of 1/|T|, the depth there
-ALL = batch.ROUNDS, batch.FINAL[:-1]
-FEW = batch.FOLLOWING
+ALL = batch.ROUNDS, batch.FINAL[:-1], batch.FINAL[-1:]
+FEW = *batch.FOLLOWING, batch.ENDING
 
 
 SIGMA, STEPS = 0.1, 12  # C; of Gauss and Newton
@@ -101,15 +101,15 @@ def main() -> None:
     for centre in CENTRES:
         nodes = np.prod(windows.tracks(centre - BEFORE, half, 2000).nodes)
         level = np.full(nodes, np.log(0.5), windows.real)
-        batch.FOLLOWING = ALL
+        batch.FOLLOWING = ALL[:2]
         begun = Path.constant(np.array([1.0, 0, 0]), np.zeros(3), level)
         path = windows.followed(centre - BEFORE, begun)[0].path
         warm = advanced(path, BEFORE * 1e-6, half)
         for name, stages in (("all", ALL), ("few", FEW)):
-            batch.FOLLOWING, clock = stages, time.process_time()
+            batch.FOLLOWING, clock = stages[:2], time.process_time()
             rival = windows.followed(centre, warm)
             stages_s = time.process_time() - clock
-            fit = windows.ended(centre, [rival])
+            fit = windows.ended(centre, [rival], stages[2])
             seconds = time.process_time() - clock
             assert fit is not None
             heading, turn = (part[0] for part in fit.path.twist(0.0))
