@@ -8,7 +8,10 @@ import pytest
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.batch_fit import rivals
+from jaxevent.egomotion.batch_fit import windows as batch
 from jaxevent.egomotion.batch_fit.path import Path
+from jaxevent.egomotion.batch_fit.photometric import Report
+from jaxevent.egomotion.batch_fit.tracks import Scene
 from jaxevent.egomotion.batch_fit.windows import Params, Windows, inflation
 from jaxevent.egomotion.geometry import A, B
 from jaxevent.recording import Events, Recording
@@ -83,6 +86,20 @@ def test_rotation_alone_starts_from_the_sharpest_too(monkeypatch, better, told, 
     expected = sharpest if better > 0 else turn
     np.testing.assert_allclose(found.O[0], expected)
     assert not moves and not found.O[1:].any() and np.exp(found.log_rho).max() < 1e-3
+
+
+def test_motions_before_a_plane_that_cost_about_the_same_go_on(monkeypatch):
+    """Which of two is true shows in the end: the false one may cost less until then."""
+    path = Path.constant(np.array([1.0, 0, 0]), np.zeros(3), np.full(4, -1.0))
+    found = [(Scene(path, None, 0.0), Report(0.1, cost, 1.0)) for cost in (5e-5, 6e-5, 9e-5)]
+    monkeypatch.setattr(Windows, "rotation", lambda self, centre: np.zeros(3))
+    monkeypatch.setattr(Windows, "cut", lambda self, centre, half, most: None)
+    monkeypatch.setattr(Windows, "before_a_plane", lambda self, centre, planes: found)
+    monkeypatch.setattr(batch, "homography", lambda cut, Omega: None)
+    monkeypatch.setattr(batch, "before_a_plane", lambda M: [])
+    windows = object.__new__(Windows)
+    windows.params = Params()
+    assert inspect.unwrap(Windows.rivals)(windows, 0) == found[:2]
 
 
 def test_skew_is_that_by_which_pixels_end_where_they_began():
