@@ -41,7 +41,7 @@ BEND = 0.1  # a larger difference of log depth between nodes is an edge
 FREE = 6 * ROWS  # numbers of a path's rows; after them come the skew and the plane's normal
 # Of conjugate gradients: steps at most, and the part of the first residual that is left at the end.
 # With 25 and 0.03 windows of slider_depth take a sixth less, but headings are up to 3.2 degrees off
-# (2.7); with 20 and 0.05 headings of evbench_seq3 are claimed that are 30 to 45 degrees off.
+# (2.9); with 20 and 0.05 headings of evbench_seq3 are claimed that are 30 to 45 degrees off.
 # (Coarse nodes of the map, solved with path and smooth depths, save no step: 10 with the map's
 # block solved exactly do what 40 do.)
 SOLVE, LEFT = 40, 0.01
