@@ -247,6 +247,11 @@ def test_what_passes_behind_something_goes_on():
     assert len(_stitch([one, other], (400, 100))) == 1
     aside = dataclasses.replace(other, p=other.p + [0.0, 30.0])
     assert len(_stitch([one, aside], (400, 100))) == 2
+    # Never of its usual size and events at once.
+    odd = np.arange(30) % 2 > 0
+    C = np.where(odd[:, None, None], 1.0, 36.0) * np.eye(2)
+    one = dataclasses.replace(_path(t, 20 + 2e-3 * t, 50.0, 6.0, 30), C=C, n=np.where(odd, 30.0, 1))
+    assert len(_stitch([one, _path(t + 31_000, 82 + 2e-3 * t, 50.0, 6.0, 30)], (400, 100))) == 1
 
 
 @pytest.mark.slow

@@ -246,10 +246,10 @@ def _gap(one: Path, other: Path, size: tuple[int, int]) -> float:
 
 
 def _whole(path: Path) -> NDArray[np.int64]:
-    """Rows in which it has most of its usual size and events."""
+    """Rows in which it has most of its usual size and events; all, where none has both."""
     size = path.size[:, 0]
     told = (path.n >= PART * np.median(path.n)) & (size >= PART * np.median(size))
-    return np.flatnonzero(told)
+    return np.flatnonzero(told) if told.any() else np.arange(len(size))
 
 
 def _later(one: Path, other: Path) -> Path:
