@@ -40,7 +40,12 @@ class Trial:
         return fitted(self.tracks, path, self.prior, self.sigma, moves=moves, steps=steps)
 
     def rotation(
-        self, path: Path, sharpest: NDArray[np.float64], moving: Scene
+        self,
+        path: Path,
+        sharpest: NDArray[np.float64],
+        moving: Scene,
+        *,
+        begun: bool = False,
     ) -> tuple[Scene, float]:
         """What rotation alone makes of a path, or from the sharpest one (rad/s) if that is better.
 
@@ -50,17 +55,27 @@ class Trial:
         A path may have come to a false turn with a translation that makes up for it, from which
         rotation alone does not find back: on evbench_seq3 260 % off, from the sharpest 9.5 %.
         Where both explain less than the `moving` scene as soon as their maps are made they are left
-        at that: steps of the rotation hardly change z.
+        at that: steps of the rotation hardly change z. Where they do not, and that scene has only
+        `begun`, it is fitted from the path.
         """
+
+        def least(scenes, moving):
+            return min(self.z(one, moving) for one in scenes)
+
         first = without_translation(path)
         turn = np.zeros_like(path.O)
         turn[0] = sharpest
         paths = first, Path(turn, first.D, first.log_rho)
-        scenes = [self.fit(one, moves=False, steps=SETTLE) for one in paths]
-        z = min(self.z(one, moving) for one in scenes)
+        settled = [self.fit(one, moves=False, steps=SETTLE) for one in paths]
+        scenes, z = settled, least(settled, moving)
         if z < TELLING:
             scenes = [self.fit(one, moves=False) for one in paths]
-            z = min(self.z(one, moving) for one in scenes)
+            z = least(scenes, moving)
+        if z < TELLING and begun:
+            moving = self.fit(path)
+            if least(settled, moving) >= TELLING:
+                scenes = settled
+            z = least(scenes, moving)
         return scenes[self.z(*scenes) > 0], z
 
     def z(self, one: Scene, other: Scene) -> float:

@@ -428,15 +428,14 @@ class Windows:
         Omega = self.rotation(centre)
         cuts = [self.cut(centre, share * half, MIDDLE) for share in (1 / 3, 2 / 3)]
         planes = side_by_side(lambda cut: before_a_plane(homography(cut, Omega)), cuts)
-        found = self.before_a_plane(centre, planes[0] + planes[1])
-        if found:
-            # Of the two motions the false one may cost 2 % less until all events are fitted.
-            return [one for one in found if self.cost(*one) < ALIKE * self.cost(*found[0])]
-        tracks = self.tracks(centre, half, TRIED)
-        starts = self.starts(centre, Omega, planes[0] + planes[1])
-        paths += [self.on_nodes(path, tracks) for path in self.aligned(centre, starts)]
-        found = self.ranked(self.rounds(centre, tracks, paths))
-        limit = CLOSE[0] * self.cost(*found[0]) + CLOSE[1] if found else 0.0
+        # Of the two before a plane the false one may cost 2 % less until all events are fitted.
+        found, (times, more) = self.before_a_plane(centre, planes[0] + planes[1]), (ALIKE, 0.0)
+        if not found:
+            tracks = self.tracks(centre, half, TRIED)
+            starts = self.starts(centre, Omega, planes[0] + planes[1])
+            paths += [self.on_nodes(path, tracks) for path in self.aligned(centre, starts)]
+            found, (times, more) = self.ranked(self.rounds(centre, tracks, paths)), CLOSE
+        limit = times * self.cost(*found[0]) + more if found else 0.0
         return [one for one in found if self.cost(*one) < limit]
 
     def rounds(
@@ -493,8 +492,9 @@ class Windows:
         close = [one for one in ranked if self.cost(*one) <= limit]
         trial = self.trial(centre) if few or len(close) > 1 else None
         # What is alone is at its end: more steps than its map takes hardly change z.
-        begun = SETTLE if len(close) == 1 else STEPS
-        fits = side_by_side(lambda one: trial.fit(one[0].path, steps=begun), close) if trial else []
+        alone = len(close) == 1
+        steps = SETTLE if alone else STEPS
+        fits = side_by_side(lambda one: trial.fit(one[0].path, steps=steps), close) if trial else []
         chosen = trial.best(fits) if trial else 0
         scene, report = close[chosen]
         sigma = max(stages[-1].sigma, SHARP * report.noise, least)
@@ -504,11 +504,8 @@ class Windows:
         if trial and few:
             others = [(one.path, fit) for (one, _), fit in zip(close, fits, strict=True)]
             best = others.pop(chosen)[1]
-            still, z = trial.rotation(scene.path, self.rotation(centre), best)
-            if begun < STEPS and z < TELLING:
-                best = trial.fit(scene.path)
-                still, z = trial.rotation(scene.path, self.rotation(centre), best)
             path = scene.path
+            still, z = trial.rotation(path, self.rotation(centre), best, begun=alone)
             if z < TELLING:
                 path, covariance = _without_heading(path, still.path, covariance)
             else:
