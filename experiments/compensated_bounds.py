@@ -14,18 +14,23 @@ Tables:
                 and the rest by how far away surfaces meet
     pans        fast pans of HDR scenes: MSE of I, and of ln(I + I0) of all, dark, well-exposed and
                 bright pixels, of the smoother, of `mc` with the motion found and the true one, of
-                the fusion alone, and with the best ingredient at every pixel; the same of sensors
-                whose pixels are alike; which part of the dark error of a pixel is that of all
-                instants along its true trajectory. With --fitted that of the fit of
-                experiments/ahdr.py, as it scores them
+                the fusion alone, and with the best ingredient at every pixel, or of the pixels
+                around it; the same of sensors whose pixels are alike; which part of the dark error
+                of a pixel is that of all instants along its true trajectory. With --fitted that of
+                the fit of experiments/ahdr.py, as it scores them
     bright      pans of HDR scenes: z2 of bright pixels that were within the range of some frame,
                 and of those that never were; needs --fitted
     thresholds  fast pans of HDR scenes by sensors whose pixels' thresholds differ more and more:
                 MSE of ln(I + I0) of bright pixels and of all, with and without learning these
     blurred     pans and objects at 300 px/s, exposures of 50 and 100 ms, as
-                experiments/motion_compensated.py scores them: the motion found, the true one and
-                the mean along it alone, as parts of the smoother's MSE; which part of the
-                smoother's error is that of all instants along the true trajectories
+                experiments/motion_compensated.py scores them, MSE as part of the smoother's: the
+                motion found; the true one as parabolas of time, and as it is, before and after the
+                image is held to the exposures; the mean along the true one; the same of a sensor
+                without noise, dead time or mismatch, and of frames that are sharp; which part of
+                the smoother's error is that of all instants along the true trajectories; how far
+                points move to the frames next to them, and by how much the motion found misses
+                (px, medians): by `mc`, by images between the frames alone, and by these without
+                their mean over time, of which events tell all
 
 Recordings are simulated into the folder. Sensors' common thresholds are given, nothing is fitted
 but with --fitted.
@@ -35,11 +40,12 @@ import argparse
 import dataclasses
 import functools
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import ahdr
+import jax.numpy as jnp
 import numpy as np
 from motion_compensated import (
     SCORING,
@@ -51,13 +57,20 @@ from motion_compensated import (
     sensor,
 )
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy.ndimage import distance_transform_edt, map_coordinates, uniform_filter
 
 import jaxevent
 from jaxevent.reconstruction.compensated import estimator, fusion, trajectories
 from jaxevent.reconstruction.compensated.agreement import agree
-from jaxevent.reconstruction.compensated.estimator import CompensatedVideo, Followed, place_of
-from jaxevent.reconstruction.compensated.warping import Along, warp
+from jaxevent.reconstruction.compensated.estimator import (
+    CompensatedVideo,
+    Followed,
+    fuse_images,
+    place_of,
+)
+from jaxevent.reconstruction.compensated.exposures import Shots, constrain
+from jaxevent.reconstruction.compensated.warping import Along, displaced, warp
+from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.reconstruction.windows import WINDOW_EVENTS
 from jaxevent.simulate import TESTING, Objects, Pan, Sensor, scene, simulate
 
@@ -68,6 +81,11 @@ MISMATCH, SEEDS = (0.03, 0.1, 0.15), (2, 3)
 FAULTLESS: dict[str, Any] = dict(
     mismatch=0, refractory=0, background_rate=0, hot_fraction=0, read_noise=0
 )
+LONG = (0.05, 0.1), (300.0,)  # s; px/s
+BLUR_SENSORS: dict[str, dict[str, Any]] = {
+    "": {}, "_faultless": FAULTLESS, "_sharp": {"exposure": 5e-4},
+}  # by label  # fmt: skip
+POOLED = {"": 1, " of 5 x 5 pixels": 5, " of 9 x 9 pixels": 9}  # px, by label
 SENSORS: dict[str, dict[str, Any]] = {"": {}, ", pixels alike": {"mismatch": 0}}  # by label
 mc = jaxevent.METHODS["mc"]
 
@@ -139,29 +157,38 @@ def regions(source: Objects, t: int, frames: NDArray[np.int64]) -> dict[str, NDA
     }
 
 
+def along_paths(target: Followed, paths: NDArray[np.float32]) -> Along:
+    """A target's images along paths (h, w, 4)."""
+    clear = np.asarray(target.clear, np.float32)
+    return warp(target.L, target.V, clear, target.instants.s, paths)
+
+
+def fused_along(params: Any, target: Followed, along: Along) -> tuple[fusion.Fused, NDArray]:
+    """What is made of a target's images along trajectories, and the ingredients (3, h, w)."""
+    place = place_of(target.instants, target.clear, len(target.instants))
+    told = fusion.compare(
+        agree(params, target.L, along, place), fusion.views(target.L, target.V, along, place)
+    )
+    return fusion.decide(params, told), np.asarray(told.ingredients)
+
+
 def object_images(
     video: CompensatedVideo, source: Objects, t: int, all_cases: bool
 ) -> dict[str, NDArray[np.floating]]:
     """Log intensities of the smoother and of `mc` with parts of it replaced by the truth."""
     target = video.follow(t)
-    instants, L, V, clear, *_ = target
-    place = place_of(instants, clear, len(instants))
-    shown = L, V, np.asarray(clear, np.float32), instants.s
     true, hidden = truly_along(target, source, t)
-    cases = {"`mc`, motion found": warp(*shown, target.paths)}
+    cases = {"`mc`, motion found": along_paths(target, target.paths)}
     if all_cases:
-        cases["true motion, by nodes"] = warp(*shown, by_nodes(target, source, t))
+        cases["true motion, by nodes"] = along_paths(target, by_nodes(target, source, t))
         cases["true motion"] = true
     cases["true motion and visibility"] = true._replace(inside=true.inside * ~hidden)
     for grown in GROWN if all_cases else ():
         along, _ = truly_along(target, source, t, grown)
         cases[f"true motion, objects {grown:g} px larger"] = along
-    images = {"smoother": L[instants.own]}
+    images = {"smoother": target.L[target.instants.own]}
     for name, along in cases.items():
-        told = fusion.compare(
-            agree(video.params, L, along, place), fusion.views(L, V, along, place)
-        )
-        images[name] = np.asarray(fusion.decide(video.params, told).L)
+        images[name] = np.asarray(fused_along(video.params, target, along)[0].L)
     return images
 
 
@@ -201,63 +228,186 @@ def objects(folder: Path) -> Iterator[str]:
         yield f"| {name} | {cells[0] / most:.2f} | {text} |"
 
 
+def truly_moved(target: Followed, source: Pan | Objects, t: int) -> NDArray[np.float64]:
+    """How far points go from a target to each of its instants, (K, h, w, 2)."""
+    times = [float(at) * 1e-6 for at in target.instants.t]
+    if isinstance(source, Pan):
+        h, w = target.L.shape[1:]
+        y, x = np.mgrid[:h, :w]
+        X, Y = panned(source, (h, w), t * 1e-6, times)
+        return np.stack([X - x, Y - y], -1)
+    return np.array([source.displacement(t * 1e-6, at)[0] for at in times], float)
+
+
+def as_parabolas(target: Followed, moved: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Paths (h, w, 4) of what `truly_moved` tells; instants near the target decide."""
+    s = target.instants.s.astype(float)
+    count, h, w, _ = moved.shape
+    near = np.exp(-4 * s**2)
+    v, a = np.linalg.lstsq(
+        near[:, None] * np.stack([s, s**2], 1),
+        (near[:, None, None, None] * moved).reshape(count, -1),
+        rcond=None,
+    )[0]
+    return np.concatenate([v.reshape(h, w, 2), a.reshape(h, w, 2)], -1).astype(np.float32)
+
+
+def ladder(
+    video: CompensatedVideo, source: Pan | Objects, t: int, all_cases: bool
+) -> tuple[dict[str, NDArray], float]:
+    """Log intensities of a target with parts of `mc` replaced by the truth, and `common`."""
+    target, params = video.follow(t), video.params
+    paths = as_parabolas(target, truly_moved(target, source, t))
+    hidden: NDArray[np.bool_] = np.zeros(target.L.shape, bool)
+    if isinstance(source, Pan):
+        true = truly_panned(target, source, t)
+    else:
+        true, hidden = truly_along(target, source, t)
+    by_parabolas, _ = fused_along(params, target, along_paths(target, paths))
+    exactly, ingredients = fused_along(params, target, true)
+    own = target.instants.own
+    base = np.float32(0) if target.smooth is None else target.smooth[own]
+    images = {
+        "smoother": target.L[own],
+        "`mc`": np.log(video(np.array([t])).mean[0] + params.I0) - base,
+        "motion found, not held": fuse_images(params, target).L,
+        "true motion as parabolas": held(video, target, by_parabolas, paths, t),
+        "true motion, not held": exactly.L,
+        "true motion": held(video, target, exactly, paths, t),
+        "mean along true motion, not held": ingredients[0],
+    }
+    chosen = images if all_cases else ("`mc`", "true motion")
+    wrong = true.L - np.log(source.intensity(t * 1e-6).clip(0, 1) + params.I0)
+    wrong = np.where((true.inside > 0) & ~hidden, wrong, np.nan)
+    shown = {name: np.asarray(images[name]) + base for name in chosen}
+    return shown, float(np.nanmean(np.nanmean(wrong, 0) ** 2) / np.nanmean(wrong**2))
+
+
+def held(
+    video: CompensatedVideo,
+    target: Followed,
+    fused: fusion.Fused,
+    paths: NDArray[np.float32],
+    t: int,
+) -> NDArray:
+    """What is fused, held to the exposures along paths (h, w, 4) where frames are steady."""
+    shutter = video.follow.shutter
+    if shutter.samples is None or target.smooth is not None:
+        return np.asarray(fused.L)
+    taken, frames = shutter(t, target.instants), FrameImages(video.recording, np.dtype(np.float32))
+    low, high = int(taken.frame.min()), int(taken.frame.max()) + 1
+    grey, intensity, _, gain = frames.read(slice(low, high), high - low)
+    rows = taken.frame - low
+    shots = Shots(grey[rows], intensity[rows], frames.response(), gain[rows])
+    return np.asarray(constrain(video.params, fused, paths, taken, shots, shutter.samples).L)
+
+
+def misses(
+    video: CompensatedVideo, source: Pan | Objects, t: int
+) -> tuple[float, float, float, float]:
+    """How far points go to the frames next to a target, and end-point errors there; medians, px.
+
+    Of `mc`; of images between the frames alone; of these without their mean over time.
+    """
+    target, p = video.follow(t), video.params
+    instants, L, V, *_ = target
+    numbers = (float(v) for v in (p.smooth, p.jump, p.edge, p.straight))
+    settings = float(p.floor), float(p.robust), trajectories.Smoothness(*numbers)
+    order = np.arange(len(instants))
+    beside = [instants.before, instants.after]
+    inner = (order > instants.before) & (order < instants.after)
+    moved = truly_moved(target, source, t)[beside]
+    s = instants.s[inner]
+
+    def found(images: NDArray) -> NDArray:
+        pyramid = trajectories.Pyramid(images, float(p.caution) * V[inner], estimator.FADE)
+        plan = trajectories.stages(s, instants.first)
+        motion = trajectories.follow(pyramid, s, plan, *settings)
+        return trajectories.spread(motion.at(0, *L.shape[1:]).p, L.shape[1:])
+
+    seen = L[inner]
+    each = (target.paths, found(seen), found(seen - seen.mean(0)))
+    at = jnp.asarray(instants.s[beside])
+    ends = [moved - np.asarray(displaced(jnp.asarray(path), at)) for path in each]
+    medians = [float(np.median(np.linalg.norm(one, axis=-1))) for one in (moved, *ends)]
+    return medians[0], medians[1], medians[2], medians[3]
+
+
 def blurs(folder: Path) -> Iterator[str]:
-    """The table, line by line."""
-    params = mc.Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4)
-    names = ("`mc`", "motion found, not held", "true motion, not held", "mean along true motion")
-    yield "| scene, exposure | smoother | " + " | ".join((*names, "common")) + " |"
-    yield "|---|---:|" + "---:|" * (len(names) + 1)
-    for cell, source, recording in blurred(folder):
-        if cell["speed"] < 300 or cell["exposure_ms"] < 50:
-            continue
-        video = mc.estimate(recording, params, progress=False)
-        errors: list[list[float]] = []
-        for t in at_and_between(recording)[0].tolist():
-            truth = source.intensity(t * 1e-6).clip(0, 1)
-            target = video.follow(t)
-            instants, L, V, clear, *_ = target
-            place = place_of(instants, clear, len(instants))
-            hidden = np.zeros(L.shape, bool)
-            if isinstance(source, Pan):
-                true = truly_panned(target, source, t)
-            else:
-                assert isinstance(source, Objects)
-                true, hidden = truly_along(target, source, t)
-            found = warp(L, V, np.asarray(clear, np.float32), instants.s, target.paths)
-            images = [L[instants.own], np.log(video(np.array([t])).mean[0] + params.I0)]
-            for along in (found, true):
-                told = fusion.compare(
-                    agree(params, L, along, place), fusion.views(L, V, along, place)
-                )
-                images.append(np.asarray(fusion.decide(params, told).L))
-            images.append(np.asarray(told.ingredients[0]))
-            shown = [(np.exp(image) - float(params.I0)).clip(0, 1) for image in images]
-            wrong = true.L - np.log(truth + params.I0)
-            wrong = np.where((true.inside > 0) & ~hidden, wrong, np.nan)
-            common = np.nanmean(np.nanmean(wrong, 0) ** 2) / np.nanmean(wrong**2)
-            errors.append([*(float(((i - truth) ** 2).mean()) for i in shown), float(common)])
-        smoothed, *others, common = np.mean(errors, 0)
-        cells = [f"{100 * smoothed:.4f}", *(f"{v / smoothed:.2f}" for v in others), f"{common:.2f}"]
-        yield f"| {cell['scene']}, {cell['exposure_ms']:g} ms | " + " | ".join(cells) + " |"
+    """The table, line by line: steps of the ladder, and a column for each recording."""
+    cells: dict[str, dict[str, float]] = {}
+    common, ends = {}, {}
+    for label, other in BLUR_SENSORS.items():
+        for cell, source, recording in blurred(folder, LONG, label, **other):
+            assert isinstance(source, Pan | Objects)
+            params = mc.Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4)
+            params = params.replace(rho_ref=0.0) if "refractory" in other else params
+            video = mc.estimate(recording, params, progress=False)
+            times = at_and_between(recording)[0].tolist()
+            errors: dict[str, list[float]] = {}
+            shares = []
+            for t in times:
+                truth = source.intensity(t * 1e-6).clip(0, 1)
+                images, share = ladder(video, source, t, not label)
+                shares.append(share)
+                for name, image in images.items():
+                    shown = (np.exp(image) - float(params.I0)).clip(0, 1)
+                    errors.setdefault(name + label.replace("_", ", "), []).append(
+                        ((shown - truth) ** 2).mean()
+                    )
+            head = f"{cell['scene']}, {cell['exposure_ms']:g} ms"
+            found = {name: float(np.mean(values)) for name, values in errors.items()}
+            cells.setdefault(head, {}).update(found)
+            if not label:
+                common[head] = np.mean(shares)
+                between = halfway(recording, 3).tolist()
+                ends[head] = np.mean([misses(video, source, t) for t in between], 0)
+    yield "| | " + " | ".join(cells) + " |"
+    yield "|---|" + "---:|" * len(cells)
+
+    def line(name: str, values: Iterable[float], digits: int = 2) -> str:
+        return f"| {name} | " + " | ".join(f"{v:.{digits}f}" for v in values) + " |"
+
+    yield line("smoother x 1e-2", (100 * c["smoother"] for c in cells.values()), 4)
+    for name in list(next(iter(cells.values())))[1:]:
+        yield line(name, (c[name] / c["smoother"] for c in cells.values()))
+    yield line("common", common.values())
+    yield line("px to the frames next to it", (v[0] for v in ends.values()), 1)
+    for k, name in enumerate(
+        ("`mc`", "images between the frames", "the same without their mean"), 1
+    ):
+        yield line(f"ends beside, {name}", (v[k] for v in ends.values()))
 
 
-def truly_panned(target: Followed, source: Pan, t: int) -> Along:
-    """A target's images along the true trajectories of a pan."""
-    instants, L, V, clear, *_ = target
-    h, w = L.shape[1:]
+def panned(
+    source: Pan, size: tuple[int, int], t: float, times: list[float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where the points of a pan's pixels at t (s) are at others: x and y, (K, h, w)."""
+    h, w = size
     at = np.mgrid[:h, :w].astype(float) - np.array([(h - 1) / 2, (w - 1) / 2])[:, None, None]
 
     def turn(roll: float, x: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
         cos, sin = np.cos(roll), np.sin(roll)
         return cos * x - sin * y, sin * x + cos * y
 
-    (x, y), roll, zoom = source.pose(t * 1e-6)
+    (x, y), roll, zoom = source.pose(t)
     right, down = turn(roll, zoom * at[1], zoom * at[0])
-    warped = np.zeros((4, *L.shape), np.float32)
-    for k, moment in enumerate(instants.t):
-        (x1, y1), roll, zoom = source.pose(float(moment) * 1e-6)
+    found = []
+    for moment in times:
+        (x1, y1), roll, zoom = source.pose(moment)
         X, Y = turn(-roll, right + x - x1, down + y - y1)
-        X, Y = X / zoom + (w - 1) / 2, Y / zoom + (h - 1) / 2
+        found.append((X / zoom + (w - 1) / 2, Y / zoom + (h - 1) / 2))
+    X, Y = (np.stack(part) for part in zip(*found, strict=True))
+    return X, Y
+
+
+def truly_panned(target: Followed, source: Pan, t: int) -> Along:
+    """A target's images along the true trajectories of a pan."""
+    instants, L, V, clear, *_ = target
+    h, w = L.shape[1:]
+    warped = np.zeros((4, *L.shape), np.float32)
+    places = panned(source, (h, w), t * 1e-6, [float(at) * 1e-6 for at in instants.t])
+    for k, (X, Y) in enumerate(zip(*places, strict=True)):
         for n, (image, order) in enumerate(((L[k], 3), (V[k], 1), (clear[k] * 1.0, 1))):
             warped[n, k] = map_coordinates(image, [Y, X], order=order, mode="nearest")
         warped[3, k] = (-0.5 <= X) & (w - 0.5 >= X) & (-0.5 <= Y) & (h - 0.5 >= Y)
@@ -269,20 +419,18 @@ def pan_images(
 ) -> tuple[dict[str, NDArray[np.floating]], Along]:
     """Log intensities of the smoother, of `mc`, and of the best ingredients; the true paths."""
     target = video.follow(t)
-    instants, L, V, clear, *_ = target
-    place = place_of(instants, clear, len(instants))
     true = truly_panned(target, source, t)
-    images = {"smoother": L[instants.own]}
-    found = warp(L, V, np.asarray(clear, np.float32), instants.s, target.paths)
+    images = {"smoother": target.L[target.instants.own]}
+    found = along_paths(target, target.paths)
     for motion, along in {"found": found, "true": true}.items():
-        told = fusion.compare(
-            agree(video.params, L, along, place), fusion.views(L, V, along, place)
-        )
-        ingredients = np.asarray(told.ingredients)
-        images[f"`mc`, {motion} motion"] = np.asarray(fusion.decide(video.params, told).L)
+        fused, ingredients = fused_along(video.params, target, along)
+        images[f"`mc`, {motion} motion"] = np.asarray(fused.L)
         images[f"fusion alone, {motion} motion"] = ingredients[0]
-        best = np.abs(ingredients - level).argmin(0)[None]
-        images[f"best ingredient, {motion} motion"] = np.take_along_axis(ingredients, best, 0)[0]
+        squares = (ingredients - level) ** 2
+        for label, size in POOLED.items():
+            best = np.stack([uniform_filter(square, size) for square in squares]).argmin(0)[None]
+            chosen = np.take_along_axis(ingredients, best, 0)[0]
+            images[f"best ingredient{label}, {motion} motion"] = chosen
     return images, true
 
 

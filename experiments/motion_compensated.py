@@ -352,19 +352,28 @@ def exposures(store: Store, folder: Path) -> None:
         store.add(cell, both, _scorer(recording, truth_of(source, t), None, parts))
 
 
-def blurred(folder: Path) -> Iterator[tuple[Row, Source, Recording]]:
-    """Recordings of long exposures, with what tells them apart."""
+def blurred(
+    folder: Path,
+    blurs: tuple[tuple[float, ...], tuple[float, ...]] = BLURS,
+    label: str = "",
+    **other: Any,
+) -> Iterator[tuple[Row, Source, Recording]]:
+    """Recordings of long exposures, with what tells them apart: exposures (s), speeds (px/s).
+
+    The label is of the sensor's `other` settings, in the names of files.
+    """
     light, seed = panorama(), SCORING[0]
-    for kind, exposure, speed in itertools.product(("pan", "objects"), *BLURS):
+    for kind, exposure, speed in itertools.product(("pan", "objects"), *blurs):
         rate = min(25.0, 0.8 / exposure)
         camera = sensor(rate, exposure, max(8, round(2 * exposure * speed)))
+        camera = dataclasses.replace(camera, **other)
         size, duration = (160, 120), 7 / rate + exposure
         source: Source = (
             Objects(size, duration, speed, seed=seed)
             if kind == "objects"
             else Pan(light, size, duration, speed, seed)
         )
-        name = f"{kind}_{1e3 * exposure:g}ms_{speed:g}px.h5"
+        name = f"{kind}_{1e3 * exposure:g}ms_{speed:g}px{label}.h5"
         recording = recorded(folder / "recordings" / name, source, camera, seed)
         yield {"scene": kind, "exposure_ms": 1e3 * exposure, "speed": speed}, source, recording
 
