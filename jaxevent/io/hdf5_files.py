@@ -8,6 +8,7 @@ files may be made of others.
 import contextlib
 import contextvars
 import functools
+import io
 import math
 import re
 import struct
@@ -38,6 +39,8 @@ _STRING = re.compile(
     re.DOTALL,
 )
 _HEAP = re.compile(rb"GCOL\x01\x00\x00\x00")  # `bytes.find` is slow among zeros
+_BEGIN = b"\x89HDF\r\n\x1a\n"
+_BLOCK, _LONGEST = 1 << 18, 64  # bytes that are searched at once; more than either of these has
 
 
 @contextlib.contextmanager
@@ -99,44 +102,64 @@ def check_heaps(path: Path) -> None:
 def search_heaps(path: Path, state: tuple[int, ...]) -> None:
     """`check_heaps` of a file in some state."""
     damaged = InputError(f"{path}: a string or its heap is damaged; fetch the file again")
-    with path.open("rb") as file:
-        pieces = [file.read(_HEAPS)]
+    with path.open("rb", buffering=0) as file:
         length = file.seek(0, 2)
-        if length > _HEAPS:
-            file.seek(max(_HEAPS, length - _HEAPS))
-            pieces.append(file.read())
-        base = max(pieces[0].find(b"\x89HDF\r\n\x1a\n"), 0)
-        for count, heap, _ in (
-            struct.unpack("<IQI", match[1]) for piece in pieces for match in _STRING.finditer(piece)
-        ):
-            if count and heap < length:
-                file.seek(heap + base)
-            if count and (heap >= length or count > length or file.read(4) != b"GCOL"):
+        strings = set[bytes]()
+        for begin, end in (0, min(_HEAPS, length)), (max(_HEAPS, length - _HEAPS), length):
+            heaps: list[int] = []
+            for place, block in _blocks(file, begin, end):
+                strings |= {match[1] for match in _STRING.finditer(block)}
+                heaps += [place + match.start() for match in _HEAP.finditer(block)]
+            if not _come_to_their_end(file, heaps, end):
                 raise damaged
-    if not all(map(_heaps_end, pieces)):
-        raise damaged
+        base = _base(file, length)
+        for count, heap, _ in (struct.unpack("<IQI", string) for string in strings):
+            if count and (heap >= length or count > length or _at(file, heap + base, 4) != b"GCOL"):
+                raise damaged
 
 
-def _heaps_end(piece: bytes) -> bool:
-    """Whether each heap of strings in some bytes of a file comes to its end.
+def _blocks(file: io.FileIO, begin: int, end: int) -> Iterator[tuple[int, memoryview]]:
+    """Bytes of a file from begin to end and where they lie, some of each block in the next one.
 
-    Every place is looked at once, as a file of 1 MB can hold 65,536 heaps one inside the other:
-    where one comes to a place of another, it goes on from where that one stopped.
+    They are overwritten: fresh memory for all of them takes longer than the search.
+    """
+    room = memoryview(bytearray(_BLOCK))
+    for place in range(begin, end, _BLOCK - _LONGEST):
+        file.seek(place)
+        yield place, room[: file.readinto(room[: end - place])]
+
+
+def _at(file: io.FileIO, place: int, count: int) -> bytes:
+    file.seek(place)
+    return file.read(count) or b""
+
+
+def _base(file: io.FileIO, length: int) -> int:
+    """Where HDF5 begins in a file: at its start, or at a power of two from 512 on."""
+    places = [0, *(512 << k for k in range(max(length.bit_length() - 9, 0)))]
+    return next((place for place in places if _at(file, place, len(_BEGIN)) == _BEGIN), 0)
+
+
+def _come_to_their_end(file: io.FileIO, heaps: list[int], end: int) -> bool:
+    """Whether each heap of strings that begins at one of some places comes to its end.
+
+    Or goes on beyond `end`. Every place is looked at once, as a file of 1 MB can hold 65,536 heaps
+    one inside the other: where one comes to a place of another, it goes on from where that one
+    stopped.
     """
     walks: dict[int, int] = {}  # by place, which heap came by
     ends: list[int] = []
-    for found in _HEAP.finditer(piece):
-        at = found.start()
-        if at + 16 > len(piece):
+    for at in heaps:
+        if at + 16 > end:
             continue
-        (size,) = struct.unpack_from("<Q", piece, at + 8)
+        (size,) = struct.unpack("<Q", _at(file, at + 8, 8))
         here, stop = at + 16, at + size
-        while here + 16 <= min(stop, len(piece)):
+        while here + 16 <= min(stop, end):
             before = walks.setdefault(here, len(ends))
             if before < len(ends):
                 here = ends[before]
                 continue
-            index, held = struct.unpack_from("<H6xQ", piece, here)
+            index, held = struct.unpack("<H6xQ", _at(file, here, 16))
             need = held if index == 0 else 16 + held + -held % 8
             if not 16 <= need <= stop - here:
                 return False

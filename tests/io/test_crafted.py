@@ -9,6 +9,7 @@ import pytest
 
 from jaxevent import cli, io
 from jaxevent.errors import InputError
+from jaxevent.io import hdf5_files
 
 NEEDS = {"bag": "rosbags", "aedat4": "aedat"}
 
@@ -34,6 +35,25 @@ def test_what_is_trusted_may_be_made_of_other_files(name, tmp_path, capsys):
     assert cli.main(words) == 2 and "jaxevent convert --trust" in capsys.readouterr().err
     assert cli.main([*words, "--trust"]) == 0
     np.testing.assert_array_equal(io.load(out).events.p, crafted.EVENTS.p)
+
+
+def test_strings_are_found_wherever_blocks_of_the_search_end(tmp_path, monkeypatch):
+    # The string's attribute or the heap's end lie across an end of a block for some of these.
+    good = tmp_path / "good.h5"
+    with h5py.File(good, "w") as file:
+        file.attrs["format"] = "jaxevent"
+    content = bytearray(good.read_bytes())
+    at = content.index(b"GCOL") + 16
+    content[at + 8 : at + 16] = (1 << 40).to_bytes(8, "little")  # the string's size in its heap
+    endless = tmp_path / "endless.h5"
+    endless.write_bytes(content)
+    bad = endless, crafted.hdf5_string_of_gigabytes(tmp_path)
+    for block in range(65, 200):
+        monkeypatch.setattr(hdf5_files, "_BLOCK", block)
+        hdf5_files.search_heaps.__wrapped__(good, ())
+        for path in bad:
+            with pytest.raises(InputError, match="a string or its heap is damaged"):
+                hdf5_files.search_heaps.__wrapped__(path, ())
 
 
 @pytest.mark.slow

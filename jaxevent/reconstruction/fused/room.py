@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from jaxevent.reconstruction.fused.loop import Images
 
-IMAGE_PIXELS = 1 << 21  # made in one pass, 9 bytes each
+IMAGE_PIXELS = 1 << 22  # made in one pass, 9 bytes each
 _SETS = 2  # the last images are held while the next ones are made
 
 
