@@ -283,6 +283,7 @@ def compared(targets: Iterator[tuple]) -> Iterator[dict[str, Any]]:
             "beyond": np.asarray(told.beyond),
             "rest": np.asarray(told.rest),
             "stays": np.asarray(told.stays),
+            "far": np.asarray(told.far),
             "truth": truth.astype(np.float32),
             "I0": float(video.params.I0),
             "hdr": hdr,
@@ -316,7 +317,7 @@ def weight(row: dict[str, Any], noises: dict[str, float]) -> float:
 
 def _doubted(row: dict[str, Any]) -> np.ndarray:
     """The signs by which the variance is told."""
-    given = (row["signs"], row["known"], row["beyond"] > 0)
+    given = (row["signs"], row["known"], row["beyond"] > 0, row["far"])
     return np.asarray(fusion.signs_of_doubt(*map(jnp.asarray, given)))
 
 
@@ -428,6 +429,7 @@ def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:
             jnp.asarray(r["beyond"]),
             jnp.asarray(r["rest"]),
             jnp.asarray(r["stays"]),
+            jnp.asarray(r["far"]),
         )
         fused = decide(params, told)
         line = []

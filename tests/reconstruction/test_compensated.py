@@ -896,17 +896,24 @@ def test_blurring_is_scipys():
     np.testing.assert_allclose(blurred, expected, atol=1e-5)
 
 
-def test_clipped_frames_on_one_side_tell_no_doubt():
+def test_frames_on_one_side_tell_doubt_as_they_show_points_and_are_far():
     X, known = (
         np.random.default_rng(3).normal(-4, 1, (len(SIGNS) + 1, 1, 3)),
         np.array([[0, 0.5, 1]]),
     )
     given = jnp.asarray(X), jnp.asarray(known)
-    np.testing.assert_array_equal(fusion.signs_of_doubt(*given, jnp.asarray(False)), X)
-    told = np.asarray(fusion.signs_of_doubt(*given, jnp.asarray(True)))
+    np.testing.assert_array_equal(
+        fusion.signs_of_doubt(*given, jnp.asarray(False), jnp.asarray(3)), X
+    )
+    told, far, near = (
+        np.asarray(fusion.signs_of_doubt(*given, jnp.asarray(True), jnp.asarray(away)))
+        for away in (1, 3, 0.5)
+    )
     apart, twice = (SIGNS.index(name) for name in ("from_each_other", "seen_twice"))
     squares = np.exp(X[apart]) - fusion.TINY
     np.testing.assert_allclose(np.exp(told[apart]) - fusion.TINY, known * squares, atol=1e-7)
+    np.testing.assert_allclose(np.exp(far[apart]) - fusion.TINY, 3 * known * squares, atol=1e-7)
+    np.testing.assert_array_equal(near, told)
     np.testing.assert_allclose(told[twice], known * X[twice])
     others = np.delete(np.arange(len(X)), [apart, twice])
     np.testing.assert_array_equal(told[others], X[others])

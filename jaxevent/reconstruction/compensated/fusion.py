@@ -57,6 +57,9 @@ class Views(NamedTuple):
     beyond: Numeric  # (), 1 where frames are on one side of the target alone, else 0
     rest: Numeric  # (), `Instants.rest`
     reach: Numeric | float  # `warping.reach`
+    # (), how far the target is from the nearest frame, in intervals from that to `Place.other`,
+    # where frames are on one side alone; else 1.
+    far: Numeric
 
 
 def views(
@@ -75,8 +78,10 @@ def views(
     images = (L[a], there, apart, twice, before, after)
     weight = weight_after(place)
     blended = (1 - weight) ** 2 * V[a] + weight**2 * V[b]
+    interval = jnp.where(a == c, 1, abs(place.s[a] - place.s[c]))
+    far = jnp.where((a == b) & (a != c), abs(place.s[a]) / interval, 1)
     sides = (weight, beyond, place.rest)
-    return Views(L[place.own], V[place.own], blended, *images, *sides, reach)
+    return Views(L[place.own], V[place.own], blended, *images, *sides, reach, far)
 
 
 def weight_after(place: Place) -> Numeric:
@@ -107,6 +112,7 @@ class Comparison(Described):
     beyond: Float[Array, ""]  # as in `Views`
     rest: Float[Array, ""]
     stays: Float[Array, "..."]  # how far points stay in their places, 0..1
+    far: Float[Array, ""]  # as in `Views`
 
 
 SOURCES = ("before", "after", "events", *OTHERS)
@@ -147,7 +153,9 @@ def compare(told: Agreement, seen: Views) -> Comparison:
     known = 1 / (1 + (seen.blended / unknown) ** 2)
     sides = (jnp.asarray(seen.beyond), jnp.asarray(seen.rest, jnp.float32))
     stays = 1 / (1 + (jnp.asarray(seen.reach, jnp.float32) / STAYS**2) ** 2)
-    return Comparison(ingredients, known, X, told.parts, visible, told.usual, *sides, stays)
+    return Comparison(
+        ingredients, known, X, told.parts, visible, told.usual, *sides, stays, jnp.asarray(seen.far)
+    )
 
 
 def decide(params: Params, comparison: Comparison) -> Fused:
@@ -168,7 +176,7 @@ def decide(params: Params, comparison: Comparison) -> Fused:
     q = _shifted(q, comparison.stays * comparison.known * quiet, 1)
     # At rest it is as the frame shows it, also where a noise event is alone.
     q = _shifted(q, comparison.rest * jnp.maximum(quiet, smooth_part(quiet, ALONE)), 2)
-    signs = signs_of_doubt(X, comparison.known, beyond)
+    signs = signs_of_doubt(X, comparison.known, beyond, comparison.far)
     P = jnp.exp(jnp.tensordot(jnp.where(beyond, params.doubt_beyond, params.doubt), signs, 1))
     # Where frames are clipped all instants rest on the same events; more of them tell no more.
     P = jnp.maximum(P, params.common * comparison.usual)
@@ -176,16 +184,17 @@ def decide(params: Params, comparison: Comparison) -> Fused:
     return Fused((q * ingredients).sum(0), P, sources, comparison.visible)
 
 
-def signs_of_doubt(X: Array, known: Array, beyond: Array) -> Array:
+def signs_of_doubt(X: Array, known: Array, beyond: Array, far: Array) -> Array:
     """Signs X (signs, h, w) by which the variance is told.
 
     Frames on one side that are clipped differ along trajectories by what they do not show. So what
-    two such frames tell counts as far as they show the point.
+    two such frames tell counts as far as they show the point. They are an interval apart, the
+    target is `far` intervals away: beyond one the square counts in proportion to it.
     """
     part = jnp.where(beyond, known, 1)
     apart, twice = (SIGNS.index(name) for name in ("from_each_other", "seen_twice"))
-    squares = jnp.exp(X[apart]) - TINY
-    X = X.at[apart].set(jnp.where(beyond, jnp.log(part * squares + TINY), X[apart]))
+    squares = (jnp.exp(X[apart]) - TINY) * part * jnp.maximum(far, 1)
+    X = X.at[apart].set(jnp.where(beyond, jnp.log(squares + TINY), X[apart]))
     return X.at[twice].multiply(part)
 
 
