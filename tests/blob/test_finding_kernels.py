@@ -12,7 +12,7 @@ from jaxevent.blob.finding.background import (
     SLICES,
     Background,
     evidence,
-    measure_dispersion,
+    measure_dispersions,
 )
 from jaxevent.blob.finding.detection import FALSE_ALARMS, Scale, detect, measure_blobs
 from jaxevent.blob.finding.found import Found
@@ -159,7 +159,7 @@ def test_scores_are_the_likelihood_of_the_best_shares(stream, background):
 
 @pytest.mark.slow
 def test_dispersion_is_variance_over_mean(stream, background):
-    told = measure_dispersion(stream, background, 0.01)
+    told = measure_dispersions(stream, background, np.array([0.01]))[0]
     number = 50
     middles = (np.arange(number) + np.arange(number) * (0.5 * (5**0.5 - 1)) % 1) / number * DURATION
     own, fullest = (
@@ -253,10 +253,18 @@ def test_streams_tell_the_same_read_piece_by_piece(stream, background, monkeypat
     monkeypatch.setattr(stream_module, "HELD", 0)
     monkeypatch.setattr(stream_module, "BATCH", 64)
     pieces = Stream(stream.recording, stream.start, stream.stop)
-    for one, other in zip(pieces.window(0.1, 0.2), stream.window(0.1, 0.2), strict=True):
-        np.testing.assert_array_equal(one, other)
+    pieces.hot = stream.hot
+    (_, path), number = lagging(tail=8.0), len(stream.window(0, 1))
+    held = stream.without([path], 3)
+    for room in (0, number):  # what is left is held where there is room for it
+        monkeypatch.setattr(stream_module, "HELD", room)
+        for one, other in ((pieces, stream), (pieces.without([path], 3), held)):
+            for told, expected in zip(one.window(0.1, 0.2), other.window(0.1, 0.2), strict=True):
+                np.testing.assert_array_equal(told, expected)
+        assert number > len(held.window(0, 1)) == len(pieces.without([path], 3).window(0, 1))
     np.testing.assert_array_equal(
-        measure_dispersion(pieces, background, 0.01), measure_dispersion(stream, background, 0.01)
+        measure_dispersions(pieces, background, np.array([0.01]))[0],
+        measure_dispersions(stream, background, np.array([0.01]))[0],
     )
 
 

@@ -263,25 +263,42 @@ def _quiet(N: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
     return quarter, np.where(quarter >= 3, quarter + 0.674 * np.sqrt(quarter + 0.5), few)
 
 
-def measure_dispersion(
-    stream: Stream, background: Background, window: float | int
-) -> NDArray[np.float64]:
+def measure_dispersions(
+    stream: Stream, background: Background, windows: NDArray[np.float64]
+) -> list[NDArray[np.float64]]:
     """Variance over mean of the background's counts in windows (s) in cells of 16 px; at least 1.
 
-    The median over the sensor's cells: targets in a minority of them do not change it. Where the
-    background is bright it is that of the cell, so large that its fullest window is no surprise.
+    Of each length of windows: the median over the sensor's cells, so that targets in a minority of
+    them do not change it. Where the background is bright it is that of the cell, so large that its
+    fullest window is no surprise.
     """
-    number = int(min(MOST_WINDOWS, stream.duration / window))
-    rows, columns = background.calm.shape[1:]
-    # At no fixed steps, for flicker has a period.
-    middles = (np.arange(number) + np.arange(number) * GOLDEN % 1) / number * stream.duration
-    slices = background.slice(middles)
-    N = np.zeros((number, rows, columns), np.int32)
-    spans = np.stack([middles - window / 2, middles + window / 2], 1)
-    spans, places, into = in_steps(spans, background.scene, background.corner)
-    stream.add_cells(spans, places, CELL, N, into)
+    middles = [_middles(int(min(MOST_WINDOWS, stream.duration / w)), stream) for w in windows]
+    spans = [np.stack([t - w / 2, t + w / 2], 1) for t, w in zip(middles, windows, strict=True)]
+    spans = np.concatenate(spans)
+    N = np.zeros((len(spans), *background.calm.shape[1:]), np.int32)
+    if background.scene is None:
+        stream.count_spans(spans, CELL, N)
+    else:
+        spans, places, into = in_steps(spans, background.scene, background.corner)
+        stream.add_cells(spans, places, CELL, N, into)
+    out, first = [], 0
+    for t in middles:
+        out.append(_dispersion(N[first : first + len(t)], background, background.slice(t)))
+        first += len(t)
+    return out
+
+
+def _middles(number: int, stream: Stream) -> NDArray[np.float64]:
+    """Of some windows, s; at no fixed steps, for flicker has a period."""
+    return (np.arange(number) + np.arange(number) * GOLDEN % 1) / number * stream.duration
+
+
+def _dispersion(
+    N: NDArray[np.int32], background: Background, slices: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Of counts (windows, rows, columns) of windows in some slices."""
     calm, activity = background.calm[slices], background.activity[slices]
-    sums = np.zeros((6, rows, columns))
+    sums = np.zeros((6, *N.shape[1:]))
     _moments(N, calm, activity, background.bright, sums)
     _, squares, expected, fullest, seen, _ = sums
     full = expected >= FULL

@@ -15,7 +15,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.finding.background import Background, measure_dispersion
+from jaxevent.blob.finding.background import Background, measure_dispersions
 from jaxevent.blob.finding.detection import CONTACT, Scale, detect, measure_blobs, touching
 from jaxevent.blob.finding.prediction import LARGE, Told, choose_scored, predict, score
 from jaxevent.blob.finding.stream import Pixels, Stream
@@ -88,7 +88,7 @@ class _Trial:
         self.begins = np.clip(
             stream.times(STRETCHES)[:, None], 2 * windows, stream.duration - windows
         )
-        dispersions = [measure_dispersion(stream, background, w) for w in windows]
+        dispersions = measure_dispersions(stream, background, windows)
         self.scales = [
             [Scale(float(w), cell, dispersion) for cell in CELLS]
             for w, dispersion in zip(windows, dispersions, strict=True)

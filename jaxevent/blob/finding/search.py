@@ -114,7 +114,8 @@ def _search(
         new = [one for one in new if not _left_over(one, found)]
         passes.append(Pass(choice, len(new)))
         found += new
-        stream = stream.without([*near, *new], 2 * GATE)
+        stitched = [one for one in new if all(one is not other for other in near)]
+        stream = stream.without([*near, *stitched], 2 * GATE)
     return found, passes
 
 

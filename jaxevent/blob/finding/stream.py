@@ -50,6 +50,7 @@ class Stream:
         self.recording, self.start, self.stop = recording, start, stop
         self.width, self.height = recording.width, recording.height
         self._hot = np.zeros((recording.height, recording.width), bool)
+        self._any_hot = False
         self._first, self._last = (recording.events.index(t) for t in (start, stop))
         self._kept: NDArray[np.bool_] | None = None  # of all these rows
         few = len(self) <= HELD
@@ -68,8 +69,8 @@ class Stream:
 
     @hot.setter
     def hot(self, hot: NDArray[np.bool_]) -> None:
-        self._hot = hot
-        if self._held is not None and hot.any():
+        self._hot, self._any_hot = hot, bool(hot.any())
+        if self._held is not None and self._any_hot:
             self._held = self._held[~hot[self._held.y, self._held.x]]
 
     def __len__(self) -> int:
@@ -81,18 +82,28 @@ class Stream:
     ) -> "Stream":
         """The same without events within `sigmas` standard deviations of some paths.
 
-        Before `until` (us), if it is given; what is held ends there.
+        Before `until` (us), if it is given; what is held ends there. If few events are left they
+        are held.
         """
-        stream, first, joined = copy.copy(self), self._first, join(paths)
+        stream, joined = copy.copy(self), join(paths)
         if self._held is not None:
             events = self._held if until is None else self._held[: self._index(until)]
             stream._held = events[candidates(events, joined, sigmas)[:, 0] == NOBODY]
             return stream
         kept = np.ones(len(self), bool) if self._kept is None else self._kept.copy()
-        rows = first, self._last if until is None else self._index(until)
-        for row, _, whose in near_paths(self.recording.events, joined, sigmas, rows):
-            kept[row - first : row - first + len(whose)] &= whose[:, 0] == NOBODY
-        stream._kept = kept
+        rows = self._first, self._last if until is None else self._index(until)
+        left, number = [Events.empty()], 0
+        for row, part, whose in near_paths(self.recording.events, joined, sigmas, rows):
+            stays = kept[row - self._first :][: len(part)]
+            stays &= whose[:, 0] == NOBODY
+            if number <= HELD:
+                left.append(part[stays & ~self.hot[part.y, part.x] if self._any_hot else stays])
+                number += len(left[-1])
+        if number <= HELD:
+            columns = zip(*((one.t, one.x, one.y, one.p) for one in left), strict=True)
+            stream._held, stream._kept = Events(*map(np.concatenate, columns)), None
+        else:
+            stream._kept = kept
         return stream
 
     def window(self, begin: float | int, end: float | int) -> Part:
@@ -138,6 +149,27 @@ class Stream:
                 at = places[one], cell, counts, into[one]
                 _add_cells(events.x, events.y, hot, kept, rows, *at)
 
+    def count_spans(self, spans: NDArray[np.float64], cell: int, counts: NDArray[np.int32]) -> None:
+        """Add to counts (n, rows, columns) the events of spans (n, 2) s, which may overlap.
+
+        As `add_cells` does of cells that stand still, but each event is looked at once.
+        """
+        us = self.start + np.rint(1e6 * spans.ravel()).astype(np.int64)
+        us = np.clip(us, self.start, self.stop)
+        edges = np.argsort(us, kind="stable")
+        us, columns, done = us[edges], counts.shape[2], 0
+        counts = counts.reshape(len(counts), -1)
+        before = np.zeros(counts.shape[1], np.int32)
+        first, last = self._index(int(us[0])), self._index(int(us[-1]))
+        for row in range(first, last, BATCH):
+            end = min(row + BATCH, last)
+            events, hot, kept = self._of_rows(row, end)
+            rows = np.searchsorted(events.t, us[done:])
+            some = len(rows) if end == last else int(np.searchsorted(rows, len(events)))
+            place = rows[:some], edges[done : done + some]
+            _count_spans(events.x, events.y, hot, kept, *place, cell, columns, before, counts)
+            done += some
+
     def times(self, number: int) -> NDArray[np.float64]:
         """Times (s) of some events that are equally many events apart."""
         share = (np.arange(number) + 0.5) / number
@@ -164,7 +196,8 @@ class Stream:
             return self._held[first:last], COLD, ALL
         some = slice(first - self._first, last - self._first)
         kept = ALL if self._kept is None else self._kept[some]
-        return self.recording.events[first:last], self.hot, kept
+        hot = self.hot if self._any_hot else COLD
+        return self.recording.events[first:last], hot, kept
 
     def _rows(self, first: int, last: int) -> Part:
         events, hot, kept = self._of_rows(first, last)
@@ -200,26 +233,44 @@ def _count(
 
     How many pixels there are, and how many events in all.
     """
-    events = len(x)
+    events, m = len(x), 0
     if events > most:
+        if len(hot) == 0 and len(kept) == 0:
+            for k in range(most):
+                m += _enter(x, y, k * (events - 1) // (most - 1), counts, px, py, m)
+            _empty(m, counts, px, py, n)
+            return m, events
         events = 0
         for i in range(len(x)):
             events += _stays(i, x, y, hot, kept)
-    m = number = following = taken = 0
+    number = following = taken = 0
     for i in range(len(x)):
         if _stays(i, x, y, hot, kept):
             if number == following:
-                if counts[y[i], x[i]] == 0:
-                    px[m], py[m] = x[i], y[i]
-                    m += 1
-                counts[y[i], x[i]] += 1
+                m += _enter(x, y, i, counts, px, py, m)
                 taken += 1
                 following = taken * (events - 1) // (most - 1) if events > most else taken
             number += 1
+    _empty(m, counts, px, py, n)
+    return m, number
+
+
+@lean_part
+def _enter(x: Any, y: Any, i: int, counts: Any, px: Any, py: Any, m: int) -> int:
+    """Count an event in its pixel, the m-th if it is new: whether it is, 0 or 1."""
+    counts[y[i], x[i]] += 1
+    if counts[y[i], x[i]] > 1:
+        return 0
+    px[m], py[m] = x[i], y[i]
+    return 1
+
+
+@lean_part
+def _empty(m: int, counts: Any, px: Any, py: Any, n: Any) -> None:
+    """Take over the counts of m pixels."""
     for k in range(m):
         n[k] = counts[py[k], px[k]]
         counts[py[k], px[k]] = 0
-    return m, number
 
 
 @lean_part
@@ -267,3 +318,32 @@ def _add_cells(
                 own[cell_at(A, x[i], y[i], cell, own.shape)] += 1
             else:
                 own[y[i] >> bits, x[i] >> bits] += 1
+
+
+@lean
+def _count_spans(
+    x: Any, y: Any, hot: Any, kept: Any, rows: Any, edges: Any, cell: int, columns: int,
+    before: Any, counts: Any,
+) -> None:  # fmt: skip
+    """Add to counts of spans those `before` their ends, less those before their beginnings.
+
+    Edges, at `rows` of the events, are numbered: twice that of the span, and 1 more at its end.
+    """
+    bits = 0
+    while 1 << bits < cell:
+        bits += 1
+    i = 0
+    for k in range(len(rows) + 1):
+        until = rows[k] if k < len(rows) else len(x)
+        while i < until:
+            if _stays(i, x, y, hot, kept):
+                before[(y[i] >> bits) * columns + (x[i] >> bits)] += 1
+            i += 1
+        if k < len(rows):
+            own = counts[edges[k] >> 1]
+            if edges[k] & 1:
+                for j in range(len(before)):
+                    own[j] += before[j]
+            else:
+                for j in range(len(before)):
+                    own[j] -= before[j]
