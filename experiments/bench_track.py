@@ -2,10 +2,10 @@
 
     python experiments/bench_track.py --data DIR [--only NAME ...] [--find]
 
-`simulated` is a target of a million events/s for four seconds. With `--find` the parts of finding
-alone. CPU seconds of this process and of ffmpeg, of the second
-of two runs in one process, so without compilation; the video's time is what a folder with it takes
-more than one without. Makes no file.
+`simulated` is a target of a million events/s for four seconds, `long` for ten. With `--find` the
+parts of finding alone. CPU seconds of this process and of ffmpeg, of the second of two runs in one
+process, so without compilation; the video's time is what a folder with it takes more than one
+without. Makes no file.
 """
 
 import argparse
@@ -37,6 +37,7 @@ PARTS = {  # of finding: where they are
     "taken away": (Stream, "without"),
     "polarity": (search, "prefer_sharper"),
 }
+SIMULATED = {"simulated": 4.0, "long": 10.0}  # s
 NAMES = ("spinning_dot.npz", "davis346_street.npz", "atis.es")
 
 
@@ -53,8 +54,8 @@ def timed(work: Callable[[], Any]) -> tuple[float, Any]:
 
 
 def recording_of(path: Path) -> Recording:
-    if path.name == "simulated":
-        return drifting(1, 1e6, 1e3, 10, 4.0, 2e4, 5)[0]
+    if path.name in SIMULATED:
+        return drifting(1, 1e6, 1e3, 10, SIMULATED[path.name], 2e4, 5)[0]
     return load(path, in_memory=False)
 
 

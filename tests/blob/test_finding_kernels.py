@@ -14,7 +14,7 @@ from jaxevent.blob.finding.background import (
     evidence,
     measure_dispersions,
 )
-from jaxevent.blob.finding.detection import FALSE_ALARMS, Scale, detect, measure_blobs
+from jaxevent.blob.finding.detection import FALSE_ALARMS, Blobs, Scale, detect, measure_blobs
 from jaxevent.blob.finding.found import Found
 from jaxevent.blob.finding.gates import CLAIMED, OWNS, Look
 from jaxevent.blob.finding.paths import Path as TargetPath
@@ -224,17 +224,20 @@ def test_events_are_shared_out_among_gates_and_blobs():
         kept = (owner >= 0) & confirmed[owner]
         for i in np.flatnonzero((labels == blob) & ~np.isin(owner, own) & ~kept):
             expected[i] = own[distance[own, i].argmin()]
-    told = seen.share_out(labels, blobs)
+    shares = seen.share_out(labels, blobs)
+    told = shares.owner
+    nobody = np.bincount(labels[told < 0], minlength=blobs + 1)
+    np.testing.assert_array_equal(shares.free, nobody[1:])
     assert (expected != owner).any()
     np.testing.assert_array_equal(told, expected)
 
-    which = labels > 1
+    which = labels > 0
     weight = (told == np.arange(targets)[:, None]) * which.astype(float)
     for i in np.flatnonzero((inside[:2].sum(0) > 1) & which):
         density = np.exp(-distance[:2, i] / 2) * n[:2]
         weight[:, i] = [*(density / density.sum()), 0, 0]
     assert 0 < (weight % 1 > 0).sum()
-    number, z, D = seen.moments(told, which)
+    number, z, D = shares.found
     np.testing.assert_allclose(number, weight.sum(1))
     for k in range(targets):
         np.testing.assert_allclose(z[k], np.average(e[k], axis=0, weights=weight[k]))
@@ -320,7 +323,7 @@ def test_gates_of_known_targets_end_at_their_size_beyond_it():
     x = np.array([42, 47, 49, 70], np.int32)
     part = Part(np.full(4, 0.01), x, np.full(4, 30, np.int32))
     owners = [
-        Look(one_target(P), part, 0.01).share_out(np.zeros(4, np.int32), 0).tolist()
+        Look(one_target(P), part, 0.01).share_out(np.zeros(4, np.int32), 0).owner.tolist()
         for P in (0.0, 1e4)
     ]
     # Of 3 standard deviations of 4.4 px^2, and of 4.4 + 4.
@@ -336,7 +339,7 @@ def test_faint_targets_that_are_known_keep_their_events_in_a_blob_with_a_large_o
     live = two._replace(confirmed=np.array([True, known]), P=np.zeros((2, 3)))
     x = np.r_[np.full(95, 32), np.full(5, 58)].astype(np.int32)
     part = Part(np.full(100, 0.01), x, np.full(100, 31, np.int32))
-    owner = Look(live, part, 0.01).share_out(np.ones(100, np.int32), 1)
+    owner = Look(live, part, 0.01).share_out(np.ones(100, np.int32), 1).owner
     assert set(owner[:95].tolist()) == {0} and set(owner[95:].tolist()) == owners
 
 
@@ -344,12 +347,13 @@ def test_faint_targets_that_are_known_keep_their_events_in_a_blob_with_a_large_o
 def test_a_target_is_updated_as_by_a_kalman_filter(background):
     live, t = one_target(3.0), 0.01
     p, P = expected_at(live, t)
-    n, z, D = np.array([16.0]), np.array([[1.5, -0.5]]), np.array([[[6.0, 1.0], [1.0, 3.0]]])
+    z, D = np.array([[1.5, -0.5]]), np.array([[[6.0, 1.0], [1.0, 3.0]]])
+    told = Blobs(np.array([16.0]), z, D)
     dispersion = background.field_of(np.ones((HEIGHT // CELL, WIDTH // CELL)), CELL, t)
     expected = Expected(
         t, 0.01, p, P, np.zeros(1, bool), background.field(t, 8), dispersion, 1.0, 1.0
     )
-    seen = update(live, expected, (n, z, D), (n, z, D))
+    seen = update(live, expected, told, told)
     assert seen.heard.all() and seen.n[0] == 16
     square = (16 * np.linalg.eigvalsh(D[0])[1] + KNOWN * 4) / (16 + KNOWN)
     assert seen.R[0] == pytest.approx(square / 32)
@@ -361,7 +365,7 @@ def test_a_target_is_updated_as_by_a_kalman_filter(background):
     assert live.nats[0] == pytest.approx(float(evidence(16, mu, 1.0)))
     # Two windows of silence: it stands still where it was.
     live.v[:] = 50.0
-    none = np.zeros(1), np.zeros((1, 2)), np.zeros((1, 2, 2))
+    none = Blobs(np.zeros(1), np.zeros((1, 2)), np.zeros((1, 2, 2)))
     before = live.p.copy()
     for miss in (1, 2):
         assert not update(live, expected, none, none).heard.any() and live.miss[0] == miss
@@ -389,6 +393,6 @@ def test_a_known_target_does_not_leap_to_few_events(background, n, away, hits, h
     expected = Expected(
         t, 0.01, p, P, np.zeros(1, bool), background.field(t, 8), dispersion, 1.0, 1.0
     )
-    told = np.array([float(n)]), np.array([[away, 0.0]]), 0.1 * np.eye(2)[None]
+    told = Blobs(np.array([float(n)]), np.array([[away, 0.0]]), 0.1 * np.eye(2)[None])
     assert update(live, expected, told, told).heard[0] == heard
     assert (live.p[0, 0] > 40.5) == heard

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.finding.detection import add_moments, finish_moments, touch
+from jaxevent.blob.finding.detection import Blobs, add_moments, finish_moments, touch
 from jaxevent.blob.finding.stream import Part
 from jaxevent.blob.finding.targets import GATE, REACH, Live, expect_one, larger_of
 from jaxevent.kernels import lean, lean_part
@@ -34,23 +34,19 @@ class Look:
         self.gates = Gates(self.p, live.v, np.empty((n, 4)), np.empty(n), live.n, self.soft)
         _expect(live, t, self.P, self.gates)
 
-    def share_out(self, labels: NDArray, blobs: int) -> NDArray[np.int64]:
-        """Whose each event is; -1: nobody's."""
-        targets = len(self.p)
-        shares = _Shares(
-            np.full(len(self.part), -1), np.zeros((blobs, targets), np.int64),
-            np.zeros(blobs, np.int64), np.zeros((blobs, targets), bool), np.zeros(blobs, bool),
-        )  # fmt: skip
-        _share_out(*self.part, self.t, labels, self.gates, shares)
-        return shares.owner
-
-    def moments(self, owner: NDArray, which: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Number (n,), mean (n, 2) and covariance (n, 2, 2) of residuals of some events."""
+    def share_out(self, labels: NDArray, blobs: int) -> "Shares":
+        """Whose each event is, of which blob each is, from 1 on, and what targets have of them."""
         targets, soft = len(self.p), np.flatnonzero(self.soft)
-        told = np.zeros(targets), np.zeros((targets, 2)), np.zeros((targets, 2, 2))
-        share = np.zeros(len(soft))
-        _moments(*self.part, self.t, owner, which, self.gates, soft, share, told)
-        return told
+        shares = Shares(
+            np.full(len(self.part), -1), np.zeros((blobs, targets), np.int64),
+            np.zeros(blobs, np.int64), np.zeros(blobs, np.int64),
+            np.zeros((blobs, targets), bool), np.zeros(blobs, bool),
+            Blobs(np.zeros(targets), np.zeros((targets, 2)), np.zeros((targets, 2, 2))),
+            Blobs(np.zeros(targets), np.zeros((targets, 2)), np.zeros((targets, 2, 2))),
+        )  # fmt: skip
+        space = soft, np.zeros(len(soft))
+        _share_out(*self.part, self.t, labels, self.gates, shares, space)
+        return shares
 
 
 @lean
@@ -75,14 +71,17 @@ def _expect(live: Any, t: Any, P: Any, gates: Any) -> None:
                 gates.soft[j] = gates.soft[k] = True
 
 
-class _Shares(NamedTuple):
-    """What `_share_out` fills."""
+class Shares(NamedTuple):
+    """Whose the events of a window are, as `_share_out` fills it in."""
 
     owner: NDArray[np.int64]  # whose each event is, -1: nobody's
     table: NDArray[np.int64]  # (blobs, targets) events of a blob in a target's gate,
-    counts: NDArray[np.int64]  # (blobs,) and all of it
+    counts: NDArray[np.int64]  # (blobs,) all of it,
+    free: NDArray[np.int64]  # (blobs,) and what is nobody's
     own: NDArray[np.bool_]  # (blobs, targets) who owns the rest of a blob,
     owned: NDArray[np.bool_]  # (blobs,) and whether it is owned
+    found: Blobs  # number, mean and covariance of residuals of each target's events in blobs,
+    anywhere: Blobs  # and of all, if some target has fewer than two in blobs
 
 
 @lean_part
@@ -100,9 +99,26 @@ def _squared(ex: float, ey: float, inverse: Any) -> float:
 
 
 @lean
-def _share_out(t: Any, x: Any, y: Any, middle: Any, labels: Any, gates: Any, shares: Any) -> None:
+def _share_out(
+    t: Any, x: Any, y: Any, middle: Any, labels: Any, gates: Any, shares: Any, space: Any
+) -> None:
+    _share(t, x, y, middle, labels, gates, shares)
+    for i in range(len(t)):
+        if labels[i] > 0 and shares.owner[i] < 0:
+            shares.free[labels[i] - 1] += 1
+    _moments(t, x, y, middle, labels, True, gates, shares.owner, space, shares.found)
+    for k in range(len(gates.p)):
+        if shares.found.n[k] < 2:
+            _moments(t, x, y, middle, labels, False, gates, shares.owner, space, shares.anywhere)
+            break
+
+
+@lean_part
+def _share(t: Any, x: Any, y: Any, middle: Any, labels: Any, gates: Any, shares: Any) -> None:
     """Whose each event is."""
-    owner, table, counts, own, owned = shares
+    owner, table, counts, own, owned = (
+        shares.owner, shares.table, shares.counts, shares.own, shares.owned,
+    )  # fmt: skip
     targets, inverse = len(gates.p), gates.inverse
     for i in range(len(t)):
         least, late = np.inf, t[i] - middle
@@ -141,15 +157,15 @@ def _share_out(t: Any, x: Any, y: Any, middle: Any, labels: Any, gates: Any, sha
                     least, owner[i] = distance, k
 
 
-@lean
+@lean_part
 def _moments(
-    t: Any, x: Any, y: Any, middle: Any, owner: Any, which: Any, gates: Any, soft: Any,
-    share: Any, told: Any,
+    t: Any, x: Any, y: Any, middle: Any, labels: Any, in_blobs: bool, gates: Any, owner: Any,
+    space: Any, told: Any,
 ) -> None:  # fmt: skip
     """Number, mean and covariance of residuals; targets in contact share events in both gates."""
-    (n, z, C), inverse = told, gates.inverse
+    (n, z, C), inverse, (soft, share) = told, gates.inverse, space
     for i in range(len(t)):
-        if not which[i]:
+        if in_blobs and labels[i] <= 0:
             continue
         late, sharing = t[i] - middle, 0
         for j in range(len(soft)):

@@ -22,7 +22,7 @@ from jaxevent.blob.finding.detection import (
     measure_blobs,
     part_blob,
 )
-from jaxevent.blob.finding.gates import Look
+from jaxevent.blob.finding.gates import Look, Shares
 from jaxevent.blob.finding.parts import unite
 from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.stream import Part, Stream
@@ -108,22 +108,18 @@ class Links:
         t = begin + w / 2
         part = self.stream.window(begin, begin + w)
         labels, blobs = detect(part, self.background, self.scale, self.size, t)
-        owner = np.full(len(part), -1)
+        look = Look(self.live, part, t)
+        shares = look.share_out(labels, blobs)
         if len(self.live.id):
-            look = Look(self.live, part, t)
-            owner, in_blob = look.share_out(labels, blobs), labels > 0
-            self._update(look, owner, in_blob)
-            self._part(part, t, owner, in_blob)
+            self._update(look, shares)
+            self._part(part, t, shares.owner, labels)
             self._join_parts(t)
             self._end(self._over())
-        self._begin_targets(part, t, owner, labels, blobs)
+        self._begin_targets(part, t, labels, shares)
 
-    def _update(self, look: Look, owner: NDArray, in_blob: NDArray) -> None:
+    def _update(self, look: Look, shares: Shares) -> None:
         """All targets after a window's events."""
         live, t = self.live, look.t
-        found = anywhere = look.moments(owner, in_blob)
-        if (found[0] < 2).any():
-            anywhere = look.moments(owner, np.ones(len(owner), bool))
         background, scale = self.background, self.scale
         seen = update(
             live,
@@ -131,8 +127,8 @@ class Links:
                 t, scale.window, look.p, look.P, look.soft, background.field(t, 3 * scale.cell),
                 background.field_of(scale.dispersion, CELL, t), scale.usual, scale.flicker,
             ),
-            found,
-            anywhere,
+            shares.found,
+            shares.anywhere,
         )  # fmt: skip
         self._confirm(seen.heard, t)
         now, m = seen.heard, look.p + seen.z
@@ -148,7 +144,7 @@ class Links:
         enough = (live.hits >= BORN) & (live.hits >= FILL * age) & (live.nats > self.enough)
         live.confirmed[heard & enough & apart] = True
 
-    def _part(self, part: Part, t: float | int, owner: NDArray, in_blob: NDArray) -> None:
+    def _part(self, part: Part, t: float | int, owner: NDArray, labels: NDArray) -> None:
         """Make two of a target that comes apart into two that go their own ways.
 
         Of parts of one object, such as both sides of an outline, the distance stays. How far apart
@@ -162,7 +158,7 @@ class Links:
             self.least[key] = min(self.least.get(key, size), size)
             if size < GROWN * self.least[key]:
                 continue
-            at = (owner == i) & in_blob
+            at = (owner == i) & (labels > 0)
             two = part_blob(part.x[at], part.y[at], live.C[i], VALLEY)
             if two is None or two.n[1] < APART * at.sum():
                 continue
@@ -248,20 +244,14 @@ class Links:
         self.confirmed |= set(over.id[over.confirmed].tolist())
         self.live = self.live.keep(~which)
 
-    def _begin_targets(
-        self, part: Part, t: float | int, owner: NDArray, labels: NDArray, blobs: int
-    ) -> None:
+    def _begin_targets(self, part: Part, t: float | int, labels: NDArray, shares: Shares) -> None:
         """Targets begin at blobs of which most events are nobody's."""
-        if not blobs:
-            return
-        free = owner < 0
-        counts = np.bincount(labels, minlength=blobs + 1)
-        of_nobody = np.bincount(labels[free], minlength=blobs + 1)[1:]
-        if not ((of_nobody >= 3) & (of_nobody >= FREE * counts[1:])).any():
-            return
-        found = measure_blobs(Part(part.t[free], part.x[free], part.y[free]), labels[free], blobs)
-        new = (found.n >= 3) & (found.n >= FREE * counts[1:])
-        self._begin(t, Blobs(found.n[new], found.p[new], found.C[new]))
+        new = (shares.free >= 3) & (shares.free >= FREE * shares.counts)
+        if new.any():
+            free = shares.owner < 0
+            some = Part(part.t[free], part.x[free], part.y[free])
+            n, p, C = measure_blobs(some, labels[free], len(new))
+            self._begin(t, Blobs(n[new], p[new], C[new]))
 
     def _begin(self, t: float | int, blobs: Blobs) -> None:
         n, p, C = blobs

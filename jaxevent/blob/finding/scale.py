@@ -23,7 +23,8 @@ from jaxevent.blob.finding.stream import Pixels, Stream
 WINDOWS = 500 * 2 ** np.arange(12)  # us
 CELLS = (2, 4, 8, 16)  # px
 LEAST_WINDOWS = 8  # in a recording
-STRETCHES, FIRST = 24, 4  # in which scales are compared; every fourth one tells the worse ones:
+STRETCHES, FEWER = 24, 12  # in which scales are compared, and of what remains after a pass
+FIRST = 4  # every fourth one tells the worse scales:
 WORSE, SIGMAS = 0.85, 2.0  # of the best one's nats, and standard deviations of their difference
 PLATEAU, TIE = 0.03, 0.005  # shares of the score that scales may lose as equally good
 MERGED = 0.3  # share of events in blobs in which smaller cells see a larger blob apart
@@ -50,13 +51,14 @@ def choose_scale(
     windows = np.asarray(WINDOWS[WINDOWS * 1e-6 <= longest] * 1e-6, np.float64)
     if not len(windows):
         return None
-    trial = _Trial(stream, background, windows)
-    first = np.arange(FIRST // 2, STRETCHES, FIRST)
+    number = STRETCHES if worth is None else FEWER
+    trial = _Trial(stream, background, windows, number)
+    first = np.arange(FIRST // 2, number, FIRST)
     trial.look(first)
     most = trial.drop()
     if worth is not None and most < worth:
         return None
-    trial.look(np.setdiff1d(np.arange(STRETCHES), first))
+    trial.look(np.setdiff1d(np.arange(number), first))
     raw, scores = trial.scores()
     best = scores.max()
     if best <= 0:
@@ -66,10 +68,10 @@ def choose_scale(
     most = raw.max(0)
     sharp = raw >= most - (1 - SHARP) * abs(most)
     longest = [trial.scales[np.flatnonzero(sharp[:, j]).max()][j] for j in range(len(CELLS))]
-    gaps = _Gaps(stream, background)
+    gaps, some = _Gaps(stream, background), trial.begins[::2]
     for j in range(len(CELLS))[::-1]:
         for i in np.flatnonzero(good[:, j]):
-            split = gaps.split(trial.scales[i][j], trial.begins[:, i], longest[:j])
+            split = gaps.split(trial.scales[i][j], some[:, i], longest[:j])
             good[i, j] = split <= MERGED
         if good[:, j].any():
             column = np.where(good[:, j], scores[:, j], -np.inf)
@@ -81,13 +83,13 @@ def choose_scale(
 
 
 class _Trial:
-    """What the scales of some windows (s) and all cells predict in the recording's stretches."""
+    """What the scales of some windows (s) and all cells predict in stretches of the recording."""
 
-    def __init__(self, stream: Stream, background: Background, windows: NDArray[np.float64]):
+    def __init__(
+        self, stream: Stream, background: Background, windows: NDArray[np.float64], number: int
+    ):
         self.stream, self.background, self.windows = stream, background, windows
-        self.begins = np.clip(
-            stream.times(STRETCHES)[:, None], 2 * windows, stream.duration - windows
-        )
+        self.begins = np.clip(stream.times(number)[:, None], 2 * windows, stream.duration - windows)
         dispersions = measure_dispersions(stream, background, windows)
         self.scales = [
             [Scale(float(w), cell, dispersion) for cell in CELLS]
