@@ -11,8 +11,9 @@ medians of errors by what the covariance tells, "squared" means of squared error
 by their variance. What general.csv holds already is not computed again.
 
 With `--uneven` the sensor has thresholds of 0.16 and 0.26, differing by 15 % between pixels, and
-times that are off by 0.5 ms. With `--seconds` recordings of varying motion, so long each, are
-estimated as a whole instead, from window to window; errors are those of all estimates.
+times that are off by 0.5 ms; `--mismatch` and `--jitter` say how much. With `--seconds` recordings
+of varying motion, so long each, are estimated as a whole instead, from window to window; errors are
+those of all estimates.
 """
 
 import argparse
@@ -96,8 +97,11 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=["wall", "shapes", "texture"])
     parser.add_argument("--seconds", type=float, help="of whole recordings, instead of windows")
     parser.add_argument("--uneven", action="store_true", help="a sensor with uneven thresholds")
+    parser.add_argument("--mismatch", type=float, default=UNEVEN.mismatch, help="of uneven ones")
+    parser.add_argument("--jitter", type=float, default=UNEVEN.jitter, help="s, likewise")
     arguments = parser.parse_args()
-    sensor = UNEVEN if arguments.uneven else None
+    own = {"mismatch": arguments.mismatch, "jitter": arguments.jitter}
+    sensor = dataclasses.replace(UNEVEN, **own) if arguments.uneven else None
     arguments.out.mkdir(parents=True, exist_ok=True)
     params, rows = batch.Params.of({}), []
     if arguments.seconds:
