@@ -71,7 +71,8 @@ def advance(to: Columns, by: NDArray, way: Columns) -> None:
 def solve(system: System, sides: NDArray[np.float64]) -> Columns:
     """H^-1 of sides (S, n) of the path and the like, undamped.
 
-    Where single precision does not hold the directions it is what was found before, or NaN.
+    Where single precision does not hold the directions it is what was found before, or NaN. That is
+    told by the sides' own unknowns, b' x, which are above 0 and grow from step to step.
     """
     shape, nodes, real = system.ease_map.shape, system.across.shape, system.ease_map.dtype
     size, number = system.ease_map.size, len(sides)
@@ -126,6 +127,8 @@ def solve(system: System, sides: NDArray[np.float64]) -> Columns:
         np.multiply(better.rest, scale[:, None].astype(real), out=way.rest)
         if step % EVERY == 0:
             now = (sides * found.t).sum(1)
+            if not (now >= (1 - GROWS) * known).all():
+                return before
             if (np.abs(now - known) <= GROWS * np.abs(now)).all():
                 break
             known, before = now, Columns(found.t.copy(), found.rest.copy())
