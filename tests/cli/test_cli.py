@@ -267,7 +267,7 @@ def test_interrupted_while_it_writes(folder):
     out.mkdir()
     words = ("--method", "last-frame", "--rate", 2e5, "--out", out / "images.h5")
     process = as_process("reconstruct", folder / "small.h5", *words)
-    while not any(path.stat().st_size > 1e5 for path in out.iterdir()):
+    while not any(path.stat().st_size > 1e5 for path in out.glob("*.part")):
         assert process.poll() is None
         time.sleep(0.02)
     process.send_signal(number)
