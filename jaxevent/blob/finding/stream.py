@@ -300,13 +300,20 @@ def near_paths(
         yield row, part, candidates(part, joined, sigmas)
 
 
+@lean_part
+def _bits(cell: int) -> int:
+    """By how many a place (px) is shifted to tell its cell."""
+    bits = 0
+    while 1 << bits < cell:
+        bits += 1
+    return bits
+
+
 @lean
 def _add_cells(
     x: Any, y: Any, hot: Any, kept: Any, rows: Any, places: Any, cell: int, counts: Any, into: Any
 ) -> None:
-    bits = 0
-    while 1 << bits < cell:
-        bits += 1
+    bits = _bits(cell)
     for k in range(len(rows)):
         own, A = counts[into[k]], places[k]
         moved = A[0, 0] != 1 or A[1, 1] != 1 or A[0, 1] != 0 or A[1, 0] != 0
@@ -329,9 +336,7 @@ def _count_spans(
 
     Edges, at `rows` of the events, are numbered: twice that of the span, and 1 more at its end.
     """
-    bits = 0
-    while 1 << bits < cell:
-        bits += 1
+    bits = _bits(cell)
     i = 0
     for k in range(len(rows) + 1):
         until = rows[k] if k < len(rows) else len(x)

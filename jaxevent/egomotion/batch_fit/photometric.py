@@ -61,7 +61,7 @@ from jaxevent.egomotion.batch_fit.weighing import subtract_mean
 CELLS = 24, 48  # px, whose errors are alike
 # Of log inverse depths, beside the usual one. Nodes that hardly an event tells of end up to 20 from
 # it before plain shapes, where single precision holds no equations.
-FURTHEST = 5.0
+RUNAWAY = 5.0
 
 
 class Report(NamedTuple):
@@ -189,7 +189,7 @@ def compute_covariance(
     """The covariance (6, 6) of C1 and O0 of a scene that was fitted with these settings."""
     path = scene.path
     usual = np.median(path.log_rho)
-    depth = np.clip(path.log_rho, usual - FURTHEST, usual + FURTHEST)
+    depth = np.clip(path.log_rho, usual - RUNAWAY, usual + RUNAWAY)
     scene = scene._replace(path=Path(path.O, path.D, depth))
     problem, seen = begin(tracks, scene, prior, float(sigma), plane)
     return spread(linearise(problem, seen, settling=False))
