@@ -27,6 +27,7 @@ from jaxevent.show.report import (
     short_names,
     tone_map,
 )
+from jaxevent.shown import plural
 
 SIDE = 360  # pixels of the longer side of a picture
 STRIPS = 12  # recordings with pictures and plots over time; more would make the page slow to open
@@ -85,8 +86,8 @@ def page(
     counts = [len(_measured(done, method, columns)) for method in methods]
     values: dict[str, Any] = {
         "title": title,
-        "about": f"{len(recordings)} recordings, {len(methods)} methods, protocol {protocol}, "
-        f"{now}",
+        "about": f"{len(recordings)} {plural('recording', len(recordings))}, {len(methods)} "
+        f"{plural('method', len(methods))}, protocol {protocol}, {now}",
         "meaning": {title: MEANINGS[place] for title, place, _, _ in columns},
         "failures": _failures(rows, names),
         "means": _means(done, methods, columns),

@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -363,6 +364,7 @@ def test_the_authors_metrics_of_references(folder):
         evaluate(config, metrics=["masked"])
     # A plot of boxes for each measure of single images.
     page = (folder / "out" / "report.html").read_text()
+    assert set(re.findall('title="([^"]*)">(?:values|method)</th>', page)) == {"click to sort"}
     boxes = page.split("<h2>All images</h2>")[1].split("<h2>")[0].split("base64,")[1:]
     drawn = "".join(base64.b64decode(box.split('"')[0]).decode() for box in boxes)
     for label in ("log MSE", "log SSIM", "authors' SSIM", "MATLAB SSIM", "masked MSE"):
