@@ -151,11 +151,14 @@ def evaluated(function: Callable[..., Any], *arrays: NDArray) -> NDArray:
 
 
 def _scan(eqn: Any, values: list[NDArray]) -> list[NDArray]:
+    """A scan step by step; by JAX where the steps take slices, or their results are stacked."""
     p = eqn.params
-    fixed, carried = p["num_consts"], p["num_carry"]
-    if len(values) > fixed + carried or len(eqn.outvars) > carried or p["reverse"]:
+    body = p["jaxpr"].jaxpr
+    ends = zip([*eqn.invars, *eqn.outvars], [*body.invars, *body.outvars], strict=True)
+    if any(whole.aval.ndim != part.aval.ndim for whole, part in ends):
         made = eqn.primitive.bind(*values, **p)
         return [np.asarray(v) for v in made]
+    fixed = len(values) - len(eqn.outvars)
     carry = values[fixed:]
     for _ in range(p["length"]):
         carry = run(p["jaxpr"], [*values[:fixed], *carry])

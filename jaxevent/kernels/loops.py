@@ -57,9 +57,9 @@ class LoopTranslation(Translation):
         name = eqn.primitive.name
         if any(isinstance(v, Known) and MARK in v.value.shape for v in values):
             raise Untranslatable("a table of elements")
-        if name == "split":
-            return self._split(eqn, values[0])
         marked = [MARK in np.shape(v.aval) for v in (*eqn.invars, *eqn.outvars)]
+        if name in ("split", "unstack") and any(marked):
+            raise Untranslatable("a split of elements")
         if name == "iota" and any(marked) and not self.single:
             return [self._numbers(eqn)]
         return super()._equation(_without_mark(eqn) if any(marked) else eqn, values)
@@ -71,12 +71,6 @@ class LoopTranslation(Translation):
             raise Untranslatable("a table of elements")
         number = self.graph.input("element", "i", Level.ELEMENT)
         return np.full([1 if size == MARK else size for size in shape], number, object)
-
-    def _split(self, eqn: Any, value: Value) -> list[Value]:
-        if MARK in eqn.invars[0].aval.shape:
-            raise Untranslatable("a split of elements")
-        ends = np.cumsum(eqn.params["sizes"])[:-1]
-        return [*np.split(self.nodes(value), ends, eqn.params["axis"])]
 
     def special(self, eqn: Any, values: list[Value]) -> NDArray | None:
         name = eqn.primitive.name

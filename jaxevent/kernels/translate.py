@@ -112,7 +112,15 @@ class Translation:
         if all(isinstance(v, Known | OfParameters) for v in values):
             if not any(isinstance(v, Known) and v.placed for v in values):
                 return self._of_parameters(eqn, values)
+        if eqn.primitive.name in ("split", "unstack"):
+            return self.parts(eqn, values[0])
         return [self._symbolic(eqn, values)]
+
+    def parts(self, eqn: Any, value: Value) -> list[Value]:
+        """What an array is taken apart into, along an axis."""
+        sizes = eqn.params.get("sizes", [1] * len(eqn.outvars))
+        parts = np.split(self.nodes(value), np.cumsum(sizes)[:-1], eqn.params["axis"])
+        return [part.reshape(var.aval.shape) for part, var in zip(parts, eqn.outvars, strict=True)]
 
     def _of_parameters(self, eqn: Any, values: list[Any]) -> list[Value]:
         arguments = [v.number if isinstance(v, OfParameters) else v.value for v in values]
