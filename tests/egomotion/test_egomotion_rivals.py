@@ -78,6 +78,8 @@ def test_rotation_alone_starts_from_the_sharpest_too(monkeypatch, better, told, 
         return better
 
     monkeypatch.setattr(rivals.Trial, "z", z)
+    for name in ("over_all", "likelier"):  # without checks of types, which scenes here have not
+        monkeypatch.setattr(rivals.Trial, name, inspect.unwrap(getattr(rivals.Trial, name)))
     (found, moves, steps), refuted = inspect.unwrap(rivals.Trial.rotation)(
         object.__new__(rivals.Trial), path, sharpest, "moving"
     )

@@ -59,24 +59,29 @@ class Trial:
         `begun`, it is fitted from the path.
         """
 
-        def least(scenes, moving):
-            return min(self.z(one, moving) for one in scenes)
-
         first = without_translation(path)
         turn = np.zeros_like(path.O)
         turn[0] = sharpest
         paths = first, Path(turn, first.D, first.log_rho)
         settled = [self.fit(one, moves=False, steps=SETTLE) for one in paths]
-        scenes, z = settled, least(settled, moving)
-        if z < TELLING:
-            scenes = [self.fit(one, moves=False) for one in paths]
-            z = least(scenes, moving)
-        if z < TELLING and begun:
+        z = self.over_all(settled, moving)
+        if z >= TELLING:
+            return self.likelier(*settled), z
+        ended = [self.fit(one, moves=False) for one in paths]
+        if begun and self.over_all(ended, moving) < TELLING:
             moving = self.fit(path)
-            if least(settled, moving) >= TELLING:
-                scenes = settled
-            z = least(scenes, moving)
-        return scenes[self.z(*scenes) > 0], z
+            z = self.over_all(settled, moving)
+            if z >= TELLING:
+                return self.likelier(*settled), z
+        return self.likelier(*ended), self.over_all(ended, moving)
+
+    def over_all(self, scenes: list[Scene], moving: Scene) -> float:
+        """z of the `moving` scene over that of the scenes which it refutes least."""
+        return min(self.z(one, moving) for one in scenes)
+
+    def likelier(self, one: Scene, other: Scene) -> Scene:
+        """The scene under which events left out cost less."""
+        return other if self.z(one, other) > 0 else one
 
     def z(self, one: Scene, other: Scene) -> float:
         """Of `other` over `one`, above 0 where events left out cost less under `other`."""
