@@ -180,9 +180,11 @@ class Motion(Shown):
         cause, other = "at several depths", "general"
         if self.model.uniform and found.both:
             cause, other = "both ways if the camera rolls", "rotation"
+        needs = "" if recording.camera else " --focal PX"
         line = (
             f"the image does not move {how}: parts of it at {found.slow:.0f} to {found.fast:.0f} "
-            f"px/s, as {cause}; sigmas count that, and --model {other} may explain it"
+            f"px/s, as {cause}; sigmas count that, and --model {other}{needs} "
+            "may explain it"
         )
         return dataclasses.replace(self, covariance=self.covariance + along + across), line
 
