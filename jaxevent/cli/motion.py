@@ -175,7 +175,7 @@ def run(
     if smooth:
         settings["smooth"] = True
     gyro, other = (imu, bias, turned), not (method or params or smooth)
-    estimator, told, values = _estimated(estimator, recording, params, settings, gyro, other)
+    estimator, told, values = estimated(estimator, recording, params, settings, gyro, other)
     told, warning = told.with_layers(recording)
     if warning:
         print(warning)
@@ -263,7 +263,7 @@ def _parameters(estimator: Any, kind: Any, path: Path | None) -> tuple[Any, set[
     return values, {*table, *table.get(estimator.name, {})}
 
 
-def _estimated(
+def estimated(
     estimator: Any,
     recording: Any,
     params: Path | None,
@@ -273,7 +273,8 @@ def _estimated(
 ) -> tuple[Any, Any, Any]:
     """The method, the motion by it, and its parameters, which suit the recording.
 
-    Where it finds nothing, by the model's `other` method. `gyro` is that of `_told`.
+    Where it finds nothing, or not before the middle, by the model's `other` method. `gyro` is that
+    of `_told`.
     """
     from jaxevent.runs.egomotion import find_estimator
 
@@ -283,14 +284,20 @@ def _estimated(
     if suited.line:
         print(suited.line)
     told = _told(estimator, recording, suited.params, settings, gyro)
-    if told.valid.any() or not other or not kind.otherwise:
-        return estimator, told, suited.params
-    print(f"{estimator.name} found no motion, so {kind.otherwise} is tried")
+    first, usual = told.t[told.valid][:1], (estimator, told, suited.params)
+    soon = len(first) and first[0] - recording.start <= (recording.stop - recording.start) / 2
+    if soon or not other or not kind.otherwise:
+        return usual
+    late = " before the recording's middle" if len(first) else ""
+    print(f"{estimator.name} found no motion{late}, so {kind.otherwise} is tried")
     estimator = find_estimator(kind.otherwise)
     suited = estimator.suit(recording, estimator.start(kind), speed=suited.speed)
     if suited.lengths:
         print(f"{estimator.name}: {suited.lengths}")
-    return estimator, _told(estimator, recording, suited.params, settings, gyro), suited.params
+    told = _told(estimator, recording, suited.params, settings, gyro)
+    if len(first) and not told.valid.any():
+        return usual
+    return estimator, told, suited.params
 
 
 def _told(estimator: Any, recording: Any, values: Any, settings: dict[str, Any], gyro: Any) -> Any:
