@@ -19,6 +19,8 @@ themselves, but for those named here:
   where no translation is told.
 - slider: pure translation along the slider, Omega 0. Planar voting: the direction of the image's
   motion, 180 degrees. General motion: heading and |Omega| from window to window.
+- stop: the end of the slider's way, which slows down, stands still from 3.22 to 3.31 s and goes
+  back. How far the heading is from that of the motion there, and what it tells.
 - axis: the slider's direction in the camera's axes, by corners tracked in the frames, of which it
   is known that the camera does not turn (needs OpenCV). The stored poses have it along x, as the
   camera's mounting was not measured. This finds (1, .0088, -.002), each good to .001 and .002.
@@ -239,6 +241,25 @@ def slider(data: Path, frames: bool = True) -> Rows:
     return rows
 
 
+def stop(data: Path, frames: bool = True) -> Rows:
+    recording = jaxevent.load(data / "slider_depth.zip")
+    motion = batch.estimate(recording[2.9:], batch.Params.of({"frames": frames}))
+    sigma = np.degrees(np.sqrt(np.trace(motion.covariance[:, :3, :3], axis1=1, axis2=2)))
+    rows: Rows = []
+    for name, first, last, along in (
+        ("slows down", 2.9, 3.18, AXIS),
+        ("stands still", 3.22, 3.31, None),
+        ("goes back", 3.31, 3.5, -AXIS),
+    ):
+        here = motion.valid & (motion.t >= 1e6 * first) & (motion.t < 1e6 * last)
+        row = {"recording": f"slider {name}", "method": "batch", "estimates": int(here.sum())}
+        if along is not None:
+            heading = angle(motion.mean[here, :3], np.broadcast_to(along, (int(here.sum()), 3)))
+            row |= {"heading deg, median": np.median(heading), "worst": heading.max()}
+        rows.append(row | {"sigma, least": sigma[here].min(), "most": sigma[here].max()})
+    return rows
+
+
 def axis(data: Path) -> Rows:
     """Of ways of ten frames each: what all epipolar lines through tracked corners meet in."""
     cv2 = require("cv2", "vision")
@@ -283,13 +304,14 @@ def table(rows: Rows) -> str:
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
-FITTED = "evbench", "slider"  # by `batch`, which takes frames
+FITTED = "evbench", "slider", "stop"  # by `batch`, which takes frames
 PARTS: dict[str, Callable[..., Rows]] = {
     "disk": disk,
     "boxes": lambda data: tubrip(data, "boxes"),
     "shapes": lambda data: tubrip(data, "shapes"),
     "evbench": evbench,
     "slider": slider,
+    "stop": stop,
     "axis": axis,
 }
 

@@ -541,8 +541,8 @@ def test_a_recording_from_end_to_end(monkeypatch):
     assert len(sequence.batch.estimate(empty, PARAMS)) == 0
 
 
-def a_fit(path, cost):
-    return batch.Fit(path, np.eye(6), 1.0, cost, np.zeros((1, 1)))
+def a_fit(path, cost, doubted=0.0):
+    return batch.Fit(path, np.eye(6), 1.0, cost, np.zeros((1, 1)), doubted)
 
 
 def test_windows_that_disagree_are_less_sure():
@@ -582,6 +582,13 @@ def test_the_end_of_a_path_is_less_sure():
     assert list(short.t) == [-4000, -2000, 0, 2000, 4000]
     first = told.covariance[told.t == -100_000, 5, 5]
     assert first > (sequence.BENT * 0.2) ** 2
+    # Where the camera is slower the same errors of its velocity turn the heading farther.
+    path.D[1, 2] = -9.9  # 1/s^2, of |T| at the middle
+    slower = sequence._blended(np.zeros(1, int), fits[:1], half, 100_000, -half, half)
+    pace = np.clip(1 - 9.9 * slower.t * 1e-6, 0.02 / np.pi * np.sqrt(3), 1)
+    heading = np.diagonal(slower.covariance[:, :3, :3], axis1=1, axis2=2)
+    np.testing.assert_allclose(heading, np.tile(1e-4 / pace[:, None] ** 2, 3), rtol=1e-6)
+    np.testing.assert_allclose(slower.covariance[:, 5, 5], grown)
 
 
 def windows_that(monkeypatch, fit, follow):
@@ -606,13 +613,13 @@ def windows_that(monkeypatch, fit, follow):
     return asked
 
 
-def test_a_path_that_is_lost_is_not_followed(monkeypatch):
+def test_a_path_that_is_lost_or_doubted_is_not_followed(monkeypatch):
     path = true_path(np.zeros(4))
     # The third window costs much more, what the sixth costs cannot be told.
     costs = {2: 2 * sequence.LOST * 1e-3, 5: np.nan}
     asked = windows_that(
         monkeypatch,
-        lambda centre, warm: (path, 1e-3),
+        lambda centre, warm: (path, 1e-3, 2.0 * (centre == first)),
         lambda centre, warm: (path, costs.get((centre - first) // 20_000, 1e-3)),
     )
     recording = seen()
@@ -621,7 +628,7 @@ def test_a_path_that_is_lost_is_not_followed(monkeypatch):
     sequence.batch.estimate(recording, batch.Params.of({**GIVEN, **short}))
     assert [(kind, (centre - first) // 20_000) for kind, centre in asked][:10] == [
         ("anew", 0),
-        ("followed", 1),
+        ("anew", 1),
         ("followed", 2),
         ("anew", 2),
         ("followed", 3),

@@ -69,6 +69,10 @@ class Path:
         T, Omega = self._motion(tau)
         return T / np.linalg.norm(T, axis=1, keepdims=True), Omega
 
+    def pace(self, tau: float | int | NDArray) -> NDArray[np.float64]:
+        """|T| at times tau (s), in units of that at 0."""
+        return np.linalg.norm(self._motion(tau)[0], axis=1)
+
     def _motion(self, tau: float | int | NDArray) -> tuple[NDArray, NDArray]:
         """As `twist`, but the velocity in units of |C1|."""
         from scipy.spatial.transform import Rotation

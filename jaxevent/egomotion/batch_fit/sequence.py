@@ -21,6 +21,9 @@ SHORTEST, LONGEST = 0.02, 2.0  # s, of half a window
 # varying motion (seeds 810, 811) squared errors of Omega 0.1 s from the middle are 40 to 180 times
 # the variance at the middle, 0.1 to 2 with this; of constant motion about 1.
 BENT = 0.5
+# rad, `Fit.doubted`, from which the next window is not followed but has rivals of its own: what is
+# followed is alone, and so told too surely.
+DOUBTED = 1.0
 LOST = 4  # times the least cost of the windows before: the path is not followed
 
 
@@ -90,6 +93,8 @@ def _followed(
                 if warm is not None and not agreed:
                     _revise(windows, centres[: len(fits)], fits, onward)
                 since, wait = 0, 2 * wait if agreed else windows.params.fresh
+                if fit.doubted > DOUBTED:
+                    since = wait
             cost = fit.cost if anew else min(cost, fit.cost)
             warm = onward(fit.path)
     return fits
@@ -127,7 +132,8 @@ def _blended(
 
     Of a window the middle two thirds count, those beyond `reach` where no other tells more. How far
     a window disagrees with its neighbours is in its covariance; on a side where it has none, `BENT`
-    of how far its motion there is from that at its middle.
+    of how far its motion there is from that at its middle. Where the camera is slower than at the
+    middle the heading is known less.
     """
     end = 2 * half // 3
     every = max(min(step // 5, (last - first) // 4), 1)
@@ -148,7 +154,8 @@ def _blended(
         way = np.concatenate([T, turn], 1) - np.concatenate(fit.path.twist(0.0), 1)
         way = BENT * way * _alone(fits, k, t[near] - centre)[:, None]
         bent = way[:, :, None] * way[:, None, :]
-        covariance[near] += weight[:, None, None] * (fit.covariance + off + bent)
+        told = _slower(fit.covariance, fit.path.pace((t[near] - centre) * 1e-6))
+        covariance[near] += weight[:, None, None] * (told + off + bent)
         agreement[near] += weight * fit.agreement
         total[near] += weight
     lost = (total < 1e-6) | ~np.isfinite(covariance).all((1, 2))
@@ -158,6 +165,19 @@ def _blended(
     mean = np.concatenate([heading, Omega / safe[:, None]], 1)
     told = Motion.of(General, t, mean, covariance / safe[:, None, None], ~lost)
     return dataclasses.replace(told, agreement=agreement / safe)
+
+
+def _slower(covariance: NDArray, pace: NDArray) -> NDArray[np.float64]:
+    """Covariances (times, 6, 6) where |T| is `pace` times that of which one is known.
+
+    What is known is the velocity, whose direction is known less the slower it is.
+    """
+    told = float(np.trace(covariance[:3, :3]))
+    most = np.pi / 2 / np.sqrt(told) if told > 0 else np.inf
+    grown = np.clip(1 / np.maximum(pace, 1e-6), 1, max(most, 1))
+    factors = np.ones((len(pace), 6))
+    factors[:, :3] = grown[:, None]
+    return factors[:, :, None] * covariance * factors[:, None, :]
 
 
 def _alone(fits: list[Fit | None], row: int, since: NDArray) -> NDArray[np.bool_]:

@@ -143,6 +143,7 @@ class Fit(NamedTuple):
     The covariance counts errors that differ from one part of the image to another (24 px). Beside
     plain shapes, where they do not, errors are far larger than it tells.
     `agreement` is the share of events that the fit explains, `cost` the robust cost per event.
+    `doubted` says how far (rad) off other headings are that are not refuted, by their likelihood.
     """
 
     path: Path
@@ -150,6 +151,7 @@ class Fit(NamedTuple):
     agreement: float
     cost: float
     map: NDArray[np.floating]
+    doubted: float = 0.0
 
 
 Rival = tuple[Scene, Report]
@@ -501,6 +503,7 @@ class Windows:
         covariance = compute_covariance(tracks, scene, prior, sigma=sigma)
         scene, report = adjust(tracks, scene, prior, sigma=sigma, settle=0, steps=1)
         covariance = inflation(report.inliers) * covariance + self.of_lens(scene.path)
+        left_open = np.zeros((6, 6))
         if trial and few:
             others = [(one.path, fit) for (one, _), fit in zip(close, fits, strict=True)]
             best = others.pop(chosen)[1]
@@ -509,14 +512,15 @@ class Windows:
             if z < TELLING:
                 path, covariance = _without_heading(path, still.path, covariance)
             else:
-                covariance = covariance + _left_open(trial, path, best, others)
+                left_open = _left_open(trial, path, best, others)
             scene = scene._replace(path=path)
         return Fit(
             scene.path,
-            covariance,
+            covariance + left_open,
             report.inliers,
             report.cost,
             scene.map,
+            float(np.sqrt(np.trace(left_open[:3, :3]))),
         )
 
     def of_lens(self, path: Path) -> NDArray[np.float64]:
