@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter
 from jaxevent.camera import UnknownResponse
 from jaxevent.methods import find
 from jaxevent.reconstruction.compensated import estimator, steadiness
+from jaxevent.reconstruction.compensated.agreement import Place
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate import Sensor, simulate
 
@@ -110,6 +111,32 @@ def test_smooth_part():
     for one, part in zip(image, got, strict=True):
         expected = gaussian_filter(one, reach, mode="constant", truncate=8) / ones
         np.testing.assert_allclose(part, expected, atol=1e-5)
+
+
+def test_beyond_the_frames_brightness_is_that_of_the_nearest_along_trajectories():
+    wall = np.full((5, HEIGHT, WIDTH), 100, np.uint8)
+    wall[4] = 145
+    b = np.log((145 / 255 + 0.3) / (100 / 255 + 0.3))
+    told = steady(still(wall, [3]))
+    usual = [told.brightness(t).usual for t in (-50_000, 100_000, 200_000, 225_000, 900_000)]
+    np.testing.assert_allclose(usual, [0, 0, 0, -b / 2, -b], rtol=1e-5)
+    flipped = steady(still(wall[::-1], [3])).brightness(-25_000).usual
+    np.testing.assert_allclose(flipped, -b / 2, rtol=1e-5)
+    wall[3] = 60  # which of the three is unusual is not told
+    assert steady(still(wall, [3])).brightness(900_000).usual == 0
+    # The point of a pixel was 3 px farther right in the nearest frame, at s = -1.
+    frame, own = np.random.default_rng(2).normal(size=(2, HEIGHT, WIDTH)).astype(np.float32)
+    paths = np.zeros((HEIGHT, WIDTH, 4), np.float32)
+    paths[..., 0] = -3
+    at, zero = np.arange(2, dtype=np.float32), np.zeros((), np.float32)
+    place = Place(at - 1, at * 0 + 1, 1 - at, at, *np.array([1, 0, 0, 0]))
+    brightness = steadiness.Brightness(np.float32(0.02), np.float32(-b))
+    base, P = steadiness.smooth_at_target(np.stack([frame, own]), place, zero, paths, brightness)
+    np.testing.assert_allclose(base[:, :-3], frame[:, 3:] - b, rtol=1e-6)
+    np.testing.assert_allclose(P, 0.02, rtol=1e-6)
+    between = place._replace(after=np.array(1))
+    base, _ = steadiness.smooth_at_target(np.stack([frame, own]), between, zero, paths, brightness)
+    np.testing.assert_array_equal(base, own)
 
 
 @pytest.mark.slow

@@ -54,6 +54,7 @@ from jaxevent.reconstruction.compensated.instants import (
 )
 from jaxevent.reconstruction.compensated.parameters import Params
 from jaxevent.reconstruction.compensated.steadiness import (
+    Brightness,
     Steadiness,
     smooth_at_target,
     smooth_part,
@@ -97,14 +98,14 @@ class Targets(Described):
     whose: Int[Numeric, "times h w"]  # the pixel whose trajectory each one takes
     taken: Taken  # each (times, n)
     steady: Float[Numeric, " times"]  # 1 where frames keep their brightness, else 0
-    doubt: Float[Numeric, " times"]  # `Steadiness.doubt`
+    brightness: Brightness  # each (times,)
     # Of exposures; None: these are not looked at.
     samples: int | None = eqx.field(static=True, default=None)
 
     def images(self, rows: NDArray) -> "Targets":
         """Those of its images, in that order."""
         each = (
-            self.rows, self.place, self.p, self.whose, self.taken, self.steady, self.doubt,
+            self.rows, self.place, self.p, self.whose, self.taken, self.steady, self.brightness,
         )  # fmt: skip
         chosen = jax.tree.map(lambda leaf: leaf[rows], each)
         return Targets(self.instants, *chosen, samples=self.samples)
@@ -412,12 +413,11 @@ def fuse_images(params: Params, target: Followed) -> Fused:
     return _decide(params, *look(params, target))
 
 
-def smoothed_back(target: Followed, fused: Fused, doubt: float) -> Fused:
+def smoothed_back(target: Followed, fused: Fused, brightness: Brightness) -> Fused:
     """What is fused, with the smooth part that was taken away from a target's images."""
     assert target.smooth is not None
     place = place_of(target.instants, target.clear, len(target.instants))
-    unknown = np.asarray(doubt, np.float32)
-    L, P = smooth_at_target(target.smooth, place, weight_after(place), unknown)
+    L, P = smooth_at_target(target.smooth, place, weight_after(place), target.paths, brightness)
     return dataclasses.replace(fused, L=fused.L + L, P=fused.P + P)
 
 
@@ -499,12 +499,12 @@ class CompensatedVideo(ImageSequence[Params]):
 
     def _held(self, t: int, target: Followed) -> Fused:
         """What a target's images give, held to the frames next to it."""
-        fused, doubt = fuse_images(self.params, target), self.follow.steady.doubt(t)
+        fused, brightness = fuse_images(self.params, target), self.follow.steady.brightness(t)
         if target.smooth is not None:  # nor can it be held to frames of another brightness
-            return smoothed_back(target, fused, doubt)
+            return smoothed_back(target, fused, brightness)
         if self.follow.shutter.samples is not None:
             fused = self._constrained(t, target, fused)
-        return dataclasses.replace(fused, P=fused.P + doubt)
+        return dataclasses.replace(fused, P=fused.P + brightness.doubt)
 
     def _constrained(self, t: int, target: Followed, fused: Fused) -> Fused:
         """What is fused, held to exposures and clipped pixels."""
@@ -613,8 +613,7 @@ class MotionCompensated(ImageEstimator[Params]):
             features, instants = features.weighted(factors), instants.weighted(factors)
         shape = (len(chosen), *trajectories.nodes(recording.height, recording.width, 0), 4)
         rows, p = np.zeros((len(chosen), room), np.int32), np.zeros(shape, np.float32)
-        places, taken = [], []
-        steady, doubt = np.ones((2, len(chosen)), np.float32)
+        places, taken, told, steady = [], [], [], []
         size = (recording.height, recording.width)
         own = np.arange(recording.height * recording.width, dtype=np.int32).reshape(size)
         whose = np.repeat(own[None], len(chosen), 0)
@@ -622,14 +621,15 @@ class MotionCompensated(ImageEstimator[Params]):
             target = follow(int(wanted[n]))
             one, clear, p[n] = target.instants, target.clear, target.p
             whose[n] = own if target.whose is None else target.whose
-            steady[n], doubt[n] = target.smooth is None, follow.steady.doubt(int(wanted[n]))
+            steady.append(target.smooth is None)
+            told.append(follow.steady.brightness(int(wanted[n])))
             rows[n, : len(one)] = np.searchsorted(every, one.t)
             places.append(place_of(one, clear, room))
             taken.append(follow.shutter(int(wanted[n]), one))
-        place, taken = (
-            jax.tree.map(lambda *leaves: np.stack(leaves), *parts) for parts in (places, taken)
+        place, taken, told = (
+            jax.tree.map(lambda *leaves: np.stack(leaves), *one) for one in (places, taken, told)
         )
-        each = (rows, place, p, whose, taken, steady, doubt)
+        each = (rows, place, p, whose, taken, np.asarray(steady, np.float32), told)
         return features, jax.device_put(Targets(instants, *each, samples=follow.shutter.samples))
 
     def run(self, params: Params, features: Features, state: Any = None) -> tuple[Any, Any]:
@@ -645,7 +645,7 @@ class MotionCompensated(ImageEstimator[Params]):
 
         @jax.checkpoint
         def one(target: tuple) -> tuple[Array, Array]:
-            rows, place, p, whose, taken, steady, doubt = target
+            rows, place, p, whose, taken, steady, told = target
             smooth = (1 - steady) * smooth_part(L[rows])
             images = (L[rows] - smooth, V[rows], clear[rows])
             if self.through_motion:
@@ -659,10 +659,10 @@ class MotionCompensated(ImageEstimator[Params]):
                 # Frames of another brightness hold nothing.
                 taken = taken._replace(present=taken.present * steady)
                 fused = constrain_purely(params, fused, paths, taken, Shots(*seen), out.samples)
-            base, variance = smooth_at_target(smooth, place, weight_after(place), doubt)
-            return fused.L + base, fused.P + variance
+            base, variance = smooth_at_target(smooth, place, weight_after(place), paths, told)
+            return fused.L + (1 - steady) * base, fused.P + variance
 
-        each = (out.rows, out.place, out.p, out.whose, out.taken, out.steady, out.doubt)
+        each = (out.rows, out.place, out.p, out.whose, out.taken, out.steady, out.brightness)
         found, P = jax.lax.map(one, each)
         image = (jnp.exp(found) - params.I0).reshape(len(found), -1)
         P = P.reshape(image.shape)

@@ -4,7 +4,9 @@ Such frames show the same points with other values, so they do not agree along a
 they have in common is all that is left when what varies slowly over the image is taken away. So
 where frames around a target are not steady its images are compared and fused without their smooth
 part, and the result is given that of the smoother's image at the target, which goes from frame to
-frame as a blend does.
+frame as a blend does. Beyond the frames it drifts with the events, and brightness is that of the
+nearest frame along trajectories. Where that one is the exception, since the two next to it are
+alike, brightness becomes theirs within an interval of frames.
 
 Steadiness is told by pixels without events around them between two frames: a change there is none
 of the scene. On slider_depth and davis346_street the median change of blocks of such pixels is
@@ -16,7 +18,7 @@ one by one, follow from their neighbours. Of two frames either follows from the 
 """
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
 from jaxevent.reconstruction.compensated.agreement import Place
+from jaxevent.reconstruction.compensated.warping import places, sample
 from jaxevent.reconstruction.features import Numeric
 from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.recording import Recording
@@ -54,17 +57,28 @@ def smooth_part(L: Any, reach: float = REACH) -> Any:
     return _averages(L.shape[-2], reach) @ L @ _averages(L.shape[-1], reach).T
 
 
+class Brightness(NamedTuple):
+    """What frames around a time tell of its brightness, each ()."""
+
+    doubt: Numeric  # variance, (ln I)^2, of which no frame tells
+    usual: Numeric  # ln I, by how much the nearest frame is to be brighter; 0 between frames
+
+
 def smooth_at_target(
-    smooth: Numeric, place: Place, weight: Numeric, doubt: Numeric
+    smooth: Numeric, place: Place, weight: Numeric, paths: Numeric, brightness: Brightness
 ) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """The smooth part at the target, of those of its instants (K, h, w), and its variance.
 
     `weight` is that of the frame after, 0..1. In between nothing tells which of the two the
-    brightness is of, nor whether it is that of either: `doubt` (), `Steadiness.doubt`.
+    brightness is of, nor whether it is that of either. `paths` (h, w, 4) lead to frames that are on
+    one side alone.
     """
+    nearest = jnp.asarray(smooth)[place.before][None]
+    Y, X = places(jnp.asarray(paths), jnp.asarray(place.s)[place.before][None])
+    beyond = sample(nearest, Y, X)[0] + brightness.usual
     apart = smooth[place.after] - smooth[place.before]
-    variance = jnp.maximum(weight * (1 - weight) * apart**2, doubt)
-    return jnp.asarray(smooth[place.own]), variance
+    variance = jnp.maximum(weight * (1 - weight) * apart**2, brightness.doubt)
+    return jnp.where(place.before == place.after, beyond, smooth[place.own]), variance
 
 
 class Steadiness:
@@ -80,6 +94,24 @@ class Steadiness:
         low = int(np.searchsorted(self._mid, first, "left"))
         high = int(np.searchsorted(self._mid, last, "right"))
         return all(abs(self._change(k)) < LEAST for k in range(low, high - 1))
+
+    def brightness(self, t: int) -> Brightness:
+        """What is told of the brightness at a time (us)."""
+        return Brightness(np.float32(self.doubt(t)), np.float32(self._usual(t)))
+
+    def _usual(self, t: int) -> float:
+        """By how much the nearest frame is to be brighter, ln I, beyond the frames; else 0."""
+        mid = self._mid
+        if len(mid) < 3 or mid[0] <= t <= mid[-1]:
+            return 0.0
+        if t < mid[0]:
+            nearest, next_to_it, away, apart = self._change(0), self._change(1), mid[0] - t, mid[:2]
+        else:
+            nearest, next_to_it = -self._change(len(mid) - 2), self._change(len(mid) - 3)
+            away, apart = t - mid[-1], mid[-2:]
+        if abs(nearest) < LEAST or abs(next_to_it) >= LEAST:
+            return 0.0
+        return nearest * min(1.0, float(away / np.diff(apart)[0]))
 
     def doubt(self, t: int) -> float:
         """The variance of brightness, (ln I)^2, at a time (us) of which no frame tells.
