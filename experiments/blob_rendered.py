@@ -179,10 +179,54 @@ def pan(rng: np.random.Generator) -> Scene:
     return Scene(draw, lambda t: np.zeros((*np.shape(t), 0, 2)), 1, 1.0)
 
 
+def shaking(rng: np.random.Generator) -> Scene:
+    """A camera that shakes before a texture, by 2 to 4 px at 5 to 9 Hz."""
+    scene, f, far = texture(rng), rng.uniform(5, 9), rng.uniform(2, 4)
+    dx, dy = far * np.array([np.cos(a := rng.uniform(0, np.pi)), np.sin(a)])
+
+    def draw(t: float) -> Image:
+        s = np.sin(2 * np.pi * f * t)
+        places = [Y + 50 + s * dy, X + 20 + s * dx]
+        return ndimage.map_coordinates(scene, places, order=1).astype(np.float32)
+
+    return Scene(draw, lambda t: np.zeros((*np.shape(t), 0, 2)), 1, 1.0)
+
+
+def before_a_pan(rng: np.random.Generator) -> Scene:
+    """A disc before a texture that a camera sees at rest for half the time, and then turns past."""
+    scene, v, u = texture(rng), rng.uniform(60, 150), rng.uniform(70, 110)
+    places = going(np.array([[20.0, rng.uniform(60, 120)]]), np.array([[u, 0.0]]))
+
+    def draw(t: float) -> Image:
+        far = [Y + 50, X + 20 + v * max(t - 0.8, 0.0)]
+        image = ndimage.map_coordinates(scene, far, order=1).astype(np.float32)
+        disc(image, places(np.array(t))[0], 9, 0.1)
+        return image
+
+    return Scene(draw, places, 12, 1.6)
+
+
+def turning(rng: np.random.Generator) -> Scene:
+    """A textured disc that turns in its place."""
+    hub, radius = rng.uniform((80, 70), (160, 110)), rng.uniform(30, 45)
+    turn, surface = rng.uniform(6, 20) * rng.choice([-1, 1]), texture(rng)
+
+    def draw(t: float) -> Image:
+        c, s, dx, dy = np.cos(turn * t), np.sin(turn * t), X - hub[0], Y - hub[1]
+        there = [100 - s * dx + c * dy, 100 + c * dx + s * dy]
+        image = grey(0.5)
+        inside = np.clip(radius - np.hypot(dx, dy) + 0.5, 0, 1)
+        seen = ndimage.map_coordinates(surface, there, order=1)
+        return (image + inside * (seen - image)).astype(np.float32)
+
+    return Scene(draw, going(hub[None], np.zeros((1, 2))), radius, 1.0)
+
+
 SCENES: dict[str, Callable[[np.random.Generator], Scene]] = {
     "propeller": propeller, "walker": lambda rng: walkers(rng, 1), "two walkers": walkers,
     "car": car, "behind a bar": behind_a_bar, "five birds": birds, "hot columns": hot_columns,
-    "pan, nothing else": pan,
+    "pan, nothing else": pan, "shaking camera": shaking, "disc before a pan": before_a_pan,
+    "turning disc": turning,
 }  # fmt: skip
 
 

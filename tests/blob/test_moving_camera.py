@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from jaxevent import blob
-from jaxevent.blob.finding.moving import goes_own_way, measure_moving_background
+from jaxevent.blob.finding.background import Background
+from jaxevent.blob.finding.moving import goes_own_way, measure_moving_background, pauses
 from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.scene import SceneMotion, measure_scene_motion
 from jaxevent.blob.finding.stream import Stream
@@ -27,8 +28,15 @@ def maps(t):
     return np.concatenate([R, b[..., None]], 2)
 
 
-def seen_by_a_moving_camera(recording, seed=0, rate=1e6):
-    """A recording with the events of 150 edges that go as `maps` tells."""
+def shaking(t):
+    """(times, 2, 3): 3 px to and fro at 7 Hz."""
+    M = np.tile(np.eye(2, 3), (len(t), 1, 1))
+    M[:, :, 2] = 3 * np.sin(2 * np.pi * 7 * t)[:, None] * [0.8, 0.6]
+    return M
+
+
+def seen_by_a_moving_camera(recording, seed=0, rate=1e6, maps=maps, begin=0.0):
+    """A recording with the events of 150 edges that go as `maps` tells, from `begin` (s) on."""
     rng = np.random.default_rng(seed)
     n = rng.poisson(rate * DURATION)
     a = rng.uniform(-SIZE, 2 * SIZE, (150, 2))
@@ -38,7 +46,7 @@ def seen_by_a_moving_camera(recording, seed=0, rate=1e6):
     there = a[k] + rng.random((n, 1)) * d[k]
     M = maps(t)
     xi = np.rint(np.einsum("nij,nj->ni", M[:, :, :2], there) + M[:, :, 2])
-    inside = ((xi >= 0) & (xi < SIZE)).all(1)
+    inside = ((xi >= 0) & (xi < SIZE)).all(1) & (t >= begin)
     own = recording.events[:]
     x, y = xi[inside].astype(np.uint16).T
     us = np.concatenate([own.t, (t[inside] * 1e6).astype(np.int64)])
@@ -55,8 +63,8 @@ def before_noise(targets, seed=0, noise=2e3):
 
 @pytest.mark.slow
 def test_the_scene_goes_as_it_was_made_to():
-    recording = seen_by_a_moving_camera(before_noise([])[0])
-    scene = measure_scene_motion(Stream(recording, 0, 800_000), 0.01)
+    recording = seen_by_a_moving_camera(before_noise([])[0], rate=4e5)
+    scene = measure_scene_motion(Stream(recording, 0, 500_000), 0.01)
     corners = np.array([[0, 0], [127, 0], [0, 95], [127, 95]], float)
     # Its places are px of the first window, whose middle is 5 ms after the start.
     first = maps(scene.t[:1])[0]
@@ -71,7 +79,7 @@ def test_the_scene_goes_as_it_was_made_to():
             np.broadcast_to(corner, moved[:, k].shape),
             atol=1e-9,
         )
-    assert scene.travel == pytest.approx(np.hypot(*SHIFT) * DURATION, rel=0.3)
+    assert scene.travel == pytest.approx(np.hypot(*SHIFT) * 0.5, rel=0.3)
     # So it does where it hardly leaves its place.
     part = blob.find(recording, 0.3, 0.4, progress=False)
     assert part.camera_moves and not len(part)
@@ -110,13 +118,34 @@ def test_what_another_depth_does_is_no_own_way():
 
 @pytest.mark.slow
 def test_only_what_goes_its_own_way_is_a_target():
+    """While the camera moves, and before it begins to."""
     own = Circle((64, 48), 28, 8.0, size=(4.0, 3.0))
     recording, truth = before_noise([Target(own, 3e4)])
-    found = blob.find(seen_by_a_moving_camera(recording), progress=False)
+    found = blob.find(seen_by_a_moving_camera(recording, begin=0.3), progress=False)
     assert found.camera_moves and "the camera moves" in found.summary()
-    (path,) = found.paths
-    assert path.end - path.begin > 0.9 * DURATION * 1e6
-    assert np.median(np.hypot(*(path.p - truth(path.t)[:, 0, :2]).T)) < 2
+    assert found.paths[0].begin < 20_000 and len(found) <= 2
+    assert sum(path.end - path.begin for path in found.paths) > 0.9 * DURATION * 1e6
+    for path in found.paths:
+        assert np.median(np.hypot(*(path.p - truth(path.t)[:, 0, :2]).T)) < 2
+
+
+@pytest.mark.slow
+def test_of_a_camera_that_shakes_it_is_said_that_it_moves():
+    recording = seen_by_a_moving_camera(before_noise([])[0], rate=4e5, maps=shaking)
+    found = blob.find(recording, stop=0.4, progress=False)
+    assert found.camera_moves and not len(found)
+
+
+def test_pauses_are_told_by_most_of_the_sensor():
+    ones = np.ones((6, 8))
+    background = Background(ones, ones[None] > 0, ones < 0, np.ones(64), 6.4)
+    assert pauses(background) == [(0.0, 6.4)]
+    level = np.repeat([0.8, 0.05, 0.7], [20, 24, 20])
+    level[[5, 30]], level[-7:] = (0.1, 0.7), 0.1  # what is short is none
+    told = pauses(dataclasses.replace(background, level=level))
+    np.testing.assert_allclose(told, [(0, 2), (2, 4.4), (4.4, 6.4)])
+    # Nor is there one where most of the sensor never sees much.
+    assert len(pauses(dataclasses.replace(background, level=level / 4))) == 1
 
 
 @pytest.mark.slow

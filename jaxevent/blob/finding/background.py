@@ -20,6 +20,7 @@ from jaxevent.events.filters import busiest_neighbour
 from jaxevent.kernels import lean, lean_part
 
 SLICES = 64  # of the recording's time
+USUAL = 0.9  # quantile over slices: what a place has where it has much
 CELL, FINE = 16, 4  # px; fine cells where the background is bright:
 BRIGHT, STEADY = 4.0, 0.5  # times the sensor's median rate, and its own in nearly all slices
 PLENTY = 12  # events per slice and cell in which finer ones have enough
@@ -58,6 +59,7 @@ class Background:
         duration: s.
         scene: How the scene moves, if it does; rate, calm and bright are of places in the scene.
         corner: x and y (px) of the scene's place where they begin.
+        level: (slices,) events of the median place, of those in its fullest slices but a tenth.
     """
 
     rate: NDArray[np.float64]
@@ -67,6 +69,7 @@ class Background:
     duration: float
     scene: SceneMotion | None = None
     corner: tuple[int, int] = (0, 0)
+    level: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.ones(SLICES))
     _means: dict[int, NDArray[np.float64]] = dataclasses.field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -244,7 +247,9 @@ def _of_counts(cells: NDArray[np.int32], duration: float) -> Background:
         if full.any():
             quarter, m = _quiet(pooled(cells, g // FINE).astype(float))
             density = np.where(full, np.maximum(m / g**2, least), density)
-    return Background(density / (duration / SLICES), calm, bright, activity, duration)
+    level = np.median(N / np.maximum(np.quantile(N, USUAL, axis=0), 1), axis=(1, 2))
+    rate = density / (duration / SLICES)
+    return Background(rate, calm, bright, activity, duration, level=level)
 
 
 def pooled(cells: NDArray, by: int) -> NDArray:

@@ -6,6 +6,7 @@ remains, so that slow and fast targets are found in one recording.
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from jaxevent.blob.finding.detection import CONTACT, Scale, touching
 from jaxevent.blob.finding.found import Found, Pass
 from jaxevent.blob.finding.lamps import without_lamps
 from jaxevent.blob.finding.links import Links
-from jaxevent.blob.finding.moving import find_moving_background, goes_own_way
+from jaxevent.blob.finding.moving import find_moving_background, goes_own_way, pauses
 from jaxevent.blob.finding.parts import join_parts
 from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.polarity import prefer_sharper
@@ -64,8 +65,50 @@ def find(
     stream = Stream(recording, *span_of(recording, start, stop))
     if len(stream) < FEWEST:
         return Found((), (), 0, 0.0, recording)
+    found: list[Path] = []
+    passes: list[Pass] = []
+    hot, events, moves = np.zeros((stream.height, stream.width), bool), 0.0, False
+    parts = _parts(stream, progress)
+    for one in parts:
+        new, done = _search(one, progress)
+        found += new
+        passes += done
+        hot |= one.stream.hot
+        events += one.background.mean * stream.width * stream.height * one.stream.duration
+        moves |= one.background.scene is not None
+    if len(parts) > 1:
+        found = _stitch(found, (stream.width, stream.height))
+    found, lamps = without_lamps(found, recording, hot)
+    found = prefer_sharper(found, recording, hot)
+    found.sort(key=lambda path: (path.begin, path.p[0].tolist()))
+    rate = events / stream.duration
+    return Found(tuple(found), tuple(passes), int(hot.sum()), rate, recording, moves, lamps)
+
+
+class _Part(NamedTuple):
+    """Events that are searched at once, and what the search begins with."""
+
+    stream: Stream
+    background: Background
+    choice: Choice | None
+
+
+def _parts(stream: Stream, progress: bool | None) -> list[_Part]:
+    """The whole; or, of a camera that moves at times, each of its pauses and what is between."""
     with stage("find: background", progress):
         background = measure_background(stream)
+    spans = pauses(background)
+    if len(spans) > 1:
+        parts = [stream.part(*span) for span in spans]
+        parts = [
+            _prepared(one, measure_background(one), progress) for one in parts if len(one) >= FEWEST
+        ]
+        if any(one.background.scene is not None for one in parts):
+            return parts
+    return [_prepared(stream, background, progress)]
+
+
+def _prepared(stream: Stream, background: Background, progress: bool | None) -> _Part:
     with stage("find: scale", progress):
         choice = choose_scale(stream, background)
     if choice is not None:
@@ -73,20 +116,12 @@ def find(
             moving = find_moving_background(stream, background, choice)
         if moving is not None:
             background, choice = moving, choose_scale(stream, moving)
-    found, passes = _search(stream, background, choice, progress)
-    rate = background.mean * stream.width * stream.height
-    moves = background.scene is not None
-    found, lamps = without_lamps(found, recording, stream.hot)
-    found = prefer_sharper(found, recording, stream.hot)
-    found.sort(key=lambda path: (path.begin, path.p[0].tolist()))
-    hot = int(stream.hot.sum())
-    return Found(tuple(found), tuple(passes), hot, rate, recording, moves, lamps)
+    return _Part(stream, background, choice)
 
 
-def _search(
-    stream: Stream, background: Background, choice: Choice | None, progress: bool | None
-) -> tuple[list[Path], list[Pass]]:
+def _search(part: _Part, progress: bool | None) -> tuple[list[Path], list[Pass]]:
     """Paths and passes against a background; the choice is that of the first pass."""
+    stream, background, choice = part
     found: list[Path] = []
     passes: list[Pass] = []
     worth = WORTH if background.scene is None else WORTH_MOVING
@@ -223,7 +258,9 @@ def _gap(one: Path, other: Path, size: tuple[int, int]) -> float:
     other = _later(one, other)
     pause = int(other.t[0] - one.t[-1])
     shorter = min(one.end - one.begin, other.end - other.begin)
-    if not 0 < pause <= max(min(PAUSE * one.window, 2 * REST * shorter), REST * shorter):
+    if one.window != other.window or not 0 < pause <= max(
+        min(PAUSE * one.window, 2 * REST * shorter), REST * shorter
+    ):
         return np.inf
     margin = EDGE * max(one.size[-1, 0], other.size[0, 0])
     at_edge = (one.p[-1] < margin) | (one.p[-1] > np.array(size) - 1 - margin)

@@ -77,6 +77,10 @@ class Stream:
         """Events in all, those left out included."""
         return self._last - self._first
 
+    def part(self, begin: float | int, end: float | int) -> "Stream":
+        """The events of begin <= t < end (s since the start), those left out included."""
+        return Stream(self.recording, *(self.start + round(1e6 * t) for t in (begin, end)))
+
     def without(
         self, paths: Sequence[Path], sigmas: float | int, until: int | None = None
     ) -> "Stream":
