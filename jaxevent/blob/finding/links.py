@@ -242,6 +242,8 @@ class Links:
             return
         over = self.live.keep(which)
         self.confirmed |= set(over.id[over.confirmed].tolist())
+        for one in over.id.tolist():
+            self.least.pop(one, None)
         self.live = self.live.keep(~which)
 
     def _begin_targets(self, part: Part, t: float | int, labels: NDArray, shares: Shares) -> None:
