@@ -28,11 +28,12 @@ each process listens at the address of its host's name, too, for the exchange it
 """
 
 import contextlib
+import functools
 import io
 import json
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import numpy as np
@@ -43,6 +44,7 @@ from jaxevent.errors import InputError
 AXIS = "devices"
 START = 300  # s that processes wait for each other at the start
 
+Q = ParamSpec("Q")
 T = TypeVar("T")
 
 
@@ -51,6 +53,22 @@ class Elsewhere:
 
 
 ELSEWHERE = Elsewhere()
+
+
+def full_precision(function: Callable[Q, T]) -> Callable[Q, T]:
+    """Have a function multiply matrices in full precision, where GPUs round factors to 11 bits."""
+
+    @functools.wraps(function)
+    def precise(*args: Q.args, **kwargs: Q.kwargs) -> T:
+        with jax.default_matmul_precision("highest"):
+            return function(*args, **kwargs)
+
+    return precise
+
+
+def at_once(steps: int) -> int:
+    """How many steps of a loop to compile into one: a GPU starts programs anew for each step."""
+    return 1 if jax.default_backend() == "cpu" else steps
 
 
 def local() -> list[Any]:

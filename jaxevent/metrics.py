@@ -384,6 +384,7 @@ def _conv(image: Array, layer: dict[str, Array], stride: int, pad: int) -> Array
         (stride, stride),
         [(pad, pad), (pad, pad)],
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        precision="highest",
     )
     return jax.nn.relu(out + layer["bias"])
 

@@ -11,10 +11,10 @@ import platformdirs
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 # The older code generator of XLA, not in jaxlib 0.11, takes a fifth less of the time again: 42 s in
 # place of 52. Programs in parts for several cores take more to compile, and all cores have tests
-# of their own.
+# of their own. GPUs add in whichever order comes, unless they are told not to.
 os.environ.setdefault(
     "XLA_FLAGS",
-    "--xla_cpu_parallel_codegen_split_count=1"
+    "--xla_cpu_parallel_codegen_split_count=1 --xla_gpu_deterministic_ops=true"
     + " --xla_cpu_use_fusion_emitters=false" * metadata.version("jaxlib").startswith("0.10."),
 )
 # What one test, worker or command has compiled, the others take from the user's cache folder, and

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxevent.devices import full_precision
+
 # lambda1 of the events of a disc over the disc's diameter: of an even rim (a disc that grows or
 # flickers), of the leading and trailing edges of one that moves, of an evenly filled one.
 SIZE_FACTORS = {"ring": 1 / math.sqrt(8), "disc": 1 / math.sqrt(6), "uniform": 1 / 4}
@@ -21,6 +23,7 @@ SIZE_FACTORS = {"ring": 1 / math.sqrt(8), "disc": 1 / math.sqrt(6), "uniform": 1
 Number = Num[Array, ""] | float | int
 
 
+@full_precision
 def inverse_ttc(
     mean_a: Float[Array, "*n 8"],
     covariance_a: Float[Array, "*n 8 8"],
@@ -46,6 +49,7 @@ def inverse_ttc(
     return jnp.where(apart, value, 0), jnp.where(apart, variance, jnp.inf)
 
 
+@full_precision
 def log_size(
     mean: Float[Array, "*n 8"], covariance: Float[Array, "*n 8 8"]
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
@@ -56,6 +60,7 @@ def log_size(
 
 
 @functools.partial(jax.jit, static_argnames="smooth")
+@full_precision
 def growth(
     times: Float[Array, " times"],
     mean: Float[Array, "times 8"],

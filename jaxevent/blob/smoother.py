@@ -24,6 +24,7 @@ from jaxevent.blob.prepare import LONGEST
 from jaxevent.blob.states import canonical, wrap
 from jaxevent.blob.steps import Filter, choose
 from jaxevent.blob.targets import Slots, own_params, predict, seconds, stands_still
+from jaxevent.devices import full_precision
 
 
 class Later(eqx.Module):
@@ -54,6 +55,7 @@ class _Update(eqx.Module):
     time: Int[Array, "*steps"]
 
     @property
+    @full_precision
     def chain(self) -> tuple[Array, Array, Array]:
         """T, c, C of F^T r -> c + T F'^T r', F^T N F -> C + T F'^T N' F' T^T; the same without."""
         F, hit = self.F.mT, self.touched[..., None]
@@ -81,6 +83,7 @@ def at_end(later: Later, slots: Slots, elapsed: Array) -> Later:
     return jax.vmap(choose)(same, shifted, nothing_later(slots))
 
 
+@full_precision
 def look_back(filter: Filter, params: TrackerParams, path: Slots, later: Later) -> Later:
     """What later events say at all moments (steps + 1, targets) of a chunk's path.
 
@@ -123,6 +126,7 @@ def look_back(filter: Filter, params: TrackerParams, path: Slots, later: Later) 
     return jax.vmap(of_target, (0, 0, 1), 1)(later, end, updates)
 
 
+@full_precision
 def tell_smoothed(
     filter: Filter, params: TrackerParams, slot: Slots, later: Later, time: Array
 ) -> tuple[Array, Array, Array]:
@@ -138,6 +142,7 @@ def tell_smoothed(
     return mean, covariance, seconds(time - slot.heard, slot.gate)
 
 
+@full_precision
 def _update_of(
     filter: Filter,
     params: TrackerParams,

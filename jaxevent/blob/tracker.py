@@ -178,7 +178,7 @@ class Tracker(Estimator[P]):
                 up to it, as they are known while events come. None: on all, where the filter can.
             compiler: "numba" follows and reads targets by kernels made of the filter's own
                 functions, "xla" by the `run` that is differentiated; both to rounding the same.
-                None: on CPUs numba, where it has a kernel.
+                None: numba, where it has a kernel.
             progress: Whether a bar is shown; None: where somebody looks on.
 
         Raises:
@@ -247,7 +247,7 @@ class Tracker(Estimator[P]):
 
     def _fused(self, params: P, compiler: str | None, packing: Packing) -> FusedRun | None:
         """The kernel that follows targets; None where XLA does."""
-        if compiler == "xla" or (compiler is None and jax.default_backend() != "cpu"):
+        if compiler == "xla":
             return None
         try:
             return FusedRun(self.filter, params, packing)

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.camera import PinholeCamera
+from jaxevent.devices import full_precision
 from jaxevent.errors import InputError
 
 Scalars = Float[Array | np.ndarray, "..."] | float | int
@@ -143,6 +144,7 @@ def unit(v: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
     return jnp.where(square > 0, v / jnp.sqrt(jnp.where(square > 0, square, 1)), v)
 
 
+@full_precision
 def rotation_exp(phi: Float[Array | np.ndarray, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
     """The rotation matrix of a rotation vector (rad), by Rodrigues' formula."""
     phi = _real(phi)
@@ -179,6 +181,7 @@ def rotation_log(R: Float[Array | np.ndarray, "*batch 3 3"]) -> Float[Array, "*b
     return jnp.where(small, series, 2 * jnp.arctan2(sine, w) / sine)[..., None] * v
 
 
+@full_precision
 def twist_exp(xi: Float[Array | np.ndarray, "*batch 6"]) -> Float[Array, "*batch 4 4"]:
     """The camera's pose after 1 s of the constant twist (T, Omega): camera to first camera."""
     xi = _real(xi)
@@ -191,6 +194,7 @@ def twist_exp(xi: Float[Array | np.ndarray, "*batch 6"]) -> Float[Array, "*batch
     return jnp.concatenate([top, last], -2)
 
 
+@full_precision
 def twist_log(P: Float[Array | np.ndarray, "*batch 4 4"]) -> Float[Array, "*batch 6"]:
     """The twist (T, Omega) that leads to the pose P in 1 s: the inverse of `twist_exp`."""
     P = _real(P)

@@ -34,6 +34,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
+from jaxevent.devices import full_precision
 from jaxevent.egomotion.geometry import A, rotation_basis, rotation_exp, unit
 from jaxevent.errors import InputError
 from jaxevent.estimator import imported
@@ -114,6 +115,7 @@ class Model(eqx.Module):
         """How the components move the image at xi: (px/s) per unit."""
         raise NotImplementedError
 
+    @full_precision
     def flow(self, xi: Float[Array, "2"], motion: Float[Array, " d"]) -> Float[Array, "2"]:
         """The flow (px/s) at a place, of a half-line its begin."""
         return jnp.asarray(self.basis(xi)) @ motion
@@ -182,12 +184,14 @@ class Model(eqx.Module):
         """A motion with its directions made unit vectors."""
         return self._by_part(lambda part, v: unit(v) if part.direction else v, motion)
 
+    @full_precision
     def mean(
         self, particles: Float[Array, "N d"], weights: Float[Array, " N"]
     ) -> Float[Array, " d"]:
         """The weighted mean; of directions that of the mean vector."""
         return self.on_manifold(weights @ particles)
 
+    @full_precision
     def apart(self, motion: Float[Array, " d"], mean: Float[Array, " d"]) -> Float[Array, " d"]:
         """How far a motion is from the mean, as the covariance counts it."""
 
@@ -196,6 +200,7 @@ class Model(eqx.Module):
 
         return self._by_part(one, motion - mean, mean)
 
+    @full_precision
     def share(
         self, particles: Float[Array, "N d"], weights: Float[Array, " N"]
     ) -> Float[Array, "N 1"]:
@@ -375,9 +380,11 @@ class General(Model):
         xp = np if isinstance(turning, np.ndarray) else jnp
         return xp.concatenate([xp.zeros_like(turning), turning], -1)
 
+    @full_precision
     def flow(self, xi, motion):
         return rotation_basis(xi, self.f) @ motion[3:]
 
+    @full_precision
     def line(self, xi, motion):
         """0 in the focus of expansion."""
         along = A(xi[0], xi[1], jnp.asarray(self.f, xi.dtype)) @ motion[:3]

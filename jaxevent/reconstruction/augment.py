@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
+from jaxevent.devices import full_precision
 from jaxevent.parameters import Choice, Number, Parameters, Positive
 from jaxevent.reconstruction.features import FrameFeatures, Points
 
@@ -111,6 +112,7 @@ def unclipped(params: CertaintyParams, frames: Greys) -> Float[Array, "frames pi
     return jnp.where(params.margin > 0, inside, 1)
 
 
+@full_precision
 def certainty(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
     """w of every frame and pixel without regard to clipping, at least `w_min`."""
     w = frames.certainty

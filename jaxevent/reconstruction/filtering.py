@@ -18,6 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxevent.devices import at_once
 from jaxevent.estimator import Described, Estimate
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import P, PixelEstimator
@@ -35,6 +36,8 @@ from jaxevent.reconstruction.layout import SHAPES, SLOTS
 from jaxevent.reconstruction.prepared import PreparedImages
 from jaxevent.reconstruction.video import ImageSequence, Video
 from jaxevent.recording import Recording, Times
+
+UNROLLED = 8  # ranks of a tile that a GPU passes over at once
 
 
 class State(eqx.Module):
@@ -146,12 +149,12 @@ class Filter(PixelEstimator[P]):
     ) -> ImageSequence[P]:
         """Images of a recording: `image, variance, valid = estimate(recording, params)(times)`.
 
-        On CPUs, in single precision, they come from a kernel that numba compiles from the method's
-        own functions (`fused`), several times faster than the `run` and `read` that XLA compiles.
-        These serve where a function has no translation, in double precision, on other devices and
-        on several. `compiler` asks for one of the two: "numba" or "xla". Further options are those
-        of `Video`. Raises `InputError` if the recording lacks what the method needs, and where
-        numba is asked for what it cannot do.
+        In single precision they come from a kernel that numba compiles from the method's own
+        functions (`fused`), which the CPU runs, several times faster than the `run` and `read` that
+        XLA compiles, and than a GPU runs these. They serve where a function has no translation, in
+        double precision and on several devices. `compiler` asks for one of the two: "numba" or
+        "xla". Further options are those of `Video`. Raises `InputError` if the recording lacks what
+        the method needs, and where numba is asked for what it cannot do.
         """
         params = self.Params() if params is None else params
         fused = video_by_kernel(FusedVideo, self, recording, params, compiler, options)
@@ -269,7 +272,8 @@ def _over_tiles(step: Callable, lanes: Any, place: Place, slots: Any) -> Any:
 
     def use(ranks: int, width: int, lanes: Any, tile: Any) -> tuple[Any, Any]:
         tile = jax.tree.map(lambda v: v.reshape(ranks, width), tile)
-        end, out = lax.scan(step, jax.tree.map(lambda s: s[:width], lanes), tile)
+        mine = jax.tree.map(lambda s: s[:width], lanes)
+        end, out = lax.scan(step, mine, tile, unroll=at_once(UNROLLED))
         lanes = jax.tree.map(lambda s, e: jnp.concatenate([e, s[width:]]), lanes, end)
         return lanes, jax.tree.map(jnp.ravel, out)
 

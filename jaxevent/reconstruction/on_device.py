@@ -31,7 +31,7 @@ from jaxevent.reconstruction.features import (
 from jaxevent.reconstruction.frames import gathered, make_segments, make_start
 from jaxevent.reconstruction.layout import SHAPES, SLOTS, Layout
 from jaxevent.reconstruction.reading import Placed, padded
-from jaxevent.reconstruction.stream import BaseCounts, EdgeCounts, StreamState, note_latest
+from jaxevent.reconstruction.stream import BaseCounts, EdgeCounts, StreamState, narrow, note_latest
 from jaxevent.reconstruction.windows import EventWindow, WindowedRecording, WindowEvents
 
 FARTHEST = 1 << 30  # us from a window's first event that times may lie: sums fit in 32 bits
@@ -155,7 +155,7 @@ class OwnEvents(eqx.Module):
 @jax.jit
 def _count(events: PixelEvents, edges: Array) -> Array:
     """ON and OFF events of each pixel earlier than each edge, (edges, 2, pixels)."""
-    return lax.map(lambda edge: events.counts(events.before(edge)), edges)
+    return jax.vmap(lambda edge: events.counts(events.before(edge)))(edges)
 
 
 @functools.partial(jax.jit, static_argnames=("width", "exposed", "room", "dtype"))
@@ -241,8 +241,7 @@ def _read(
     begin, stop = own.places(events)
     pixel = jnp.arange(begin.shape[0], dtype=jnp.int32)
 
-    def one(at: tuple[Array, Array]) -> dict[str, Array]:
-        time, row = at
+    def one(time: Array, row: Array) -> dict[str, Array]:
         end = _bisect(events.t, begin, stop, time + 1)
         any_yet = end > begin
         last = jnp.where(any_yet, events.t.at[end - 1].get(mode="clip"), own.last)
@@ -253,7 +252,7 @@ def _read(
         since = jnp.maximum(time - last, 0).astype(dtype) * 1e-6
         return {"slot": slot, "since": since, "on": on.astype(dtype), "off": off.astype(dtype)}
 
-    return lax.map(one, (times, rows))
+    return jax.vmap(one)(times, rows)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -352,9 +351,7 @@ class DeviceWindows(WindowedRecording):
         while room < len(around):
             room += room // 4
         t, cell = np.full(room, NEVER, np.int32), np.full(room, 2 * self.pixels, np.int32)
-        t[: len(around)] = around.t - base_time
-        pixel = around.y.astype(np.int32) * self.recording.width + around.x
-        cell[: len(around)] = pixel << 1 | around.p
+        narrow(self._stream(around), base_time, t, cell)
         return _sorted(jnp.asarray(t), jnp.asarray(cell), self.pixels)
 
     def _edges(self, start: int | None, used: slice, base_time: int) -> NDArray[np.int32]:
@@ -404,9 +401,10 @@ class DeviceWindows(WindowedRecording):
         after = before.copy()
         after.frames = max(used.stop, 1)
         note_latest(self._stream(events.own), after.last)
-        image = after.last.reshape(self.recording.height, self.recording.width)
-        around = np.lib.stride_tricks.sliding_window_view(np.pad(image, 1, "edge"), (3, 3))
-        after.near = np.pad(around.max((2, 3)), 1).ravel()
+        image = np.pad(after.last.reshape(self.recording.height, self.recording.width), 1, "edge")
+        rows = np.maximum(np.maximum(image[:-2], image[1:-1]), image[2:])
+        near = np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
+        after.near = np.pad(near, 1).ravel()
         return after
 
 

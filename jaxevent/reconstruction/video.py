@@ -27,6 +27,7 @@ P = TypeVar("P", bound=FrameParams)
 
 BEGINS = 32  # windows from which filtering can be taken up again
 BATCH = 8  # images read per call; 8 x 90,000 pixels stay in the second-level cache
+DEVICE_BATCH = 32  # on a GPU, where each call costs as much as several images
 
 
 @runtime_checkable
@@ -251,6 +252,7 @@ class Video(ImageSequence[P]):
         super().__init__(estimator, recording, params, progress=progress)
         self._devices, self._factors = devices, factors
         self._mesh = pixel_mesh(devices)
+        self._batch = BATCH if jax.default_backend() == "cpu" else DEVICE_BATCH
         self._windows = _windows_of(
             recording,
             Timing.of(params),
@@ -282,10 +284,13 @@ class Video(ImageSequence[P]):
             window, reader, trajectory = self._window_of(int(times[done]))
             stop = window.stop
             end = len(times) if stop is None else int(np.searchsorted(times, stop))
-            for first in range(done, end, BATCH):
-                batch = times[first : min(first + BATCH, end)]
+            for first in range(done, end, self._batch):
+                batch = times[first : min(first + self._batch, end)]
                 out = self._place(reader(batch))
-                yield batch, _read(self.estimator, self.params, trajectory, out)
+                images = _read(self.estimator, self.params, trajectory, out)
+                for leaf in images:
+                    leaf.copy_to_host_async()
+                yield batch, images
             done = end
 
     def _place(self, part: Any) -> Any:
@@ -375,4 +380,4 @@ class Video(ImageSequence[P]):
             self._begins = sorted([*self._begins, following], key=lambda b: b.time)
             if len(self._begins) > BEGINS:  # the first one, the last one, and half of the others
                 self._begins = [self._begins[0], *self._begins[1:-1][::2], self._begins[-1]]
-        return FilteredWindow(window, window.reader(BATCH), trajectory), following
+        return FilteredWindow(window, window.reader(self._batch), trajectory), following

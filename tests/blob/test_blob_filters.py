@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import integrate, linalg
+from traced import FULL, products
 
 from jaxevent import blob
 from jaxevent.blob.association import share
 from jaxevent.blob.filters.ellipse import truncation
+from jaxevent.blob.quantities import inverse_ttc, log_size
 from jaxevent.blob.steps import Batch
 
 TRACKERS = ("moment", "chi2_split", "chi2", "constant_velocity")
@@ -432,16 +434,28 @@ def test_nothing_breaks_the_numbers(name, float32, optimised):
     def report(state):
         mean, P = steps.moments(params, state)
         ahead = steps.expected(params, state)
-        return mean, jnp.diagonal(P), jnp.linalg.det(ahead.spread), ahead.P_p
+        scale = jnp.sqrt(jnp.diagonal(P))
+        skew = (jnp.abs(P - P.T) / (scale * scale[:, None] + 1e-30)).max()
+        return mean, jnp.diagonal(P), skew, jnp.linalg.det(ahead.spread), ahead.P_p
 
-    state, (mean, variances, det, P_p) = jax.jit(
+    state, (mean, variances, skew, det, P_p) = jax.jit(
         lambda e: scanned(name, params, [3.0, -2.0], 10.0, e, report=report)
     )(events)
     for part in (mean, variances, det, P_p, *leaves(state)):
         assert np.isfinite(part).all()
-    assert (variances >= 0).all() and (det > 0).all()
+    assert (variances >= 0).all() and (det > 0).all() and skew.max() < 1e-5
     assert (np.diagonal(P_p, axis1=1, axis2=2) > 0).all()
     assert np.abs(mean[-1, :2]).max() < 5  # 50 events after the last gap
+
+
+def test_products_are_of_full_precision():
+    """GPUs round the factors of others to 11 bits."""
+    params = params_of("chi2", polarity_offset=True)
+    events = tuple(jnp.ones(shape) for shape in [(3,), (3, 2, 2), (3, 2), (3, 2), (3, 2)])
+    found = products(lambda e: scanned("chi2", params, [3.0, -2.0], 10.0, e)[0].P, events)
+    blob = jnp.ones(8), jnp.eye(8)
+    found += products(inverse_ttc, *blob, *blob) + products(log_size, *blob)
+    assert len(found) > 5 and set(found) == {FULL}
 
 
 @pytest.mark.slow

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 import scipy.linalg
 from scipy.spatial.transform import Rotation
+from traced import FULL, products
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import geometry, scores
+from jaxevent.egomotion.models import General
 from jaxevent.egomotion.twists import from_gyro, from_poses, gyro_bias
 from jaxevent.errors import InputError
 from jaxevent.recording import Imu, Poses
@@ -273,3 +275,12 @@ def test_metrics_of_zero_vectors():
         scores.axis_error([[np.nan, 0, 0]], one)
     with pytest.raises(InputError, match="cannot be compared"):
         scores.motion_errors(T=(one, np.ones((2, 3))))
+
+
+def test_products_are_of_full_precision():
+    """GPUs round the factors of others to 11 bits."""
+    twist, model = jnp.ones(6), General(f=100.0)
+    found = products(lambda xi: geometry.twist_log(geometry.twist_exp(xi)), twist)
+    found += products(model.flow, jnp.ones(2), twist)
+    found += products(model.mean, jnp.ones((4, 6)), jnp.ones(4))
+    assert len(found) > 5 and set(found) == {FULL}

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
+from traced import FULL, products
 
 import jaxevent
 from jaxevent.errors import InputError
@@ -742,6 +743,14 @@ def test_prepared_images_are_those_of_the_video():
     np.testing.assert_allclose(image.reshape(2, 40, 48), whole.mean, atol=2e-3)
     np.testing.assert_allclose(P.reshape(2, 40, 48), whole.covariance, rtol=0.1)
     np.testing.assert_array_equal(valid.reshape(2, 40, 48), whole.valid)
+
+
+@pytest.mark.slow
+def test_products_are_of_full_precision():
+    """GPUs round the factors of others to 11 bits: choices shift, images by up to 0.05."""
+    _, value = prepared()
+    found = products(value, params().raw)
+    assert len(found) > 5 and set(found) == {FULL}
 
 
 @pytest.mark.slow

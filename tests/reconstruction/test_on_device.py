@@ -71,15 +71,14 @@ def test_images_are_those_of_the_host(name, monkeypatch):
     times = np.linspace(recording.start, recording.stop, 7).astype(np.int64)
     params = method.Params(spread=0.0) if "spread" in method.Params.numbers else method.Params()
 
-    def images():
+    def images(backend, kind):
+        monkeypatch.setattr(jax, "default_backend", lambda: backend)
         video = method.estimate(recording, params, compiler="xla", window_events=90)
-        return type(video._windows), look(video, times)
+        assert type(video._windows) is kind
+        return look(video, times)
 
-    kind, expected = images()
-    assert kind is WindowedRecording
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    kind, found = images()
-    assert kind is DeviceWindows
+    expected = images("cpu", WindowedRecording)
+    found = images("gpu", DeviceWindows)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 

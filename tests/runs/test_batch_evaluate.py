@@ -346,7 +346,7 @@ def several(tmp_path_factory) -> tuple[Path, list[dict]]:
 
 @pytest.mark.slow
 def test_workers_and_client_of_a_cluster_may_die(several, tmp_path, float32, monkeypatch):
-    import distributed
+    distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
 
     monkeypatch.setattr("jaxevent.show.page.page", lambda *arguments: "")
     folder, expected = several

@@ -27,6 +27,7 @@ from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.states import wrap
 from jaxevent.blob.steps import Batch, Filter, choose
 from jaxevent.blob.tracker import Tracker
+from jaxevent.devices import full_precision
 from jaxevent.parameters import Choice, Count, Positive
 
 P_POSITION_MAX = 1e6  # px^2; in single precision a longer pause would leave nothing of R
@@ -272,6 +273,7 @@ def _per(state: State) -> Array:
     return state.size if state.logarithmic else jnp.ones_like(state.size)
 
 
+@full_precision
 def _update_scalars(x: Array, P: Array, measurements: list[_Measurement]) -> tuple[Array, Array]:
     """One scalar after the other, all at the predicted state: equal to the joint update."""
     # Rounding may take a variance that falls a millionfold below 0; the last term is as large.

@@ -188,9 +188,9 @@ class Voting(MotionEstimator[Params]):
             compiler: "numba" runs a kernel made of the filter's own functions, "xla" the `run` that
                 is differentiated. Log-likelihoods of the two are the same to rounding, and weights
                 to `params.off` where the kernel interpolates; which particles are resampled may
-                differ then, as with another seed. None: on CPUs, in single precision and from
-                100,000 scored events on (one in `params.every` is), numba, where there is a kernel:
-                for all but the literal likelihood.
+                differ then, as with another seed. None: in single precision and from 100,000 scored
+                events on (one in `params.every` is) numba, where there is a kernel: for all but the
+                literal likelihood.
 
         Raises:
             InputError: The model is unknown, or it needs a camera and there is none, or numba is
@@ -239,8 +239,8 @@ class Voting(MotionEstimator[Params]):
         """The filter as a kernel; None where XLA compiles it."""
         if compiler not in (None, "numba", "xla"):
             raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
-        on_host = jnp.result_type(float) == np.float32 and jax.default_backend() == "cpu"
-        if compiler == "xla" or (compiler is None and not (on_host and events >= KERNEL_EVENTS)):
+        single = jnp.result_type(float) == np.float32
+        if compiler == "xla" or (compiler is None and not (single and events >= KERNEL_EVENTS)):
             return None
         try:
             return FusedRun(params, model)

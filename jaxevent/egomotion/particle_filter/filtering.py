@@ -9,6 +9,7 @@ from jax import lax
 from jax.nn import logsumexp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from jaxevent.devices import full_precision
 from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.particle_filter.likelihood import score
@@ -278,6 +279,7 @@ def step(
     return after, info
 
 
+@full_precision
 def _covariance(apart: Float[Array, "N d"], weights: Float[Array, " N"]) -> Float[Array, "d d"]:
     return (apart * weights[:, None]).T @ apart
 

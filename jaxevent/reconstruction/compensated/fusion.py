@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxevent.devices import full_precision
 from jaxevent.estimator import Described
 from jaxevent.reconstruction.compensated.agreement import (
     Agreement,
@@ -158,6 +159,7 @@ def compare(told: Agreement, seen: Views) -> Comparison:
     )
 
 
+@full_precision
 def decide(params: Params, comparison: Comparison) -> Fused:
     """Choose between the ingredients by the signs, as far as frames show what they are.
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax.scipy.sparse.linalg import bicgstab, cg
 from jaxtyping import Array, Float
 
+from jaxevent.devices import full_precision
 from jaxevent.reconstruction.compensated.trajectories import OUTSIDE
 from jaxevent.reconstruction.compensated.warping import places, sample, spread_purely, within
 from jaxevent.reconstruction.features import Numeric
@@ -90,6 +91,7 @@ def _soften(nodes: Array) -> Array:
     return nodes
 
 
+@full_precision
 def equations(p: Array, seen: Seen, numbers: Numbers) -> Equations:
     """The normal equations of `trajectories.step`, as a pure function."""
     L, V, s, present = seen
@@ -144,6 +146,7 @@ def imbalance(p: Array, seen: Seen, numbers: Numbers) -> Array:
     return eq.b - _pull(eq, p)
 
 
+@full_precision
 def _solve(eq: Equations, right: Array) -> Array:
     degree = jnp.pad(eq.across, [(0, 0), (1, 0)]) + jnp.pad(eq.across, [(0, 0), (0, 1)])
     degree = degree + jnp.pad(eq.down, [(1, 0), (0, 0)]) + jnp.pad(eq.down, [(0, 1), (0, 0)])

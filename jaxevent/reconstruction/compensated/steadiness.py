@@ -26,6 +26,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
+from jaxevent.devices import full_precision
 from jaxevent.reconstruction.compensated.agreement import Place
 from jaxevent.reconstruction.compensated.warping import places, sample
 from jaxevent.reconstruction.features import Numeric
@@ -52,6 +53,7 @@ def _averages(size: int, reach: float) -> NDArray[np.float32]:
     return (weights / weights.sum(1, keepdims=True)).astype(np.float32)
 
 
+@full_precision
 def smooth_part(L: Any, reach: float = REACH) -> Any:
     """What varies slowly over images (..., h, w), of NumPy or JAX: a Gaussian of `reach` px."""
     return _averages(L.shape[-2], reach) @ L @ _averages(L.shape[-1], reach).T

@@ -21,6 +21,7 @@ from jaxtyping import Int
 from numpy.typing import NDArray
 
 from jaxevent import dispatch
+from jaxevent.devices import full_precision
 from jaxevent.estimator import Estimate
 from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.reconstruction.clock import Timing
@@ -157,7 +158,8 @@ def prepared_by_kernel(
 
     See `Filter.prepare_images`. Raises `InputError` where numba is asked for what it cannot do.
     """
-    if not (wants_kernel(compiler, jax.local_devices()) and IN_TURN):
+    elsewhere = compiler is None and jax.default_backend() != "cpu"
+    if elsewhere or not (wants_kernel(compiler, jax.local_devices()) and IN_TURN):
         return None
     if "rho_ref" in params.followed:
         return None
@@ -204,6 +206,7 @@ def _images(about: Any, number: Any, rows: Any, params: Any) -> Any:
     return _called(about, number, rows, params, ())
 
 
+@full_precision
 def _images_jvp(about: Any, primals: Any, tangents: Any) -> Any:
     """The images' changes: sums of derivatives by numbers times the numbers' changes."""
     number, rows, params = primals

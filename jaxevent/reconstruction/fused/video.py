@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
@@ -123,8 +122,8 @@ def wants_kernel(compiler: str | None, devices: Sequence[Any]) -> bool:
     """Whether numba is asked for, or is what serves on these devices; raises `InputError`."""
     if compiler not in (None, "numba", "xla"):
         raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
-    on_host = jnp.result_type(float) == np.float32 and jax.default_backend() == "cpu"
-    return compiler == "numba" or (compiler is None and on_host and len(devices) < 2)
+    single = jnp.result_type(float) == np.float32
+    return compiler == "numba" or (compiler is None and single and len(devices) < 2)
 
 
 def video_by_kernel(
