@@ -8,7 +8,8 @@ Parts: images (bench_images.py: the complete path from a file to images, losses,
 blob and motion, which take minutes. CPU seconds of this process are compared, so other programs on
 the machine change little: `--gate` compares the ratios with bench_baseline.json and exits with 1
 if one is worse than its tolerance; `--bless` writes those of the parts that ran. `gpu`
-(bench_gpu.py) times a GPU against the CPU's kernels, by the clock, and has no gate.
+(bench_gpu.py) times a GPU against the CPU's kernels, by the clock, and `path` (bench_path.py) the
+parts of the complete path and of gradients; these two have no gate.
 """
 
 import argparse
@@ -104,6 +105,18 @@ def memory() -> Found:
     return {}, {"peak memory of 10 M events, GB": row["peak"]}
 
 
+def gpu() -> str:
+    from bench_gpu import gpu_bench
+
+    return gpu_bench()
+
+
+def path() -> str:
+    from bench_path import path_bench
+
+    return path_bench()
+
+
 PARTS: dict[str, Callable[[], Found]] = {
     "images": images,
     "xla": xla,
@@ -114,6 +127,7 @@ PARTS: dict[str, Callable[[], Found]] = {
     "motion": motion,
     "memory": memory,
 }
+TABLES = {"gpu": gpu, "path": path}  # alone, without a gate
 USUAL = [name for name in PARTS if name not in ("blob", "motion")]
 
 
@@ -131,7 +145,7 @@ def machine() -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"{', '.join(PARTS)}, gpu")
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"{', '.join([*PARTS, *TABLES])}")
     parser.add_argument(
         "--gate", action="store_true", help="exit with 1 if worse than the baseline"
     )
@@ -139,10 +153,8 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write all numbers")
     arguments = parser.parse_args()
     parts = arguments.parts or USUAL
-    if parts == ["gpu"]:
-        from bench_gpu import gpu_bench
-
-        print(f"{machine()}\n\n{gpu_bench()}")
+    if len(parts) == 1 and parts[0] in TABLES:
+        print(f"{machine()}\n\n{TABLES[parts[0]]()}")
         return 0
     if unknown := set(parts) - set(PARTS):
         parser.error(f"there are no parts {', '.join(sorted(unknown))}")

@@ -202,6 +202,7 @@ def losses(
     method: Any = jaxevent.akf,
     start: Any = None,
     names: tuple[str, ...] = OF_AKF,
+    compilers: tuple[str, ...] = ("numba", "xla"),
 ) -> dict[str, Callable[[], object]]:
     """The mean squared error at 8 images, and it with its gradient by these parameters.
 
@@ -220,7 +221,7 @@ def losses(
 
     raw, tasks = {name: start.raw[name] for name in names}, {}
     functions = {"loss": jax.jit(loss), "gradient": jax.jit(jax.value_and_grad(loss))}
-    for compiler in ("numba", "xla"):
+    for compiler in compilers:
         times = frames.t[rows] + 20_000
         images = method.prepare_images(recording, times, start, compiler=compiler)
         for name, function in functions.items():
