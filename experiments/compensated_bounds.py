@@ -22,8 +22,9 @@ Tables:
                 and of those that never were; needs --fitted
     thresholds  fast pans of HDR scenes by sensors whose pixels' thresholds differ more and more:
                 MSE of ln(I + I0) of bright pixels and of all, with and without learning these
-    blurred     pans and objects at 300 px/s, exposures of 50 and 100 ms, as
-                experiments/motion_compensated.py scores them, MSE as part of the smoother's: the
+    blurred     pans and objects at 300 px/s, exposures of 50 and 100 ms, or those of --speeds and
+                --exposures, as experiments/motion_compensated.py scores them, MSE as part of the
+                smoother's: the
                 motion found; the true one as parabolas of time, and as it is, before and after the
                 image is held to the exposures; the mean along the true one; the same of a sensor
                 without noise, dead time or mismatch, and of frames that are sharp; which part of
@@ -81,7 +82,7 @@ MISMATCH, SEEDS = (0.03, 0.1, 0.15), (2, 3)
 FAULTLESS: dict[str, Any] = dict(
     mismatch=0, refractory=0, background_rate=0, hot_fraction=0, read_noise=0
 )
-LONG = (0.05, 0.1), (300.0,)  # s; px/s
+LONG, FAST = (50.0, 100.0), (300.0,)  # ms; px/s
 BLUR_SENSORS: dict[str, dict[str, Any]] = {
     "": {}, "_faultless": FAULTLESS, "_sharp": {"exposure": 5e-4},
 }  # by label  # fmt: skip
@@ -333,12 +334,18 @@ def misses(
     return medians[0], medians[1], medians[2], medians[3]
 
 
-def blurs(folder: Path) -> Iterator[str]:
-    """The table, line by line: steps of the ladder, and a column for each recording."""
+def blurs(
+    folder: Path, exposures: tuple[float, ...] = LONG, speeds: tuple[float, ...] = FAST
+) -> Iterator[str]:
+    """The table, line by line: steps of the ladder, and a column for each recording.
+
+    Exposures are in ms, speeds in px/s.
+    """
+    chosen = tuple(1e-3 * exposure for exposure in exposures), speeds
     cells: dict[str, dict[str, float]] = {}
     common, ends = {}, {}
     for label, other in BLUR_SENSORS.items():
-        for cell, source, recording in blurred(folder, LONG, label, **other):
+        for cell, source, recording in blurred(folder, chosen, label, **other):
             assert isinstance(source, Pan | Objects)
             params = mc.Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4)
             params = params.replace(rho_ref=0.0) if "refractory" in other else params
@@ -355,7 +362,7 @@ def blurs(folder: Path) -> Iterator[str]:
                     errors.setdefault(name + label.replace("_", ", "), []).append(
                         ((shown - truth) ** 2).mean()
                     )
-            head = f"{cell['scene']}, {cell['exposure_ms']:g} ms"
+            head = f"{cell['scene']}, {cell['exposure_ms']:g} ms, {cell['speed']:g} px/s"
             found = {name: float(np.mean(values)) for name, values in errors.items()}
             cells.setdefault(head, {}).update(found)
             if not label:
@@ -542,7 +549,12 @@ def main() -> None:
     parser.add_argument("--tables", nargs="+", default=list(tables), choices=tables)
     parser.add_argument("--out", type=Path, required=True, help="folder for everything made")
     parser.add_argument("--fitted", type=Path, help="params.toml of experiments/ahdr.py, for HDR")
+    parser.add_argument("--exposures", type=float, nargs="+", default=LONG, help="of blurred, ms")
+    parser.add_argument("--speeds", type=float, nargs="+", default=FAST, help="of blurred, px/s")
     arguments = parser.parse_args()
+    tables["blurred"] = functools.partial(
+        blurs, exposures=tuple(arguments.exposures), speeds=tuple(arguments.speeds)
+    )
     for name in ("pans", "bright"):
         tables[name] = functools.partial(tables[name], fitted=arguments.fitted)
     out = arguments.out.absolute()
