@@ -35,7 +35,7 @@ from jaxevent.egomotion.patch_fits import (
     sharpness,
     standard,
 )
-from jaxevent.egomotion.patches import Look, usual_speed
+from jaxevent.egomotion.patches import Look, tried, usual_speed
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording
 
@@ -69,8 +69,8 @@ def choose(recording: Recording, camera: PinholeCamera | None = None) -> Choice:
     seen = [] if speed is None else looks(recording, speed, camera)
     if not seen:
         raise InputError(
-            f"{recording.name}: nothing is seen to move in windows of 1.6 ms to 1.6 s; name the "
-            "model of its motion"
+            f"{recording.name}: nothing is seen to move {tried(recording)}; name the model of its "
+            "motion"
         )
     if camera is None:
         line = (

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.models import MODELS, Model, find_model, in_words
 from jaxevent.egomotion.motion import Motion
-from jaxevent.egomotion.patches import Speed, usual_speed
+from jaxevent.egomotion.patches import Speed, tried, usual_speed
 from jaxevent.egomotion.truth import Known
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator
@@ -156,9 +156,7 @@ class MotionEstimator(Estimator[P]):
             return Suited(params, speed, "", "")
         speed = speed or usual_speed(recording, camera)
         if speed is None:
-            still = (
-                "nothing was seen to move in windows of 1.6 ms to 1.6 s; windows are as by default"
-            )
+            still = f"nothing was seen to move {tried(recording)}; windows are as by default"
             return Suited(params, None, still, "")
         chosen = self.lengths(params, speed)
         chosen = {name: value for name, value in chosen.items() if name not in given}

@@ -87,6 +87,23 @@ def usual_speed(recording: Recording, camera: PinholeCamera | None = None) -> Sp
     return speed
 
 
+def tried(recording: Recording) -> str:
+    """Of which lengths windows are tried, in words: those that fit in the recording."""
+    if len(recording.events) < FEWEST:
+        return "in so few events"
+    fit = [float(length) for length in LENGTHS if _fits(recording, length)]
+    if not fit:
+        return "in so short a recording"
+    ends = sorted({fit[0], fit[-1]})
+    told = [f"{1e3 * one:.2g} ms" if one < 0.1 else f"{one:.2g} s" for one in ends]
+    return f"in windows of {' to '.join(told)}"
+
+
+def _fits(recording: Recording, length: float) -> bool:
+    """Whether the recording is as long as a window of this length (s)."""
+    return 2 * round(5e5 * length) <= recording.stop - recording.start + 1
+
+
 def _measured(recording: Recording, camera: PinholeCamera | None) -> Speed | None:
     if len(recording.events) < FEWEST:
         return None
@@ -144,7 +161,7 @@ def look(
     columns = int((xi[..., 0].max() - corner[0]) // PATCH) + 1
     half, index = round(5e5 * length), recording.events.index
     start, stop = index(middle - half), index(middle + half)
-    if stop - start < FEWEST or 2 * half > recording.stop - recording.start + 1:
+    if stop - start < FEWEST or not _fits(recording, length):
         return None
     events = recording.events[start : min(stop, start + 40 * MOST)]
     at = xi[events.y, events.x] - corner

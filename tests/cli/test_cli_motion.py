@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 import jaxevent
 from jaxevent import cli, egomotion, methods
 from jaxevent.camera import PinholeCamera
+from jaxevent.cli import motion as command
 from jaxevent.egomotion import choice, voting
 from jaxevent.egomotion.comparison import compare
 from jaxevent.egomotion.estimator import MotionEstimator, Suited
@@ -79,15 +80,8 @@ def test_columns_are_exact():
     }
 
 
-@pytest.mark.parametrize("late", [False, True])
-def test_another_method_is_tried_where_the_usual_one_finds_nothing_soon(
-    folder, capsys, monkeypatch, late
-):
-    recording = jaxevent.load(folder / "planar.h5")
-    end = np.array([recording.stop - 1])
-    only_last = Motion.of(Planar, end, np.ones((1, 2)), np.eye(2)[None], np.array([True]))
-    seen = only_last if late else Motion.nothing(Planar)
-    monkeypatch.setattr(Voting, "estimate", lambda *_, **__: seen)
+def test_another_method_is_tried_where_the_usual_one_finds_nothing(folder, capsys, monkeypatch):
+    monkeypatch.setattr(Voting, "estimate", lambda self, *_, model, **__: Motion.nothing(model))
     monkeypatch.setattr(Planar, "otherwise", "planes")
     found, asked = Speed(9.0, 8.0, 10.0, ()), []
 
@@ -99,15 +93,42 @@ def test_another_method_is_tried_where_the_usual_one_finds_nothing_soon(
     words = ["motion", str(folder / "planar.h5"), "--model", "planar", "--out", str(folder / "out")]
     assert cli.main(words) == 0
     printed = capsys.readouterr().out
-    before = " before the recording's middle" if late else ""
-    assert f"voting found no motion{before}, so planes is tried" in printed
+    assert "voting found no motion, so planes is tried" in printed
     # How fast the image moves is said once, the windows of either method.
     assert asked == [None, found]  # measured once
     assert printed.count("moves at 9: px/s") == 1 and "\nplanes: window = 2 s\n" in printed
     assert "planar motion by planes" in printed and "never found" not in printed
-    if not late:  # a method that was asked for stays
-        assert cli.main([*words[:-1], str(folder / "other"), "--method", "voting"]) == 0
-        assert "never found" in capsys.readouterr().out
+    assert cli.main([*words[:-1], str(folder / "other"), "--method", "voting"]) == 0
+    assert "never found" in capsys.readouterr().out  # a method that was asked for stays
+
+
+@pytest.mark.parametrize(
+    ("first", "other", "taken"),
+    [(0.4, 0.0, "voting"), (0.6, 0.0, "planes"), (0.6, None, "voting"), (None, None, "planes")],
+)
+def test_another_method_is_tried_where_the_usual_one_finds_nothing_soon(
+    folder, capsys, monkeypatch, first, other, taken
+):
+    """By when in the recording either finds its only motion, None never."""
+    recording = jaxevent.load(folder / "planar.h5")
+    long = recording.stop - recording.start
+
+    def told(estimator, *_):
+        share = first if estimator.name == "voting" else other
+        if share is None:
+            return Motion.nothing(Planar)
+        t = recording.start + np.array([round(share * long)])
+        return Motion.of(Planar, t, np.ones((1, 2)), np.eye(2)[None], np.array([True]))
+
+    monkeypatch.setattr(command, "_told", told)
+    monkeypatch.setattr(Planar, "otherwise", "planes")
+    suited = Suited(voting.Params(), None, "", "")
+    monkeypatch.setattr(MotionEstimator, "suit", lambda *_, **__: suited)
+    used, seen, _ = command.estimated(voting, recording, None, {"model": Planar}, None, True)
+    assert used.name == taken and seen.valid.any() == (first is not None)
+    late = " before the recording's middle" if first else ""
+    said = f"voting found no motion{late}, so planes is tried"
+    assert (said in capsys.readouterr().out) == (first != 0.4)
 
 
 def test_a_folder_of_everything(folder, capsys):

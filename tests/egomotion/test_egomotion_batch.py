@@ -589,6 +589,9 @@ def test_the_end_of_a_path_is_less_sure():
     heading = np.diagonal(slower.covariance[:, :3, :3], axis1=1, axis2=2)
     np.testing.assert_allclose(heading, np.tile(1e-4 / pace[:, None] ** 2, 3), rtol=1e-6)
     np.testing.assert_allclose(slower.covariance[:, 5, 5], grown)
+    path.D[1, 2] = -8.0  # it stands still after 1 / 8 s
+    stops = path.twist(np.array([0.0, 0.125]))[0]
+    np.testing.assert_array_equal(stops, [[0, 0, 1], [0, 0, 0]])
 
 
 def windows_that(monkeypatch, fit, follow):

@@ -65,9 +65,13 @@ class Path:
         return placing.Motion(*self.polynomials(), f)
 
     def twist(self, tau: float | int | NDArray) -> tuple[NDArray, NDArray]:
-        """Unit heading R' C' and Omega to second order, (times, 3) each, at times tau (s)."""
+        """Unit heading R' C' and Omega to second order, (times, 3) each, at times tau (s).
+
+        Where the camera stands still the heading is 0.
+        """
         T, Omega = self._motion(tau)
-        return T / np.linalg.norm(T, axis=1, keepdims=True), Omega
+        size = np.linalg.norm(T, axis=1, keepdims=True)
+        return T / np.where(size > 0, size, 1), Omega
 
     def pace(self, tau: float | int | NDArray) -> NDArray[np.float64]:
         """|T| at times tau (s), in units of that at 0."""
