@@ -35,7 +35,9 @@ BRIGHT = 1.5  # times the mean rate: what is bright is an edge if it is
 STRIP, SIDES = 16, 3  # of the sensor's width or height a side takes, and how many are reached
 OFTEN = 0.25  # of the windows: of a dense scene little stands out in a strip
 LONG, LARGE = 2.5, 0.1  # so many times as long as wide, or of this share of the map's shorter side
-SCENE = 0.15  # share of the bright that is edges
+# Share of the bright that is edges; where a cell has fewer than so many events more must be, for by
+# chance many cells are bright and lie side by side: 0.37 of 20 blobs and noise, 0.98 of a disc.
+SCENE, SOME, CLEAR = 0.15, 3, 0.5
 # Or share of the scene that is bright: 0.22 of soft textures, 0.05 to 0.1 of stars. Of noise it is
 # 0.21, but of so many events in a cell less; nats per event that its map tells more when it moves.
 TEXTURE, PLENTY, SURE = 0.15, 20, 0.05
@@ -91,11 +93,12 @@ def _looks_like_one(moving: Background) -> float | None:
     Of edges, or of a texture: much of it is bright, by more than chance makes of few events.
     """
     seen = np.kron(moving.calm.any(0), np.ones((CELL // FINE, CELL // FINE))) > 0
-    if _of_edges(np.where(seen, moving.rate, 0), moving.mean) >= SCENE:
+    events = moving.mean * FINE**2 * moving.duration
+    edges = _of_edges(np.where(seen, moving.rate, 0), moving.mean)
+    if edges >= (SCENE if events >= SOME else CLEAR):
         return 0.0
     bright = float((moving.rate[seen] > BRIGHT * moving.mean).mean())
-    told = moving.mean * FINE**2 * moving.duration >= PLENTY
-    return SURE if told and bright > TEXTURE else None
+    return SURE if events >= PLENTY and bright > TEXTURE else None
 
 
 def _gain(stream: Stream, moving: Background, w: float | int) -> float:
