@@ -177,6 +177,11 @@ def run(
             "the camera moves, and no blob was found that goes its own way; jaxevent motion tells "
             "how the camera moves, --seed X,Y,SIZE says where a blob is"
         )
+    elif found is not None and found.full:
+        print(
+            "no blob was found, and most of the image changes: if the camera moves, jaxevent "
+            "motion tells how; --seed X,Y,SIZE says where a blob is"
+        )
     else:
         print("no blob was found; say where one is with --seed X,Y,SIZE, or try --detect")
     if written.left_out:

@@ -7,7 +7,12 @@ import pytest
 
 from jaxevent import blob
 from jaxevent.blob.finding.background import Background
-from jaxevent.blob.finding.moving import goes_own_way, measure_moving_background, pauses
+from jaxevent.blob.finding.moving import (
+    _looks_like_one,
+    goes_own_way,
+    measure_moving_background,
+    pauses,
+)
 from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.scene import SceneMotion, measure_scene_motion
 from jaxevent.blob.finding.stream import Stream
@@ -146,6 +151,18 @@ def test_pauses_are_told_by_most_of_the_sensor():
     np.testing.assert_allclose(told, [(0, 2), (2, 4.4), (4.4, 6.4)])
     # Nor is there one where most of the sensor never sees much.
     assert len(pauses(dataclasses.replace(background, level=level / 4))) == 1
+
+
+def test_noise_of_few_events_is_no_scene():
+    """Bright cells lie side by side by chance; those of a scene lie along its lines."""
+    rng = np.random.default_rng(0)
+    lines = np.where(np.arange(180) % 12 == 0, 1.0, 0.0) * np.ones((320, 1))
+    for mean in (0.5, 1.0, 2.0):
+        for rate, scene in ((np.full(lines.shape, mean), False), (12 * mean * lines, True)):
+            rate = rng.poisson(rate) / 16  # px, for 1 s
+            seen = np.ones((1, 80, 45), bool)
+            one = Background(rate, seen, seen[0], np.ones(1), 1.0)
+            assert (_looks_like_one(one) is not None) == scene
 
 
 @pytest.mark.slow

@@ -273,10 +273,15 @@ def test_nothing_found_is_an_empty_table(tmp_path, capsys, monkeypatch):
     assert len(images) > 40
     with Image.open(out / "tracks.png") as figure:
         assert figure.width > 800
-    # Where the camera moves it is said.
-    monkeypatch.setattr(blob, "find", lambda one, **_: blob.Found((), (), 0, 1.0, one, True))
-    assert cli.main([*map(str, argv[:-1]), str(tmp_path / "a.csv")]) == 0
-    assert "the camera moves, and no blob was found" in capsys.readouterr().out
+    # Where the camera moves it is said, and where it may.
+    for name, given, told in (
+        ("a.csv", {"camera_moves": True}, "the camera moves, and no blob was found"),
+        ("b.csv", {"full": True}, "no blob was found, and most of the image changes"),
+    ):
+        nothing = functools.partial(blob.Found, (), (), 0, 1.0, **given)
+        monkeypatch.setattr(blob, "find", lambda one, nothing=nothing, **_: nothing(one))
+        assert cli.main([*map(str, argv[:-1]), str(tmp_path / name)]) == 0
+        assert told in capsys.readouterr().out
 
 
 @pytest.mark.slow

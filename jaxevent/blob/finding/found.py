@@ -43,6 +43,7 @@ class Found:
         recording: Whose events these are.
         camera_moves: Whether the background was taken for a scene that moves past the camera.
         lamps: How many things that flicker with the mains were left out.
+        full: Whether most of the sensor sees events most of the time, whatever makes them.
     """
 
     paths: tuple[Path, ...]
@@ -52,6 +53,7 @@ class Found:
     recording: Recording
     camera_moves: bool = False
     lamps: int = 0
+    full: bool = False
 
     def __len__(self) -> int:
         return len(self.paths)

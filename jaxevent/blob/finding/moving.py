@@ -36,8 +36,8 @@ STRIP, SIDES = 16, 3  # of the sensor's width or height a side takes, and how ma
 OFTEN = 0.25  # of the windows: of a dense scene little stands out in a strip
 LONG, LARGE = 2.5, 0.1  # so many times as long as wide, or of this share of the map's shorter side
 # Share of the bright that is edges; where a cell has fewer than so many events more must be, for by
-# chance many cells are bright and lie side by side: 0.37 of 20 blobs and noise, 0.98 of a disc.
-SCENE, SOME, CLEAR = 0.15, 3, 0.5
+# chance many cells are bright and lie side by side: 0.48 of 20 blobs and noise, 0.98 of a disc.
+SCENE, SOME, CLEAR = 0.15, 3, 0.7
 # Or share of the scene that is bright: 0.22 of soft textures, 0.05 to 0.1 of stars. Of noise it is
 # 0.21, but of so many events in a cell less; nats per event that its map tells more when it moves.
 TEXTURE, PLENTY, SURE = 0.15, 20, 0.05
@@ -51,6 +51,11 @@ STEADY = 0.2  # sizes by which a target may leave its velocity's way in a window
 STEP = 0.01  # s before and after, between which the scene's motion at a target is told
 
 
+def is_full(background: Background) -> bool:
+    """Whether most of the sensor sees events in a usual slice."""
+    return float(np.quantile(background.level, USUAL)) > DENSE
+
+
 def pauses(background: Background) -> list[tuple[float, float]]:
     """Spans (s) in which most of a scene is quiet, and those between them; the whole, if none is.
 
@@ -59,7 +64,7 @@ def pauses(background: Background) -> list[tuple[float, float]]:
     most = float(np.quantile(background.level, USUAL))
     quiet = ndimage.binary_opening(background.level < QUIET * most, np.ones(PAUSE))
     moves = ndimage.binary_opening(~quiet, np.ones(PAUSE))
-    first = np.flatnonzero(np.diff(moves)) + 1 if most > DENSE else []
+    first = np.flatnonzero(np.diff(moves)) + 1 if is_full(background) else []
     edges = np.array([0, *first, SLICES]) / SLICES * background.duration
     return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 

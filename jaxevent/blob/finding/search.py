@@ -16,7 +16,7 @@ from jaxevent.blob.finding.detection import CONTACT, Scale, touching
 from jaxevent.blob.finding.found import Found, Pass
 from jaxevent.blob.finding.lamps import without_lamps
 from jaxevent.blob.finding.links import Links
-from jaxevent.blob.finding.moving import find_moving_background, goes_own_way, pauses
+from jaxevent.blob.finding.moving import find_moving_background, goes_own_way, is_full, pauses
 from jaxevent.blob.finding.parts import join_parts
 from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.polarity import prefer_sharper
@@ -67,7 +67,8 @@ def find(
         return Found((), (), 0, 0.0, recording)
     found: list[Path] = []
     passes: list[Pass] = []
-    hot, events, moves = np.zeros((stream.height, stream.width), bool), 0.0, False
+    hot, events = np.zeros((stream.height, stream.width), bool), 0.0
+    moves = full = False
     parts = _parts(stream, progress)
     for one in parts:
         new, done = _search(one, progress)
@@ -76,13 +77,15 @@ def find(
         hot |= one.stream.hot
         events += one.background.mean * stream.width * stream.height * one.stream.duration
         moves |= one.background.scene is not None
+        full |= is_full(one.background)
     if len(parts) > 1:
         found = _stitch(found, (stream.width, stream.height))
     found, lamps = without_lamps(found, recording, hot)
     found = prefer_sharper(found, recording, hot)
     found.sort(key=lambda path: (path.begin, path.p[0].tolist()))
     rate = events / stream.duration
-    return Found(tuple(found), tuple(passes), int(hot.sum()), rate, recording, moves, lamps)
+    number = int(hot.sum())
+    return Found(tuple(found), tuple(passes), number, rate, recording, moves, lamps, full)
 
 
 class _Part(NamedTuple):
