@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import imageio_ffmpeg
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from jaxevent import cli
@@ -26,6 +26,7 @@ def fails(capsys, argv: list, *named: object) -> None:
 def decoded(path: Path, height: int, width: int, pixels: str = "gray") -> tuple[NDArray, str]:
     """The grey images (T, H, W) of a video, in "rgb24" (T, H, W, 3), and what ffmpeg says of it."""
     # Not by the reader of imageio, which forks; JAX warns that this may deadlock.
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
     program = imageio_ffmpeg.get_ffmpeg_exe()
     decode = [program, "-i", path, "-f", "rawvideo", "-pix_fmt", pixels, "pipe:1"]
     done = subprocess.run(decode, capture_output=True, check=True)
