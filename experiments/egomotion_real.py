@@ -154,10 +154,17 @@ def nearest_rotation(
     return Omega, rms[0], rms[1]
 
 
+def fitted(recording: jaxevent.Recording, frames: bool) -> egomotion.Motion:
+    """General motion without settings, to events alone if told so."""
+    params = batch.Params.of({"frames": frames})
+    suited = batch.suit(recording, params, camera=recording.camera).params
+    return batch.estimate(recording, suited)
+
+
 def evbench(data: Path, frames: bool = True) -> Rows:
     recording = jaxevent.load(data / "evbench_seq3_calibrated.npz")
     twist = np.asarray(recording.extra["camera_twist_pnp"])
-    motion = batch.estimate(recording, batch.Params.of({"frames": frames}))
+    motion = fitted(recording, frames)
     mean, covariance = motion.mean[motion.valid], motion.covariance[motion.valid]
     turn = np.linalg.norm(mean[:, 3:] - twist[3:], axis=1) / np.linalg.norm(twist[3:])
     heading = angle(mean[:, :3], np.broadcast_to(twist[:3], mean[:, :3].shape))
@@ -214,7 +221,7 @@ def slider(data: Path, frames: bool = True) -> Rows:
             "lost": int(lost.sum()),
         }
     )
-    motion = batch.estimate(recording[:3.1], batch.Params.of({"frames": frames}))
+    motion = fitted(recording[:3.1], frames)
     late = 1e-3 * offset(recording)
     for first, last in ((0.0, 1.0), (1.0, 2.0), (2.0, 3.1)):
         here = motion.valid & (motion.t >= 1e6 * first) & (motion.t < 1e6 * last)
@@ -243,7 +250,7 @@ def slider(data: Path, frames: bool = True) -> Rows:
 
 def stop(data: Path, frames: bool = True) -> Rows:
     recording = jaxevent.load(data / "slider_depth.zip")
-    motion = batch.estimate(recording[2.9:], batch.Params.of({"frames": frames}))
+    motion = fitted(recording[2.9:], frames)
     sigma = np.degrees(np.sqrt(np.trace(motion.covariance[:, :3, :3], axis1=1, axis2=2)))
     rows: Rows = []
     for name, first, last, along in (
