@@ -170,20 +170,7 @@ def run(
     texts = {"params.toml": toml.parameters(tracks.params) + "\n"}
     written = output.write(tracks, show_progress(), texts, tracker.name)
     count = recording.events.index(tracks.stop) - recording.events.index(tracks.start)
-    if len(tracks):
-        print("\n".join(written.summary()))
-    elif found is not None and found.camera_moves:
-        print(
-            "the camera moves, and no blob was found that goes its own way; jaxevent motion tells "
-            "how the camera moves, --seed X,Y,SIZE says where a blob is"
-        )
-    elif found is not None and found.full:
-        print(
-            "no blob was found, and most of the image changes: if the camera moves, jaxevent "
-            "motion tells how; --seed X,Y,SIZE says where a blob is"
-        )
-    else:
-        print("no blob was found; say where one is with --seed X,Y,SIZE, or try --detect")
+    print("\n".join(written.summary()) if len(tracks) else _nothing(found))
     if written.left_out:
         print("\n" + "\n".join(written.left_out))
     how = ", ".join(written.files) + f" in {out}" if not out.suffix else str(out)
@@ -192,3 +179,18 @@ def run(
         f"\n{how}: {len(tracks):,} {plural('track', len(tracks))}, {count:,} events in "
         f"{seconds:.2f} s, {count / seconds:,.0f} events/s{slow}"
     )
+
+
+def _nothing(found: Any) -> str:
+    """What to say where no blob was tracked, of what was found without settings, or None."""
+    if found is not None and found.camera_moves:
+        return (
+            "the camera moves, and no blob was found that goes its own way; jaxevent motion tells "
+            "how the camera moves, --seed X,Y,SIZE says where a blob is"
+        )
+    if found is not None and found.full:
+        return (
+            "no blob was found, and most of the image changes: if the camera moves, jaxevent "
+            "motion tells how; --seed X,Y,SIZE says where a blob is"
+        )
+    return "no blob was found; say where one is with --seed X,Y,SIZE, or try --detect"
