@@ -230,6 +230,20 @@ def losses(
     return tasks
 
 
+def read(path: Path, in_memory: bool) -> Recording:
+    """As a process that reads the file for the first time."""
+    search_heaps.cache_clear()
+    return load(path, in_memory=in_memory)
+
+
+def images(given: Recording | Path, compiler: Any, rate: int) -> None:
+    """The complete path of a recording in memory, or in a file."""
+    given = read(given, in_memory=False) if isinstance(given, Path) else given
+    times = np.arange(given.start, given.stop, 1_000_000 // rate)
+    for _ in jaxevent.akf.estimate(given, compiler=compiler).batches(times):
+        pass
+
+
 def images_bench(recording: Recording, path: Path) -> tuple[dict[str, float], dict[str, float]]:
     """The complete path by both compilers, losses and gradients.
 
@@ -243,25 +257,14 @@ def images_bench(recording: Recording, path: Path) -> tuple[dict[str, float], di
     check_program(recording, grey)
     large = stream(5_000_000, 2.0, 1, (1280, 720))
 
-    def read(in_memory: bool) -> Recording:
-        search_heaps.cache_clear()  # as a process that reads the file for the first time
-        return load(path, in_memory=in_memory)
-
-    def images(given: Recording | None, compiler: Any, rate: int) -> None:
-        given = read(False) if given is None else given
-        times = np.arange(given.start, given.stop, 1_000_000 // rate)
-        video = jaxevent.akf.estimate(given, compiler=compiler)
-        for _ in video.batches(times):
-            pass
-
     tasks: dict[str, Callable[[], object]] = {
         "program": lambda: program(e.t, e.x, e.y, e.p, grey, frames.t, *NUMBERS),
-        "reading": lambda: read(True),
+        "reading": lambda: read(path, in_memory=True),
         "numba memory": lambda: images(recording, "numba", 100),
         **losses(recording),
     }
     for compiler in ("numba", "xla"):
-        for name, given, rate in (("100", None, 100), ("500", None, 500), ("large", large, 25)):
+        for name, given, rate in (("100", path, 100), ("500", path, 500), ("large", large, 25)):
             if compiler == "numba" or name == "100":
                 tasks[f"{compiler} {name}"] = functools.partial(images, given, compiler, rate)
     least, n = least_cpu(tasks), len(e) / 1e6

@@ -16,12 +16,10 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from bench_images import NUMBERS, OF_AKF, losses, program, stream
+from bench_images import NUMBERS, OF_AKF, images, losses, program, stream
 from timing import least_cpu
 
-import jaxevent
 from jaxevent.io import load, save
-from jaxevent.io.hdf5_files import search_heaps
 from jaxevent.reconstruction.fused import bands, passes
 from jaxevent.recording import Events
 
@@ -46,14 +44,6 @@ def timed(parts: Seconds, **functions: tuple[Any, str]) -> Iterator[None]:
 
             stack.enter_context(mock.patch.object(owner, method, outer))
         yield
-
-
-def images(path: Path, rate: float) -> None:
-    search_heaps.cache_clear()  # as a process that reads the file for the first time
-    recording = load(path, in_memory=False)
-    times = np.arange(recording.start, recording.stop, round(1e6 / rate))
-    for _ in jaxevent.akf.estimate(recording).batches(times):
-        pass
 
 
 def least_parts(run: Callable[[], object], columns: type) -> tuple[float, float, Seconds]:
@@ -84,8 +74,8 @@ def path_bench() -> str:
         path = Path(folder) / "bench.h5"
         save(recording, path)
         kind = type(load(path, in_memory=False).events)
-        cpu, clock, parts = least_parts(functools.partial(images, path, 100), kind)
-        _, _, few = least_parts(functools.partial(images, path, 1), kind)
+        cpu, clock, parts = least_parts(functools.partial(images, path, None, 100), kind)
+        _, _, few = least_parts(functools.partial(images, path, None, 1), kind)
     many = parts["passes"] - few["passes"]
     rows = {
         "passes over the events, 2 images": few["passes"],

@@ -24,14 +24,13 @@ Tables:
                 MSE of ln(I + I0) of bright pixels and of all, with and without learning these
     blurred     pans and objects at 300 px/s, exposures of 50 and 100 ms, or those of --speeds and
                 --exposures, as experiments/motion_compensated.py scores them, MSE as part of the
-                smoother's: the
-                motion found; the true one as parabolas of time, and as it is, before and after the
-                image is held to the exposures; the mean along the true one; the same of a sensor
-                without noise, dead time or mismatch, and of frames that are sharp; which part of
-                the smoother's error is that of all instants along the true trajectories; how far
-                points move to the frames next to them, and by how much the motion found misses
-                (px, medians): by `mc`, by images between the frames alone, and by these without
-                their mean over time, of which events tell all
+                smoother's: the motion found; the true one as parabolas of time, and as it is,
+                before and after the image is held to the exposures; the mean along the true one;
+                the same of a sensor without noise, dead time or mismatch, and of frames that are
+                sharp; which part of the smoother's error is that of all instants along the true
+                trajectories; how far points move to the frames next to them, and by how much the
+                motion found misses (px, medians): by `mc`, by images between the frames alone, and
+                by these without their mean over time, of which events tell all
 
 Recordings are simulated into the folder. Sensors' common thresholds are given, nothing is fitted
 but with --fitted.

@@ -18,6 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Int
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from jaxevent.reconstruction.clock import Clock, Timing, rates
 from jaxevent.reconstruction.features import (
@@ -401,10 +402,8 @@ class DeviceWindows(WindowedRecording):
         after = before.copy()
         after.frames = max(used.stop, 1)
         note_latest(self._stream(events.own), after.last)
-        image = np.pad(after.last.reshape(self.recording.height, self.recording.width), 1, "edge")
-        rows = np.maximum(np.maximum(image[:-2], image[1:-1]), image[2:])
-        near = np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
-        after.near = np.pad(near, 1).ravel()
+        image = after.last.reshape(self.recording.height, self.recording.width)
+        after.near = np.pad(ndimage.maximum_filter(image, 3, mode="nearest"), 1).ravel()
         return after
 
 
