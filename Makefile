@@ -1,4 +1,4 @@
-.PHONY: demo test suite quick lint docs bench clean
+.PHONY: demo test suite quick lint docs bench gpu clean
 .DELETE_ON_ERROR:
 
 # Python keeps the bytecode of what is imported, whatever the environment says: nothing else is
@@ -46,6 +46,13 @@ docs: .venv/docs.stamp
 bench: .venv/bench.stamp
 	$(bin)/python experiments/bench.py
 
+# All tests, then the table of speed, with an NVIDIA GPU.
+gpu: .venv/gpu.stamp
+	@JAX_PLATFORMS=cuda $(bin)/python -c 'import jax; jax.devices()' 2>/dev/null || \
+	    { echo "JAX finds no NVIDIA GPU here: look at what nvidia-smi says" >&2; exit 1; }
+	$(suite)
+	$(bin)/python experiments/bench.py gpu
+
 clean:
 	rm -rf .venv build dist site jaxevent-demo .pytest_cache .hypothesis .ruff_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
@@ -67,6 +74,11 @@ clean:
 
 .venv/bench.stamp: extras := bench,plot,video
 .venv/bench.stamp: pyproject.toml constraints.txt | .venv/made.stamp
+	$(install)
+	@touch $@
+
+.venv/gpu.stamp: extras := test,gpu
+.venv/gpu.stamp: pyproject.toml constraints.txt | .venv/made.stamp
 	$(install)
 	@touch $@
 

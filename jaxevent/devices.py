@@ -66,9 +66,14 @@ def full_precision(function: Callable[Q, T]) -> Callable[Q, T]:
     return precise
 
 
+def accelerated() -> bool:
+    """Whether JAX computes on a GPU, or another device than the CPU, unless told otherwise."""
+    return jax.default_backend() != "cpu"
+
+
 def at_once(steps: int) -> int:
     """How many steps of a loop to compile into one: a GPU starts programs anew for each step."""
-    return 1 if jax.default_backend() == "cpu" else steps
+    return steps if accelerated() else 1
 
 
 def local() -> list[Any]:

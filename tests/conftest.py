@@ -17,6 +17,8 @@ os.environ.setdefault(
     "--xla_cpu_parallel_codegen_split_count=1 --xla_gpu_deterministic_ops=true"
     + " --xla_cpu_use_fusion_emitters=false" * metadata.version("jaxlib").startswith("0.10."),
 )
+# By default each process takes three quarters of a GPU's memory for itself.
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 # What one test, worker or command has compiled, the others take from the user's cache folder, and
 # so does the next run. The environment reaches the commands that tests start.
 os.environ.setdefault(

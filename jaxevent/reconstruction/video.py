@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.devices import accelerated
 from jaxevent.errors import InputError, require
 from jaxevent.estimator import Estimate
 from jaxevent.progress import bar
@@ -217,7 +218,7 @@ def _windows_of(
     recording: Recording, timing: Timing, devices: int, **options: Any
 ) -> WindowedRecording:
     """A recording in windows: prepared on a GPU where images are made on one, else on the host."""
-    if jax.default_backend() != "cpu" and devices < 2:
+    if accelerated() and devices < 2:
         from jaxevent.reconstruction.on_device import DeviceWindows  # others need not load it
 
         if DeviceWindows.serves(timing):
@@ -252,7 +253,7 @@ class Video(ImageSequence[P]):
         super().__init__(estimator, recording, params, progress=progress)
         self._devices, self._factors = devices, factors
         self._mesh = pixel_mesh(devices)
-        self._batch = BATCH if jax.default_backend() == "cpu" else DEVICE_BATCH
+        self._batch = DEVICE_BATCH if accelerated() else BATCH
         self._windows = _windows_of(
             recording,
             Timing.of(params),

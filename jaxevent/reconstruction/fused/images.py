@@ -21,7 +21,7 @@ from jaxtyping import Int
 from numpy.typing import NDArray
 
 from jaxevent import dispatch
-from jaxevent.devices import full_precision
+from jaxevent.devices import accelerated, full_precision
 from jaxevent.estimator import Estimate
 from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.reconstruction.clock import Timing
@@ -158,7 +158,7 @@ def prepared_by_kernel(
 
     See `Filter.prepare_images`. Raises `InputError` where numba is asked for what it cannot do.
     """
-    elsewhere = compiler is None and jax.default_backend() != "cpu"
+    elsewhere = compiler is None and accelerated()
     if elsewhere or not (wants_kernel(compiler, jax.local_devices()) and IN_TURN):
         return None
     if "rho_ref" in params.followed:
