@@ -1,6 +1,7 @@
 """General motion of simulated scenes: the batch estimator's errors, scene by scene.
 
     python experiments/egomotion_general.py --out general [--seeds 100 101 ...] [--scenes wall ...]
+    python experiments/egomotion_general.py --out walls --scenes wall --motions varying --seeds 820
     python experiments/egomotion_general.py --out whole --seconds 1.2 --seeds 210 --scenes texture
 
 Scenes are those of `simulate.motion_scene`, 240x180, f = 200 px, 0.5 s of an ideal camera, constant
@@ -96,6 +97,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for the tables")
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(196, 206)))
     parser.add_argument("--scenes", nargs="+", default=["wall", "shapes", "texture"])
+    parser.add_argument("--motions", nargs="+", default=["constant", "varying"])
     parser.add_argument("--seconds", type=float, help="of whole recordings, instead of windows")
     parser.add_argument("--uneven", action="store_true", help="a sensor with uneven thresholds")
     parser.add_argument("--mismatch", type=float, default=UNEVEN.mismatch, help="of uneven ones")
@@ -118,7 +120,7 @@ def main() -> None:
     done = {(row["scene"], row["seed"]) for row in rows}
     for seed in arguments.seeds:
         for scene in arguments.scenes:
-            for motion in ("constant", "varying"):
+            for motion in arguments.motions:
                 if (f"{scene} {motion}", seed) in done:
                     continue
                 rows.append(window(scene, motion, seed, params, sensor))

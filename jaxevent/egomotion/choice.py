@@ -99,9 +99,9 @@ def choose(recording: Recording, camera: PinholeCamera | None = None) -> Choice:
     return decide(z, lambda: told(recording, camera, guesses[:: -(-len(guesses) // WINDOWS)]))
 
 
-def decide(z: dict[tuple[str, str], float], longer: Callable[[], list[float]]) -> Choice:
-    """The choice by z of patches and, where rotation is the simplest left, those of `longer`
-    windows, of general motion over rotation."""
+def decide(z: dict[tuple[str, str], float], longer: Callable[[], float | None]) -> Choice:
+    """The choice by z of patches and, where rotation is the simplest left, that of `longer`
+    windows, of general motion over rotation, None where these hold too few events."""
     lines = [
         _line(one, other, value, Z_DEPTH if one == General.name else Z)
         for (one, other), value in z.items()
@@ -110,13 +110,12 @@ def decide(z: dict[tuple[str, str], float], longer: Callable[[], list[float]]) -
     simple = Rotation if z["rotation", "planar"] > -Z else Planar
     chosen, sure = General if z["general", simple.name] > Z_DEPTH else simple, True
     if chosen is Rotation:
-        moves = longer()
-        value = float(sum(moves) / np.sqrt(max(len(moves), 1)))
-        if moves:
+        value = longer()
+        if value is not None:
             z = z | {("general", "rotation"): value}
             lines.append(f"in longer windows {_line('general', 'rotation', value, Z)}")
-        chosen = General if value > Z else Rotation
-        sure = chosen is General or (bool(moves) and value < UNSURE)
+        chosen = General if value is not None and value > Z else Rotation
+        sure = chosen is General or (value is not None and value < UNSURE)
     lines.append(f"chosen: {chosen.title}")
     if not sure:
         lines.append(

@@ -33,16 +33,40 @@ class Guess(NamedTuple):
     Omega: NDArray[np.float64]  # rad/s
 
 
-def told(recording: Recording, camera: PinholeCamera, guesses: list[Guess]) -> list[float]:
+class Told(NamedTuple):
+    """z of a translation in a window, and which events it holds, the first and after the last."""
+
+    z: float
+    first: int
+    last: int
+
+
+def told(recording: Recording, camera: PinholeCamera, guesses: list[Guess]) -> float | None:
     """z of a translation, of the windows about some times: above 3 it is seen.
 
-    Windows that hold too few events are left out.
+    None where all windows hold too few events.
     """
     found = [_told(recording, camera, guess) for guess in guesses]
-    return [z for z in found if z is not None]
+    return together([one for one in found if one is not None])
 
 
-def _told(recording: Recording, camera: PinholeCamera, guess: Guess) -> float | None:
+def together(windows: list[Told]) -> float | None:
+    """z of some windows, None of none.
+
+    Each is standard normal where nothing moves; two windows that share events correlate by the
+    number of these over the geometric mean of their own: windows of a recording that is shorter
+    than they are hold the same events, and two of them tell no more than one.
+    """
+    if not windows:
+        return None
+    z, first, last = np.array(windows, np.float64).T
+    shared = np.minimum(last, last[:, None]) - np.maximum(first, first[:, None])
+    own = np.sqrt(last - first)
+    alike = np.maximum(shared, 0) / (own * own[:, None])
+    return float(z.sum() / np.sqrt(alike.sum()))
+
+
+def _told(recording: Recording, camera: PinholeCamera, guess: Guess) -> Told | None:
     half = min(max(WAY / 2 / guess.speed, SHORTEST), LONGEST)
     centre = guess.centre
     windows = Windows(recording, Params.of({"half_window": half}), camera)
@@ -64,4 +88,4 @@ def _told(recording: Recording, camera: PinholeCamera, guess: Guess) -> float | 
     ]
     moving[0] = Path(moving[0].O, moving[0].D, depths(moving[0], trial.tracks))
     fits = side_by_side(lambda path: trial.fit(path, moves=path is not still), [still, *moving])
-    return max(trial.z(fits[0], fit) for fit in fits[1:])
+    return Told(max(trial.z(fits[0], fit) for fit in fits[1:]), first, last)
