@@ -222,11 +222,29 @@ def turning(rng: np.random.Generator) -> Scene:
     return Scene(draw, going(hub[None], np.zeros((1, 2))), radius, 1.0)
 
 
+def circling(rng: np.random.Generator) -> Scene:
+    """Eight small discs that go round on one circle, far enough apart to be eight."""
+    hub, radius = rng.uniform((90, 75), (150, 105)), rng.uniform(35, 50)
+    turn, size = rng.uniform(40, 70) * rng.choice([-1, 1]), rng.uniform(3, 5)
+
+    def places(t: NDArray) -> NDArray:
+        angle = turn * np.asarray(t, float)[..., None] + np.arange(8) * np.pi / 4
+        return hub + radius * np.stack([np.cos(angle), np.sin(angle)], -1)
+
+    def draw(t: float) -> Image:
+        image = grey(0.5)
+        for p in places(np.array(t)):
+            disc(image, p, size, 0.1)
+        return image
+
+    return Scene(draw, places, 6, 0.5)
+
+
 SCENES: dict[str, Callable[[np.random.Generator], Scene]] = {
     "propeller": propeller, "walker": lambda rng: walkers(rng, 1), "two walkers": walkers,
     "car": car, "behind a bar": behind_a_bar, "five birds": birds, "hot columns": hot_columns,
     "pan, nothing else": pan, "shaking camera": shaking, "disc before a pan": before_a_pan,
-    "turning disc": turning,
+    "turning disc": turning, "circling discs": circling,
 }  # fmt: skip
 
 

@@ -87,7 +87,7 @@ def find_moving_background(
         gain = _looks_like_one(moving)
         if gain is None:  # whatever the window
             return None
-        if scene.travel >= MOVED and _gain(stream, moving, window) >= gain:
+        if scene.travel >= MOVED and map_gain(stream, moving, window) >= gain:
             return moving
     return None
 
@@ -106,7 +106,7 @@ def _looks_like_one(moving: Background) -> float | None:
     return SURE if events >= PLENTY and bright > TEXTURE else None
 
 
-def _gain(stream: Stream, moving: Background, w: float | int) -> float:
+def map_gain(stream: Stream, moving: Background, w: float | int) -> float:
     """Nats per event that a map tells more as it moves than one at rest, in most windows of w s."""
     scene = moving.scene
     assert scene is not None

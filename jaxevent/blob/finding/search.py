@@ -23,6 +23,7 @@ from jaxevent.blob.finding.polarity import prefer_sharper
 from jaxevent.blob.finding.scale import Choice, choose_scale
 from jaxevent.blob.finding.stream import Stream
 from jaxevent.blob.finding.targets import FAINT, GATE, HOLD, REACH, SEEN, larger
+from jaxevent.blob.finding.turning import join_turning
 from jaxevent.blob.seeds import span_of
 from jaxevent.progress import stage
 from jaxevent.recording import Recording
@@ -154,7 +155,8 @@ def _search(part: _Part, progress: bool | None) -> tuple[list[Path], list[Pass]]
         found += new
         stitched = [one for one in new if all(one is not other for other in near)]
         stream = stream.without([*near, *stitched], 2 * GATE)
-    return found, passes
+    with stage("find: what turns in its place", progress):
+        return join_turning(found, part.stream, background), passes
 
 
 def _lasting(path: Path, duration: float | int) -> bool:
