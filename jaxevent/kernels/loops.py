@@ -39,7 +39,7 @@ REAL = np.{real}
 I, F = types.int64, types.{real}
 CELLS, WHOLE, NUMBERS = types.CPointer(F), types.CPointer(I), types.CPointer(types.float64)
 HOW = {{"error_model": "numpy", "fastmath": {{"contract"}}}}
-LOOP = {{"error_model": "numpy", "fastmath": {{"contract", "reassoc", "nsz"}}}}
+LOOP = {{"error_model": "numpy", "fastmath": {{"contract", "reassoc", "nsz", "arcp"}}}}
 {constants}
 
 
