@@ -176,3 +176,15 @@ def test_targets_that_go_together_are_no_scene():
     recording, _ = before_noise(targets)
     found = blob.find(recording, progress=False)
     assert not found.camera_moves and len(found) > 15
+
+
+def test_stars_side_by_side_are_no_edges():
+    rate = np.full((180, 320), 10.0)
+    one = Background(rate, np.ones((1, 45, 80)) > 0, rate < 0, np.ones(1), 1.0)
+    rate[10::20, 10::24] = rate[10::20, 12::24] = 200.0  # each of two cells, 8 px apart
+    rate[10::20, 11::24] = 30.0  # and some of both between them
+    assert _looks_like_one(one) is None
+    rate[10::20, 10::24] = rate[10::20, 16::24] = 200.0  # 24 px long
+    for k in range(12, 16):
+        rate[10::20, k::24] = 200.0
+    assert _looks_like_one(one) is not None

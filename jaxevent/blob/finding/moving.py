@@ -35,6 +35,9 @@ BRIGHT = 1.5  # times the mean rate: what is bright is an edge if it is
 STRIP, SIDES = 16, 3  # of the sensor's width or height a side takes, and how many are reached
 OFTEN = 0.25  # of the windows: of a dense scene little stands out in a strip
 LONG, LARGE = 2.5, 0.1  # so many times as long as wide, or of this share of the map's shorter side
+# Cells: what is long is no less large, for two stars side by side are 1 to 1.5. Share of edges of 43
+# stars up to 0.23 without, 0 with it; of nine real scenes 0.42 to 0.99 without, 0.41 to 0.99.
+PAIR = 1.5
 # Share of the bright that is edges; where a cell has fewer than so many events more must be, for by
 # chance many cells are bright and lie side by side: 0.48 of 20 blobs and noise, 0.98 of a disc.
 SCENE, SOME, CLEAR = 0.15, 3, 0.7
@@ -158,8 +161,9 @@ def _of_edges(rate: NDArray[np.float64], mean: float) -> float:
     mx, my = total(x), total(y)
     xx, yy, xy = total(x * x) - mx**2, total(y * y) - my**2, total(x * y) - mx * my
     half, cross = (xx + yy) / 2 + 1 / 12, np.hypot((xx - yy) / 2, xy)
-    long = np.sqrt(half + cross) > LONG * np.sqrt(half - cross)
-    large = np.sqrt(half + cross) > LARGE * min(rate.shape)
+    size = np.sqrt(half + cross)
+    long = (size > LONG * np.sqrt(half - cross)) & (size > PAIR)
+    large = size > LARGE * min(rate.shape)
     return float(mass[long | large].sum() / max(mass.sum(), 1e-300))
 
 
