@@ -35,8 +35,8 @@ BRIGHT = 1.5  # times the mean rate: what is bright is an edge if it is
 STRIP, SIDES = 16, 3  # of the sensor's width or height a side takes, and how many are reached
 OFTEN = 0.25  # of the windows: of a dense scene little stands out in a strip
 LONG, LARGE = 2.5, 0.1  # so many times as long as wide, or of this share of the map's shorter side
-# Cells: what is long is no less large, for two stars side by side are 1 to 1.5. Share of edges of 43
-# stars up to 0.23 without, 0 with it; of nine real scenes 0.42 to 0.99 without, 0.41 to 0.99.
+# Cells: what is long is no less large, for two stars side by side are 1 to 1.5. Share of edges of
+# 43 stars up to 0.23 without, 0 with it; of nine real scenes 0.42 to 0.99 without, 0.41 to 0.99.
 PAIR = 1.5
 # Share of the bright that is edges; where a cell has fewer than so many events more must be, for by
 # chance many cells are bright and lie side by side: 0.48 of 20 blobs and noise, 0.98 of a disc.
