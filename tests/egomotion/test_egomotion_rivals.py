@@ -104,6 +104,40 @@ def test_motions_before_a_plane_that_cost_about_the_same_go_on(monkeypatch):
     assert inspect.unwrap(Windows.rivals)(windows, 0) == found[:2]
 
 
+@pytest.mark.parametrize(("z", "cost"), [(1.9, 1.2), (9.0, 1.2), (1.9, 1.6)])
+def test_a_rival_that_is_not_refuted_leaves_the_heading_open(monkeypatch, z, cost):
+    """Though most events agree: by its likelihood, if it costs about as little."""
+    turned = np.array([0.8, 0.6, 0.0]), np.array([0.0, 0.0, 0.3])
+    paths = [
+        Path.constant(heading, Omega, np.full(4, -1.0))
+        for heading, Omega in ((np.array([1.0, 0, 0]), np.zeros(3)), turned)
+    ]
+    report = Report(0.01, 1e-4, 0.9)
+    found = [
+        (Scene(path, None, 0.0), report._replace(cost=1e-4 * times))
+        for path, times in zip(paths, (1.0, cost), strict=True)
+    ]
+    trial = SimpleNamespace(
+        fit=lambda path, steps: path, best=lambda fits: 0, z=lambda one, other: z
+    )
+    for name, value in {"tracks": None, "prior": None, "trial": trial, "parallax": 20.0}.items():
+        monkeypatch.setattr(Windows, name, lambda *_, value=value: value)
+    monkeypatch.setattr(Windows, "of_lens", lambda self, path: np.zeros((6, 6)))
+    monkeypatch.setattr(batch, "adjust", lambda tracks, scene, *_, **__: (scene, report))
+    monkeypatch.setattr(batch, "_adjusted", lambda tracks, scene, seen, *_, **__: (scene, seen))
+    monkeypatch.setattr(batch, "_left_open", inspect.unwrap(batch._left_open))
+    monkeypatch.setattr(batch, "compute_covariance", lambda *_, **__: 1e-6 * np.eye(6))
+    monkeypatch.setattr(batch, "Fit", lambda *values: values)
+    windows = object.__new__(Windows)
+    windows.params, windows.least = Params(), {}
+    _, covariance, *_, doubted = inspect.unwrap(Windows.ended)(windows, 0, found)
+    apart = np.concatenate([turned[0] - [1, 0, 0], turned[1]])
+    more = np.exp(-(z**2) / 2) * np.outer(apart, apart) if cost < batch.ALIKE else 0.0
+    told = inflation(0.9) * 1e-6 * np.eye(6)
+    np.testing.assert_allclose(covariance, told + more, rtol=1e-9)
+    assert doubted**2 == pytest.approx(np.trace((covariance - told)[:3, :3]))
+
+
 def test_skew_is_that_by_which_pixels_end_where_they_began():
     # Three ON and two OFF events at every pixel; one more shows ON events alone.
     rows = []

@@ -504,16 +504,15 @@ class Windows:
         scene, report = adjust(tracks, scene, prior, sigma=sigma, settle=0, steps=1)
         covariance = inflation(report.inliers) * covariance + self.of_lens(scene.path)
         left_open = np.zeros((6, 6))
-        if trial and few:
+        if trial:
             others = [(one.path, fit) for (one, _), fit in zip(close, fits, strict=True)]
-            best = others.pop(chosen)[1]
-            path = scene.path
-            still, z = trial.rotation(path, self.rotation(centre), best, begun=alone)
-            if z < TELLING:
-                path, covariance = _without_heading(path, still.path, covariance)
-            else:
-                left_open = _left_open(trial, path, best, others)
-            scene = scene._replace(path=path)
+            best, path = others.pop(chosen)[1], scene.path
+            left_open = _left_open(trial, path, best, others)
+            if few:
+                still, z = trial.rotation(path, self.rotation(centre), best, begun=alone)
+                if z < TELLING:
+                    path, covariance = _without_heading(path, still.path, covariance)
+                    scene, left_open = scene._replace(path=path), np.zeros((6, 6))
         return Fit(
             scene.path,
             covariance + left_open,
