@@ -378,6 +378,26 @@ def test_lamps_are_told_by_their_flicker(hertz, way, late, left_out):
     assert number == left_out and kept == paths[left_out:]
 
 
+@pytest.mark.parametrize(("leaves", "left_out"), [(1.4, 1), (0.6, 0)])
+def test_a_track_that_hops_from_a_lamp_is_the_lamp_s_if_it_is_mostly_there(leaves, left_out):
+    """Of 2 s; what it goes on with then travels and sends events whenever it likes."""
+    rng = np.random.default_rng(4)
+    t, xi, on = lamp(rng, [40.0, 40.0], 100.0, 2.0, 3000)
+    away = np.flatnonzero(t > leaves)
+    t[away], on[away] = rng.uniform(leaves, 2, len(away)), rng.random(len(away)) < 0.5
+    xi[away] = np.c_[40 + 60 * (t[away] - leaves), 0 * away + 40] + 2 * rng.normal(
+        size=(len(away), 2)
+    )
+    order = np.argsort(t)
+    x, y = np.rint(xi[order]).T.astype(np.uint16)
+    us = np.rint(1e6 * t[order]).astype(np.int64)
+    recording = Recording("lamps", *SMALL, Events(us, x, y, on[order]))
+    at = np.arange(10_000, 2_000_000, 20_000)
+    path = _path(at, 40 + 60 * np.maximum(at * 1e-6 - leaves, 0), 40, 3.5, 30)
+    kept, number = without_lamps([path], recording, np.zeros(SMALL[::-1], bool))
+    assert number == left_out and len(kept) == 1 - left_out
+
+
 @pytest.mark.slow
 def test_a_lamp_behind_a_target_is_no_target():
     recording, truth = scene([Target(Circle((64, 48), 30, 5.0, 0.0, size=(3.0, 2.5)), 1e4)], 1.0)

@@ -25,31 +25,47 @@ PIECE = 250_000  # us; at half a hertz beside f an eighth of a turn
 IN_TIME = 0.36
 ENOUGH = 1000  # events of a piece that tell its share
 SIGMAS = 5.0  # of what chance makes of the share
-TRAVELS = 6.0  # sizes between the places of its first and its last third: no lamp
+STAYS = 3.0  # sizes from its median place, where it is while it comes in time: a lamp is no farther
+QUARTERS = 4  # of a track's rows: one that stays in none of them is no lamp
 
 
 def without_lamps(
     paths: list[Path], recording: Recording, hot: NDArray[np.bool_]
 ) -> tuple[list[Path], int]:
     """The paths that are none of lamps, and how many are. `hot` (rows, columns) are left out."""
-    standing = [k for k, path in enumerate(paths) if not _travels(path)]
-    if not standing:
+    some = [
+        k
+        for k, path in enumerate(paths)
+        if any(_stays(path, rows) for rows in np.array_split(np.arange(len(path.t)), QUARTERS))
+    ]
+    if not some:
         return paths, 0
-    in_time = _in_time([paths[k] for k in standing], recording, hot)
-    lamps = {k for k, share in zip(standing, in_time, strict=True) if share > IN_TIME}
+    begin = min(paths[k].begin for k in some)
+    lamps = set()
+    for k, shares in zip(some, _in_time([paths[k] for k in some], recording, hot), strict=True):
+        # A track that hops between a lamp and targets is that of the lamp if it is mostly there.
+        rows = np.flatnonzero(shares[(paths[k].t - begin) // PIECE] > IN_TIME)
+        if np.nanmedian(shares) > IN_TIME and _stays(paths[k], rows):
+            lamps.add(k)
     return [path for k, path in enumerate(paths) if k not in lamps], len(lamps)
 
 
-def _travels(path: Path) -> bool:
-    third = max(1, len(path.t) // 3)
-    way = path.p[-third:].mean(0) - path.p[:third].mean(0)
-    return bool(np.hypot(*way) > TRAVELS * np.median(path.size[:, 0]))
+def _stays(path: Path, rows: NDArray[np.int64]) -> bool:
+    """Whether a path is near one place at most of the times of some rows."""
+    if not len(rows):
+        return False
+    p = path.p[rows]
+    away = np.hypot(*(p - np.median(p, 0)).T)
+    return bool(np.median(away) <= STAYS * np.median(path.size[rows, 0]))
 
 
 def _in_time(
     paths: list[Path], recording: Recording, hot: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """The share of paths' events that comes in time with the mains; 0 where it may be chance."""
+    """The share (paths, pieces) of events that comes in time with the mains; NaN without events.
+
+    Pieces begin with the first of the paths; all of a path are 0 where it may be chance.
+    """
     joined = join(paths)
     begin = joined.begins.min()
     pieces = (joined.ends.max() - begin) // PIECE + 1
@@ -73,6 +89,4 @@ def _in_time(
     # Then some piece has more than one event.
     sure = power.sum(1) > SIGMAS * np.sqrt((n**2).sum(1))
     each = np.where(n > 1, power / np.maximum(n**2 - n, 1), np.nan)
-    share = np.zeros(len(paths))
-    share[sure] = np.nanmedian(each[sure], 1)
-    return share
+    return np.where(sure[:, None], each, 0.0)
