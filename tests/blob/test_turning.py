@@ -42,7 +42,10 @@ def texture(rng):
 @pytest.mark.slow
 def test_a_textured_disc_that_turns_in_its_place_is_one():
     disc = turned(texture(np.random.default_rng(1)), 60, 0.3)
-    (path,) = blob.find(disc, progress=False).paths
+    found = blob.find(disc, progress=False)
+    (path,) = found.paths
+    assert path.turn == pytest.approx(OMEGA, rel=0.01)
+    assert "1 turns in place at -14 rad/s" in found.summary()
     assert np.hypot(*(path.p - HUB).T).max() < 1
     assert path.end - path.begin > 0.95 * DURATION * 1e6
     # A full disc's deviation along each axis is half of its radius.
@@ -54,7 +57,7 @@ def test_blobs_that_circle_about_one_point_are_as_many_as_they_are():
     angle = 2 * np.pi * np.arange(5) / 5
     places = RADIUS * np.stack([np.cos(angle), np.sin(angle)], 1)
     found = blob.find(turned(places, 8e3, 2.0), progress=False)
-    assert len(found) == 5
+    assert len(found) == 5 and all(path.turn is None for path in found.paths)
 
 
 def test_the_turn_of_events_is_what_it_was_made():

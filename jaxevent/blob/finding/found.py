@@ -71,6 +71,10 @@ class Found:
             text += f", {self.lamps} {plural('lamp', self.lamps)} left out"
         if self.camera_moves:
             text += ", the camera moves"
+        turns = [f"{path.turn:.3g}" for path in self.paths if path.turn is not None]
+        if turns:
+            verb = "turns" if len(turns) == 1 else "turn"
+            text += f", {len(turns)} {verb} in place at {' and '.join(turns)} rad/s"
         if not len(self):
             return text
         size, speed, rate = (self._typical(values) for values in self._numbers())

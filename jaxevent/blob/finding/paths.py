@@ -27,6 +27,7 @@ class Path:
         window: us.
         agility: px^2/s^3, noise of its velocity.
         polarity: Of its events, 1 ON and 0 OFF; None: both. See `prefer_sharper`.
+        turn: rad/s at which it turns in its place, from x to y; None: not told. See `join_turning`.
     """
 
     t: NDArray[np.int64]
@@ -37,6 +38,7 @@ class Path:
     window: int
     agility: float
     polarity: int | None = None
+    turn: float | None = None
 
     @property
     def begin(self) -> int:

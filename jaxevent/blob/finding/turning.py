@@ -86,7 +86,7 @@ def _turning(pieces: list[Path], own: Stream, background: Background) -> Path | 
     moving = measure_moving_background(own, scene)
     if not _is_one(moving, turn.centre) or map_gain(own, moving, window * 1e-6) < SURE:
         return None
-    return _whole(own, turn.centre, window, background)
+    return _whole(own, Turn(_mean_rate(scene), centre), window, background)
 
 
 def _middle(own: Stream) -> NDArray[np.float64]:
@@ -170,6 +170,12 @@ def _as_motion(t: NDArray, angles: NDArray, centre: NDArray[np.float64]) -> Scen
     return SceneMotion(t, np.concatenate([A, (centre - A @ centre)[..., None]], 2))
 
 
+def _mean_rate(scene: SceneMotion) -> float:
+    """How fast a scene turns from its first window to its last, rad/s."""
+    angles = np.unwrap(np.arctan2(scene.maps[:, 1, 0], scene.maps[:, 0, 0]))
+    return float((angles[-1] - angles[0]) / (scene.t[-1] - scene.t[0]))
+
+
 def _is_one(moving: Background, centre: NDArray[np.float64]) -> bool:
     """Whether what is bright in a map that turns hangs together, about the point of the turn."""
     seen = np.kron(moving.calm.any(0), np.ones((CELL // FINE, CELL // FINE))) > 0
@@ -188,10 +194,8 @@ def _is_one(moving: Background, centre: NDArray[np.float64]) -> bool:
     return bool(away @ np.linalg.solve(C, away) < 1)
 
 
-def _whole(
-    own: Stream, centre: NDArray[np.float64], window: int, background: Background
-) -> Path | None:
-    """The path of all events of a place, about the point about which it turns.
+def _whole(own: Stream, turn: Turn, window: int, background: Background) -> Path | None:
+    """The path of all events of a place that turns.
 
     Of windows (us) with more events than the darkest background gives; None, if there are none.
     """
@@ -200,7 +204,7 @@ def _whole(
     for k in range(int(own.duration / w)):
         part = own.window(k * w, (k + 1) * w)
         if evidence(len(part), background.least * area * w, 1) > -np.log(SEEN):
-            e = np.stack([part.x, part.y], 1) - centre
+            e = np.stack([part.x, part.y], 1) - turn.centre
             rows.append(((k + 0.5) * w, e.mean(0), e.T @ e / len(e) + np.eye(2) / 12, len(e)))
     if not rows:
         return None
@@ -208,5 +212,6 @@ def _whole(
     R = larger(C) / 2 / n
     us = own.start + np.rint(t * 1e6).astype(np.int64)
     agility = fit_agility(t, m, R, float(np.median(larger(C))) / w**3)
-    p = np.tile(centre, (len(t), 1))
-    return Path(us, p, np.zeros_like(p), C, n.astype(float), window, agility)
+    p = np.tile(turn.centre, (len(t), 1))
+    n = n.astype(float)
+    return Path(us, p, np.zeros_like(p), C, n, window, agility, turn=turn.rate)
