@@ -222,6 +222,25 @@ def turning(rng: np.random.Generator) -> Scene:
     return Scene(draw, going(hub[None], np.zeros((1, 2))), radius, 1.0)
 
 
+def before_turning(rng: np.random.Generator) -> Scene:
+    """A disc that swings slowly before a textured disc that turns in its place, never beside it."""
+    behind = turning(rng)
+    (hub,), far = behind.places(np.array(0.0)), behind.reach - 12
+    angle, rate, size = rng.uniform(0, np.pi), rng.uniform(1, 4), rng.uniform(5, 8)
+    along = far * np.array([np.cos(angle), np.sin(angle)])
+
+    def places(t: NDArray) -> NDArray:
+        swing = hub + along * np.sin(rate * np.asarray(t, float)[..., None])
+        return np.stack([np.broadcast_to(hub, swing.shape), swing], -2)
+
+    def draw(t: float) -> Image:
+        image = behind.draw(t)
+        disc(image, places(np.array(t))[1], size, 0.05)
+        return image
+
+    return Scene(draw, places, 12, 1.0)
+
+
 def circling(rng: np.random.Generator) -> Scene:
     """Eight small discs that go round on one circle, far enough apart to be eight."""
     hub, radius = rng.uniform((90, 75), (150, 105)), rng.uniform(35, 50)
@@ -244,7 +263,8 @@ SCENES: dict[str, Callable[[np.random.Generator], Scene]] = {
     "propeller": propeller, "walker": lambda rng: walkers(rng, 1), "two walkers": walkers,
     "car": car, "behind a bar": behind_a_bar, "five birds": birds, "hot columns": hot_columns,
     "pan, nothing else": pan, "shaking camera": shaking, "disc before a pan": before_a_pan,
-    "turning disc": turning, "circling discs": circling,
+    "turning disc": turning, "disc before a turning disc": before_turning,
+    "circling discs": circling,
 }  # fmt: skip
 
 
