@@ -58,27 +58,12 @@ clean:
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 .venv/demo.stamp: extras := plot,video
-.venv/demo.stamp: pyproject.toml constraints.txt | .venv/made.stamp
-	$(install)
-	@touch $@
-
 .venv/test.stamp: extras := test
-.venv/test.stamp: pyproject.toml constraints.txt | .venv/made.stamp
-	$(install)
-	@touch $@
-
 .venv/docs.stamp: extras := docs
-.venv/docs.stamp: pyproject.toml constraints.txt | .venv/made.stamp
-	$(install)
-	@touch $@
-
 .venv/bench.stamp: extras := bench,plot,video
-.venv/bench.stamp: pyproject.toml constraints.txt | .venv/made.stamp
-	$(install)
-	@touch $@
-
 .venv/gpu.stamp: extras := test,gpu
-.venv/gpu.stamp: pyproject.toml constraints.txt | .venv/made.stamp
+.venv/demo.stamp .venv/test.stamp .venv/docs.stamp .venv/bench.stamp .venv/gpu.stamp: \
+    pyproject.toml constraints.txt | .venv/made.stamp
 	$(install)
 	@touch $@
 
