@@ -114,9 +114,14 @@ class Background:
         return float(self.rate.min())
 
     @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Places of `rate` that are seen when no target is there."""
+        return np.kron(self.calm.any(0), np.ones((CELL // FINE, CELL // FINE), bool))
+
+    @property
     def mean(self) -> float:
         """1/(px s), over all places that are seen when no target is there."""
-        part = np.kron(self.calm.any(0), np.ones((CELL // FINE, CELL // FINE)))
+        part = self.seen
         return float((self.rate * part).sum() / part.sum())
 
     @property

@@ -100,7 +100,7 @@ def _looks_like_one(moving: Background) -> float | None:
 
     Of edges, or of a texture: much of it is bright, by more than chance makes of few events.
     """
-    seen = np.kron(moving.calm.any(0), np.ones((CELL // FINE, CELL // FINE))) > 0
+    seen = moving.seen
     events = moving.mean * FINE**2 * moving.duration
     edges = _of_edges(np.where(seen, moving.rate, 0), moving.mean)
     if edges >= (SCENE if events >= SOME else CLEAR):

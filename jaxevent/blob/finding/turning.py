@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from jaxevent.blob.finding.agility import fit_agility
-from jaxevent.blob.finding.background import BRIGHT, CELL, FINE, Background, evidence, look_up
+from jaxevent.blob.finding.background import BRIGHT, FINE, Background, evidence, look_up
 from jaxevent.blob.finding.moving import SIDES, SURE, map_gain, measure_moving_background
 from jaxevent.blob.finding.paths import Path
 from jaxevent.blob.finding.scene import SceneMotion
@@ -178,8 +178,7 @@ def _mean_rate(scene: SceneMotion) -> float:
 
 def _is_one(moving: Background, centre: NDArray[np.float64]) -> bool:
     """Whether what is bright in a map that turns hangs together, about the point of the turn."""
-    seen = np.kron(moving.calm.any(0), np.ones((CELL // FINE, CELL // FINE))) > 0
-    rate = np.where(seen, moving.rate - moving.rate.min(), 0)
+    rate = np.where(moving.seen, moving.rate - moving.rate.min(), 0)
     total = float(rate.sum())
     labels = np.zeros(rate.shape, np.int32)
     ndimage.label(rate * total > DIM * (rate**2).sum(), np.ones((3, 3)), labels)
