@@ -506,13 +506,14 @@ class Windows:
         left_open = np.zeros((6, 6))
         if trial:
             others = [(one.path, fit) for (one, _), fit in zip(close, fits, strict=True)]
-            best, path = others.pop(chosen)[1], scene.path
-            left_open = _left_open(trial, path, best, others)
+            best, path, z = others.pop(chosen)[1], scene.path, np.inf
             if few:
                 still, z = trial.rotation(path, self.rotation(centre), best, begun=alone)
-                if z < TELLING:
-                    path, covariance = _without_heading(path, still.path, covariance)
-                    scene, left_open = scene._replace(path=path), np.zeros((6, 6))
+            if z < TELLING:
+                path, covariance = _without_heading(path, still.path, covariance)
+                scene = scene._replace(path=path)
+            else:
+                left_open = _left_open(trial, path, best, others)
         return Fit(
             scene.path,
             covariance + left_open,
