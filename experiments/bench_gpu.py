@@ -13,7 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from bench_images import losses, stream
+from bench_images import images, losses, stream
 
 import jaxevent
 from jaxevent.blob import moment
@@ -24,12 +24,6 @@ from jaxevent.simulate import Line, Target, motion_scene, simulate_blobs
 
 REPEAT = 3  # of which the first compiles
 EVENTS = 5_000_000
-
-
-def images(method: Any, recording: Any, compiler: str) -> None:
-    times = np.arange(recording.frames.t[0], recording.stop, 10_000)
-    for _ in method.estimate(recording, compiler=compiler, progress=False).batches(times):
-        pass
 
 
 def prepare(recording: Any, compiler: str) -> None:
@@ -57,6 +51,9 @@ def tasks(events: int) -> dict[str, tuple[int, Callable[[str], object]]]:
     many, seeds = targets()
     scene, _ = motion_scene("rotation", "constant", 200, size=(160, 120), duration=0.1)
 
+    def made(method: Any) -> Callable[[str], object]:
+        return functools.partial(images, recording, rate=100, method=method)
+
     def track(compiler: str) -> None:
         params = moment.Params(events_per_step=32)
         moment.estimate(many, params, seeds=seeds, compiler=compiler, progress=False)
@@ -65,8 +62,8 @@ def tasks(events: int) -> dict[str, tuple[int, Callable[[str], object]]]:
         voting.estimate(scene, model="rotation", compiler=compiler, progress=False)
 
     return {
-        "akf, 100 Hz images": (events, functools.partial(images, jaxevent.akf, recording)),
-        "aks, 100 Hz images": (events, functools.partial(images, jaxevent.aks, recording)),
+        "akf, 100 Hz images": (events, made(jaxevent.akf)),
+        "aks, 100 Hz images": (events, made(jaxevent.aks)),
         "akf, loss and 8 gradients": (events, lambda compiler: of_losses[f"{compiler} gradient"]()),
         "windows prepared": (events, functools.partial(prepare, recording)),
         "moment, 64 targets": (len(many.events), track),

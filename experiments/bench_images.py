@@ -236,11 +236,11 @@ def read(path: Path, in_memory: bool) -> Recording:
     return load(path, in_memory=in_memory)
 
 
-def images(given: Recording | Path, compiler: Any, rate: int) -> None:
+def images(given: Recording | Path, compiler: Any, rate: int, method: Any = jaxevent.akf) -> None:
     """The complete path of a recording in memory, or in a file."""
     given = read(given, in_memory=False) if isinstance(given, Path) else given
     times = np.arange(given.start, given.stop, 1_000_000 // rate)
-    for _ in jaxevent.akf.estimate(given, compiler=compiler).batches(times):
+    for _ in method.estimate(given, compiler=compiler).batches(times):
         pass
 
 
