@@ -24,8 +24,7 @@ def add(commands: Any) -> None:
         action="store_true",
         help="read HDF5 that is made of other files; it could name any file of yours",
     )
-    arguments.add_size(one)
-    arguments.add_stream(one)
+    arguments.add_reading(one)
 
 
 def run(
@@ -33,13 +32,10 @@ def run(
     target: Path,
     compression: str | None,
     trust: bool,
-    size: tuple[int, int] | None,
-    stream: str | None,
+    reading: dict[str, Any],
 ) -> None:
-    from jaxevent.io import load, save
+    from jaxevent.io import save
 
-    recording = load(
-        source, size, in_memory=False, progress=show_progress(), stream=stream, trust=trust
-    )
+    recording = arguments.open_recording(source, reading, trust=trust)
     save(recording, target, compression, progress=show_progress())
     print_stored(recording, target)

@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from jaxevent.errors import InputError
 from jaxevent.io import reading, times
 from jaxevent.io.decoded import BLOCK, Columns, decoded
+from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Recording
 
 NAMES = {
@@ -127,11 +128,9 @@ def of_records(records: NDArray, source: str) -> dict[str, NDArray]:
     return {key: records[name] for key, name in fields.items()}
 
 
-def read_npy(
-    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
-) -> Recording:
-    """Read an array; `size` is (width, height). Raises `InputError` for bad input."""
-    source = str(path)
+def read_npy(path: Path, options: ReadOptions) -> Recording:
+    """Read an array. Raises `InputError` for bad input."""
+    source, size = str(path), options.size
     with reading(source):
         records = np.load(path, mmap_mode="r", allow_pickle=False)
     plain = records.ndim == 2 and records.shape[1] == 4 and records.dtype.kind in "iuf"
@@ -160,7 +159,7 @@ def read_npy(
             x, y, p = (np.ascontiguousarray(fields[key]) for key in "xyp")
             yield row, (t, x, y, p)
 
-    return Recording(path.stem, *size, decoded(decode, size, source, in_memory, progress))
+    return Recording(path.stem, *size, decoded(decode, size, source, options))
 
 
 def is_text(head: bytes) -> bool:
@@ -171,14 +170,12 @@ def is_text(head: bytes) -> bool:
     )
 
 
-def read_text(
-    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
-) -> Recording:
-    """Read a table of text; `size` is (width, height). Raises `InputError` for bad input."""
+def read_text(path: Path, options: ReadOptions) -> Recording:
+    """Read a table of text. Raises `InputError` for bad input."""
     source = str(path)
     with reading(source), path.open("rb") as file:
         table = _table(file, source)
-    size = size or table.size
+    size = options.size or table.size
     table = _told(path, table, size)
     if size is None:
         raise InputError(
@@ -186,7 +183,7 @@ def read_text(
             "--size"
         )
     decode = functools.partial(_rows, path, table)
-    return Recording(path.stem, *size, decoded(decode, size, source, in_memory, progress))
+    return Recording(path.stem, *size, decoded(decode, size, source, options))
 
 
 class _Table:

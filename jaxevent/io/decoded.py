@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.io import checked_events, reading
+from jaxevent.io.options import ReadOptions
 from jaxevent.progress import bar
 from jaxevent.recording import Events, EventSource, Triggers
 
@@ -36,8 +37,7 @@ def decoded(
     decode: Decoder,
     size: tuple[int, int],
     source: str,
-    in_memory: bool = True,
-    progress: bool | None = None,
+    options: ReadOptions,
     origin: int = 0,
 ) -> EventSource:
     """All events of a decoder, checked: `Events` in memory, else `DecodedEvents`.
@@ -50,7 +50,7 @@ def decoded(
     row = 0
     with (
         reading(source),
-        bar(desc="decode", unit=" events", unit_scale=True, progress=progress) as shown,
+        bar(desc="decode", unit=" events", unit_scale=True, progress=options.progress) as shown,
     ):
         for state, (t, x, y, p) in decode(None):
             if not len(t):
@@ -63,7 +63,7 @@ def decoded(
                     f"{blocks[-1].last} us; sort the events by time (stable)"
                 )
             blocks.append(_Block(state, row, first, last))
-            if in_memory or len(kept) < 2:
+            if options.in_memory or len(kept) < 2:
                 kept.append(events)
             else:
                 kept[1] = events
@@ -71,7 +71,7 @@ def decoded(
             shown.update(len(events))
     if not blocks:
         return Events.empty()
-    if in_memory or len(blocks) <= 2:
+    if options.in_memory or len(blocks) <= 2:
         return _joined(kept)
     return DecodedEvents(decode, blocks, row, (kept[0], kept[1]), size, source, origin)
 

@@ -24,6 +24,7 @@ import numpy as np
 from jaxevent.errors import InputError
 from jaxevent.io import reading
 from jaxevent.io.decoded import BLOCK, Columns, decoded
+from jaxevent.io.options import ReadOptions
 from jaxevent.kernels import compiled
 from jaxevent.recording import Recording
 
@@ -32,10 +33,8 @@ _HEADER = 20
 _KINDS = {0: "generic data", 1: "DVS events", 2: "ATIS events", 4: "colour events"}
 
 
-def read(
-    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
-) -> Recording:
-    """Read a file; `size` is (width, height). Raises `InputError` for bad input."""
+def read(path: Path, options: ReadOptions) -> Recording:
+    """Read a file. Raises `InputError` for bad input."""
     with reading(str(path)), path.open("rb") as file:
         head = file.read(_HEADER)
     version, kind = tuple(head[12:15]), head[15] if len(head) > 15 else None
@@ -52,7 +51,7 @@ def read(
     if len(head) < _HEADER:
         raise InputError(f"{path}: ends inside its header; fetch the file again")
     width, height = (int(n) for n in np.frombuffer(head, "<u2", 2, 16))
-    size = size or (width, height)
+    size = options.size or (width, height)
     found: Counter[str] = Counter()
 
     def decode(state: tuple[int, int] | None) -> Iterator[tuple[Any, Columns]]:
@@ -77,7 +76,7 @@ def read(
                 f"-{len(rest)} FILE"
             )
 
-    events = decoded(decode, size, str(path), in_memory, progress)
+    events = decoded(decode, size, str(path), options)
     extra = {name: np.array(number) for name, number in found.items()}
     return Recording(path.stem, *size, events, extra=extra)
 

@@ -51,6 +51,7 @@ from jaxevent.io import (
 from jaxevent.io.columns import time_scale
 from jaxevent.io.description import CLOCK
 from jaxevent.io.hdf5_files import array, attribute, dataset, open_file
+from jaxevent.io.options import ReadOptions
 from jaxevent.io.output import complete_hdf5
 from jaxevent.progress import bar
 from jaxevent.recording import (
@@ -288,19 +289,28 @@ class StoredImages:
         return np.asarray(images, dtype)
 
 
-def read(path: Path, size: tuple[int, int] | None) -> Recording:
-    """Read a file into memory; `size` is (width, height). Raises `InputError` for bad input."""
-    with reading(str(path)), open_file(path) as file:
-        return in_memory(_recording(file, path, size))
+def read(path: Path, options: ReadOptions) -> Recording:
+    """Read a file. Raises `InputError` for bad input.
+
+    Unless `options.in_memory`, events and images stay in it: `StoredEvents`, `StoredImages`.
+    """
+    return read_stored(path, options, _recording)
 
 
-def open_stored(path: Path, size: tuple[int, int] | None) -> Recording:
-    """Read all but events and images, which stay in the file: `StoredEvents`, `StoredImages`."""
+def read_stored(
+    path: Path,
+    options: ReadOptions,
+    read_open: Callable[[h5py.File, Path, ReadOptions], Recording],
+) -> Recording:
+    """Read an HDF5 file by `read_open`, and its events and images as `options.in_memory` says."""
     with reading(str(path)):
-        return _recording(open_file(path), path, size)
+        if not options.in_memory:
+            return read_open(open_file(path), path, options)
+        with open_file(path) as file:
+            return _in_memory(read_open(file, path, options))
 
 
-def in_memory(recording: Recording) -> Recording:
+def _in_memory(recording: Recording) -> Recording:
     """The recording with its events and images read from their file."""
     frames = recording.frames
     if frames is not None:
@@ -314,8 +324,8 @@ def is_matlab(path: Path, file: Any) -> bool:
         return stored.read(6) == b"MATLAB" and isinstance(file.get("events"), h5py.Dataset)
 
 
-def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Recording:
-    source = str(path)
+def _recording(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
+    source, size = str(path), options.size
     with reading(source):
         names = ("format", "version", "name", "width", "height")
         held = ((name, attribute(file, name)) for name in names)

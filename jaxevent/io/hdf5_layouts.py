@@ -33,6 +33,7 @@ from jaxevent.io import (
     ecf,
     pinhole,
     reading,
+    refuse_stream,
     sensor_size,
     times,
     vectors,
@@ -40,8 +41,9 @@ from jaxevent.io import (
 )
 from jaxevent.io.columns import find, order_of
 from jaxevent.io.decoded import DecodedImages
-from jaxevent.io.hdf5 import Column, Microseconds, StoredEvents, StoredImages, in_memory
-from jaxevent.io.hdf5_files import array, attribute, dataset, filters_of, open_file
+from jaxevent.io.hdf5 import Column, Microseconds, StoredEvents, StoredImages, read_stored
+from jaxevent.io.hdf5_files import array, attribute, dataset, filters_of
+from jaxevent.io.options import ReadOptions
 from jaxevent.io.truth import read_poses
 from jaxevent.recording import Frames, Imu, Recording, Triggers
 
@@ -56,33 +58,24 @@ def knows(file: Any) -> bool:
     return any(_fields(file, name) is not None for name in _GROUPS)
 
 
-def read(path: Path, size: tuple[int, int] | None, stream: str | None = None) -> Recording:
-    """Read a file into memory; `size` is (width, height). Raises `InputError` for bad input.
+def read(path: Path, options: ReadOptions) -> Recording:
+    """Read a file. Raises `InputError` for bad input.
 
-    `stream` is "left" or "right" of a file with two cameras.
+    Unless `options.in_memory`, events and images stay in it. `options.stream` is "left" or "right"
+    of a file with two cameras.
     """
-    with reading(str(path)), open_file(path) as file:
-        return in_memory(_recording(file, path, size, stream))
+    return read_stored(path, options, _recording)
 
 
-def open_stored(path: Path, size: tuple[int, int] | None, stream: str | None = None) -> Recording:
-    """Read all but events and images, which stay in the file."""
-    with reading(str(path)):
-        return _recording(open_file(path), path, size, stream)
-
-
-def _recording(
-    file: Any, path: Path, size: tuple[int, int] | None, stream: str | None
-) -> Recording:
-    source = str(path)
+def _recording(file: Any, path: Path, options: ReadOptions) -> Recording:
+    source, size, stream = str(path), options.size, options.stream
     for name in _SIDES:
         group = file.get(name)
         if isinstance(group, h5py.Group):
             side = _side(path, group, stream)
             read = _m3ed if name == "prophesee" else _mvsec
             return read(file, path, size, f"{name}/{side}")
-    if stream is not None:
-        raise InputError(f"{path}: holds one camera only; leave out stream= or --stream")
+    refuse_stream(path, options)
     if not _is_plain(file):
         with reading(source):
             name = next(name for name in _GROUPS if _fields(file, name) is not None)

@@ -42,6 +42,7 @@ from numpy.typing import NDArray
 from jaxevent.errors import InputError, require
 from jaxevent.io import companions, reading
 from jaxevent.io.decoded import BLOCK, Columns, Decoder, TriggerList, decoded
+from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Recording
 
 _LONGEST_HEADER = 1 << 16
@@ -56,10 +57,8 @@ _SIZES = (  # of sensors whose files may not tell their size, by the name of Met
 )
 
 
-def read(
-    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
-) -> Recording:
-    """Read a RAW or DAT file; `size` is (width, height). Raises `InputError` for bad input."""
+def read(path: Path, options: ReadOptions) -> Recording:
+    """Read a RAW or DAT file. Raises `InputError` for bad input."""
     with reading(str(path)):
         header, start = _header(path)
         stated = header.get("format", "").partition(";")[0].upper()
@@ -90,13 +89,13 @@ def read(
                 "convert it with Metavision's tools"
             )
         _whole_words(path, length - start, width)
-        size = size or _size(header)
+        size = options.size or _size(header)
     if size is None:
         raise InputError(
             f"{path}: the header does not tell the sensor's size; give size=(width, height) or "
             "--size"
         )
-    events = decoded(decode, size, str(path), in_memory, progress)
+    events = decoded(decode, size, str(path), options)
     extra = {name: np.array(number) for name, number in sorted(found.items())}
     return Recording(path.stem, *size, events, extra=extra, triggers=triggers.all())
 
