@@ -53,14 +53,15 @@ def blocks(source: EventSource, start: int = 0, stop: int | None = None) -> Iter
 
 def pick(events: Events, rows: NDArray) -> Events:
     """Some of the events, by a mask or by rows."""
-    return Events(events.t[rows], events.x[rows], events.y[rows], events.p[rows])
+    return events[rows]
 
 
 def rewrite(part: Part, step: Callable[[Events], Events]) -> Part:
     """The same with `step` of its events, which are passed block by block, in order."""
     done = [step(block) for block in blocks(source_of(part))]
     done = done or [Events.empty()]
-    events = Events(*(np.concatenate([getattr(e, name) for e in done]) for name in "txyp"))
+    columns = (np.concatenate([getattr(e, name) for e in done]) for name in "txyp")
+    events = Events.of_checked(*columns)
     if isinstance(part, Recording):
         return dataclasses.replace(part, events=events)
     return events  # ty: ignore[invalid-explicit-return]

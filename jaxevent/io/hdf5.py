@@ -160,7 +160,7 @@ class StoredEvents:
 
         `size` is (width, height). Raises `InputError` unless the fields fit each other.
         """
-        self._size = size
+        self.checked_size = size
         self._source = source
         self._t, self._x, self._y, self._p = (columns[name] for name in "txyp")
         shapes = [field.shape for field in (self._t, self._x, self._y, self._p)]
@@ -194,7 +194,7 @@ class StoredEvents:
         with reading(f"{self._source}: events"):
             t = times(self._t[part], self._source, "event", first_row=part.start) + self._offset
             x, y, p = self._x[part], self._y[part], self._p[part]
-        events = checked_events(t, x, y, p, self._size, self._source, first_row=start - lead)
+        events = checked_events(t, x, y, p, self.checked_size, self._source, first_row=start - lead)
         return events[lead:] if lead else events
 
     def columns(self, rows: slice, room: EventColumns | None = None) -> EventColumns | None:

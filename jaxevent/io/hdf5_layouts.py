@@ -11,7 +11,7 @@
                                 (`ecf`); attribute geometry; /EXT_TRIGGER/events, records t, p, id
     v2e                         /events (N, 4): t in us, x, y, p; the order is told by the content
     others                      /events or the file itself with t, x, y and p, whole lists or
-                                records, under the names that `columns.NAMES` lists
+                                records, under the names that `jaxevent.arrays.NAMES` lists
 
 Integers are us, floats seconds. Exposures are unknown: 0. Where a file holds two cameras, left or
 right must be chosen. M3ED's frames come from cameras beside the event camera, with pixels of their

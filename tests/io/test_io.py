@@ -925,7 +925,7 @@ def test_stored_images_are_read_when_asked_for(tmp_path):
     odd = stored[1::2]
     np.testing.assert_array_equal(np.asarray(odd.images), images[1::2])
     np.testing.assert_array_equal(np.asarray(odd[1:].images), images[3::2])
-    np.testing.assert_array_equal(np.asarray(stored[::-1].images), images[::-1])
+    np.testing.assert_array_equal(np.asarray(stored.images[::-1]), images[::-1])
     chosen = stored[np.array([4, 0, 4])]
     np.testing.assert_array_equal(chosen.intensity, images[[4, 0, 4]] / np.float32(255))
     copy = tmp_path / "copy.h5"
