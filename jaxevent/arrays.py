@@ -144,7 +144,7 @@ def check_unit(time_unit: Any) -> None:
     """Raise `InputError` unless a unit of time is "s", "ms", "us" or "ns", or None."""
     if time_unit is not None and time_unit not in get_args(TimeUnit):
         raise InputError(
-            f"time_unit = {time_unit!r} is no unit of time; give 's', 'ms', 'us' or 'ns'"
+            f"time_unit = {brief(time_unit)} is no unit of time; give 's', 'ms', 'us' or 'ns'"
         )
 
 
@@ -239,6 +239,11 @@ def numbers(values: NDArray, source: str, what: str) -> NDArray:
     return values
 
 
+def brief(value: Any) -> str:
+    """A value on one line, cut to 60 characters, for messages."""
+    return " ".join(repr(value).split())[:60]
+
+
 def _place(source: str) -> str:
     return f"{source}: " if source else ""
 
@@ -248,7 +253,7 @@ def as_size(width: Any, height: Any, source: str) -> tuple[int, int]:
     for name, side in (("width", width), ("height", height)):
         if not isinstance(side, int | np.integer) or isinstance(side, bool):
             raise InputError(
-                f"{_place(source)}{name} is {side!r:.60}; give a whole number of pixels"
+                f"{_place(source)}{name} is {brief(side)}; give a whole number of pixels"
             )
     if min(width, height) < 1 or max(width, height) > MAX_PIXELS:
         raise InputError(

@@ -214,7 +214,7 @@ def _check_rows(rows: Any, what: str) -> None:
     """Raise `InputError` for what chooses one row, or several columns, of `what`."""
     if not isinstance(rows, slice) and (np.ndim(rows) != 1 or np.asarray(rows).dtype.kind == "O"):
         raise InputError(
-            f"{what} are chosen by a slice, a mask or a list of rows, not {rows!r:.40}; write "
+            f"{what} are chosen by a slice, a mask or a list of rows, not {arrays.brief(rows)}; write "
             f"{what}[row : row + 1] for one of them"
         )
 
@@ -263,7 +263,7 @@ class CheckedEvents:
             ):
                 return row
         raise InputError(
-            f"{self._name}: index({time}) of {type(self._source).__name__} is {row!r:.40}; it must "
+            f"{self._name}: index({time}) of {type(self._source).__name__} is {arrays.brief(row)}; it must "
             "be the number of events earlier than that time (us)"
         )
 
@@ -273,7 +273,9 @@ def _checked_source(events: Any, size: tuple[int, int], name: str) -> EventSourc
     if isinstance(events, Events):
         events.check_places(*size, name)
         return events
-    built_in = isinstance(events, str | bytes | list | tuple | range)  # these have `index` too
+    built_in = isinstance(
+        events, type | str | bytes | list | tuple | range
+    )  # these have `index` too
     if built_in or not (isinstance(events, EventSource) and callable(events.index)):
         raise InputError(
             f"{name}: events is a {type(events).__name__}, not jaxevent.Events; make the recording "
@@ -517,7 +519,7 @@ class Recording(Shown):
     def __post_init__(self):
         if not isinstance(self.name, str):
             raise InputError(
-                f"name is {self.name!r:.60}, a {type(self.name).__name__}; give a text, the "
+                f"name is {arrays.brief(self.name)}, a {type(self.name).__name__}; give a text, the "
                 "recording's name"
             )
         size = arrays.as_size(self.width, self.height, self.name)
@@ -647,13 +649,10 @@ class Recording(Shown):
             if frame_times is None:
                 raise InputError("frame_times is missing; give the time of each of the frames")
             middle = arrays.as_times(frame_times, "frame_times", time_unit)
-            if exposure is None:
-                lengths = np.zeros(len(middle), np.int64)
-            elif np.ndim(exposure) == 0:
-                lengths = arrays.as_times([exposure], "exposure", time_unit).repeat(len(middle))
-            else:
-                lengths = arrays.as_times(exposure, "exposure", time_unit)
-            made = Frames(middle, grey, lengths)
+            lengths = arrays.as_array(0 if exposure is None else exposure, "exposure")
+            if lengths.ndim == 0:
+                lengths = np.broadcast_to(lengths, middle.shape)
+            made = Frames(middle, grey, arrays.as_times(lengths, "exposure", time_unit))
         further = {} if extra is None else extra
         if colours is not None and isinstance(further, Mapping):
             further = {"rgb": colours, **further}
