@@ -15,12 +15,15 @@ import abc
 import dataclasses
 import importlib
 import inspect
-from collections.abc import Iterator
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 import equinox as eqx
 import jax
+import numpy as np
 
+from jaxevent.arrays import brief
+from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording, Times
@@ -78,6 +81,47 @@ class Result(Protocol):
         ...
 
 
+class OptionKind(NamedTuple):
+    """Values that an option takes, and words for them."""
+
+    fits: Callable[[Any], bool]
+    text: str
+
+
+def of_class(kind: type, optional: bool = True) -> OptionKind:
+    """Objects of a class, and None where the option is `optional`."""
+    text = f"{kind.__module__}.{kind.__name__}{' or None' if optional else ''}"
+    return OptionKind(lambda v: isinstance(v, kind) or (optional and v is None), text)
+
+
+def whole(least: int) -> OptionKind:
+    """Whole numbers from `least` to what int64 holds."""
+
+    def fits(value: Any) -> bool:
+        is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        return is_whole and least <= value < 1 << 63
+
+    return OptionKind(fits, f"a whole number from {least} on")
+
+
+def _is_number(value: Any) -> bool:
+    return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
+
+
+FLAG = OptionKind(lambda v: v is None or isinstance(v, bool | np.bool_), "True, False or None")
+TIME = OptionKind(
+    lambda v: v is None or _is_number(v), "one time, integer microseconds or float seconds, or None"
+)
+ROWS = OptionKind(
+    lambda v: v is None or (isinstance(v, Sequence) and not isinstance(v, str)) or np.ndim(v) > 0,
+    "a list with an entry for each, or None",
+)
+DEVICES = OptionKind(
+    lambda v: isinstance(v, Sequence) and all(isinstance(one, jax.Device) for one in v),
+    "a list of devices of JAX",
+)
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class Estimator(abc.ABC, Generic[P]):
     """One estimator: a name, its `Params`, and the steps from a recording to a result.
@@ -98,6 +142,23 @@ class Estimator(abc.ABC, Generic[P]):
     name: str
     Params: type[P]
     family: ClassVar[str]
+    option_kinds: ClassVar[Mapping[str, OptionKind]] = {
+        "camera": of_class(PinholeCamera),
+        "cloud": whole(0),
+        "detect": FLAG,
+        "devices": DEVICES,
+        "model": OptionKind(
+            lambda v: v is None or isinstance(v, str | type), "a name or class of a motion model"
+        ),
+        "progress": FLAG,
+        "refine": FLAG,
+        "seed": whole(0),
+        "seeds": ROWS,
+        "smooth": FLAG,
+        "start": TIME,
+        "stop": TIME,
+        "window_events": whole(1),
+    }
     needs_frames: bool = dataclasses.field(default=False, kw_only=True)
     differentiable: bool = dataclasses.field(default=True, kw_only=True)
     has_covariance: bool = dataclasses.field(default=True, kw_only=True)
@@ -120,7 +181,11 @@ class Estimator(abc.ABC, Generic[P]):
         return f"<{self.family} method {self.name!r}: {self.about.partition('. ')[0] or 'no text'}>"
 
     def check(self, recording: Recording) -> None:
-        """Raise `InputError` if the recording lacks what the estimator needs."""
+        """Raise `InputError` if the recording lacks what the estimator needs.
+
+        Events that were changed since the recording was made are found here, before kernels run.
+        """
+        recording.check_events()
         if self.needs_frames and recording.frames is None:
             raise InputError(
                 f"{recording.name}: holds no frames, which the method {self.name!r} needs"
@@ -151,6 +216,15 @@ class Estimator(abc.ABC, Generic[P]):
     @abc.abstractmethod
     def estimate(self, recording: Recording, params: P | None = None, **options: Any) -> Any:
         """The `Result` of a recording; see the family's own for its options."""
+
+    def check_options(self, **options: Any) -> None:
+        """Raise `InputError` for an option of another kind than `option_kinds` says."""
+        for name, value in options.items():
+            kind = self.option_kinds.get(name)
+            if kind is not None and not kind.fits(value):
+                raise InputError(
+                    f"the method {self.name!r} takes {name} as {kind.text}, not {brief(value)}"
+                )
 
     def refuse_unknown(self, options: dict[str, Any]) -> None:
         """Raise `InputError` for options that `estimate` does not take."""

@@ -214,8 +214,8 @@ def _check_rows(rows: Any, what: str) -> None:
     """Raise `InputError` for what chooses one row, or several columns, of `what`."""
     if not isinstance(rows, slice) and (np.ndim(rows) != 1 or np.asarray(rows).dtype.kind == "O"):
         raise InputError(
-            f"{what} are chosen by a slice, a mask or a list of rows, not {arrays.brief(rows)}; write "
-            f"{what}[row : row + 1] for one of them"
+            f"{what} are chosen by a slice, a mask or a list of rows, not {arrays.brief(rows)}; "
+            f"write {what}[row : row + 1] for one of them"
         )
 
 
@@ -263,8 +263,8 @@ class CheckedEvents:
             ):
                 return row
         raise InputError(
-            f"{self._name}: index({time}) of {type(self._source).__name__} is {arrays.brief(row)}; it must "
-            "be the number of events earlier than that time (us)"
+            f"{self._name}: index({time}) of {type(self._source).__name__} is {arrays.brief(row)}; "
+            "it must be the number of events earlier than that time (us)"
         )
 
 
@@ -519,8 +519,8 @@ class Recording(Shown):
     def __post_init__(self):
         if not isinstance(self.name, str):
             raise InputError(
-                f"name is {arrays.brief(self.name)}, a {type(self.name).__name__}; give a text, the "
-                "recording's name"
+                f"name is {arrays.brief(self.name)}, a {type(self.name).__name__}; give a text, "
+                "the recording's name"
             )
         size = arrays.as_size(self.width, self.height, self.name)
         for side, pixels in zip(("width", "height"), size, strict=True):
@@ -776,10 +776,15 @@ class Recording(Shown):
         Arrays that were changed since the recording was made are found, too.
         """
         source = source or self.name
+        self.check_events(source)
+        if self.frames is not None:
+            self.frames.check(self.width, self.height, source)
+        return self
+
+    def check_events(self, source: str | None = None) -> None:
+        """Raise `InputError` where events in memory were changed, and where there is no data."""
+        source = source or self.name
         if not len(self.events) and not self.frames:
             raise InputError(f"{source}: holds no event and no frame; nothing can be estimated")
         if isinstance(self.events, Events):
             self.events.check(self.width, self.height, source)
-        if self.frames is not None:
-            self.frames.check(self.width, self.height, source)
-        return self

@@ -126,6 +126,7 @@ class PixelEstimator(ImageEstimator[P]):
         `options` are those of `Video`. Raises `InputError` if the recording lacks what the method
         needs.
         """
+        self.check_options(**options)
         return Video(self, recording, self.Params() if params is None else params, **options)
 
     def live(
@@ -139,5 +140,6 @@ class PixelEstimator(ImageEstimator[P]):
         """
         if self.looks_ahead:
             raise InputError(f"the method {self.name!r} needs what comes later; use akf")
+        self.check_options(**options)
         params = self.Params() if params is None else params
         return LiveVideo(self, size, params, frames=frames, **options)

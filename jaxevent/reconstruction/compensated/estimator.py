@@ -686,6 +686,7 @@ class MotionCompensated(ImageEstimator[Params]):
         `options` are those of `CompensatedVideo`.
         """
         self.refuse_unknown({name: v for name, v in options.items() if name != "progress"})
+        self.check_options(**options)
         chosen = self.Params() if params is None else params
         return CompensatedVideo(self, recording, chosen, **options)
 
