@@ -6,14 +6,50 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxevent.errors import InputError
 from jaxevent.io.output import complete
 from jaxevent.io.places import check, locked
-from jaxevent.show.report import markdown_table
+from jaxevent.show.report import flatten, markdown_table, means
+
+if TYPE_CHECKING:
+    import pandas
 
 Write = Callable[[str, bytes], None]
+
+
+class Rows(list[dict[str, Any]]):
+    """Rows of results: a list of dicts that shows itself as a table."""
+
+    def __repr__(self) -> str:
+        return self.table()
+
+    def table(self) -> str:
+        """The rows as a Markdown table, aligned as plain text too."""
+        return markdown_table(self)
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The rows as a pandas table; nested names are joined by dots, lists are left out."""
+        import pandas
+
+        flat = [flatten(row) for row in self]
+        return pandas.DataFrame(
+            [{k: v for k, v in row.items() if not isinstance(v, list)} for row in flat]
+        )
+
+
+class Evaluation(Rows):
+    """What `evaluate` returns: its rows, and the means of each method over recordings."""
+
+    def means(self) -> "pandas.DataFrame":
+        """The means over recordings: a line for each method, with the number of recordings.
+
+        NaN where no recording has the number.
+        """
+        import pandas
+
+        return pandas.DataFrame(means(self)).set_index("method")
 
 
 def check_folder(
