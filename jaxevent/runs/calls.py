@@ -14,6 +14,7 @@ import numpy as np
 from jaxevent import methods
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
+from jaxevent.io.output import values_of
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
 from jaxevent.runs.config import Named, Tables
@@ -36,7 +37,7 @@ def is_config(arguments: Sequence[Any], settings: Mapping[str, Any], call: Colle
         InputError: There are arguments that go with recordings beside the path of a TOML file.
     """
     first = arguments[0] if arguments else settings.get("config")
-    if "config" not in settings and (not arguments or not is_path(first)):
+    if first is None or not is_path(first):
         return False
     beside = [name for name in call if name in settings]
     if Path(first).suffix == ".toml":
@@ -195,7 +196,7 @@ def described(value: Any) -> Any:
     if isinstance(value, Recording | Metric):
         return value.name
     if isinstance(value, Parameters):
-        return described(value.values())
+        return described(values_of(value))
     if isinstance(value, Mapping):
         return {name: described(one) for name, one in value.items() if one is not None}
     if isinstance(value, list):

@@ -36,8 +36,9 @@ from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.truth import Known, known
 from jaxevent.egomotion.twists import from_gyro, imu_rotation
 from jaxevent.errors import InputError
+from jaxevent.estimator import Estimate
 from jaxevent.parameters import Parameters
-from jaxevent.recording import Recording
+from jaxevent.recording import Recording, Times
 from jaxevent.runs.config import (
     METRICS,
     NOT_NEGATIVE,
@@ -237,6 +238,16 @@ def _settings(
     return settings
 
 
+class SampledMotion(Motion):
+    """A motion that is known at the times of its estimates alone: nothing is interpolated."""
+
+    def __call__(
+        self, times: Times, *, centred: bool = False, extrapolate: bool = False
+    ) -> Estimate:
+        rows = np.searchsorted(self.t, np.asarray(times))
+        return Estimate(self.mean[rows], self.covariance[rows], self.valid[rows])
+
+
 def _of_function(
     recording: Recording, method: Function, times: NDArray[np.int64], model: type[Model]
 ) -> Motion:
@@ -245,8 +256,7 @@ def _of_function(
     mean, covariance, _ = method.estimate(recording, times, [(d,)])
     if covariance is None or covariance.shape != (len(times), d, d):
         covariance = np.full((len(times), d, d), np.nan)
-    valid = np.isfinite(mean).all(1)
-    return Motion.of(model, times, np.where(valid[:, None], mean, 0), covariance, valid)
+    return SampledMotion.of(model, times, mean, covariance, np.isfinite(mean).all(1))
 
 
 def _own(

@@ -378,8 +378,9 @@ def _key(
 
     None where a method or a metric is an object that no module holds: what it computes may change.
     """
-    named = [entry.sent, *plan.options.get("metrics", ())]
-    if not all(isinstance(one, str) for one in named):
+    objects = [entry.sent, *plan.options.get("metrics", ())]
+    named = [one for one in objects if isinstance(one, str)]
+    if len(named) < len(objects):
         return None
     code = [code_of(one) for one in named if ":" in one]
     if None in code:

@@ -215,15 +215,14 @@ def plan_of(table: Mapping[str, Any], folder: Path, config: Path | None, text: b
     }
     if not found["fit"]:
         raise InputError('no recording is given; add recordings = ["file.zip"]')
-    places = [
-        recording if isinstance(recording, Recording) else recording.resolve()
-        for split in SPLITS
-        for _, recording in found[split]
-    ]
-    for (name, _), place in zip((one for s in SPLITS for one in found[s]), places, strict=True):
-        if sum(place is other or _same(place, other) for other in places) > 1:
-            what = name if isinstance(place, Recording) else place
-            raise InputError(f"{what} is in two of recordings, validation and test; choose one")
+    given = [one for split in SPLITS for one in found[split]]
+    keys = [id(one) if isinstance(one, Recording) else one.resolve() for _, one in given]
+    for (name, _), key in zip(given, keys, strict=True):
+        if keys.count(key) > 1:
+            raise InputError(
+                f"{key if isinstance(key, Path) else name} is in two of recordings, validation and "
+                "test; choose one"
+            )
     apart = bool(found["validation"] or found["test"])
     if apart and "split" in table:
         raise InputError("split is for configurations without validation and test; omit it")
@@ -255,10 +254,6 @@ def plan_of(table: Mapping[str, Any], folder: Path, config: Path | None, text: b
         None if apart else tuple(table.get("split", (2, 1, 1))),
         table.get("window"),
     )
-
-
-def _same(one: Path | Recording, other: Path | Recording) -> bool:
-    return isinstance(one, Path) and isinstance(other, Path) and one == other
 
 
 def _task(entry: Mapping[str, Any], table: Mapping[str, Any], folder: Path) -> Task:

@@ -430,10 +430,10 @@ def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 def _table_of_means(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The means of each method, as a Markdown table below that of the rows; "" of one recording."""
-    if len({row["recording"] for row in rows}) < 2 or all("error" in row for row in rows):
-        return ""
+    """A Markdown table of each method's means; empty where no method has several recordings."""
     found = means(rows)
+    if all(row["recordings"] < 2 for row in found):
+        return ""
     columns = [column for column in columns_of(rows) if column[1] in found[0]]
     table = [["mean of", "recordings", *(title for title, _, _, _ in columns)]]
     for row in found:
