@@ -7,7 +7,7 @@ tables of what is true.
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from jaxevent import methods
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
 from jaxevent.io.output import values_of
-from jaxevent.parameters import Parameters
+from jaxevent.parameters import Parameters, read_toml
 from jaxevent.recording import Recording
 from jaxevent.runs.config import Named, Tables
 from jaxevent.runs.own import Metric, find_method, import_path, named_metric
@@ -25,28 +25,43 @@ PathLike = str | os.PathLike
 CALLED = "# As called from Python; of objects only the names are told.\n"
 
 
-def is_config(arguments: Sequence[Any], settings: Mapping[str, Any], call: Collection[str]) -> bool:
-    """Whether a call of `evaluate` or `fit` names a configuration rather than recordings.
+class Forms(NamedTuple):
+    """The two forms of a call: of a configuration, and of objects."""
 
-    Args:
-        arguments: By position.
-        settings: By name.
-        call: Names of arguments that go with recordings alone.
+    example: str  # of objects
+    of_file: Collection[str]  # names of arguments that a configuration may have beside it
+    of_objects: Collection[str]  # of those that tell objects from a configuration
 
-    Raises:
-        InputError: There are arguments that go with recordings beside the path of a TOML file.
-    """
-    first = arguments[0] if arguments else settings.get("config")
-    if first is None or not is_path(first):
-        return False
-    beside = [name for name in call if name in settings]
-    if Path(first).suffix == ".toml":
+    def is_config(self, arguments: Sequence[Any], settings: Mapping[str, Any]) -> bool:
+        """Whether a call names a configuration rather than recordings.
+
+        Args:
+            arguments: By position.
+            settings: By name.
+
+        Raises:
+            InputError: There are arguments beside the path of a TOML file that go with recordings
+                alone, or a single path is that of something else.
+        """
+        first = arguments[0] if arguments else settings.get("config")
+        if first is None or not is_path(first):
+            return False
+        beside = [name for name in settings if name not in self.of_file]
+        if Path(first).suffix != ".toml":
+            method = len(arguments) > 1 and names_method(arguments[1])
+            if method or any(name in self.of_objects for name in settings):
+                return False
+            try:
+                read_toml(first)
+            except InputError as error:
+                raise InputError(
+                    f"{error}; or if it is a recording, give a method too: {self.example}"
+                ) from None
         if beside:
             raise InputError(
-                f"{first}: the file says what {beside[0]} says; omit one, or the other"
+                f"{first}: {beside[0]} is no argument beside a configuration; set it in the file"
             )
         return True
-    return not (beside or (len(arguments) > 1 and names_method(arguments[1])))
 
 
 def is_path(value: Any) -> bool:
@@ -195,6 +210,8 @@ def described(value: Any) -> Any:
         return described(value.recording) if is_path(value.recording) else value.name
     if isinstance(value, Recording | Metric):
         return value.name
+    if isinstance(value, Tables):
+        return "given in Python"
     if isinstance(value, Parameters):
         return described(values_of(value))
     if isinstance(value, Mapping):

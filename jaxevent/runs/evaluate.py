@@ -77,9 +77,9 @@ from jaxevent.parameters import Parameters, read_toml
 from jaxevent.recording import Recording
 from jaxevent.runs.calls import (
     CALLED,
+    Forms,
     PathLike,
     described,
-    is_config,
     method_name,
     methods_of,
     metrics_of,
@@ -164,8 +164,8 @@ def evaluate(*arguments: Any, **settings: Any) -> Evaluation:
 
     Args:
         config: The TOML file.
-        recordings: A `Recording` or a path, a list of them, or a mapping from names. Of recordings
-            with the same name the second is called "name (2)".
+        recordings: A `Recording` or a path, a list of them, what `jaxevent.datasets.open` gives, or
+            a mapping from names. Of recordings with the same name the second is called "name (2)".
         methods: A method, a list of methods, or a mapping from labels. A method is a name, an
             `Estimator`, a function `method(recording, times)` (see `jaxevent.runs.own`), a pair
             (method, params), or a mapping with the keys of a [[method]].
@@ -199,12 +199,17 @@ def evaluate(*arguments: Any, **settings: Any) -> Evaluation:
         InputError: The file, an argument or a parameter cannot be used, `out` not be written or
             only over other files, the cluster not be reached; or no row could be computed.
     """
-    if is_config(arguments, settings, CALL):
+    if FORMS.is_config(arguments, settings):
         return _evaluate_file(*arguments, **settings)
     return _evaluate_objects(*arguments, **settings)
 
 
-CALL = ("recordings", "methods", "protocol")  # arguments that only the second form has
+FORMS = Forms(
+    'jaxevent.evaluate(recording, ["akf"])',
+    ("config", "out", "progress", "metrics", "workers", "cluster", "scheduler_file", "retries",
+     "replace"),
+    ("recordings", "methods", "protocol"),
+)  # fmt: skip
 
 
 def _evaluate_file(
@@ -225,7 +230,7 @@ def _evaluate_file(
 
 
 def _evaluate_objects(
-    recordings: Any,
+    recordings: Any = None,
     methods: Any = None,
     *,
     metrics: Any = (),
@@ -240,9 +245,7 @@ def _evaluate_objects(
     **settings: Any,
 ) -> Evaluation:
     if methods is None:
-        raise InputError(
-            'no method is given; give methods, as jaxevent.evaluate(recordings, ["akf"])'
-        )
+        raise InputError(f"no method is given; give a recording and methods, as {FORMS.example}")
     table = settings_of({**settings, "protocol": protocol})
     for name in ("positions", "truth"):
         if name in table:

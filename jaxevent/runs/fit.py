@@ -62,9 +62,9 @@ from jaxevent.recording import Recording
 from jaxevent.runs import findings
 from jaxevent.runs.calls import (
     CALLED,
+    Forms,
     PathLike,
     described,
-    is_config,
     recordings_of,
     settings_of,
 )
@@ -166,28 +166,34 @@ def fit(*arguments: Any, **settings: Any) -> Fits:
         InputError: The file, a recording or a parameter cannot be used, `out` cannot be written,
             holds another run's checkpoint or is written by another process.
     """
-    if is_config(arguments, settings, CALL):
+    if FORMS.is_config(arguments, settings):
         return _fit_file(*arguments, **settings)
     return _fit_objects(*arguments, **settings)
 
 
-CALL = ("method", "fit", "search", "params")  # arguments that only the second form has
+FORMS = Forms(
+    'jaxevent.fit(recording, akf, fit=["c_on"])',
+    ("config", "out", "recordings", "resume", "progress", "replace"),
+    ("method", "fit", "search", "params"),
+)
 
 
 def _fit_file(
     config: PathLike,
-    out: PathLike,
+    out: PathLike | None = None,
     recordings: Sequence[Any] | None = None,
     resume: bool = False,
     progress: bool | None = None,
     replace: bool = True,
 ) -> Fits:
+    if out is None:
+        raise InputError(f"{config}: out is missing; give the folder of the results")
     plan = devices.in_step(lambda: read_plan(Path(config), recordings))
     return _fit(plan, Path(out), resume, progress, replace)
 
 
 def _fit_objects(
-    recordings: Any,
+    recordings: Any = None,
     method: Any = None,
     *,
     out: PathLike | None = None,
@@ -197,9 +203,7 @@ def _fit_objects(
     **settings: Any,
 ) -> Fits:
     if method is None:
-        raise InputError(
-            'no method is given; give one, as jaxevent.fit(recording, akf, fit=["c_on"])'
-        )
+        raise InputError(f"no method is given; give a recording and one, as {FORMS.example}")
     if isinstance(method, list | dict | type):
         raise InputError(
             f"the method is {a_kind(method)}; give one Estimator, or its name, and fit others apart"

@@ -143,7 +143,7 @@ def test_metrics_that_cannot_be(metric, said):
         (3, "blend", {}, "recordings are an int; give a list of recordings or paths"),
         ([3], "blend", {}, "recordings hold an int; give jaxevent.Recording objects or paths"),
         ([], "blend", {}, "recordings is missing"),
-        (small(), None, {}, "no method is given; give methods"),
+        (small(), None, {}, "no method is given; give a recording and methods"),
         (small(), 3, {}, "methods are an int; give a list of methods"),
         (small(), [3], {}, "the method 3 is an int, not an Estimator"),
         (small(), type(blend), {}, "is a class; give an object of it"),
@@ -157,7 +157,8 @@ def test_metrics_that_cannot_be(metric, said):
         (small(), [blend, "moment"], {}, "'moment' is of blob, not of reconstruction"),
         (small(), blend, {"cluster": 3}, "the cluster is an int; give the address"),
         ("none.h5", "blend", {}, "none.h5: there is no such file"),
-        ("run.toml", None, {"protocol": "held-out"}, "run.toml: the file says what protocol says"),
+        ("run.toml", None, {"gap": 4}, "run.toml: gap is no argument beside a configuration"),
+        ("none.h5", None, {}, "none.h5: cannot be read .* give a method too: jaxevent.evaluate"),
     ],
 )
 def test_calls_that_cannot_be(recordings, methods, settings, said):
@@ -255,7 +256,9 @@ def test_digest_of_what_is_the_same(tmp_path):
     lazy = jaxevent.load(tmp_path / "small.h5", in_memory=False)
     assert not isinstance(lazy.events, Events)
     assert contents.digest(lazy) == contents.digest(jaxevent.load(tmp_path / "small.h5"))
-    found = {contents.digest(one) for one in (small(), noisier(1), small(width=25), [1, 2], [12])}
+    found = {
+        contents.digest(one) for one in (small(), noisier(1), small(frames=None), [1, 2], [12])
+    }
     assert len(found) == 5
     with pytest.raises(InputError, match="an object in a recording"):
         contents.digest(small(extra={"what": object()}))
@@ -392,7 +395,9 @@ def test_fits_of_objects(tmp_path):
 @pytest.mark.parametrize(
     ("recordings", "method", "settings", "said"),
     [
-        (small(), None, {}, "no method is given; give one"),
+        (small(), None, {}, "no method is given; give a recording and one"),
+        ("run.toml", None, {"fit": ["c_on"]}, "fit is no argument beside a configuration"),
+        ("run.toml", None, {}, "run.toml: out is missing; give the folder"),
         (small(), "edi", {}, "nothing is to be fitted"),
         (small(), "edi", {"fit": "c_on"}, "fit is 'c_on'; give a list of names"),
         (small(), "edi", {"fit": ["con"]}, "there is no parameter 'con'; did you mean 'c_on'"),
