@@ -33,7 +33,7 @@ class Forms(NamedTuple):
     of_objects: Collection[str]  # of those that tell objects from a configuration
 
     def is_config(self, arguments: Sequence[Any], settings: Mapping[str, Any]) -> bool:
-        """Whether a call names a configuration rather than recordings.
+        """Tell whether a call names a configuration rather than recordings.
 
         Args:
             arguments: By position.
@@ -69,7 +69,7 @@ def is_path(value: Any) -> bool:
 
 
 def names_method(value: Any) -> bool:
-    """Whether an argument can only be meant as a method, or several."""
+    """Tell whether an argument can only mean a method, or several."""
     if is_path(value):
         return isinstance(value, str) and (value in methods.names() or ":" in value)
     return value is not None
@@ -111,7 +111,7 @@ def methods_of(given: Any) -> list[dict[str, Any]]:
 
 
 def _is_pair(given: Any) -> bool:
-    """Whether it is (method, params); two methods may be a tuple too."""
+    """Tell a pair (method, params) from a tuple of two methods."""
     return (
         isinstance(given, tuple)
         and len(given) == 2
@@ -156,7 +156,7 @@ def point(name: str, value: Any) -> str:
 
 
 def method_name(given: Any) -> str:
-    """What a method is called where it has no label."""
+    """Return the name of a method that has no label."""
     return given if isinstance(given, str) else find_method(given).name
 
 

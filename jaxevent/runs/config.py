@@ -39,7 +39,7 @@ class Tables:
 
     @classmethod
     def of(cls, given: Any) -> "Tables | str":
-        """Of what a caller gives: a mapping from recordings' names, or anything like a table."""
+        """Make them of a table, or of a mapping from recordings' names; a text stays one."""
         if isinstance(given, str):
             return given
         if isinstance(given, os.PathLike):
@@ -82,7 +82,7 @@ def is_table(value: Any) -> bool:
 
 
 def is_column(value: Any) -> bool:
-    """Whether a value of a mapping is a column of numbers rather than a table."""
+    """Tell whether a value of a mapping is a column of numbers rather than a table."""
     return not (isinstance(value, str | os.PathLike | Mapping) or hasattr(value, "columns")) and (
         not hasattr(value, "to_dataframe")
     )
@@ -106,7 +106,7 @@ def _table(given: Any) -> Any:
 
 
 def known_as(path: Path) -> str:
-    """How other programs' results call a recording: its name without suffix."""
+    """Return the name of a recording in other programs' results: that of its file, no suffix."""
     return path.name if path.is_dir() else path.stem
 
 

@@ -1,4 +1,4 @@
-"""What recordings hold: hashes of files, kept, and of objects; the recording last loaded."""
+"""Contents of recordings: hashes of files, kept, and of objects; the recording last loaded."""
 
 import contextlib
 import dataclasses

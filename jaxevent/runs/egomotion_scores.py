@@ -227,7 +227,7 @@ def _settings(
     options: Mapping[str, Any],
     bias: NDArray[np.float64],
 ) -> dict[str, Any]:
-    """What `estimate` of the method takes of the protocol's settings."""
+    """Return those of the protocol's settings that the method's `estimate` takes."""
     settings: dict[str, Any] = {}
     if options.get("smooth", False) and "smooth" in method.options:
         settings["smooth"] = True

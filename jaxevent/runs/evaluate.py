@@ -270,7 +270,7 @@ def _evaluate_objects(
 
 
 class Origin(NamedTuple):
-    """What an evaluation was asked for by: its title, its text, and the files that it reads."""
+    """Title and text of a configuration or a call, and the files that it reads."""
 
     title: str
     text: bytes

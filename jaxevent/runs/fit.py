@@ -279,7 +279,7 @@ def _text(tasks: Sequence[Task], rows: Any, found: Any, gained: Any) -> str:
 
 
 def _finished(rows: list[dict[str, Any]], out: Path, plan: Plan) -> Fits:
-    """What a run returned that had ended, from its folder."""
+    """Read the result of a run that had ended from its folder."""
     kept = json.loads((out / "results.json").read_bytes())
     params = {
         task.label: task.method.Params.load(out / "params.toml", task.label) for task in plan.tasks

@@ -208,7 +208,7 @@ def find_method(given: Any, family: str | None = None) -> Estimator | Function:
 
 
 def import_path(thing: Any) -> str | None:
-    """How other processes find an object: the name of a method of the library, "module:object".
+    """Return the text by which other processes find an object: a method's name, "module:object".
 
     None where they cannot: it was made in a notebook or inside a function, or is in no module.
     """

@@ -41,7 +41,7 @@ class Rows(list[dict[str, Any]]):
 
 
 class Evaluation(Rows):
-    """What `evaluate` returns: its rows, and the means of each method over recordings."""
+    """Rows of `evaluate`, with the means of each method over recordings."""
 
     def means(self) -> "pandas.DataFrame":
         """The means over recordings: a line for each method, with the number of recordings.
@@ -54,7 +54,7 @@ class Evaluation(Rows):
 
 
 class Fits(Rows):
-    """What `fit` returns: rows of scores before and after, and what was found.
+    """Rows of `fit`, scores before and after, with the parameters that were found.
 
     Attributes:
         params_by_method: The fitted `Params` of each method, by label.
