@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent import arrays
 from jaxevent.camera import PinholeCamera, Response, TableResponse, UnknownResponse
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, OrderError
 from jaxevent.shown import Shown, plural
 
 if TYPE_CHECKING:
@@ -194,7 +194,7 @@ class Events:
         """Raise `InputError` unless the events are sorted by time."""
         row = arrays.first_decrease(self.t)
         if row is not None:
-            raise InputError(
+            raise OrderError(
                 f"{source}: event {first_row + row} is at {self.t[row]} us, earlier than the one "
                 f"before it at {self.t[row - 1]} us; sort the events by time (stable)"
             )
