@@ -25,7 +25,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxevent import Events, Frames, InputError, Recording
-from jaxevent.camera import PinholeCamera
 from jaxevent.recording import Imu, Poses, Triggers
 
 SIZE = WIDTH, HEIGHT = 64, 48
@@ -507,7 +506,7 @@ def fields() -> Iterator[Case]:
         Triggers: {"t": t, "edge": np.ones(4, int), "channel": np.zeros(4, int)},
     }
     for kind, given in good.items():
-        for name, value in given.items():
+        for name in given:
             for what, form in layouts().items():
                 call = lambda k=kind, n=name, f=form, g=given: k(**{**g, n: f(g[n])})  # noqa: E731
                 yield Case(
@@ -597,8 +596,8 @@ def mutated(column: str, value: int) -> Recording:
     return recording
 
 
-def cases() -> list[Case]:
-    """All of them, in one order."""
+def constructions() -> list[Case]:
+    """Cases of arrays, of events, frames and recordings."""
     found = []
     for column in "txyp":
         for kind, form, right in columns(column):
@@ -648,7 +647,12 @@ def cases() -> list[Case]:
                     right,
                 )
             )
-    return [*found, *whole_arguments(), *fields(), *estimates()]
+    return [*found, *whole_arguments(), *fields()]
+
+
+def cases() -> list[Case]:
+    """All of them, in one order."""
+    return [*constructions(), *estimates()]
 
 
 def leaves(thing: Any) -> list[np.ndarray]:
@@ -712,7 +716,7 @@ def run(wanted: list[Case]) -> dict[str, str]:
     while left:
         done = subprocess.run(
             [sys.executable, __file__, "--child"], input=json.dumps(left), text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ, "PYTHONFAULTHANDLER": "1"},
+            capture_output=True, env={**os.environ, "PYTHONFAULTHANDLER": "1"},
         )  # fmt: skip
         lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
         if not lines:
