@@ -333,7 +333,7 @@ class Frames:
             )
         if not lazy:
             arrays.check_image_values(images, source)
-            images = arrays.plain_images(images)
+            images = arrays.plain_images(np.asarray(images))
         for name, values in (("t", t), ("images", images), ("exposure", exposure)):
             object.__setattr__(self, name, values)
         self._check_times(source)
@@ -342,7 +342,7 @@ class Frames:
     def of_checked(
         cls, t: NDArray[np.int64], images: NDArray | ImageSource, exposure: NDArray[np.int64]
     ) -> "Frames":
-        """Frames that were checked, as rows of other frames are."""
+        """Frames that were checked, as rows of others are, or references of linear intensity."""
         frames = object.__new__(cls)
         for name, values in (("t", t), ("images", images), ("exposure", exposure)):
             object.__setattr__(frames, name, values)
@@ -657,8 +657,7 @@ class Recording(Shown):
         if colours is not None and isinstance(further, Mapping):
             further = {"rgb": colours, **further}
         recording = cls(name, *size, events, made, camera, poses, imu, further, triggers)
-        if not len(events) and not made:
-            raise InputError(f"{name}: t is empty and there are no frames; give events or frames")
+        recording.refuse_empty()
         return recording
 
     def __repr__(self) -> str:
@@ -776,15 +775,20 @@ class Recording(Shown):
         Arrays that were changed since the recording was made are found, too.
         """
         source = source or self.name
+        self.refuse_empty(source)
         self.check_events(source)
         if self.frames is not None:
             self.frames.check(self.width, self.height, source)
         return self
 
     def check_events(self, source: str | None = None) -> None:
-        """Raise `InputError` where events in memory were changed, and where there is no data."""
-        source = source or self.name
-        if not len(self.events) and not self.frames:
-            raise InputError(f"{source}: holds no event and no frame; nothing can be estimated")
+        """Raise `InputError` where events in memory were changed since they were checked."""
         if isinstance(self.events, Events):
-            self.events.check(self.width, self.height, source)
+            self.events.check(self.width, self.height, source or self.name)
+
+    def refuse_empty(self, source: str | None = None) -> None:
+        """Raise `InputError` where there is neither an event nor a frame."""
+        if not len(self.events) and not self.frames:
+            raise InputError(
+                f"{source or self.name}: holds no event and no frame; nothing can be estimated"
+            )

@@ -580,7 +580,7 @@ def estimates() -> Iterator[Case]:
             f"{name}/recording/empty",
             lambda f=run: f(Recording("e", *SIZE, Events.empty())),
             run,
-            REFUSED,
+            EITHER,
         )
         yield Case(f"{name}/option/unknown", lambda f=run: f(colour=3), run, REFUSED)
         for option in options[method]:

@@ -98,8 +98,7 @@ def load(
             parse_repair(repair)
         with naming(path):
             recording = _reader(path, options)(path, options)
-    if not len(recording.events) and not recording.frames:
-        raise InputError(f"{path}: holds no event and no frame; nothing can be estimated")
+    recording.refuse_empty(str(path))
     return dataclasses.replace(recording, notes=(*recording.notes, *options.notes))
 
 
