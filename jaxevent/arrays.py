@@ -283,10 +283,12 @@ def coordinates(
         values = values.astype(np.float32) if values.dtype.itemsize < 4 else values
         good = (values >= origin) & (values <= last) & (values == np.rint(values))
         bad_row = None if good.all() else int(np.argmin(good))
-    elif len(values) and not origin <= values.min() <= values.max() <= last:
-        bad_row = int(np.argmax((values < origin) | (values > last)))
     else:
-        bad_row = None
+        # What the type cannot hold is not looked for.
+        kind, bad_row = np.iinfo(values.dtype), None
+        low = kind.min < origin and len(values) and values.min() < origin
+        if low or (kind.max > last and len(values) and values.max() > last):
+            bad_row = int(np.argmax((values < origin) | (values > last)))
     if bad_row is not None:
         known = max(size) < MAX_PIXELS
         on = f"on the {size[0]}x{size[1]} sensor " if known else ""
