@@ -217,15 +217,6 @@ class Estimator(abc.ABC, Generic[P]):
     def estimate(self, recording: Recording, params: P | None = None, **options: Any) -> Any:
         """The `Result` of a recording; see the family's own for its options."""
 
-    def check_options(self, **options: Any) -> None:
-        """Raise `InputError` for an option of another kind than `option_kinds` says."""
-        for name, value in options.items():
-            kind = self.option_kinds.get(name)
-            if kind is not None and not kind.fits(value):
-                raise InputError(
-                    f"the method {self.name!r} takes {name} as {kind.text}, not {brief(value)}"
-                )
-
     def refuse_unknown(self, options: dict[str, Any]) -> None:
         """Raise `InputError` for options that `estimate` does not take."""
         for name in options:
@@ -234,6 +225,15 @@ class Estimator(abc.ABC, Generic[P]):
                 raise InputError(
                     f"the method {self.name!r} has no option {name!r}; leave it out (known: "
                     f"{known})"
+                )
+
+    def check_options(self, **options: Any) -> None:
+        """Raise `InputError` for an option of another kind than `option_kinds` says."""
+        for name, value in options.items():
+            kind = self.option_kinds.get(name)
+            if kind is not None and not kind.fits(value):
+                raise InputError(
+                    f"the method {self.name!r} takes {name} as {kind.text}, not {brief(value)}"
                 )
 
 

@@ -24,6 +24,7 @@ def source_of(part: Events | Recording) -> EventSource:
 def size_of(part: Events | Recording, size: Size | None) -> Size:
     """(width, height) of the sensor: the recording's, else what was given."""
     if isinstance(part, Recording):
+        part.check_events()
         return part.width, part.height
     if size is None:
         raise InputError("events alone do not tell the sensor; give size=(width, height)")

@@ -27,14 +27,14 @@ class ImageEstimator(Estimator[P]):
     family: ClassVar[str] = "reconstruction"
     has_likelihood: ClassVar[bool] = False  # whether it has `log_likelihood` of the frames given
 
+    def check_span(self, recording: Recording, times: Times, params: P) -> None:
+        """Raise `InputError` for times outside the recording, its frames on either clock."""
+        check_times(times, *time_span(recording, params.clock_offset), recording.name)
+
     def check(self, recording: Recording) -> None:
         """Raise `InputError` for a recording without data, or without what the method needs."""
         super().check(recording)
         recording.refuse_empty()
-
-    def check_span(self, recording: Recording, times: Times, params: P) -> None:
-        """Raise `InputError` for times outside the recording, its frames on either clock."""
-        check_times(times, *time_span(recording, params.clock_offset), recording.name)
 
     @abc.abstractmethod
     def estimate(
