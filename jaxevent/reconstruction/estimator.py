@@ -27,6 +27,15 @@ class ImageEstimator(Estimator[P]):
     family: ClassVar[str] = "reconstruction"
     has_likelihood: ClassVar[bool] = False  # whether it has `log_likelihood` of the frames given
 
+    @property
+    def by_parameters(self) -> str:
+        if not self.differentiable:
+            return super().by_parameters
+        return (
+            f"prepare once outside, images = {self.spelled}.prepare_images(recording, times), and "
+            "map or differentiate images(params)"
+        )
+
     def check_span(self, recording: Recording, times: Times, params: P) -> None:
         """Raise `InputError` for times outside the recording, its frames on either clock."""
         check_times(times, *time_span(recording, params.clock_offset), recording.name)
