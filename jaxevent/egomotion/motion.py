@@ -269,7 +269,7 @@ class Motion(Shown):
         """Make a pandas table of the motion, with the columns that `jaxevent motion` writes as CSV.
 
         Args:
-            times: Integers (us) or floats (s); by default those of the estimates, `t`.
+            times: Integers (us) or floats (s); by default the table holds the estimates themselves.
             centred: Whether an estimate counts for the time that what it saw shows, see the call.
 
         Returns:
@@ -282,8 +282,10 @@ class Motion(Shown):
         """
         import pandas
 
-        us = self.t if times is None else np.atleast_1d(microseconds(times))
-        told = self(us, centred=centred, extrapolate=times is None)
+        if times is None:
+            us, told = self.t, Estimate(self.mean, self.covariance, self.valid)
+        else:
+            us, told = np.atleast_1d(microseconds(times)), self(times, centred=centred)
         table = pandas.DataFrame(table_columns(self.model, us, told))
         units = dict(zip(self.model.components, self.model.units, strict=True))
         sigmas = {f"sigma_{name}": unit for name, unit in units.items()}
