@@ -233,9 +233,9 @@ class Level(eqx.Module):
 def bounded_ratio(params: AugmentParams, ratio: Array, known: Array) -> Array:
     """Replace calibrated over nominal thresholds by 1 where out of bounds or not known (10).
 
-    Within `ratio_width` / 2 of a bound a ratio r becomes 1 + w (r - 1), with the weight w = t^2 (3 -
-    2 t) for t that rises from 0 to 1 across it. So images have derivatives by all that ratios
-    depend on, and elsewhere are those of hard bounds.
+    Within `ratio_width` / 2 of a bound a ratio r becomes 1 + w (r - 1), with the weight
+    w = t^2 (3 - 2 t) for t that rises from 0 to 1 across the bound. So images do not jump as the
+    parameters change. Elsewhere the bounds are hard.
 
     Args:
         params: Bounds and width, as ratios.
