@@ -29,7 +29,10 @@ def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
 
     Raises `InputError` for other types and for times that are not finite or too large for int64.
     """
-    time = np.asarray(time)
+    try:
+        time = np.asarray(time)
+    except ValueError:  # lists of different lengths
+        time = np.empty(0, object)
     if time.dtype.kind not in "iuf":
         raise InputError(
             f"{what} are {time.dtype}; give integers (microseconds) or floats (seconds)"

@@ -22,10 +22,23 @@ class ImageEstimator(Estimator[P]):
     Images are `Estimate`s: `mean` is intensity, 0 the frames' black and 1 their white, and goes
     beyond; `covariance` is the variance of log intensity ln(I + I0), NaN of methods that estimate
     none; `valid` is false where the intensity is not a finite number.
+
+    Attributes:
+        fuses: Whether images rest on events and frames together, so that thresholds must suit both.
     """
 
     family: ClassVar[str] = "reconstruction"
+    fuses: bool = dataclasses.field(default=True, kw_only=True)
     has_likelihood: ClassVar[bool] = False  # whether it has `log_likelihood` of the frames given
+
+    @property
+    def by_parameters(self) -> str:
+        if not self.differentiable:
+            return super().by_parameters
+        return (
+            f"prepare once outside, images = {self.spelled}.prepare_images(recording, times), and "
+            "map or differentiate images(params)"
+        )
 
     def check_span(self, recording: Recording, times: Times, params: P) -> None:
         """Raise `InputError` for times outside the recording, its frames on either clock."""

@@ -430,7 +430,7 @@ class Smoother(PixelEstimator[Params]):
 
     has_likelihood: ClassVar[bool] = True
     options: frozenset[str] = dataclasses.field(
-        default=frozenset({"window_events", "devices", "compiler"}), kw_only=True
+        default=frozenset({"window_events", "devices", "compiler", "factors"}), kw_only=True
     )
 
     @property

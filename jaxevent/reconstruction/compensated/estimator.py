@@ -85,7 +85,7 @@ CLEARLY = 0.97  # of the misfit by time, where the course tells more than noise
 FASTEST = 2.0  # times as fast as what moves on the whole: what exposures are sampled for
 INFLATE = 3.0  # of the variance of an image that motion is refined with
 
-evidence = Evidence("evidence", Params)  # reads images at single instants
+evidence = Evidence("evidence", Params, fuses=False)  # reads images at single instants
 
 
 class Targets(Described):
