@@ -6,9 +6,9 @@ and from the numbers. Whole numbers are usually microseconds, numbers with decim
 layout may have a usual unit of its own. The numbers are compared with what recordings are like
 under each unit, as a sum of log-likelihoods:
 
-    span         log10 of seconds, normal: mean 0.7, standard deviation 1.3
-    rate         log10 of events per pixel and second, normal: mean 0, deviation 1.2 above, 1.5 below
-    repetition   log10 of seconds between events of one pixel, the 5 % quantile: mean -3, deviation 0.9
+    span         log10 of seconds: mean 0.7, standard deviation 1.3
+    rate         log10 of events per pixel and second: mean 0, deviation 1.2 above and 1.5 below
+    repetition   log10 of seconds between events of a pixel, 5 % quantile: mean -3, deviation 0.9
     magnitude    up to 12 days after zero, or a date between 2000 and 2050
     resolution   the largest power of ten of which all times are multiples
 
@@ -115,6 +115,15 @@ def unit_of_name(name: str) -> str | None:
     return None
 
 
+def split_unit(name: str) -> tuple[str, str | None]:
+    """Return a name without the unit at its end, and the unit, as of "frame_t_ns"."""
+    for unit, words in _SPELLED.items():
+        end = rf"\s*[\[(]\s*(?:{words})\s*[\])]|[\s_./:-]+(?:{words})"
+        if found := re.fullmatch(rf"(.+?)(?:{end})", name.strip(), re.IGNORECASE):
+            return found.group(1), unit
+    return name, None
+
+
 def unit_of_words(words: Any) -> str | None:
     """Return the unit that an attribute such as "us" or "[microseconds]" states; else None."""
     if not isinstance(words, str):
@@ -190,7 +199,7 @@ def infer_unit(
             )
     elif not known:
         unit = expected
-        if _is_impossible(numbers.largest, unit) and not _is_impossible(numbers.largest, best):
+        if numbers.span and _is_impossible(numbers.largest, unit) and not _is_impossible(numbers.largest, best):
             unit = best
             notes.append(f"event times are taken as {NAMES[unit]}, by their magnitude")
             _warn(_doubt(source, numbers, unit, expected))
@@ -199,16 +208,14 @@ def infer_unit(
         after = max((u for u in scores if u != unit), key=lambda u: scores[u])
         is_doubtful = scores[unit] < scores[after] + _DOUBT
         if unit != expected or is_doubtful:
-            notes.append(
-                f"event times are taken as {NAMES[unit]}, since {numbers.describe(unit)}"
-            )
+            notes.append(f"event times are taken as {NAMES[unit]}, since {numbers.describe(unit)}")
             _warn(_doubt(source, numbers, unit, expected if unit != expected else after))
     scale = SCALES[unit]
     if options.time_unit is None and numbers.has_decimals and numbers.span * scale > _LONGEST_US:
         raise InputError(
             f"{source}: the times are numbers with decimals, so {NAMES[unit]}, but span "
-            f"{numbers.span * scale / 86400e6:.0f} days; give their unit, time_unit= or "
-            "--time-unit, or store them as integer microseconds"
+            f"{numbers.span * scale / 86400e6:.0f} days; store them as integer microseconds, or "
+            "give their unit, time_unit= or --time-unit"
         )
     notes += _resolution(numbers, unit, source)
     return InferredUnit(unit, tuple(notes))
@@ -240,11 +247,12 @@ class _Numbers(NamedTuple):
 
     @classmethod
     def of(cls, sample: Mapping[str, NDArray], count: int, size: tuple[int, int]) -> "_Numbers":
+        pixels = max(size[0] * size[1], 1)
         kept = np.isfinite(sample["t"])
         stored = sample["t"][kept]
         t = stored.astype(np.float64)
         if not len(t):
-            return cls(count, size[0] * size[1], 0.0, 0.0, None, None, True, 0.0)
+            return cls(count, pixels, 0.0, 0.0, None, None, True, 0.0)
         # Differences of integers are exact, those of large ones as floats are not.
         whole = stored.dtype.kind != "f"
         steps = np.diff(stored.astype(np.int64) if whole else t).astype(np.float64)
@@ -255,7 +263,7 @@ class _Numbers(NamedTuple):
         largest = float(np.abs(t).max())
         return cls(
             count,
-            size[0] * size[1],
+            pixels,
             span,
             largest,
             _repetition(stored, sample["x"][kept], sample["y"][kept]),
@@ -343,11 +351,10 @@ def _repetition(t: NDArray, x: NDArray, y: NDArray) -> float | None:
     """Return the 5 % quantile of intervals between events of one pixel, None of too few."""
     order = np.lexsort((x[:-1], y[:-1]))  # the last event is not next to the others
     x, y, t = x[order], y[order], t[order]
-    same = (x[1:] == x[:-1]) & (y[1:] == y[:-1]) & (t[1:] >= t[:-1])
+    same = (x[1:] == x[:-1]) & (y[1:] == y[:-1]) & (t[1:] > t[:-1])
     if np.count_nonzero(same) < _FEWEST_REPETITIONS:
         return None
-    found = float(np.quantile((t[1:][same] - t[:-1][same]).astype(np.float64), 0.05))
-    return max(found, 0.5 if t.dtype.kind != "f" else 1e-12)
+    return float(np.quantile((t[1:][same] - t[:-1][same]).astype(np.float64), 0.05))
 
 
 def _digits(values: NDArray) -> int | None:
@@ -464,8 +471,9 @@ class Clock(NamedTuple):
         if others[best] <= _MUCH / 2 or not self._has_plausible_intervals(values, best):
             return as_usual
         note = f"{what} times are taken as {NAMES[best]}, on the clock of the events"
-        notes.append(note)
-        if best != self.unit:
+        is_new = note not in notes
+        notes += [note] * is_new
+        if best != self.unit and is_new:
             _warn(
                 f"{source}: {note}; as {NAMES[unit]}, the usual unit, they would not fit the "
                 f"events: write whole microseconds, or {NAMES[unit]}, to be sure"
