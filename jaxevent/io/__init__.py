@@ -303,16 +303,16 @@ def _hdf5_reader(path: Path, options: ReadOptions) -> Reader:
         ours = isinstance(events, h5py.Group) and {"t", "x", "y", "p"} <= set(events)
         ours |= str(hdf5_files.attribute(file, "format")) == "jaxevent"
         others = not ours and hdf5_layouts.knows(file)
-        matlab = hdf5.is_matlab(path, file)
-    if others:
+        matlab = hdf5.is_matlab(path)
+    if others and not matlab:
         return hdf5_layouts.read
     refuse_stream(path, options)
-    if ours:
-        return hdf5.read
     if matlab:
         from jaxevent.io import mat
 
         return mat.read_v73
+    if ours:
+        return hdf5.read
     raise InputError(
         f"{path}: the HDF5 file has neither events/t, x, y and p nor events under other known "
         f"names; {READABLE}"

@@ -406,10 +406,10 @@ def _in_memory(recording: Recording) -> Recording:
     return dataclasses.replace(recording, events=recording.events[:], frames=frames)
 
 
-def is_matlab(path: Path, file: Any) -> bool:
-    """Whether MATLAB wrote a file with `events`: it puts 512 bytes of its own before HDF5."""
+def is_matlab(path: Path) -> bool:
+    """Whether MATLAB wrote a file: it puts 512 bytes of its own before HDF5."""
     with path.open("rb") as stored:
-        return stored.read(6) == b"MATLAB" and isinstance(file.get("events"), h5py.Dataset)
+        return stored.read(6) == b"MATLAB"
 
 
 def _recording(file: h5py.File, path: Path, options: ReadOptions) -> Recording:

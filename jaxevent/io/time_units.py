@@ -44,6 +44,7 @@ _CONTRADICTION = 8.0  # nats by which another unit must exceed a stated one for 
 _COARSEST_US = 1000.0  # rounding of a type that is refused
 _FEWEST_STEPS = 64  # of a rounded type within the span of the events
 _LONGEST_US = 1e12  # of a recording with times that have decimals: 11.6 days
+_LARGEST_US = 2.0**62  # beyond which times are refused in any case
 _INTERVALS_US = (150.0, 5e6)  # between images, poses and samples
 _LITTLE, _MUCH = 0.02, 0.5  # intersection over union of the spans of two clocks
 
@@ -199,7 +200,11 @@ def infer_unit(
             )
     elif not known:
         unit = expected
-        if numbers.span and _is_impossible(numbers.largest, unit) and not _is_impossible(numbers.largest, best):
+        if (
+            numbers.span
+            and _is_impossible(numbers.largest, unit)
+            and not _is_impossible(numbers.largest, best)
+        ):
             unit = best
             notes.append(f"event times are taken as {NAMES[unit]}, by their magnitude")
             _warn(_doubt(source, numbers, unit, expected))
@@ -403,17 +408,16 @@ def _rounding(values: NDArray, largest: float) -> float:
 
 def _resolution(numbers: _Numbers, unit: str, source: str) -> list[str]:
     """Return a note on times rounded by their type; `InputError` where that loses them."""
-    rounding = numbers.rounding * SCALES[unit]
-    if rounding <= 1:
+    rounding, largest = (value * SCALES[unit] for value in (numbers.rounding, numbers.largest))
+    if rounding <= 1 or numbers.count < 2 or largest >= _LARGEST_US:
         return []
-    what = f"{_short(rounding)}, near {_short(numbers.largest * SCALES[unit])}"
     steps = numbers.span / numbers.rounding
     few = numbers.count >= FEWEST_EVENTS and steps < _FEWEST_STEPS
     if rounding >= _COARSEST_US or few:
         raise InputError(
             f"{source}: the type of the event times cannot resolve them: as {NAMES[unit]} its "
-            f"numbers are {what}, apart; store integer microseconds or 64-bit floats, counted "
-            "from the start of the recording"
+            f"numbers near {_short(largest)} are {_short(rounding)} apart; store integer "
+            "microseconds or 64-bit floats, counted from the start of the recording"
         )
     return [f"event times are rounded by their type to {_short(rounding)}"]
 
