@@ -2,10 +2,10 @@
 
     python experiments/time_units.py
 
-Each file has its own sensor, length, event rate, resolution and clock, drawn from a seed. Events come
-in bursts of one pixel, as of moving edges, with a dead time, on a background of noise. A table shows,
-for each unit and kind of number, the share of files whose unit is right, of those that are wrong in
-silence, and of those that warn.
+Each file has its own sensor, length, event rate, resolution and clock, drawn from a seed. Events
+come in bursts of one pixel, as of moving edges, with a dead time, on a background of noise. A table
+shows, for each unit and kind of number, the share of files whose unit is right, of those that are
+wrong in silence, of those that warn, and of those that are refused.
 """
 
 import warnings
@@ -17,8 +17,8 @@ from jaxevent.io.options import ReadOptions
 from jaxevent.io.time_units import SAMPLE, SCALES, infer_unit
 
 SENSORS = [(64, 48), (128, 128), (240, 180), (346, 260), (640, 480), (1280, 720)]
-FILES = 300  # of each row
-LARGEST = 200_000  # events that are simulated; the count of longer files is what it would be
+FILES = 200  # of each row
+LARGEST = 70_000  # events that are simulated; the count of longer files is what it would be
 
 
 def simulate(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, tuple]:

@@ -56,6 +56,7 @@ _MATRIX, _COMPRESSED = 14, 15  # types of elements
 _FLAGS, _SIZES, _NAME = 6, 5, 1
 _NUMBERS = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13}
 _CLASSES = range(6, 16)  # of arrays: double, single and the integers
+_VARIABLES = ("image", "time_image", "exposure", "f_Q", "ct", "HDR_mat")  # but events
 _STRUCT = 2  # class of a struct
 
 
@@ -261,7 +262,11 @@ def _find_events(arrays: dict[str, NDArray]) -> _StoredEvents | None:
         if (fields := find(inside)) is not None:
             columns = {key: arrays.pop(prefix + name) for key, name in fields.items()}
             return _StoredEvents(columns, None, fields["t"])
-    plain = [name for name, value in arrays.items() if as_rows(value) is not None]
+    plain = [
+        name
+        for name, value in arrays.items()
+        if name not in _VARIABLES and as_rows(value) is not None
+    ]
     return _StoredEvents({}, arrays.pop(plain[0])) if len(plain) == 1 else None
 
 
@@ -280,8 +285,10 @@ def _events(
                 f"{source} has shape {found.array.shape}; store it as N x 4 (t in us, x, y, p)"
             )
         order = "txyp"
-        if not found.is_layout or (rows[1:, 0] < rows[:-1, 0]).any():
-            with contextlib.suppress(InputError) if found.is_layout else contextlib.nullcontext():
+        if not found.is_layout:
+            order = order_of(rows[:SAMPLE], (size[0] + 1, size[1] + 1), source)
+        elif not _has_order_of_layout(rows[:SAMPLE]):
+            with contextlib.suppress(InputError):  # the first bad value is named
                 order = order_of(rows[:SAMPLE], (size[0] + 1, size[1] + 1), source)
         columns = {name: rows[:, order.index(name)] for name in "txyp"}
     t, x, y, p = (columns[name] for name in "txyp")
@@ -298,6 +305,11 @@ def _events(
     if is_from_0:
         unit = unit._replace(notes=(*unit.notes, "x and y count from 0, as a 0 occurs"))
     return events, unit
+
+
+def _has_order_of_layout(rows: NDArray) -> bool:
+    """Whether the first of four columns can be times and the last polarities."""
+    return bool((rows[1:, 0] >= rows[:-1, 0]).all() or np.isin(rows[:, 3], (-1, 0, 1)).all())
 
 
 def _vector(value: NDArray) -> NDArray:

@@ -44,6 +44,7 @@ _CONTRADICTION = 8.0  # nats by which another unit must exceed a stated one for 
 _COARSEST_US = 1000.0  # rounding of a type that is refused
 _FEWEST_STEPS = 64  # of a rounded type within the span of the events
 _LONGEST_US = 1e12  # of a recording with times that have decimals: 11.6 days
+_GAP = 1000.0  # times the sum of all other steps that a gap lasts
 _LARGEST_US = 2.0**62  # beyond which times are refused in any case
 _INTERVALS_US = (150.0, 5e6)  # between images, poses and samples
 _LITTLE, _MUCH = 0.02, 0.5  # intersection over union of the spans of two clocks
@@ -202,8 +203,8 @@ def infer_unit(
         unit = expected
         if (
             numbers.span
-            and _is_impossible(numbers.largest, unit)
-            and not _is_impossible(numbers.largest, best)
+            and _is_impossible(numbers.median, unit)
+            and not _is_impossible(numbers.median, best)
         ):
             unit = best
             notes.append(f"event times are taken as {NAMES[unit]}, by their magnitude")
@@ -245,6 +246,7 @@ class _Numbers(NamedTuple):
     pixels: int
     span: float
     largest: float
+    median: float  # without sign
     repetition: float | None
     digits: int | None  # decimal places, negative for multiples of ten; None for any number
     is_float: bool
@@ -257,12 +259,15 @@ class _Numbers(NamedTuple):
         stored = sample["t"][kept]
         t = stored.astype(np.float64)
         if not len(t):
-            return cls(count, pixels, 0.0, 0.0, None, None, True, 0.0)
+            return cls(count, pixels, 0.0, 0.0, 0.0, None, None, True, 0.0)
         # Differences of integers are exact, those of large ones as floats are not.
         whole = stored.dtype.kind != "f"
         steps = np.diff(stored.astype(np.int64) if whole else t).astype(np.float64)
-        # The sum of steps forwards is the span also where a counter wraps or one time goes back.
+        # The sum of steps forwards is the span also where a counter wraps or one time goes back. A
+        # step that exceeds all others by far is a gap or a damaged time.
         span = float(steps[steps > 0].sum())
+        longest = float(steps[: count - 1 if count <= len(t) else -1].max(initial=0.0))
+        span -= longest if longest > _GAP * (span - longest) else 0.0
         if len(steps) and steps[-1] < 0 and count > len(t):
             span *= count / len(t)
         largest = float(np.abs(t).max())
@@ -271,6 +276,7 @@ class _Numbers(NamedTuple):
             pixels,
             span,
             largest,
+            float(np.median(np.abs(t))),
             _repetition(stored, sample["x"][kept], sample["y"][kept]),
             _digits(stored),
             not whole,
@@ -295,13 +301,13 @@ class _Numbers(NamedTuple):
         score = self._prior(unit, usual)
         seconds = SCALES[unit] * 1e-6
         if not self.span:
-            return score + _of_magnitude(self.largest * seconds)
+            return score + _of_magnitude(self.median * seconds)
         score += _normal(np.log10(self.span * seconds), 0.7, 1.3)
         rate = np.log10(self.rate(unit))
         score += _normal(rate, 0.0, 1.2 if rate > 0 else 1.5)
         if self.repetition is not None:
             score += max(_normal(np.log10(self.repetition * seconds), -3.0, 0.9), -6.0)
-        return score + _of_magnitude(self.largest * seconds) + self._of_resolution(unit)
+        return score + _of_magnitude(self.median * seconds) + self._of_resolution(unit)
 
     def _prior(self, unit: str, usual: str | None) -> float:
         if self.rounding >= 1:
@@ -370,10 +376,10 @@ def _digits(values: NDArray) -> int | None:
         t = values.astype(np.float64)
         error = 2 * np.spacing(np.abs(values).max()).astype(np.float64)
         for n in range(10):
-            scaled = t * 10.0**n
             # Numbers that are whole only within an error of half a step say nothing.
-            if error * 10.0**n > 0.05 and n:
+            if n and error * 10.0**n > 0.05:
                 return None
+            scaled = t * 10.0**n
             if (np.abs(scaled - np.rint(scaled)) <= error * 10.0**n * (n > 0)).all():
                 if n:
                     return n
