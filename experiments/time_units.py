@@ -39,6 +39,9 @@ def simulate(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.nd
     place = np.arange(len(which)) - np.repeat(np.cumsum(size) - size, size)
     t = begin[which] + place * gap * random.uniform(0.5, 1.5, len(which))
     noise = len(t) // 5
+    if random.random() < 0.2:  # nothing but noise
+        t, pixel, which = t[:0], pixel, which[:0]
+        noise = held
     t = np.concatenate([t, random.uniform(0, part, noise)])
     pixel = np.concatenate([pixel[which], random.integers(0, pixels, noise)])
     order = np.argsort(t)

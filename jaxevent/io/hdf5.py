@@ -139,6 +139,7 @@ class Microseconds:
     def __init__(self, stored: Column, unit: str, source: str):
         self._stored, self._unit, self._source = stored, unit, source
         self.shape, self.dtype = stored.shape, np.dtype(np.int64)
+        self.is_float = stored.dtype.kind == "f"
 
     def __getitem__(self, rows: Any) -> Any:
         values = np.asarray(self._stored[rows])
@@ -212,7 +213,10 @@ def _unit_attribute(t: Column) -> tuple[str, str] | None:
 
 
 def clock_of_columns(
-    columns: Mapping[str, Column], unit: InferredUnit, source: str, offset: int = 0
+    columns: Mapping[str, Column],
+    unit: InferredUnit,
+    source: str,
+    offset: int = 0,
 ) -> Clock:
     """Return the clock of events for the times of images, poses and samples beside them.
 
@@ -224,10 +228,11 @@ def clock_of_columns(
     """
     t = columns["t"]
     if len(t.shape) != 1 or not t.shape[0] or t.dtype.kind not in "iu":
-        return Clock(unit.name, 0, 0)
+        return Clock(unit.name, 0, 0, False)
     with reading(f"{source}: events"):
         first, last = t[:1][0], t[t.shape[0] - 1 :][0]
-    return Clock(unit.name, int(first) + offset, int(last) + offset)
+    is_float = isinstance(t, Microseconds) and t.is_float
+    return Clock(unit.name, int(first) + offset, int(last) + offset, is_float)
 
 
 class StoredEvents:
@@ -467,7 +472,7 @@ def _recording(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
             "times in integer microseconds"
         )
     notes = list(unit.notes)
-    clock = Clock("us", 0, 0)
+    clock = Clock("us", 0, 0, False)
     if not states_unit:
         clock = clock_of_columns(columns, unit, source, offset)
 

@@ -229,10 +229,10 @@ def _recording(path: Path, options: ReadOptions, variables: dict) -> Recording:
     otherwise = f"{path}: has no image to tell the sensor's size;"
     told = None if images is None else (images.shape[2], images.shape[1])
     size = sensor_size(options.size, told, frames=None, otherwise=otherwise)
-    events, unit = _events(path, found, size, options)
+    events, unit, clock = _events(path, found, size, options)
     notes, frames = list(unit.notes), None
     if images is not None:
-        frames = _frames(path, images, arrays, clock_of(unit, events.t), notes)
+        frames = _frames(path, images, arrays, clock, notes)
     extra = {name: _squeeze(value) for name, value in arrays.items() if name != "HDR_mat"}
     if "HDR_mat" in arrays:
         number = 0 if frames is None else len(frames)
@@ -272,12 +272,13 @@ def _find_events(arrays: dict[str, NDArray]) -> _StoredEvents | None:
 
 def _events(
     path: Path, found: _StoredEvents, size: tuple[int, int], options: ReadOptions
-) -> tuple[Events, InferredUnit]:
+) -> tuple[Events, InferredUnit, Clock]:
     source = f"{path}: events"
     if found.array is None:
         columns = {name: _vector(value) for name, value in found.columns.items()}
     elif found.array.size == 0:
-        return Events.empty(), InferredUnit("us")
+        unit = InferredUnit("us")
+        return Events.empty(), unit, clock_of(unit, found.array, ())
     else:
         rows = as_rows(found.array)
         if rows is None:
@@ -299,12 +300,12 @@ def _events(
         sample = first_and_last(lambda part: {n: columns[n][part] for n in "txyp"}, len(t))
         stated = stated_unit(found.name_of_t, t)
         unit = infer_unit(sample, len(t), size, source, options, stated=stated, usual="us")
-    t = to_microseconds(t, unit.name, source, "event")
+    us = to_microseconds(t, unit.name, source, "event")
     p = signed(p, unsigned_off(p))
-    events = checked_events(t, x, y, p, size, source, origin=0 if is_from_0 else 1)
+    events = checked_events(us, x, y, p, size, source, origin=0 if is_from_0 else 1)
     if is_from_0:
         unit = unit._replace(notes=(*unit.notes, "x and y count from 0, as a 0 occurs"))
-    return events, unit
+    return events, unit, clock_of(unit, t, us)
 
 
 def _has_order_of_layout(rows: NDArray) -> bool:

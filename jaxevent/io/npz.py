@@ -102,7 +102,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
     x, y, p = (columns[name] for name in "xyp")
     events = checked_events(t, x, y, signed(p, unsigned_off(p)), size, source)
     notes = list(unit.notes)
-    clock = clock_of(unit, events.t)
+    clock = clock_of(unit, columns["t"], events.t)
 
     def stamps(name: str, what: str) -> NDArray[np.int64]:
         values, of_type = numbers_of_dates(take(name)[0])

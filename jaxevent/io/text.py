@@ -79,9 +79,9 @@ def _read(path: Path, root: Path | zipfile.Path, options: ReadOptions) -> Record
             "seconds with decimals, or give the unit, time_unit= or --time-unit"
         )
     notes = list(unit.notes)
-    t = to_microseconds(t, unit.name, source, "event")
-    events = checked_events(t, x, y, signed(p, unsigned_off(p)), size, source)
-    clock = clock_of(unit, t)
+    us = to_microseconds(t, unit.name, source, "event")
+    events = checked_events(us, x, y, signed(p, unsigned_off(p)), size, source)
+    clock = clock_of(unit, t, us)
 
     frames = poses = imu = camera = None
     if images is not None:

@@ -6,9 +6,10 @@ and from the numbers. Whole numbers are usually microseconds, numbers with decim
 layout may have a usual unit of its own. The numbers are compared with what recordings are like
 under each unit, as a sum of log-likelihoods:
 
-    span         log10 of seconds: mean 0.7, standard deviation 1.3
+    span         log10 of seconds: mean 0.7, standard deviation 1.3 above and 1.8 below
     rate         log10 of events per pixel and second: mean 0, deviation 1.2 above and 1.5 below
-    repetition   log10 of seconds between events of a pixel, 5 % quantile: mean -3, deviation 0.9
+    bursts       log10 of seconds between events of a pixel, 5 % quantile: mean -3, deviation 0.9,
+                 where it is far below that of independent events
     magnitude    up to 12 days after zero, or a date between 2000 and 2050
     resolution   the largest power of ten of which all times are multiples
 
@@ -19,7 +20,7 @@ layout does not state is a note of the recording. The constants were chosen on s
 
 Times of images, poses and IMU samples of the same file are on the clock of the events: they keep
 their usual unit unless, in it, they miss the events or their intervals cannot be, and another unit
-mends both.
+mends both. Of numbers of the same kind as the event times, the unit of these comes first.
 """
 
 import re
@@ -39,7 +40,9 @@ NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nano
 FEWEST_EVENTS = 300
 SAMPLE = 1 << 16  # events from which order, unit and signs are inferred
 _FEWEST_REPETITIONS = 100  # intervals between events of one pixel
-_DOUBT = 2.5  # nats by which an undoubted unit exceeds the next
+_BURST = 0.01  # of the mean interval, or of the sample; of independent events it is 0.025 or more
+_DOUBT = 2.7  # nats by which an undoubted unit exceeds the next
+_SUPERIORITY = 1.0  # nats by which a unit must exceed the usual one
 _CONTRADICTION = 8.0  # nats by which another unit must exceed a stated one for a warning
 _COARSEST_US = 1000.0  # rounding of a type that is refused
 _FEWEST_STEPS = 64  # of a rounded type within the span of the events
@@ -69,7 +72,7 @@ _NAMED = {
 _WHOLE = {"us": 0.0, "ns": -3.0, "ms": -3.5, "s": -10.0}
 _DECIMAL = {"s": 0.0, "ms": -3.5, "us": -4.0, "ns": -8.0}
 _ROUNDED = {"s": 0.0, "us": -0.5, "ms": -3.0, "ns": -3.0}  # whole, since their type is coarse
-_UNUSUAL = -6.0  # of units other than the usual one of a layout
+_UNUSUAL = -4.0  # of units other than the usual one of a layout
 
 
 class InferredUnit(NamedTuple):
@@ -188,13 +191,14 @@ def infer_unit(
     best = max(scores, key=lambda unit: scores[unit])
     known = count >= FEWEST_EVENTS and numbers.span > 0
     notes: list[str] = []
+    doubt = ""
     if options.time_unit is not None:
         unit = options.time_unit
     elif stated is not None:
         unit = stated[0]
         notes.append(f"event times are {NAMES[unit]}, by {stated[1]}")
         if known and scores[best] > scores[unit] + _CONTRADICTION:
-            _warn(
+            doubt = (
                 f"{source}: event times are {NAMES[unit]} by {stated[1]}, but "
                 f"{numbers.describe(unit)}; as {NAMES[best]} {numbers.describe(best)}: if the "
                 f"name is wrong, give time_unit={best!r} or --time-unit {best}"
@@ -208,14 +212,14 @@ def infer_unit(
         ):
             unit = best
             notes.append(f"event times are taken as {NAMES[unit]}, by their magnitude")
-            _warn(_doubt(source, numbers, unit, expected))
+            doubt = _doubt(source, numbers, unit, expected)
     else:
-        unit = best
+        unit = best if scores[best] > scores[expected] + _SUPERIORITY else expected
         after = max((u for u in scores if u != unit), key=lambda u: scores[u])
         is_doubtful = scores[unit] < scores[after] + _DOUBT
         if unit != expected or is_doubtful:
             notes.append(f"event times are taken as {NAMES[unit]}, since {numbers.describe(unit)}")
-            _warn(_doubt(source, numbers, unit, expected if unit != expected else after))
+            doubt = _doubt(source, numbers, unit, expected if unit != expected else after)
     scale = SCALES[unit]
     if options.time_unit is None and numbers.has_decimals and numbers.span * scale > _LONGEST_US:
         raise InputError(
@@ -224,6 +228,8 @@ def infer_unit(
             "give their unit, time_unit= or --time-unit"
         )
     notes += _resolution(numbers, unit, source)
+    if doubt:
+        _warn(doubt)
     return InferredUnit(unit, tuple(notes))
 
 
@@ -271,13 +277,18 @@ class _Numbers(NamedTuple):
         if len(steps) and steps[-1] < 0 and count > len(t):
             span *= count / len(t)
         largest = float(np.abs(t).max())
+        repetition = _repetition(stored, sample["x"][kept], sample["y"][kept])
+        if repetition is not None:
+            held = float(steps[: SAMPLE - 1][steps[: SAMPLE - 1] > 0].sum())
+            if repetition > _BURST * min(span * pixels / count, held):
+                repetition = None
         return cls(
             count,
             pixels,
             span,
             largest,
             float(np.median(np.abs(t))),
-            _repetition(stored, sample["x"][kept], sample["y"][kept]),
+            repetition,
             _digits(stored),
             not whole,
             _rounding(stored, largest),
@@ -302,7 +313,8 @@ class _Numbers(NamedTuple):
         seconds = SCALES[unit] * 1e-6
         if not self.span:
             return score + _of_magnitude(self.median * seconds)
-        score += _normal(np.log10(self.span * seconds), 0.7, 1.3)
+        span = np.log10(self.span * seconds)
+        score += _normal(span, 0.7, 1.3 if span > 0.7 else 1.8)
         rate = np.log10(self.rate(unit))
         score += _normal(rate, 0.0, 1.2 if rate > 0 else 1.5)
         if self.repetition is not None:
@@ -326,13 +338,13 @@ class _Numbers(NamedTuple):
             return -1.2
         if not self.has_decimals:
             typical = {"us": 0, "ms": 0, "ns": -3, "s": 0}[unit]
-            return -0.3 if self.digits == typical else -2.3 if unit == "ns" else -4.0
+            return -0.3 if self.digits == typical else -4.0
         typical = {"s": 6, "ms": 3, "us": 3, "ns": 3}[unit]
         if self.digits == typical:
             return -0.3
         if unit == "s":
             return {1: -6.0, 2: -6.0, 3: -3.5, 4: -3.5, 5: -3.0}.get(self.digits, -1.5)
-        return -3.0 if self.digits > typical else -1.5
+        return -3.5 if self.digits > typical else -1.5
 
 
 def _normal(value: float, mean: float, deviation: float) -> float:
@@ -439,12 +451,15 @@ class Clock(NamedTuple):
 
     Attributes:
         unit: Unit of the event times, as stored.
-        first, last: Times of the first and last event in us; equal where there are none.
+        first: Time of the first event in us.
+        last: Time of the last event in us; that of the first where there are none.
+        is_float: Whether the times are stored as floats.
     """
 
     unit: str
     first: int
     last: int
+    is_float: bool
 
     def read(
         self,
@@ -473,6 +488,9 @@ class Clock(NamedTuple):
         as_usual = to_microseconds(values, unit, source, what)
         if stated is not None or self.last <= self.first or len(as_usual) < 2:
             return as_usual
+        is_alike = self.unit != unit and self.is_float == (values.dtype.kind == "f")
+        if is_alike and self._fits(values, self.unit):
+            return to_microseconds(values, self.unit, source, what)
         if self._fits(values, unit):
             return as_usual
         others = {other: self._overlap(values, other) for other in SCALES if other != unit}
@@ -516,7 +534,7 @@ def _ends(values: NDArray, unit: str) -> tuple[float, float]:
     return float(values.min()) * SCALES[unit], float(values.max()) * SCALES[unit]
 
 
-def clock_of(unit: InferredUnit | str, t: Sequence[int] | NDArray) -> Clock:
-    """Return the clock of events with the times `t` (us), of which the ends are read."""
-    name = unit if isinstance(unit, str) else unit.name
-    return Clock(name, int(t[0]), int(t[-1])) if len(t) else Clock(name, 0, 0)
+def clock_of(unit: InferredUnit, stored: NDArray, t: Sequence[int] | NDArray) -> Clock:
+    """Return the clock of events with the times `t` (us), which are `stored` in a unit."""
+    first, last = (int(t[0]), int(t[-1])) if len(t) else (0, 0)
+    return Clock(unit.name, first, last, stored.dtype.kind == "f")
