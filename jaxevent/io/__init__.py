@@ -250,9 +250,18 @@ def _streamed_reader(path: Path, head: bytes) -> Reader:
 
 def _table_reader(path: Path, head: bytes) -> Reader | None:
     """The reader of a file of columns, told by its first bytes."""
-    if head.startswith((b"#!AER-DAT", b"Event Stream", b"% ")):
+    if head.startswith((b"#!AER-DAT", b"Event Stream")):
         return None
     from jaxevent.io import columns
+
+    if head.startswith(b"% "):
+        # Prophesee's header is followed by binary words, comments of a table by text.
+        with path.open("rb") as file:
+            first = file.read(1 << 13)
+        is_table = columns.is_text(first) and any(
+            line.strip() and not line.startswith(b"%") for line in first.splitlines()
+        )
+        return columns.read_text if is_table else None
 
     if head.startswith(columns.NUMPY_MAGIC):
         return columns.read_npy

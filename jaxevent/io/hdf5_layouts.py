@@ -94,7 +94,7 @@ def _recording(file: Any, path: Path, options: ReadOptions) -> Recording:
         name_of_t = (_fields(file, name) or {})["t"]
         columns = _columns(file, name, source)
     images = _images(file, source) if isinstance(file.get("images"), h5py.Group) else None
-    told = _told_size(file, source)
+    told = _told_size(file, source) if size is None else None
     if told is None and images is not None:
         told = (images[1].shape[2], images[1].shape[1])
     otherwise = f"{path}: neither an attribute nor an image tells the sensor's size;"

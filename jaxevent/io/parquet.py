@@ -108,10 +108,8 @@ class _Parquet:
 class _Feather:
     def __init__(self, path: Path):
         arrow = require("pyarrow", "parquet")
-        with arrow.memory_map(str(path)) as mapped:
-            self._file = arrow.ipc.open_file(mapped)
+        self._file = arrow.ipc.open_file(arrow.memory_map(str(path)))
         self.names = [str(name) for name in self._file.schema.names]
-        self._path = path
         self.rows = []
         for number in range(self._file.num_record_batches):
             self.rows.append(self._file.get_batch(number).num_rows)
