@@ -10,6 +10,7 @@ accepts the same values and words its errors alike.
 
 import contextlib
 import os
+import re
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -47,6 +48,9 @@ _UNREADABLE = {
     },
 }
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+_PROPHESEE = re.compile(
+    rb"^% *(evt|format|version|data file|end)\b", re.I | re.M
+)  # lines of its headers
 _SMALL = 1 << 27  # bytes of arrays that every file may unfold to
 _MOST_COMPRESSED = 100  # times that a larger one may unfold to of its own bytes
 TIME_UNITS = ("s", "ms", "us", "ns")
@@ -255,12 +259,9 @@ def _table_reader(path: Path, head: bytes) -> Reader | None:
     from jaxevent.io import columns
 
     if head.startswith(b"% "):
-        # Prophesee's header is followed by binary words, comments of a table by text.
         with path.open("rb") as file:
             first = file.read(1 << 13)
-        is_table = columns.is_text(first) and any(
-            line.strip() and not line.startswith(b"%") for line in first.splitlines()
-        )
+        is_table = columns.is_text(first) and not _PROPHESEE.search(first)
         return columns.read_text if is_table else None
 
     if head.startswith(columns.NUMPY_MAGIC):

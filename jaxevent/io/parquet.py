@@ -108,6 +108,7 @@ class _Parquet:
 class _Feather:
     def __init__(self, path: Path):
         arrow = require("pyarrow", "parquet")
+        self._table = arrow.Table
         self._file = arrow.ipc.open_file(arrow.memory_map(str(path)))
         self.names = [str(name) for name in self._file.schema.names]
         self.rows = []
@@ -116,4 +117,4 @@ class _Feather:
             check_unfolded(8 * sum(self.rows), path.stat().st_size, str(path))
 
     def read(self, number: int, names: list[str]) -> Any:
-        return self._file.get_batch(number).select(names)
+        return self._table.from_batches([self._file.get_batch(number)]).select(names)
