@@ -62,6 +62,7 @@ _BYTES = 1 << 24  # of text parsed together: about a million events
 _LONGEST_LINE = 1 << 12
 _TEXT_SAMPLE = 16 * SAMPLE  # bytes of text from which order, unit and signs are inferred
 _ORDERS = ("txyp", "xypt", "xytp", "ptxy")
+_UNIT = re.compile(r"\s*[\[(][^\])]*[\])]$|_px$")
 _UNSIGNED = tuple((1 << bits) - 1 for bits in (8, 16, 32, 64))  # -1 without its sign
 
 
@@ -73,6 +74,8 @@ def find(names: Sequence[str]) -> dict[str, str] | None:
     found = {}
     for field, aliases in NAMES.items():
         fitting = [name for name in names if name.strip().lower() in aliases]
+        if field != "t" and not fitting:  # "x [px]"
+            fitting = [name for name in names if _UNIT.sub("", name.strip().lower()) in aliases]
         if field == "t" and not fitting:
             fitting = [name for name in names if unit_of_name(name)][:1]
         if len(fitting) != 1:

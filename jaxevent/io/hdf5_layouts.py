@@ -9,8 +9,8 @@
                                 calib/{intrinsics (fx fy cx cy), distortion_coeffs, resolution}
     Metavision                  /CD/events, records with fields t, x, y, p, also compressed by ECF
                                 (`ecf`); attribute geometry; /EXT_TRIGGER/events, records t, p, id
-    v2e                         /events (N, 4) or (4, N): t in us, x, y, p; the order is told by the
-                                content; 4294967295 is a polarity of -1
+    v2e                         /events, or the only dataset, (N, 4) or (4, N): t in us, x, y, p;
+                                the order is told by the content; 4294967295 is a polarity of -1
     others                      /events or the file itself with t, x, y and p, whole lists or
                                 records, under the names that `columns.NAMES` lists
 
@@ -63,7 +63,9 @@ _SIDES = {"prophesee": "M3ED", "davis": "MVSEC"}
 
 def knows(file: Any) -> bool:
     """Whether a file holds events in one of these layouts."""
-    if any(isinstance(file.get(name), h5py.Group) for name in _SIDES) or _is_plain(file):
+    if any(isinstance(file.get(name), h5py.Group) for name in _SIDES):
+        return True
+    if _plain_name(file) is not None:
         return True
     return any(_fields(file, name) is not None for name in _GROUPS)
 
@@ -88,7 +90,8 @@ def _recording(file: Any, path: Path, options: ReadOptions) -> Recording:
     refuse_stream(path, options)
     columns: dict[str, Column] = {}
     name, name_of_t = "", "t"
-    if not _is_plain(file):
+    plain = _plain_name(file)
+    if plain is None:
         with reading(source):
             name = next(name for name in _GROUPS if _fields(file, name) is not None)
         name_of_t = (_fields(file, name) or {})["t"]
@@ -99,7 +102,7 @@ def _recording(file: Any, path: Path, options: ReadOptions) -> Recording:
         told = (images[1].shape[2], images[1].shape[1])
     otherwise = f"{path}: neither an attribute nor an image tells the sensor's size;"
     size = sensor_size(size, told, frames=None, otherwise=otherwise)
-    columns = columns or _plain_columns(file, size, source)
+    columns = columns if plain is None else _plain_columns(file, plain, size, source)
     unit = InferredUnit("us")
     if name == "CD/events":
         refuse_time_unit(path, options)
@@ -128,18 +131,22 @@ def _triggers(file: Any, source: str) -> Triggers | None:
     return Triggers(t, whole["p"].astype(np.int8), whole["id"].astype(np.uint8))
 
 
-def _is_plain(file: Any) -> bool:
-    """Whether `events` are four columns without names. (MATLAB's have a header before HDF5.)"""
-    events = file.get("events")
-    if not isinstance(events, h5py.Dataset) or file.userblock_size:
-        return False
+def _plain_name(file: Any) -> str | None:
+    """The name of four columns without names: `events`, or whatever stands alone in a file.
+
+    None where there are none. (MATLAB's files have a header before HDF5.)
+    """
+    names = ["events"] if "events" in file else list(file)[:2]
+    found = file.get(names[0]) if len(names) == 1 else None
+    if not isinstance(found, h5py.Dataset) or file.userblock_size or found.dtype.kind not in "iuf":
+        return None
     # Of a virtual dataset the shape cannot be asked for without following it.
-    is_virtual = events.id.get_create_plist().get_layout() == h5py.h5d.VIRTUAL
-    return events.dtype.kind in "iuf" and (is_virtual or events.ndim == 2 and 4 in events.shape)
+    is_virtual = found.id.get_create_plist().get_layout() == h5py.h5d.VIRTUAL
+    return names[0] if is_virtual or found.ndim == 2 and 4 in found.shape else None
 
 
-def _plain_columns(file: Any, size: tuple[int, int], source: str) -> dict[str, Column]:
-    whole = dataset(file, "events", source)
+def _plain_columns(file: Any, name: str, size: tuple[int, int], source: str) -> dict[str, Column]:
+    whole = dataset(file, name, source)
     is_wide = whole.shape[1] != 4  # (4, events)
     first = np.asarray(whole[:, :SAMPLE].T if is_wide else whole[:SAMPLE])
     order = order_of(first, size, source)

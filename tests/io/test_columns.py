@@ -67,11 +67,13 @@ def test_one_array_is_read_alike(order, wide, kind, tmp_path):
     np.savez(tmp_path / "b.npz", events=array, other=np.zeros((3, 4)))
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["events"] = array
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file["data"] = array
     ones = {"x": c["x"] + 1, "y": c["y"] + 1}
     from_one = rows(c | ones, order).astype(kind)
     scipy.io.savemat(tmp_path / "a.mat", {"data": from_one.T if wide else from_one})
     scipy.io.savemat(tmp_path / "b.mat", {"data": array})
-    for name in ("a.npy", "a.npz", "b.npz", "a.h5", "a.mat", "b.mat"):
+    for name in ("a.npy", "a.npz", "b.npz", "a.h5", "b.h5", "a.mat", "b.mat"):
         recording = assert_read(tmp_path / name, c)
     assert recording.notes == ("x and y count from 0, as a 0 occurs",)
 
@@ -212,6 +214,8 @@ def test_names_of_columns():
     assert find(["t_us", "t_ns", "x", "y", "on"])["t"] == "t_us"
     assert find(["t", "ts", "x", "y", "p"]) is None
     assert find(["x", "y", "p"]) is None
+    units = ["x [px]", "y_px", "t [us]", "polarity (1)"]
+    assert find(units) == dict(zip("xytp", units, strict=True))
 
 
 # Parquet and Feather
