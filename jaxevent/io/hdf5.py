@@ -412,7 +412,7 @@ def _in_memory(recording: Recording) -> Recording:
 
 
 def is_matlab(path: Path) -> bool:
-    """Whether MATLAB wrote a file: it puts 512 bytes of its own before HDF5."""
+    """Return whether MATLAB wrote a file: it puts 512 bytes of its own before HDF5."""
     with path.open("rb") as stored:
         return stored.read(6) == b"MATLAB"
 

@@ -309,7 +309,7 @@ def _events(
 
 
 def _has_order_of_layout(rows: NDArray) -> bool:
-    """Whether the first of four columns can be times and the last polarities."""
+    """Return whether the first of four columns can be times and the last polarities."""
     return bool((rows[1:, 0] >= rows[:-1, 0]).all() or np.isin(rows[:, 3], (-1, 0, 1)).all())
 
 

@@ -189,7 +189,7 @@ def _words(line: bytes) -> list[str]:
 
 
 def _are_names(words: list[str]) -> bool:
-    """Whether a line names columns: none of its words begins as a number does."""
+    """Return whether a line names columns: none of its words begins as a number does."""
     return bool(words) and not any(re.match(r"[+-]?\.?\d|nan|inf", w, re.I) for w in words)
 
 
