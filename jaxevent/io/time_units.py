@@ -364,7 +364,12 @@ def _of_magnitude(seconds: float) -> float:
 
 
 def _convention(numbers: _Numbers) -> str:
-    """Return the usual unit of a table: us for whole numbers that differ, s for decimals."""
+    """Return the usual unit of a table: us for whole numbers that differ, s for decimals.
+
+    Large numbers of a coarse type are whole in any case; dates are then seconds.
+    """
+    if numbers.rounding >= 1 and 9.4e8 <= numbers.median < 2.6e9:
+        return "s"
     if numbers.is_float and (numbers.has_decimals or not numbers.span):
         return "s"
     return "us"
