@@ -17,7 +17,7 @@ from jaxevent.errors import InputError
 TimeUnit = Literal["s", "ms", "us", "ns"]
 
 NAMES = {
-    "t": ("t", "ts", "time", "timestamp", "timestamps"),
+    "t": ("t", "ts", "time", "times", "timestamp", "timestamps", "time_stamp"),
     "x": ("x", "xs"),
     "y": ("y", "ys"),
     "p": ("p", "ps", "pol", "pols", "polarity", "polarities", "on"),

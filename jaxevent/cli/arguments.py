@@ -46,7 +46,12 @@ def add_reading(one: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="which camera, of a file that holds several: a topic, left, right or a number",
     )
-    one.set_defaults(reading=("size", "stream"))
+    one.add_argument(
+        "--time-unit",
+        choices=("s", "ms", "us", "ns"),
+        help="unit of the event times, for a table that does not state it; default: inferred",
+    )
+    one.set_defaults(reading=("size", "stream", "time_unit"))
 
 
 def open_recording(path: Path, reading: dict[str, Any], **more: Any) -> Any:

@@ -2,14 +2,16 @@
 
 The layouts are described in the reader modules, and what each was checked against: `aedat2`,
 `aedat4`, `columns` (tables of text and NumPy records), `event_stream`, `evimo`, `hdf5`,
-`hdf5_layouts`, `mat`, `n_caltech`, `npz`, `prophesee`, `ros` (with `bags` and `ros_events`) and
-`text`. They are imported when first needed. This module also turns the raw numbers of a file into
-checked fields, so that every reader accepts the same values and words its errors alike.
+`hdf5_layouts`, `mat`, `n_caltech`, `npz`, `parquet`, `prophesee`, `ros` (with `bags` and
+`ros_events`) and `text`; the unit of times in tables in `time_units`. They are imported when first
+needed. This module also turns the raw numbers of a file into checked fields, so that every reader
+accepts the same values and words its errors alike.
 """
 
 import contextlib
 import dataclasses
 import os
+import re
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -30,15 +32,37 @@ __all__ = ["load", "save", "times"]
 Reader = Callable[[Path, ReadOptions], Recording]
 
 _BAGS = (b"#ROSBAG", b"\x89MCAP0\r\n", b"SQLite format 3\0")
+_UNPACK = "unpack it and load the file inside"
+_UNREADABLE = {
+    b"\x1f\x8b": ("compressed by gzip", _UNPACK),
+    b"BZh": ("compressed by bzip2", _UNPACK),
+    b"\xfd7zXZ\0": ("compressed by xz", _UNPACK),
+    b"\x28\xb5\x2f\xfd": ("compressed by zstd", _UNPACK),
+    b"7z\xbc\xaf\x27\x1c": ("an archive of 7-Zip", _UNPACK),
+    b"Rar!": ("an archive of RAR", _UNPACK),
+    b"FEA1": ("Feather version 1", "write it anew as Parquet"),
+    b"SIMPLE  =": ("FITS", "store events as a table of text or .npz"),
+    **{
+        b"\x80" + bytes([protocol]): (
+            "a pickle, which can run any program when it is read",
+            "if you trust it, load it with pickle and write it as .npz with t, x, y and p",
+        )
+        for protocol in range(2, 6)
+    },
+}
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+_PROPHESEE = re.compile(
+    rb"^% *(evt|format|version|data file|end)\b", re.I | re.M
+)  # lines of its headers
 _SMALL = 1 << 27  # bytes of arrays that every file may unfold to
 _MOST_COMPRESSED = 100  # times that a larger one may unfold to of its own bytes
+TIME_UNITS = ("s", "ms", "us", "ns")
 
 READABLE = (
     "readable are a folder or zip with events.txt (Event-Camera Dataset), AEDAT 2 and 4, "
     "Prophesee RAW and DAT, Event Stream, bags of ROS 1 and ROS 2, HDF5 (jaxevent's own, DSEC, "
     "MVSEC, M3ED and others), MATLAB .mat (v5 and v7.3), N-Caltech101 .bin, folders of EVIMO2, "
-    ".npz, .npy and tables of text"
+    ".npz, .npy, Parquet, Feather and tables of text"
 )
 
 
@@ -71,7 +95,8 @@ def load(
         trust: Whether HDF5 may be made of other files, by links, external storage or virtual
             datasets. Such a file can have any file read that you may read, or never end.
         frames: Which images become the frames, of a file that holds several kinds.
-        time_unit: The unit of the event times, "s", "ms", "us" or "ns"; None infers it.
+        time_unit: The unit of the event times, "s", "ms", "us" or "ns", of formats that do not
+            state it; None infers it (`jaxevent.io.time_units`), with an `InputWarning` in doubt.
         repair: How to mend event times that go back: "sort" late events, "drop" outliers, "unwrap"
             a counter, keep a "part" between resets, or several of them, as in "unwrap,sort"; see
             `jaxevent.io.disorder`. None refuses such times, and the message says what would help.
@@ -85,6 +110,10 @@ def load(
         raise InputError(
             f"size = {size} must be two positive numbers of pixels, (width, height), of at most "
             f"{arrays.MAX_PIXELS}"
+        )
+    if time_unit not in (None, *TIME_UNITS):
+        raise InputError(
+            f"time_unit = {time_unit!r} is not a unit of time; give 's', 'ms', 'us' or 'ns'"
         )
     options = ReadOptions(size, in_memory, progress, stream, frames, time_unit, repair)
     with contextlib.ExitStack() as stack:
@@ -137,6 +166,7 @@ def _reader(path: Path, options: ReadOptions) -> Reader:
     with reading(str(path)):
         head = b"" if is_folder else _head(path)
     if read := _reader_of_streams(path, head):
+        refuse_time_unit(path, options)
         return read
     if not is_folder and head.startswith(HDF5_MAGIC) or _later_hdf5(path, is_folder):
         return _hdf5_reader(path, options)
@@ -145,6 +175,7 @@ def _reader(path: Path, options: ReadOptions) -> Reader:
         from jaxevent.io import evimo
 
         if evimo.knows(path):
+            refuse_time_unit(path, options)
             return evimo.read
         if not (path / "events.txt").is_file():
             raise InputError(f"{path}: the folder holds no events.txt; {READABLE}")
@@ -159,13 +190,25 @@ def _reader(path: Path, options: ReadOptions) -> Reader:
         from jaxevent.io import mat
 
         return mat.read_v5
-    return _streamed_reader(path, head)
+    if read := _table_reader(path, head):
+        return read
+    read = _streamed_reader(path, head)
+    refuse_time_unit(path, options)
+    return read
 
 
 def refuse_stream(path: Path, options: ReadOptions) -> None:
     """Raise `InputError` where a camera of a file is named that holds only one."""
     if options.stream is not None:
         raise InputError(f"{path}: holds one camera only; leave out stream= or --stream")
+
+
+def refuse_time_unit(path: Path, options: ReadOptions) -> None:
+    """Raise `InputError` where a unit of time is given for a format that states it."""
+    if options.time_unit is not None:
+        raise InputError(
+            f"{path}: this format states the unit of its times; leave out time_unit= or --time-unit"
+        )
 
 
 def _head(path: Path) -> bytes:
@@ -209,17 +252,35 @@ def _streamed_reader(path: Path, head: bytes) -> Reader:
         from jaxevent.io import prophesee
 
         return prophesee.read
-    from jaxevent.io import columns
-
-    if head.startswith(columns.NUMPY_MAGIC):
-        return columns.read_npy
-    if columns.is_text(head):
-        return columns.read_text
     from jaxevent.io import n_caltech
 
     if n_caltech.is_plausible(path):
         return n_caltech.read
+    for magic, (what, remedy) in _UNREADABLE.items():
+        if head.startswith(magic):
+            raise InputError(f"{path}: is {what}; {remedy}")
     raise InputError(f"{path}: the format is not recognised; {READABLE}")
+
+
+def _table_reader(path: Path, head: bytes) -> Reader | None:
+    """The reader of a file of columns, told by its first bytes."""
+    if head.startswith((b"#!AER-DAT", b"Event Stream")):
+        return None
+    from jaxevent.io import columns
+
+    if head.startswith(b"% "):
+        with path.open("rb") as file:
+            first = file.read(1 << 13)
+        is_table = columns.is_text(first) and not _PROPHESEE.search(first)
+        return columns.read_text if is_table else None
+
+    if head.startswith(columns.NUMPY_MAGIC):
+        return columns.read_npy
+    if head.startswith((b"PAR1", b"ARROW1\0\0")):
+        from jaxevent.io import parquet
+
+        return parquet.read
+    return columns.read_text if columns.is_text(head) else None
 
 
 def _zip_reader(path: Path) -> Reader:
@@ -262,16 +323,16 @@ def _hdf5_reader(path: Path, options: ReadOptions) -> Reader:
         ours = isinstance(events, h5py.Group) and {"t", "x", "y", "p"} <= set(events)
         ours |= str(hdf5_files.attribute(file, "format")) == "jaxevent"
         others = not ours and hdf5_layouts.knows(file)
-        matlab = hdf5.is_matlab(path, file)
-    if others:
+        matlab = hdf5.is_matlab(path)
+    if others and not matlab:
         return hdf5_layouts.read
     refuse_stream(path, options)
-    if ours:
-        return hdf5.read
     if matlab:
         from jaxevent.io import mat
 
         return mat.read_v73
+    if ours:
+        return hdf5.read
     raise InputError(
         f"{path}: the HDF5 file has neither events/t, x, y and p nor events under other known "
         f"names; {READABLE}"

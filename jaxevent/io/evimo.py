@@ -35,11 +35,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import LUMA
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
 from jaxevent.io import check_unfolded, pinhole, reading, sensor_size, times, vectors, whole_number
 from jaxevent.io.decoded import BLOCK, Columns, DecodedImages, decoded
-from jaxevent.io.images import LUMA
 from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Frames, Imu, Poses, Recording
 

@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import LUMA
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
 from jaxevent.io import pinhole, reading, sensor_size
 from jaxevent.io.bags import Bag
 from jaxevent.io.decoded import DecodedImages, decoded
-from jaxevent.io.images import LUMA
 from jaxevent.io.options import ReadOptions
 from jaxevent.io.ros_events import ARRAYS, PACKET, event_topic
 from jaxevent.recording import Frames, Imu, Poses, Recording

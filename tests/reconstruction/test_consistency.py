@@ -51,9 +51,11 @@ def test_the_ratio_is_that_of_thresholds():
 def test_contradictions_are_said_with_the_parameters():
     recording = recorded()
     said = events_contradict_frames(recording, Params(c_on=C, c_off=C))
+    assert said is not None
     assert said.startswith("wandering: events contradict frames") and "\n" not in said
     assert "c_on = 0.2, c_off = 0.2 and I0 = 1; " in said and "I0 about 0.003" in said
     high = events_contradict_frames(recording, Params(c_on=C / 3, c_off=C / 3, I0=I0))
+    assert high is not None
     assert "changes by 3.2 times" in high and "higher thresholds" in high
     for c in (C / 1.5, C, 1.5 * C):
         assert events_contradict_frames(recording, Params(c_on=c, c_off=c, I0=I0)) is None
