@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator
+from jaxevent.events.clocks import check_clocks
 from jaxevent.reconstruction.clock import Timing, time_span
 from jaxevent.reconstruction.features import Features, ReadOut
 from jaxevent.reconstruction.live import LiveVideo
@@ -22,7 +23,12 @@ class ImageEstimator(Estimator[P]):
     Images are `Estimate`s: `mean` is intensity, 0 the frames' black and 1 their white, and goes
     beyond; `covariance` is the variance of log intensity ln(I + I0), NaN of methods that estimate
     none; `valid` is false where the intensity is not a finite number.
+
+    Attributes:
+        joins_frames: Whether it combines events with frames, whose clocks then have to agree.
     """
+
+    joins_frames: bool = dataclasses.field(default=True, kw_only=True)
 
     family: ClassVar[str] = "reconstruction"
     has_likelihood: ClassVar[bool] = False  # whether it has `log_likelihood` of the frames given
@@ -30,6 +36,14 @@ class ImageEstimator(Estimator[P]):
     def check_span(self, recording: Recording, times: Times, params: P) -> None:
         """Raise `InputError` for times outside the recording, its frames on either clock."""
         check_times(times, *time_span(recording, params.clock_offset), recording.name)
+
+    def check_clocks(self, recording: Recording, params: P) -> None:
+        """Raise `InputError` or warn if frames and events that it combines cannot be on one clock.
+
+        See `jaxevent.events.clocks`.
+        """
+        if self.joins_frames:
+            check_clocks(recording, params.clock_offset)
 
     @abc.abstractmethod
     def estimate(
@@ -114,6 +128,7 @@ class PixelEstimator(ImageEstimator[P]):
         """
         self.check(recording)
         params = self.Params() if params is None else params
+        self.check_clocks(recording, params)
         if not extrapolate:
             self.check_span(recording, times, params)
         return prepare(recording, times, Timing.of(params), filtering=self.filters)

@@ -57,7 +57,10 @@ def read_frames(
                 recording, frames=Frames(t, images, np.zeros(len(t), np.int64))
             )
     if recording.frames is None:
-        raise InputError(f"{path}: holds no frames; give the other camera's recording or images")
+        missing = recording.describe_left_out("frames")
+        raise InputError(
+            f"{path}: holds no frames{missing}; give the other camera's recording or images"
+        )
     return dataclasses.replace(recording, name=str(path))
 
 
