@@ -50,7 +50,7 @@ from jaxevent.io import (
 )
 from jaxevent.io.columns import time_scale
 from jaxevent.io.description import CLOCK
-from jaxevent.io.hdf5_files import array, attribute, dataset, open_file
+from jaxevent.io.hdf5_files import array, attribute, dataset, describe_images, open_file
 from jaxevent.io.options import ReadOptions
 from jaxevent.io.output import complete_hdf5
 from jaxevent.progress import bar
@@ -399,7 +399,23 @@ def _recording(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
             )
     table = dataset(file, "ms_to_idx", source) if "ms_to_idx" in file else None
     events = StoredEvents(columns, size, source, offset, table)
-    return Recording(name, *size, events, frames, camera, poses, imu, extra, triggers)
+    left_out = {} if frames is not None else _describe_frames(file, path)
+    return Recording(
+        name, *size, events, frames, camera, poses, imu, extra, triggers, left_out=left_out
+    )
+
+
+def _describe_frames(file: h5py.File, path: Path) -> dict[str, str]:
+    """What `Recording.left_out` says of frames in the file, or of DSEC's beside it."""
+    images = companions.images(path)
+    if images is None:
+        return describe_images(file)
+    return {
+        "frames": (
+            f"{images} holds those of another camera; bring them onto the events' pixels by "
+            "jaxevent register"
+        )
+    }
 
 
 def _is_dsec(file: Any) -> bool:

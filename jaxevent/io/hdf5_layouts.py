@@ -9,7 +9,9 @@
                                 calib/{intrinsics (fx fy cx cy), distortion_coeffs, resolution}
     Metavision                  /CD/events, records with fields t, x, y, p, also compressed by ECF
                                 (`ecf`); attribute geometry; /EXT_TRIGGER/events, records t, p, id
-    v2e                         /events (N, 4): t in us, x, y, p; the order is told by the content
+    v2e                         /events (N, 4): t in us, x, y, p; the order is told by the content;
+                                /frame (frames, H, W) uint8, /frame_ts in us, /frame_idx, the
+                                number of events before each frame, which is not needed
     others                      /events or the file itself with t, x, y and p, whole lists or
                                 records, under the names that `columns.NAMES` lists
 
@@ -42,7 +44,8 @@ from jaxevent.io import (
 from jaxevent.io.columns import find, order_of
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.hdf5 import Column, Microseconds, StoredEvents, StoredImages, read_stored
-from jaxevent.io.hdf5_files import array, attribute, dataset, filters_of
+from jaxevent.io.hdf5_files import array, attribute, dataset, describe_images, filters_of
+from jaxevent.io.images import grey_of_bgr
 from jaxevent.io.options import ReadOptions
 from jaxevent.io.truth import read_poses
 from jaxevent.recording import Frames, Imu, Recording, Triggers
@@ -83,12 +86,21 @@ def _recording(file: Any, path: Path, options: ReadOptions) -> Recording:
     else:
         columns = {}
     frames = _images(file, source) if isinstance(file.get("images"), h5py.Group) else None
+    if isinstance(file.get("frame"), h5py.Dataset):
+        frames = _frames_of_v2e(file, source)
     told = _told_size(file, source)
     otherwise = f"{path}: neither an attribute nor an image tells the sensor's size;"
     size = sensor_size(size, told, frames=frames, otherwise=otherwise)
     columns = columns or _plain_columns(file, size, source)
     stored = StoredEvents(columns, size, source)
-    return Recording(path.stem, *size, stored, frames, triggers=_triggers(file, source))
+    return Recording(
+        path.stem,
+        *size,
+        stored,
+        frames,
+        triggers=_triggers(file, source),
+        left_out=describe_images(file) if frames is None else {},
+    )
 
 
 def _triggers(file: Any, source: str) -> Triggers | None:
@@ -158,7 +170,9 @@ def _m3ed(file: Any, path: Path, size: tuple[int, int] | None, group: str) -> Re
         table = dataset(file, f"{group}/ms_map_idx", source)
     events = StoredEvents(columns, size, source, 0, table)
     poses = read_poses(path, group)
-    return Recording(path.stem, *size, events, camera=camera, poses=poses)
+    return Recording(
+        path.stem, *size, events, camera=camera, poses=poses, left_out=describe_images(file)
+    )
 
 
 def _camera(file: Any, group: str, source: str) -> PinholeCamera | None:
@@ -263,6 +277,22 @@ def _pair(values: Any, source: str) -> tuple[int, int]:
     return first, second
 
 
+def _frames_of_v2e(file: Any, source: str) -> Frames | None:
+    """The frames that v2e keeps beside its events; None without times."""
+    stored = dataset(file, "frame", source)
+    if stored.ndim != 3 or not isinstance(file.get("frame_ts"), h5py.Dataset):
+        return None
+    t = _times(file, "frame_ts", source)
+    if len(t) != len(stored):
+        raise InputError(
+            f"{source}: frame holds {len(stored)} images, frame_ts {len(t)} times; there must be "
+            "one time for each image"
+        )
+    if not len(t):
+        return None
+    return Frames(t, StoredImages(stored, f"{source}: frame"), np.zeros_like(t))
+
+
 def _images(file: Any, source: str) -> Frames | None:
     """The images of event_utils, one dataset each, in the order of their names."""
     with reading(f"{source}: images"):
@@ -281,9 +311,7 @@ def _images(file: Any, source: str) -> Frames | None:
         pixels = array(file, f"images/{name}", source)
         if pixels.ndim == 2:
             return pixels
-        # As event_utils stores them with OpenCV: blue, green, red.
-        grey = pixels[..., :3] @ np.array([0.114, 0.587, 0.299])
-        return (grey if pixels.dtype.kind == "f" else np.rint(grey)).astype(pixels.dtype)
+        return grey_of_bgr(pixels)  # as event_utils stores them with OpenCV
 
     images = DecodedImages(
         lambda row: (image(name) for name in names[row:]),

@@ -8,8 +8,9 @@
 
 All t are seconds; events.txt with whole numbers only, which would be microseconds or worse, is
 refused. Only events.txt is required, and it may be empty where there are images. In a
-zip the files may lie in one top folder. The exposure of the images is unknown: 0. Colour images
-become grey (ITU-R 601 luma); where all are, `extra["rgb"]` keeps their colours.
+zip the files may lie in one top folder; a zip of one text alone, as rpg_e2vid reads, may name it
+otherwise. The exposure of the images is unknown: 0. Colour images become grey (ITU-R 601 luma);
+where all are, `extra["rgb"]` keeps their colours.
 """
 
 import re
@@ -24,7 +25,15 @@ from numpy.typing import NDArray
 from tqdm.utils import CallbackIOWrapper
 
 from jaxevent.errors import InputError
-from jaxevent.io import check_unfolded, checked_events, pinhole, reading, sensor_size, times
+from jaxevent.io import (
+    check_unfolded,
+    checked_events,
+    find_event_texts,
+    pinhole,
+    reading,
+    sensor_size,
+    times,
+)
 from jaxevent.io.images import kept_colours, read_grey_and_colour
 from jaxevent.io.options import ReadOptions
 from jaxevent.progress import bar
@@ -36,25 +45,23 @@ def read(path: Path, options: ReadOptions) -> Recording:
     if path.is_dir():
         return _read(path, path, options)
     with reading(str(path)), zipfile.ZipFile(path) as archive:
-        inside = [
-            name
-            for name in archive.namelist()
-            if name.count("/") <= 1 and name.rpartition("/")[2] == "events.txt"
-        ]
+        inside = [name for name in find_event_texts(archive.namelist()) if name.count("/") <= 1]
         if len(inside) != 1:
             raise InputError(
                 f"{path}: holds {len(inside)} events.txt at its top or in a top folder; "
                 "make a zip of one recording"
             )
-        root = zipfile.Path(archive, inside[0].removesuffix("events.txt"))
-        return _read(path, root, options)
+        folder, _, name = inside[0].rpartition("/")
+        return _read(path, zipfile.Path(archive, folder and f"{folder}/"), options, name)
 
 
-def _read(path: Path, root: Path | zipfile.Path, options: ReadOptions) -> Recording:
-    source = f"{path}: events.txt"
+def _read(
+    path: Path, root: Path | zipfile.Path, options: ReadOptions, name: str = "events.txt"
+) -> Recording:
+    source = f"{path}: {name}"
     frames, colours = _frames(path, root)
     columns, header = _table(
-        root / "events.txt", source, "t x y p", header="width height", progress=options.progress
+        root / name, source, "t x y p", header="width height", progress=options.progress
     )
     otherwise = (
         f"{source}: neither a first line 'width height' nor an image tells the sensor's size;"
