@@ -72,10 +72,14 @@ def test_spans_of_two_clocks(frames, events, is_disjoint):
     assert f"from {events[0] / 1000:.6f} to {events[1] / 1000:.6f} s" in mismatch.text
 
 
-def test_without_events_or_frames():
+def test_few_events_and_none():
     one = recording()
     assert compare_clocks(dataclasses.replace(one, frames=None)) is None
     assert compare_clocks(dataclasses.replace(one, events=one.events[:0])) is None
+    near, far = recording(range(800, 1801, 50)), recording(range(7000, 8001, 50))
+    few = [dataclasses.replace(some, events=some.events[::4]) for some in (near, far)]
+    assert compare_clocks(few[0]) is None
+    assert compare_clocks(few[1]).is_disjoint
 
 
 def test_exposures_and_the_offset_count():

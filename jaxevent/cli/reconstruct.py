@@ -134,7 +134,8 @@ def run(
         asked = frame_times(recording.frames, values)
     elif asked is None:
         spanned = recording
-        if estimator.joins_frames or estimator.needs_frames:
+        joins = getattr(estimator, "joins_frames", True) or estimator.needs_frames
+        if joins:
             check_clocks(recording, values.clock_offset)
         elif compare_clocks(recording, values.clock_offset) is not None:
             spanned = dataclasses.replace(recording, frames=None)

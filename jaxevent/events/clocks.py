@@ -14,6 +14,7 @@ import numpy as np
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.recording import Recording
 
+FEWEST_EVENTS = 100  # whose span says anything about a clock, short of one that is far off
 LEAST_OVERLAP = 0.5  # of the shorter of the two spans
 NEAR_INTERVALS = 3  # intervals between frames that a span may miss the other by
 NEAR_US = 1_000_000  # us between disjoint spans, from which they are refused
@@ -67,6 +68,8 @@ def compare_clocks(recording: Recording, clock_offset: Any = 0.0) -> ClockMismat
     near, shorter = NEAR_INTERVALS * interval, min(last - first, end - begin)
     if common < 0 and -common > max(near, NEAR_US):
         return ClockMismatch(True, spans)
+    if len(events) < FEWEST_EVENTS:
+        return None
     if common < LEAST_OVERLAP * shorter and shorter - common > near:
         return ClockMismatch(False, spans)
     is_slow = interval > end - begin and LEAST_RATIO * (last - first) > end - begin

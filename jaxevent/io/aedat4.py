@@ -58,7 +58,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
         for kind in ("events", "frame", "imus", "triggers")
     }
     number, chosen = _choose(path, of_kind["events"], options.stream, streams)
-    left_out: dict[str, str] = {}
+    unchosen: dict[str, str] = {}
     for kind, field in (("frame", "frames"), ("imus", "imu"), ("triggers", "triggers")):
         several = of_kind[kind]
         listed = ", ".join(map(str, several))
@@ -75,7 +75,12 @@ def read(path: Path, options: ReadOptions) -> Recording:
             chosen[kind] = several[of_kind["events"].index(number)]
         elif several:
             remedy = f"; choose one with frames={several[0]}" if kind == "frame" else ""
-            left_out[field] = f"the streams {listed} hold some, of which none is chosen{remedy}"
+            unchosen[field] = f"the streams {listed} hold some, of which none is chosen{remedy}"
+    if number is None and "frame" not in chosen:
+        raise InputError(
+            f"{path}: holds no events, and frames in the streams "
+            f"{', '.join(map(str, of_kind['frame']))}; choose one with frames="
+        )
     frames, rgb, imu, triggers = _others(path, chosen, options.in_memory)
     extra: dict[str, NDArray] = {} if rgb is None else {"rgb": rgb}
     left_out = [
@@ -112,7 +117,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
         imu=imu,
         extra=extra,
         triggers=triggers,
-        left_out=left_out,
+        left_out=unchosen,
     )
 
 

@@ -13,7 +13,7 @@ import contextlib
 import dataclasses
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -317,12 +317,11 @@ def read_files(
         return np.stack(grey), kept_colours(colours)
 
     def left(which: int, shape: tuple[int, ...], kind: np.dtype) -> DecodedImages:
-        return DecodedImages(
-            lambda row: (read_grey_and_colour(file, str(file))[which] for file in files[row:]),
-            (len(files), *shape),
-            kind,
-            source,
-        )
+        def images(row: int) -> Iterator[NDArray]:
+            for file in files[row:]:
+                yield np.asarray(read_grey_and_colour(file, str(file))[which])
+
+        return DecodedImages(images, (len(files), *shape), kind, source)
 
     rgb = {"rgb": left(1, (*shape, 3), np.dtype(np.uint8))} if are_colours and differ else {}
     return left(0, shape, kind), rgb
