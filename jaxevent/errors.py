@@ -18,6 +18,10 @@ class InputError(ValueError):
     """
 
 
+class OrderError(InputError):
+    """Event times go back."""
+
+
 class InputWarning(UserWarning):
     """Something about the input is doubtful, but can be used.
 

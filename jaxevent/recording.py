@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.camera import PinholeCamera, Response, TableResponse, UnknownResponse
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, OrderError
 from jaxevent.shown import Shown, plural
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ class Events:
         backwards = self.t[1:] < self.t[:-1]
         if backwards.any():
             row = int(np.argmax(backwards)) + 1
-            raise InputError(
+            raise OrderError(
                 f"{source}: event {first_row + row} is at {self.t[row]} us, earlier than the one "
                 f"before it at {self.t[row - 1]} us; sort the events by time (stable)"
             )

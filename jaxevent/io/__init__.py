@@ -9,6 +9,7 @@ file into checked fields, so that every reader accepts the same values and words
 
 import codecs
 import contextlib
+import dataclasses
 import os
 import re
 import zipfile
@@ -74,7 +75,9 @@ def load(
             datasets. Such a file can have any file read that you may read, or never end.
         frames: Which images become the frames, of a file that holds several kinds.
         time_unit: The unit of the event times, "s", "ms", "us" or "ns"; None infers it.
-        repair: How to mend event times that go back; None refuses them.
+        repair: How to mend event times that go back: "sort" late events, "drop" outliers, "unwrap"
+            a counter, keep a "part" between resets, or several of them, as in "unwrap,sort"; see
+            `jaxevent.io.disorder`. None refuses such times, and the message says what would help.
 
     Raises:
         InputError: The file is missing, damaged or of another format, or what it holds is not a
@@ -92,7 +95,12 @@ def load(
             from jaxevent.io.hdf5_files import trusting
 
             stack.enter_context(trusting())
-        return _reader(path, options)(path, options).check(str(path))
+        if repair is not None:
+            from jaxevent.io.disorder import parse_repair
+
+            parse_repair(repair)
+        recording = _reader(path, options)(path, options).check(str(path))
+    return dataclasses.replace(recording, notes=(*recording.notes, *options.notes))
 
 
 def save(

@@ -48,6 +48,7 @@ NUMPY_MAGIC = b"\x93NUMPY"
 _BYTES = 1 << 24  # of text parsed together: about a million events
 _LONGEST_LINE = 1 << 12
 _SAMPLE = 1 << 16  # events, or 16 times as many bytes of text, that tell order and unit
+_SELDOM = 0.1  # share of events before which times that go back may fall
 _LONGEST = 1_000_000  # seconds of a recording
 _ORDERS = ("txyp", "xypt", "xytp", "ptxy")
 
@@ -76,15 +77,18 @@ def order_of(rows: NDArray, size: tuple[int, int] | None, source: str) -> str:
     def is_place(values: NDArray, count: int) -> bool:
         return bool(((values >= 0) & (values < count) & (values == np.rint(values))).all())
 
-    def fits(order: str, width: int, height: int) -> bool:
+    def fits(order: str, width: int, height: int, falls: float) -> bool:
         t, x, y, p = (rows[:, order.index(name)] for name in "txyp")
-        is_sorted = bool((t[1:] >= t[:-1]).all())
-        return is_sorted and is_p(p) and is_place(x, width) and is_place(y, height)
+        is_sorted = np.count_nonzero(t[1:] < t[:-1]) <= falls * len(t)
+        return bool(is_sorted) and is_p(p) and is_place(x, width) and is_place(y, height)
 
     largest = (1 << 16, 1 << 16)
-    fitting = [order for order in _ORDERS if fits(order, *(size or largest))]
-    # On a sensor too small for them the one order will do, so that the event outside is named.
-    fitting = fitting or [order for order in _ORDERS if fits(order, *largest)]
+    fitting: list[str] = []
+    # On a sensor too small for them the one order will do, so that the event outside is named, and
+    # where no column never falls, one that seldom does, so that the fault of its times is named.
+    for falls in (0.0, _SELDOM):
+        for sides in (size or largest, largest):
+            fitting = fitting or [order for order in _ORDERS if fits(order, *sides, falls)]
     if len(fitting) != 1:
         named = " or ".join(" ".join(order) for order in (fitting or _ORDERS))
         raise InputError(

@@ -14,7 +14,6 @@ atis.es to the same 1,326,017 events, and the same short files of every byte; it
 word where a file ends inside an event.
 """
 
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ import numpy as np
 
 from jaxevent.errors import InputError
 from jaxevent.io import reading
-from jaxevent.io.decoded import BLOCK, Columns, decoded
+from jaxevent.io.decoded import BLOCK, Columns, Tally, decoded
 from jaxevent.io.options import ReadOptions
 from jaxevent.kernels import compiled
 from jaxevent.recording import Recording
@@ -52,7 +51,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
         raise InputError(f"{path}: ends inside its header; fetch the file again")
     width, height = (int(n) for n in np.frombuffer(head, "<u2", 2, 16))
     size = options.size or (width, height)
-    found: Counter[str] = Counter()
+    found = Tally()
 
     def decode(state: tuple[int, int] | None) -> Iterator[tuple[Any, Columns]]:
         offset, t = state or (_HEADER, 0)
@@ -63,8 +62,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
                 state = (offset, t)
                 data = np.frombuffer(rest + piece, np.uint8)
                 columns, count, crossings, used, t = _decode(data, t, kind == 2)
-                if crossings:
-                    found["intensity_events"] += crossings
+                found.add("intensity_events", crossings, offset)
                 offset += used
                 rest = data[used:].tobytes()
                 ts, xs, ys, ps = (column[:count] for column in columns)
@@ -77,8 +75,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
             )
 
     events = decoded(decode, size, str(path), options)
-    extra = {name: np.array(number) for name, number in found.items()}
-    return Recording(path.stem, *size, events, extra=extra)
+    return Recording(path.stem, *size, events, extra=found.arrays())
 
 
 @compiled

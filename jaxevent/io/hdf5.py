@@ -29,7 +29,7 @@ refused before any memory is asked for.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, OrderError
 from jaxevent.io import (
     check_unfolded,
     checked_events,
@@ -49,7 +49,9 @@ from jaxevent.io import (
     whole_number,
 )
 from jaxevent.io.columns import time_scale
+from jaxevent.io.decoded import decoded
 from jaxevent.io.description import CLOCK
+from jaxevent.io.disorder import Columns, examine
 from jaxevent.io.hdf5_files import array, attribute, dataset, describe_images, open_file
 from jaxevent.io.options import ReadOptions
 from jaxevent.io.output import complete_hdf5
@@ -194,8 +196,26 @@ class StoredEvents:
         with reading(f"{self._source}: events"):
             t = times(self._t[part], self._source, "event", first_row=part.start) + self._offset
             x, y, p = self._x[part], self._y[part], self._p[part]
-        events = checked_events(t, x, y, p, self._size, self._source, first_row=start - lead)
+        try:
+            events = checked_events(t, x, y, p, self._size, self._source, first_row=start - lead)
+        except OrderError:
+            times_of_blocks = (columns[0] for _, columns in self.decode(None))
+            raise examine(times_of_blocks, source=self._source).explain(self._source) from None
         return events[lead:] if lead else events
+
+    def decode(self, row: int | None) -> Iterator[tuple[int, Columns]]:
+        """Blocks of columns that are not checked, from a row on: a `Decoder`."""
+        for start in range(row or 0, len(self), _BLOCK):
+            part = slice(start, min(start + _BLOCK, len(self)))
+            with reading(f"{self._source}: events"):
+                t = times(self._t[part], self._source, "event", first_row=start) + self._offset
+                yield start, (t, self._x[part], self._y[part], self._p[part])
+
+    def repaired(self, options: ReadOptions) -> EventSource:
+        """These events, with their times repaired as the options say."""
+        if options.repair is None:
+            return self
+        return decoded(self.decode, self._size, self._source, options)
 
     def columns(self, rows: slice, room: EventColumns | None = None) -> EventColumns | None:
         """See `recording.ColumnSource`."""
@@ -398,7 +418,7 @@ def _recording(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
                 "in integer microseconds"
             )
     table = dataset(file, "ms_to_idx", source) if "ms_to_idx" in file else None
-    events = StoredEvents(columns, size, source, offset, table)
+    events = StoredEvents(columns, size, source, offset, table).repaired(options)
     left_out = {} if frames is not None else _describe_frames(file, path)
     return Recording(
         name, *size, events, frames, camera, poses, imu, extra, triggers, left_out=left_out
@@ -497,7 +517,8 @@ def _write_events(
     count = len(events)
     offset = int(events[:1].t[0]) if count else 0
     last_ms = (int(events[count - 1 :].t[0]) - offset) // 1000 if count else -1
-    is_sparse = last_ms >= max(_MOST_MS, 2 * count)
+    # Where times go back, reading the block that does so raises the error.
+    is_sparse = not -1 <= last_ms < max(_MOST_MS, 2 * count)
     file["t_offset"] = np.int64(offset)
     options = _options(count, compression)
     t, x, y, p = (
@@ -520,7 +541,7 @@ def _write_events(
         if ms_to_idx is None:
             continue
         # The milliseconds that begin after the last block and not after this one's last event.
-        end = int(since[-1]) // 1000 + 1
+        end = min(int(since[-1]) // 1000, last_ms) + 1
         for first in range(ms, end, _BLOCK):
             begin = np.arange(first, min(first + _BLOCK, end))
             ms_to_idx[first : first + len(begin)] = row + np.searchsorted(since, 1000 * begin)

@@ -77,7 +77,7 @@ def _recording(file: Any, path: Path, options: ReadOptions) -> Recording:
         if isinstance(group, h5py.Group):
             side = _side(path, group, stream)
             read = _m3ed if name == "prophesee" else _mvsec
-            return read(file, path, size, f"{name}/{side}")
+            return read(file, path, options, f"{name}/{side}")
     refuse_stream(path, options)
     if not _is_plain(file):
         with reading(source):
@@ -92,7 +92,7 @@ def _recording(file: Any, path: Path, options: ReadOptions) -> Recording:
     otherwise = f"{path}: neither an attribute nor an image tells the sensor's size;"
     size = sensor_size(size, told, frames=frames, otherwise=otherwise)
     columns = columns or _plain_columns(file, size, source)
-    stored = StoredEvents(columns, size, source)
+    stored = StoredEvents(columns, size, source).repaired(options)
     return Recording(
         path.stem,
         *size,
@@ -152,8 +152,8 @@ def _side(path: Path, group: Any, stream: str | None) -> str:
     return str(stream)
 
 
-def _m3ed(file: Any, path: Path, size: tuple[int, int] | None, group: str) -> Recording:
-    source = str(path)
+def _m3ed(file: Any, path: Path, options: ReadOptions, group: str) -> Recording:
+    source, size = str(path), options.size
     columns = _columns(file, group, source)
     camera = None
     if f"{group}/calib/intrinsics" in file:
@@ -168,7 +168,7 @@ def _m3ed(file: Any, path: Path, size: tuple[int, int] | None, group: str) -> Re
     table = None
     if f"{group}/ms_map_idx" in file:
         table = dataset(file, f"{group}/ms_map_idx", source)
-    events = StoredEvents(columns, size, source, 0, table)
+    events = StoredEvents(columns, size, source, 0, table).repaired(options)
     poses = read_poses(path, group)
     return Recording(
         path.stem, *size, events, camera=camera, poses=poses, left_out=describe_images(file)
@@ -201,8 +201,8 @@ class _Part:
         return self._whole.fields(self._key)[rows]
 
 
-def _mvsec(file: Any, path: Path, size: tuple[int, int] | None, group: str) -> Recording:
-    source = str(path)
+def _mvsec(file: Any, path: Path, options: ReadOptions, group: str) -> Recording:
+    source, size = str(path), options.size
     whole = dataset(file, f"{group}/events", source)
     if whole.ndim != 2 or whole.shape[1] != 4:
         raise InputError(
@@ -225,7 +225,7 @@ def _mvsec(file: Any, path: Path, size: tuple[int, int] | None, group: str) -> R
         imu = Imu(stamps, values[:, 3:], values[:, :3])
     otherwise = f"{path}: has no {group}/image_raw to tell the sensor's size;"
     size = sensor_size(size, frames=frames, otherwise=otherwise)
-    events = StoredEvents(columns, size, source)
+    events = StoredEvents(columns, size, source).repaired(options)
     poses = read_poses(path, group)
     return Recording(path.stem, *size, events, frames, poses=poses, imu=imu)
 

@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.io import check_unfolded, checked_events, reading, sensor_size, times
+from jaxevent.io import check_unfolded, reading, sensor_size, times
+from jaxevent.io.decoded import from_columns
 from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Events, Frames, Recording
 
@@ -150,7 +151,7 @@ def _recording(path: Path, options: ReadOptions, variables: dict) -> Recording:
     frames = _frames(path, arrays) if "image" in arrays else None
     otherwise = f"{path}: has no image to tell the sensor's size;"
     size = sensor_size(options.size, frames=frames, otherwise=otherwise)
-    events = _events(path, columns, size)
+    events = _events(path, columns, size, options)
     extra = {name: _squeeze(value) for name, value in arrays.items() if name != "HDR_mat"}
     if "HDR_mat" in arrays:
         number = 0 if frames is None else len(frames)
@@ -158,7 +159,7 @@ def _recording(path: Path, options: ReadOptions, variables: dict) -> Recording:
     return Recording(path.stem, *size, events, frames, extra=extra)
 
 
-def _events(path: Path, columns: NDArray, size: tuple[int, int]) -> Events:
+def _events(path: Path, columns: NDArray, size: tuple[int, int], options: ReadOptions) -> Events:
     source = f"{path}: events"
     if columns.size == 0:
         return Events.empty()
@@ -167,7 +168,8 @@ def _events(path: Path, columns: NDArray, size: tuple[int, int]) -> Events:
             f"{source} has shape {columns.shape}; store it as N x 4 (t in us, x, y, p)"
         )
     t, x, y, p = columns.T if columns.shape[1] == 4 else columns
-    return checked_events(times(t, source, "event", scale=1.0), x, y, p, size, source, origin=1)
+    timed = times(t, source, "event", scale=1.0), x, y, p
+    return from_columns(timed, size, source, options, origin=1)
 
 
 def _frames(path: Path, arrays: dict[str, NDArray]) -> Frames | None:

@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.io import checked_events, pinhole, reading, sensor_size, times, vectors, whole_number
+from jaxevent.io import pinhole, reading, sensor_size, times, vectors, whole_number
 from jaxevent.io.columns import find, of_records, time_scale
+from jaxevent.io.decoded import from_columns
 from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Frames, Imu, Recording
 
@@ -62,7 +63,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
     size = sensor_size(options.size, told, frames=frames, otherwise=otherwise)
     source = str(path)
     t = times(t, source, "event", time_scale(t, source))
-    events = checked_events(t, x, y, p, size, source)
+    events = from_columns((t, x, y, p), size, source, options)
     imu = None
     if "imu_t" in arrays:
         imu_t, gyro, acc = take("imu_t", "gyro", "acc")

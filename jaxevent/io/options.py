@@ -14,7 +14,8 @@ class ReadOptions:
         stream: Name of the camera whose events are read; None where the file holds one.
         frames: Name of the images that become the frames; None lets the reader choose.
         time_unit: Unit of the event times, "s", "ms", "us" or "ns"; None infers it.
-        repair: Name of the repair of times that go back; None refuses them.
+        repair: Repairs of event times that go back; None refuses them.
+        notes: Remarks that readers add, for `Recording.notes`.
     """
 
     size: tuple[int, int] | None = None
@@ -24,3 +25,4 @@ class ReadOptions:
     frames: str | None = None
     time_unit: str | None = None
     repair: str | None = None
+    notes: list[str] = dataclasses.field(default_factory=list, compare=False)

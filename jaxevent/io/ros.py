@@ -66,7 +66,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
         {topic for kind in chosen for topic in bag.topics(kind)} - set(chosen.values()) - {None}
     )
     left_out += [other for other in bag.topics(*ARRAYS, PACKET) if other != topic]
-    extra = {name: np.array(number) for name, number in sorted(found.untimed.items())}
+    extra: dict[str, Any] = dict(found.untimed.arrays())
     extra |= {"topics_left_out": np.array(left_out)} if left_out else {}
     extra |= {} if colours is None else {"rgb": colours}
     triggers = found.triggers()

@@ -27,13 +27,13 @@ from tqdm.utils import CallbackIOWrapper
 from jaxevent.errors import InputError
 from jaxevent.io import (
     check_unfolded,
-    checked_events,
     find_event_texts,
     pinhole,
     reading,
     sensor_size,
     times,
 )
+from jaxevent.io.decoded import from_columns
 from jaxevent.io.images import kept_colours, read_grey_and_colour
 from jaxevent.io.options import ReadOptions
 from jaxevent.progress import bar
@@ -73,7 +73,8 @@ def _read(
             f"{source}: all times are whole numbers, but those of this layout are seconds; write "
             "seconds with decimals, or load a table with the line 't x y p' before events in us"
         )
-    events = checked_events(times(t, source, "event"), x, y, p, size, source)
+    columns = times(t, source, "event"), x, y, p
+    events = from_columns(columns, size, source, options)
 
     poses = imu = camera = None
     if (root / "groundtruth.txt").is_file():
