@@ -88,7 +88,8 @@ def test_exposures_and_the_offset_count():
     assert compare_clocks(recording([12_000], exposure=2_100)) is None
     far = recording(range(7000, 8001, 50))
     assert compare_clocks(far, -7.0) is None
-    assert compare_clocks(recording(), 7.0).is_disjoint
+    mismatch = compare_clocks(recording(), 7.0)
+    assert mismatch.is_disjoint and "8.000000 s with clock_offset = 7 s, the" in mismatch.text
 
 
 JOINING = ("akf", "aks", "cf", "cf-augmented", "edi", "augmented", "mc")

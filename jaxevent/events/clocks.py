@@ -56,8 +56,9 @@ def compare_clocks(recording: Recording, clock_offset: Any = 0.0) -> ClockMismat
     first = int(frames.t[0]) - int(frames.exposure[0]) // 2 + late
     last = int(frames.t[-1]) + int(frames.exposure[-1]) // 2 + late
     begin, end = int(events[:1].t[0]), int(events[len(events) - 1 :].t[0])
+    shifted = f" with clock_offset = {float(clock_offset):g} s" if late else ""
     spans = (
-        f"the frames last from {first / 1e6:.6f} to {last / 1e6:.6f} s, the events from "
+        f"the frames last from {first / 1e6:.6f} to {last / 1e6:.6f} s{shifted}, the events from "
         f"{begin / 1e6:.6f} to {end / 1e6:.6f} s"
     )
     common = min(last, end) - max(first, begin)  # us; negative: the distance between the spans
@@ -96,12 +97,12 @@ def check_clocks(recording: Recording, clock_offset: Any = 0.0) -> None:
     if mismatch.is_disjoint:
         raise InputError(
             f"{recording.name}: {mismatch.text}, which cannot be one clock and unit; correct the "
-            "times of the frames, estimate their offset by jaxevent register, or use a method of "
-            "events alone, such as high-pass, at times of the events"
+            "times of the frames or clock_offset, estimate it by jaxevent register, or use a "
+            "method of events alone, such as high-pass, at times of the events"
         )
     warnings.warn(
         f"{recording.name}: {mismatch.text}, which is unlikely of one clock and unit; check the "
-        "times of the frames",
+        "times of the frames and clock_offset",
         InputWarning,
         stacklevel=3,
     )
