@@ -134,8 +134,7 @@ def run(
         asked = frame_times(recording.frames, values)
     elif asked is None:
         spanned = recording
-        joins = getattr(estimator, "joins_frames", True) or estimator.needs_frames
-        if joins:
+        if getattr(estimator, "fuses", True) or estimator.needs_frames:
             check_clocks(recording, values.clock_offset)
         elif compare_clocks(recording, values.clock_offset) is not None:
             spanned = dataclasses.replace(recording, frames=None)

@@ -37,7 +37,7 @@ def advance(params: FrameParams, state: State, dt: Array, frame: Observation) ->
     return State(frame.level, jnp.broadcast_to(state.P, frame.level.shape))
 
 
-def _direct(name: str, model: type[Level], about: str, joins_frames: bool = True) -> Filter:
+def _direct(name: str, model: type[Level], about: str, **more: Any) -> Filter:
     def observe(values: Any, frames: FrameFeatures) -> Direct:
         return Direct(model(values, frames))
 
@@ -49,8 +49,8 @@ def _direct(name: str, model: type[Level], about: str, joins_frames: bool = True
         advance,
         needs_frames=True,
         has_covariance=False,
-        joins_frames=joins_frames,
         about=about,
+        **more,
     )
 
 
@@ -67,6 +67,6 @@ augmented = _direct(
     "them with a threshold calibrated for each pixel.",
 )
 blend = _direct(
-    "blend", Blended, "The frames before and after, blended by time; no events.", joins_frames=False
+    "blend", Blended, "The frames before and after, blended by time; no events.", fuses=False
 )
-last_frame = _direct("last-frame", Held, "The last frame, held; no events.", joins_frames=False)
+last_frame = _direct("last-frame", Held, "The last frame, held; no events.", fuses=False)

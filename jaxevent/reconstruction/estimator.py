@@ -25,12 +25,11 @@ class ImageEstimator(Estimator[P]):
     none; `valid` is false where the intensity is not a finite number.
 
     Attributes:
-        joins_frames: Whether it combines events with frames, whose clocks then have to agree.
+        fuses: Whether images rest on events and frames together, whose clocks have to agree.
     """
 
-    joins_frames: bool = dataclasses.field(default=True, kw_only=True)
-
     family: ClassVar[str] = "reconstruction"
+    fuses: bool = dataclasses.field(default=True, kw_only=True)
     has_likelihood: ClassVar[bool] = False  # whether it has `log_likelihood` of the frames given
 
     def check_span(self, recording: Recording, times: Times, params: P) -> None:
@@ -42,7 +41,7 @@ class ImageEstimator(Estimator[P]):
 
         See `jaxevent.events.clocks`.
         """
-        if self.joins_frames:
+        if self.fuses:
             check_clocks(recording, params.clock_offset)
 
     @abc.abstractmethod

@@ -276,7 +276,7 @@ flow = Flow(
     "flow",
     Params,
     needs_frames=True,
-    joins_frames=False,
+    fuses=False,
     differentiable=False,
     has_covariance=False,
     about="The frames before and after, each moved along the optical flow between them (dense "
