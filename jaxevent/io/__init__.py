@@ -20,12 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent import arrays
+from jaxevent.arrays import times
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
 from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Events, Frames, Recording
 
-__all__ = ["load", "save"]
+__all__ = ["load", "save", "times"]
 
 Reader = Callable[[Path, ReadOptions], Recording]
 
@@ -34,8 +36,6 @@ HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _LINE = 1 << 12  # bytes of a line that are looked at
 _SMALL = 1 << 27  # bytes of arrays that every file may unfold to
 _MOST_COMPRESSED = 100  # times that a larger one may unfold to of its own bytes
-_MOST_PIXELS = 1 << 16  # of a side: coordinates are uint16
-_MOST_TIME = 1 << 62  # us, 146,000 years: sums and differences of two times stay in int64
 
 READABLE = (
     "readable are a folder or zip with events.txt (Event-Camera Dataset), AEDAT 2 and 4, "
@@ -84,10 +84,10 @@ def load(
             valid recording; the message names the place and the remedy.
     """
     path = Path(path)
-    if size is not None and not 1 <= min(size) <= max(size) <= _MOST_PIXELS:
+    if size is not None and not 1 <= min(size) <= max(size) <= arrays.MAX_PIXELS:
         raise InputError(
             f"size = {size} must be two positive numbers of pixels, (width, height), of at most "
-            f"{_MOST_PIXELS}"
+            f"{arrays.MAX_PIXELS}"
         )
     options = ReadOptions(size, in_memory, progress, stream, frames, time_unit, repair)
     with contextlib.ExitStack() as stack:
@@ -99,7 +99,9 @@ def load(
             from jaxevent.io.disorder import parse_repair
 
             parse_repair(repair)
-        recording = _reader(path, options)(path, options).check(str(path))
+        with naming(path):
+            recording = _reader(path, options)(path, options)
+    recording.refuse_empty(str(path))
     return dataclasses.replace(recording, notes=(*recording.notes, *options.notes))
 
 
@@ -301,6 +303,17 @@ def _hdf5_reader(path: Path, options: ReadOptions) -> Reader:
 
 
 @contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Put the path before the message of an `InputError` that does not name it."""
+    try:
+        yield
+    except InputError as error:
+        if type(error) is not InputError or str(path) in str(error):
+            raise
+        raise InputError(f"{path}: {error}") from error
+
+
+@contextlib.contextmanager
 def reading(source: str) -> Iterator[None]:
     """Turn whatever a parser raises on a bad file into an `InputError` naming `source`.
 
@@ -337,31 +350,6 @@ def check_unfolded(size: int, stored: int, source: str) -> None:
         )
 
 
-def times(
-    values: NDArray, source: str, what: str, scale: float = 1e6, first_row: int = 0
-) -> NDArray[np.int64]:
-    """Times (n,) as int64 us: integers are us already, floats are multiplied by `scale`.
-
-    `first_row` is the row of the first one in `source`.
-    """
-    values = _numbers(values, source, f"{what} times")
-    is_float = values.dtype.kind == "f"
-    values = values.astype(np.float64, copy=False) if is_float else values
-    # NaN and infinity fail this comparison too.
-    most = _MOST_TIME / scale if is_float else _MOST_TIME
-    if len(values) and not -most < values.min() <= values.max() < most:
-        row = int(np.argmin((values > -most) & (values < most)))
-        unit = "seconds" if is_float and scale == 1e6 else "microseconds"
-        shown = f"{values[row]:.16g}" if is_float else str(values[row])
-        raise InputError(
-            f"{source}: {what} {first_row + row} has the time {shown}, not finite "
-            f"or too large for {unit}; correct the unit or remove it"
-        )
-    if not is_float:
-        return values.astype(np.int64, copy=False)
-    return np.rint(values * scale).astype(np.int64)
-
-
 def checked_events(
     t: NDArray,
     x: NDArray,
@@ -378,61 +366,16 @@ def checked_events(
     `t` is int64 us. Coordinates count from `origin`. Polarity is bool, 0/1 or -1/1. `first_row` is
     the row of the first event in `source`. Raises `InputError` for the first bad event.
     """
-    if min(size) < 1 or max(size) > _MOST_PIXELS:
-        raise InputError(
-            f"{source}: the sensor has {size[0]}x{size[1]} pixels, but at most {_MOST_PIXELS} of a "
-            "side, and at least one, can be read; correct its size with size=(width, height) or "
-            "--size"
-        )
-    if not len(t) == len(x) == len(y) == len(p):
-        raise InputError(
-            f"{source}: t, x, y and p have {len(t)}, {len(x)}, {len(y)} and {len(p)} values; "
-            "they must be equally long"
-        )
-
-    def pixels(name: str, values: NDArray, count: int) -> NDArray[np.uint16]:
-        values = _numbers(values, source, name)
-        last = origin + count - 1
-        if values.dtype.kind == "f":
-            good = (values >= origin) & (values <= last) & (values == np.rint(values))
-            bad_row = None if good.all() else int(np.argmin(good))
-        elif len(values) and not origin <= values.min() <= values.max() <= last:
-            bad_row = int(np.argmax((values < origin) | (values > last)))
-        else:
-            bad_row = None
-        if bad_row is not None:
-            raise InputError(
-                f"{source}: event {first_row + bad_row} has {name} = {values[bad_row]:.12g}; on "
-                f"the {size[0]}x{size[1]} sensor {name} is a whole number from {origin} to {last}, "
-                "so give the sensor's size or remove the event"
-            )
-        return (values - origin if origin else values).astype(np.uint16, copy=False)
-
-    x, y = pixels("x", x, size[0]), pixels("y", y, size[1])
-    events = Events(t, x, y, _polarity(p, source, first_row))
-    events.check(*size, source, first_row)
+    arrays.as_size(*size, source)
+    arrays.check_lengths(t, x, y, p, source)
+    events = Events.of_checked(
+        arrays.as_plain(t, np.int64),
+        arrays.coordinates("x", x, size, source, first_row=first_row, origin=origin),
+        arrays.coordinates("y", y, size, source, first_row=first_row, origin=origin),
+        arrays.polarities(p, source, first_row),
+    )
+    events.check_order(source, first_row)
     return events
-
-
-def _polarity(p: NDArray, source: str, first_row: int) -> NDArray[np.bool_]:
-    if p.dtype.kind == "b" and p.ndim == 1:
-        return p
-    p = _numbers(p, source, "p")
-    if p.dtype == np.uint8 and (not len(p) or p.max() <= 1):
-        return p.view(np.bool_)
-    on, off, negative = p == 1, p == 0, p == -1
-    good = on | off | negative
-    if not good.all():
-        row = int(np.argmin(good))
-        raise InputError(
-            f"{source}: event {first_row + row} has the polarity {p[row]:.12g}; it must be 1 for "
-            "ON and 0 or -1 for OFF"
-        )
-    if off.any() and negative.any():
-        raise InputError(
-            f"{source}: polarities 0 and -1 both occur; use 0/1 or -1/1 throughout, 1 being ON"
-        )
-    return on
 
 
 def pinhole(values: NDArray, source: str) -> PinholeCamera:
@@ -450,7 +393,11 @@ def whole_number(value: Any, source: str, what: str) -> int:
     """One number of a file as an int, or `InputError` unless it is a whole one below 2^62."""
     value = np.asarray(value)
     number = value.item() if value.size == 1 and value.dtype.kind in "iuf" else None
-    if number is None or not -_MOST_TIME < number < _MOST_TIME or number != int(number):
+    if (
+        number is None
+        or not -arrays.MAX_TIME_US < number < arrays.MAX_TIME_US
+        or number != int(number)
+    ):
         raise InputError(
             f"{source}: {what} must be one whole number, not {np.ravel(value)[:3]}; correct it"
         )
@@ -481,11 +428,3 @@ def vectors(values: NDArray, shape: tuple[int, int], source: str, what: str) -> 
             "numbers, one row per time"
         )
     return values.astype(np.float64, copy=False)
-
-
-def _numbers(values: NDArray, source: str, what: str) -> NDArray:
-    if values.ndim != 1 or values.dtype.kind not in "iuf":
-        raise InputError(
-            f"{source}: {what} is {values.dtype} of shape {values.shape}; store a list of numbers"
-        )
-    return values

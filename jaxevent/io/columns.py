@@ -24,7 +24,7 @@ import codecs
 import functools
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -32,18 +32,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import find, times
 from jaxevent.errors import InputError
-from jaxevent.io import reading, times
+from jaxevent.io import reading
 from jaxevent.io.decoded import BLOCK, Columns, decoded
 from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Recording
 
-NAMES = {
-    "t": ("t", "ts", "time", "timestamp", "timestamps"),
-    "x": ("x", "xs"),
-    "y": ("y", "ys"),
-    "p": ("p", "ps", "pol", "pols", "polarity", "polarities", "on"),
-}
 NUMPY_MAGIC = b"\x93NUMPY"
 _BYTES = 1 << 24  # of text parsed together: about a million events
 _LONGEST_LINE = 1 << 12
@@ -51,17 +46,6 @@ _SAMPLE = 1 << 16  # events, or 16 times as many bytes of text, that tell order 
 _SELDOM = 0.1  # share of events before which times that go back may fall
 _LONGEST = 1_000_000  # seconds of a recording
 _ORDERS = ("txyp", "xypt", "xytp", "ptxy")
-
-
-def find(names: Sequence[str]) -> dict[str, str] | None:
-    """Which of some names are t, x, y and p; None unless each is there, once."""
-    found = {}
-    for field, aliases in NAMES.items():
-        fitting = [name for name in names if name.strip().lower() in aliases]
-        if len(fitting) != 1:
-            return None
-        found[field] = fitting[0]
-    return found
 
 
 def order_of(rows: NDArray, size: tuple[int, int] | None, source: str) -> str:

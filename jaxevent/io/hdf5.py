@@ -162,7 +162,7 @@ class StoredEvents:
 
         `size` is (width, height). Raises `InputError` unless the fields fit each other.
         """
-        self._size = size
+        self.checked_size = size
         self._source = source
         self._t, self._x, self._y, self._p = (columns[name] for name in "txyp")
         shapes = [field.shape for field in (self._t, self._x, self._y, self._p)]
@@ -197,7 +197,9 @@ class StoredEvents:
             t = times(self._t[part], self._source, "event", first_row=part.start) + self._offset
             x, y, p = self._x[part], self._y[part], self._p[part]
         try:
-            events = checked_events(t, x, y, p, self._size, self._source, first_row=start - lead)
+            events = checked_events(
+                t, x, y, p, self.checked_size, self._source, first_row=start - lead
+            )
         except OrderError:
             times_of_blocks = (columns[0] for _, columns in self.decode(None))
             raise examine(times_of_blocks, source=self._source).explain(self._source) from None
@@ -215,7 +217,7 @@ class StoredEvents:
         """These events, with their times repaired as the options say."""
         if options.repair is None:
             return self
-        return decoded(self.decode, self._size, self._source, options)
+        return decoded(self.decode, self.checked_size, self._source, options)
 
     def columns(self, rows: slice, room: EventColumns | None = None) -> EventColumns | None:
         """See `recording.ColumnSource`."""

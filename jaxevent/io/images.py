@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import LUMA
 from jaxevent.errors import InputError
 from jaxevent.io import check_unfolded, reading
 from jaxevent.io.decoded import DecodedImages
@@ -31,7 +32,6 @@ TIMES = ("timestamps.txt", "images.txt", "timestamp.txt")
 _EXPOSURES = "*exposure_timestamps*.txt"
 _INNER = ("rectified", "distorted")  # folders of images in DSEC's folder of a camera
 _DEEP_COLOUR = re.compile(r"\b(L|LA|RGB\w*|CMYK);16")  # Pillow's name of how pixels are stored
-LUMA = np.array([0.299, 0.587, 0.114])
 
 
 @dataclasses.dataclass(frozen=True)

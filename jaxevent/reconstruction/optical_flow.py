@@ -276,8 +276,8 @@ flow = Flow(
     "flow",
     Params,
     needs_frames=True,
-    fuses=False,
     differentiable=False,
+    fuses=False,
     has_covariance=False,
     about="The frames before and after, each moved along the optical flow between them (dense "
     "inverse search), blended by time; no events. Needs the extra `vision`.",
