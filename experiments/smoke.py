@@ -5,29 +5,30 @@ Prints one line of JSON: for each part None, or the reason why it failed.
 
 import importlib.metadata
 import json
-import re
 import subprocess
 import sys
 import tempfile
-import tomllib
 from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from versions import core_dependencies
 
 import jaxevent
 
 CROP = files("jaxevent") / "data/slider_depth_crop.h5"
-PROJECT = Path(__file__).parent.parent / "pyproject.toml"
+FIT = """
+recordings = [{crop}]
+iterations = 2
+rounds = 1
+
+[[method]]
+name = "akf"
+fit = ["c_on"]
+"""
 REASON = 200  # characters of a reason that are printed
-
-
-def core_dependencies() -> list[str]:
-    """Return the names of the core dependencies, in the order of pyproject.toml."""
-    listed = tomllib.loads(PROJECT.read_text())["project"]["dependencies"]
-    return [re.split(r"[^\w-]", line)[0] for line in listed]
 
 
 def try_images() -> None:
@@ -97,12 +98,15 @@ def try_motion() -> None:
 
 
 def try_commands() -> None:
-    """`jaxevent info` and `jaxevent reconstruct` end well."""
+    """Commands end well: what is in a file, images, a fit, and an evaluation."""
     with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "images.h5"
+        config, out = Path(folder) / "fit.toml", Path(folder) / "images.h5"
+        config.write_text(FIT.format(crop=json.dumps(str(CROP))))
         for words in (
             ["info", str(CROP)],
             ["reconstruct", str(CROP), "--method", "akf", "--rate", "50", "--out", str(out)],
+            ["fit", str(config), "--out", f"{folder}/fitted"],
+            ["evaluate", str(config), "--out", f"{folder}/results"],
         ):
             command = [sys.executable, "-m", "jaxevent.cli", *words]
             done = subprocess.run(command, capture_output=True, text=True)

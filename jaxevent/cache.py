@@ -154,8 +154,8 @@ def _own_folder(base: Path) -> Path | None:
             reason = _foreign_access(one.stat())
             if reason:
                 warnings.warn(
-                    f"{one}: compiled programs are not kept there nor read from there, since {reason}"
-                    "; remove the folder, or name one of your own by JAXEVENT_CACHE=FOLDER, or "
+                    f"{one}: compiled programs are neither kept nor looked for there, as {reason}; "
+                    "remove the folder, or name one of your own by JAXEVENT_CACHE=FOLDER, or "
                     "keep none by JAXEVENT_CACHE=0",
                     stacklevel=3,
                 )

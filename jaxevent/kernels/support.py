@@ -7,8 +7,11 @@ imported, as beside a NumPy that it does not know, functions run as Python and X
 kernel would compute.
 """
 
+import importlib
 import warnings
 from typing import Any
+
+__all__ = ["HAS_INTERNALS", "HAS_NUMBA", "intrinsic", "ir", "is_tested", "numba", "types"]
 
 TESTED = ((0, 61), (0, 68))  # first and last release of numba whose private interfaces are used
 
@@ -48,6 +51,6 @@ HAS_NUMBA = numba is not None
 HAS_INTERNALS = HAS_NUMBA and is_tested(numba.__version__)
 if HAS_INTERNALS:
     try:
-        from jaxevent.kernels import internals as internals
+        importlib.import_module("jaxevent.kernels.internals")
     except (ImportError, AttributeError):  # a build of numba that lacks some of them
         HAS_INTERNALS = False

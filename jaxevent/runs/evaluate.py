@@ -61,10 +61,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
 import jaxevent
+from jaxevent.devices import double_precision
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
 from jaxevent.io.companions import companions
@@ -250,7 +250,7 @@ def _compute(
         if known is not None:
             row = {"method": method, **known, "params": source.values()}
             return {"row": row, "picture": None}
-    with jax.enable_x64(double):
+    with double_precision(double):
         recording = _opened.load(Path(path), size, stream, progress)
         if method in kind.sources:
             source, values = kind.sources[method](**params), None
