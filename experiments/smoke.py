@@ -19,15 +19,12 @@ from versions import core_dependencies
 import jaxevent
 
 CROP = files("jaxevent") / "data/slider_depth_crop.h5"
-FIT = """
+COMPARE = """
 recordings = [{crop}]
-iterations = 2
-rounds = 1
-
 [[method]]
 name = "akf"
-fit = ["c_on"]
 """
+FIT = "iterations = 2\nrounds = 1" + COMPARE + 'fit = ["c_on"]'
 REASON = 200  # characters of a reason that are printed
 
 
@@ -100,13 +97,14 @@ def try_motion() -> None:
 def try_commands() -> None:
     """Commands end well: what is in a file, images, a fit, and an evaluation."""
     with tempfile.TemporaryDirectory() as folder:
-        config, out = Path(folder) / "fit.toml", Path(folder) / "images.h5"
-        config.write_text(FIT.format(crop=json.dumps(str(CROP))))
+        fit, compare, out = (Path(folder) / name for name in ("fit.toml", "compare.toml", "a.h5"))
+        for config, text in ((fit, FIT), (compare, COMPARE)):
+            config.write_text(text.format(crop=json.dumps(str(CROP))))
         for words in (
             ["info", str(CROP)],
             ["reconstruct", str(CROP), "--method", "akf", "--rate", "50", "--out", str(out)],
-            ["fit", str(config), "--out", f"{folder}/fitted"],
-            ["evaluate", str(config), "--out", f"{folder}/results"],
+            ["fit", str(fit), "--out", f"{folder}/fitted"],
+            ["evaluate", str(compare), "--out", f"{folder}/results"],
         ):
             command = [sys.executable, "-m", "jaxevent.cli", *words]
             done = subprocess.run(command, capture_output=True, text=True)
