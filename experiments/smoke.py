@@ -17,8 +17,9 @@ import numpy as np
 from versions import core_dependencies
 
 import jaxevent
+from jaxevent.recording import Frames, Recording
 
-CROP = files("jaxevent") / "data/slider_depth_crop.h5"
+CROP = Path(str(files("jaxevent") / "data/slider_depth_crop.h5"))
 COMPARE = """
 recordings = [{crop}]
 [[method]]
@@ -28,21 +29,28 @@ FIT = "iterations = 2\nrounds = 1" + COMPARE + 'fit = ["c_on"]'
 REASON = 200  # characters of a reason that are printed
 
 
+def load_crop() -> tuple[Recording, Frames]:
+    """Load the packaged recording; returns it and its frames."""
+    recording = jaxevent.load(CROP)
+    assert recording.frames is not None
+    return recording, recording.frames
+
+
 def try_images() -> None:
     """Images between frames are near to the frames around, by a filter, a smoother and paths."""
-    recording = jaxevent.load(CROP)
-    times = recording.frames.t[4:6] + 5_000
+    recording, frames = load_crop()
+    times = frames.t[4:6] + 5_000
     for method in (jaxevent.akf, jaxevent.aks, jaxevent.mc):
         image, variance, valid = method.estimate(recording)(times)
         assert valid.mean() > 0.9 and (variance[valid] >= 0).all()
-        error = np.abs(image - recording.frames[4:6].intensity)[valid].mean()
+        error = np.abs(image - frames[4:6].intensity)[valid].mean()
         assert error < 0.1, f"images of {method.name} are {error:.3f} away from the frames"
 
 
 def try_compilers() -> None:
     """Images by numba and by XLA are the same to rounding."""
-    recording = jaxevent.load(CROP)
-    times = recording.frames.t[4:6] + 5_000
+    recording, frames = load_crop()
+    times = frames.t[4:6] + 5_000
     numba, xla = (
         jaxevent.akf.estimate(recording, compiler=compiler)(times).mean
         for compiler in (None, "xla")
@@ -54,8 +62,8 @@ def try_gradient() -> None:
     """The gradient of a loss of akf by kernels is that by XLA."""
     import jax
 
-    recording = jaxevent.load(CROP)
-    given, hidden = recording.with_frames(slice(0, None, 2)), recording.frames[1:8:2]
+    recording, frames = load_crop()
+    given, hidden = recording.with_frames(slice(0, None, 2)), frames[1:8:2]
     params = jaxevent.akf.Params(c_on=0.083, c_off=0.059)
     truth = hidden.intensity.reshape(len(hidden), -1)
 

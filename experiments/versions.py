@@ -66,6 +66,7 @@ def attempt(uv: str, python: str, resolution: str, folder: Path) -> dict[str, An
         if name not in ("PYTHONPATH", "VIRTUAL_ENV", "UV_CONSTRAINT", "PIP_CONSTRAINT")
     }
     environment["JAXEVENT_CACHE"] = str(folder / "compiled")
+    environment["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"  # compiling is most of the time
     install = [uv, "pip", "install", "--quiet", "--python", str(bin), "--resolution", resolution]
     for words in (
         [uv, "venv", "--quiet", "--python", python, str(folder)],

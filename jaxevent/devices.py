@@ -71,7 +71,7 @@ def double_precision(enabled: bool) -> contextlib.AbstractContextManager[Any]:
     """Compute in double precision within a `with` block, or in single precision."""
     if hasattr(jax, "enable_x64"):  # since JAX 0.8
         return jax.enable_x64(enabled)
-    from jax.experimental import enable_x64
+    from jax.experimental import enable_x64  # ty: ignore[missing-module-member]
 
     return enable_x64(enabled)
 

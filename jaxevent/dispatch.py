@@ -42,7 +42,7 @@ def check_platform() -> None:
     try:
         jax.default_backend()
     except (RuntimeError, AssertionError) as error:
-        asked = jax.config.jax_platforms  # ty: ignore[unresolved-attribute]
+        asked = jax.config.jax_platforms  # ty: ignore[missing-attribute]
         reason = " ".join(str(error).split()).partition(" (set JAX_PLATFORMS")[0].rstrip(".")[:200]
         raise InputError(
             f"JAX_PLATFORMS is {asked!r}, and JAX finds no such device here"

@@ -25,10 +25,11 @@ def test_folders_and_keys_are_made_for_the_user_alone(base):
     before = os.umask(0)
     try:
         folder = cache.folder_for_compiled()
+        assert folder is not None
         key = cache.secret_key(folder)
     finally:
         os.umask(before)
-    assert folder.parent == base and len(key) == 32
+    assert folder.parent == base and key is not None and len(key) == 32
     assert [mode(p) for p in (folder, base, base.parent)] == [0o700] * 3
     assert mode(folder / "key") == 0o600
     assert os.listdir(folder) == ["key"]
