@@ -29,6 +29,7 @@ LEAST = 0.3  # s; shorter compilations are not worth a file
 MAPS = 30_000
 
 KEY_BYTES = 32
+_OPEN = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)  # which not every system has
 
 
 def keep_compiled() -> Path | None:
@@ -65,7 +66,13 @@ def folder_for_compiled() -> Path | None:
     wanted = os.environ.get("JAXEVENT_CACHE", "")
     if wanted == "0":
         return None
-    return _own_folder((Path(wanted) if wanted else _user_folder()).absolute())
+    base = (Path(wanted) if wanted else _user_folder()).absolute()
+    folder = _own_folder(base)
+    if folder is not None and not folder.is_dir():  # somebody removed it meanwhile
+        _own_folder.cache_clear()
+        secret_key.cache_clear()
+        folder = _own_folder(base)
+    return folder
 
 
 @functools.cache
@@ -90,7 +97,7 @@ def secret_key(folder: Path) -> bytes | None:
 def _read_key(path: Path) -> bytes | None:
     """The content of a key's file; None where there is none, or not the user's alone."""
     try:
-        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
+        descriptor = os.open(path, os.O_RDONLY | _OPEN)
     except OSError:
         return None
     try:

@@ -1,6 +1,7 @@
 """The folder of compiled programs is the user's alone, or is not used."""
 
 import os
+import shutil
 import stat
 
 import pytest
@@ -44,6 +45,14 @@ def test_a_folder_that_others_may_write_to_is_not_used(place, open_to, base):
     with pytest.warns(UserWarning, match="other users may write to it"):
         assert cache.folder_for_compiled() is None
     assert cache.folder_for_compiled() is None  # said once
+
+
+def test_a_folder_that_was_removed_is_made_again(base):
+    folder = cache.folder_for_compiled()
+    key = cache.secret_key(folder)
+    shutil.rmtree(base)
+    assert cache.folder_for_compiled() == folder and folder.is_dir()
+    assert cache.secret_key(folder) not in (None, key)
 
 
 def test_a_folder_that_others_may_read_is_used(base):
