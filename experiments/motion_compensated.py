@@ -199,7 +199,6 @@ def scored(
             image[k],
             None if variance is None else variance[k],
             truth[k : k + 1],
-            (),
             float(params.I0),
             None if moving is None else moving[k],
         )

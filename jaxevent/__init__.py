@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         show,
         simulate,
     )
-    from jaxevent.errors import InputError
+    from jaxevent.errors import InputError, InputWarning
     from jaxevent.estimator import Estimate, Estimator
     from jaxevent.io import load, save
     from jaxevent.methods import METHODS
@@ -53,7 +53,7 @@ __version__ = "0.1.0"
 
 # Loaded when first used: the readers and the compiled preparation are slow to import.
 _HOMES = {
-    "jaxevent.errors": ("InputError",),
+    "jaxevent.errors": ("InputError", "InputWarning"),
     "jaxevent.estimator": ("Estimate", "Estimator"),
     "jaxevent.io": ("load", "save"),
     "jaxevent.methods": ("METHODS",),
@@ -81,6 +81,7 @@ __all__ = [
     "Events",
     "Frames",
     "InputError",
+    "InputWarning",
     "Parameters",
     "Recording",
     "akf",

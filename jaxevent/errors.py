@@ -18,6 +18,17 @@ class InputError(ValueError):
     """
 
 
+class OrderError(InputError):
+    """Event times go back."""
+
+
+class InputWarning(UserWarning):
+    """Something about the input is doubtful, but can be used.
+
+    The message is one sentence that names the place and the remedy; the command line prints it.
+    """
+
+
 class MissingExtra(InputError):
     """A package is not installed that an extra of jaxevent installs.
 

@@ -123,8 +123,8 @@ class Estimator(abc.ABC, Generic[P]):
         """Raise `InputError` if the recording lacks what the estimator needs."""
         if self.needs_frames and recording.frames is None:
             raise InputError(
-                f"{recording.name}: holds no frames, which the method {self.name!r} needs; choose "
-                "a method that uses events"
+                f"{recording.name}: holds no frames, which the method {self.name!r} needs"
+                f"{recording.describe_left_out('frames')}; choose a method that uses events"
             )
 
     @abc.abstractmethod

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.camera import PinholeCamera, Response, TableResponse, UnknownResponse
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, OrderError
 from jaxevent.shown import Shown, plural
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ class Events:
         backwards = self.t[1:] < self.t[:-1]
         if backwards.any():
             row = int(np.argmax(backwards)) + 1
-            raise InputError(
+            raise OrderError(
                 f"{source}: event {first_row + row} is at {self.t[row]} us, earlier than the one "
                 f"before it at {self.t[row - 1]} us; sort the events by time (stable)"
             )
@@ -296,6 +296,11 @@ class Recording(Shown):
     HDR reference images, a known motion). Of these the library reads: the camera response, see
     `response`; `rgb`, colour frames (frames, height, width, 3) uint8, which may stay in a file as
     frames do, see `jaxevent.colour`.
+
+    `notes` are remarks of the reader, one sentence without a full stop each, that `jaxevent info`
+    prints: the unit of time it inferred, the number of words it skipped. `left_out` says, by the
+    name of a field that is None ("frames", "camera"), what the file holds of it and how to have it
+    read; messages that miss the field end with that.
     """
 
     name: str
@@ -308,6 +313,8 @@ class Recording(Shown):
     imu: Imu | None = None
     extra: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     triggers: Triggers | None = None
+    notes: tuple[str, ...] = ()
+    left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def __repr__(self) -> str:
         count = len(self.events)
@@ -399,6 +406,10 @@ class Recording(Shown):
                 f"reaches from {self.start} to {self.stop} us"
             )
         return part
+
+    def describe_left_out(self, field: str) -> str:
+        """The end of a message that misses a field that is None: what the file holds of it."""
+        return f" ({self.left_out[field]})" if field in self.left_out else ""
 
     def with_frames(self, rows: slice | NDArray) -> "Recording":
         """The same recording with only some of its frames."""

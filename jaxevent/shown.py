@@ -13,6 +13,12 @@ class Shown:
         return as_html(self)
 
 
+def a_kind(thing: Any) -> str:
+    """The kind of a thing with its article: a Filter, an int."""
+    name = type(thing).__name__
+    return "None" if thing is None else f"a{'n' * (name[0] in 'aeiouAEIOU')} {name}"
+
+
 def plural(what: str, number: int) -> str:
     """The word for so many: one track, two tracks."""
     return what if number == 1 else what + "s"

@@ -20,7 +20,7 @@ DOCS = ROOT / "docs"
 WITH_CODE = [
     page.relative_to(DOCS).as_posix()
     for page in sorted(DOCS.rglob("*.md"))
-    if "```" in page.read_text()
+    if "```" in page.read_text() and page.name != "notebook.md"  # see test_notebook_tasks.py
 ]
 
 

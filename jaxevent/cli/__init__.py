@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ from jaxevent.cli import (
     view,
 )
 from jaxevent.cli.arguments import guarded
-from jaxevent.errors import InputError, require
+from jaxevent.errors import InputError, InputWarning, require
 
 # In the order of `jaxevent --help`.
 COMMANDS = (
@@ -59,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 sys.stdout.flush()  # help
             command = arguments.pop("command")
             words = ["jaxevent", *(sys.argv[1:] if argv is None else argv)]
-            with guarded(arguments, words) as options, _shown(words):
+            with guarded(arguments, words) as options, _shown(words), _plain_warnings():
                 command(**options)
             sys.stdout.flush()
     except InputError as error:
@@ -112,6 +113,23 @@ def _shown(words: Sequence[str]) -> Iterator[None]:
     from jaxevent.progress import stage
 
     with stage(" ".join(words[:2])), contextlib.redirect_stdout(_Printed(sys.stdout)):
+        yield
+
+
+@contextlib.contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Print each warning about input as one line, without the line of code that raised it."""
+    with warnings.catch_warnings():
+        usual = warnings.showwarning
+
+        def show(message: Any, category: Any, *rest: Any, **more: Any) -> None:
+            if issubclass(category, InputWarning):
+                _say(f"warning: {message}")
+            else:
+                usual(message, category, *rest, **more)
+
+        warnings.simplefilter("always", InputWarning)
+        warnings.showwarning = show  # ty: ignore[invalid-assignment]
         yield
 
 

@@ -38,12 +38,22 @@ def add_size(one: argparse.ArgumentParser) -> None:
     )
 
 
-def add_stream(one: argparse.ArgumentParser) -> None:
+def add_reading(one: argparse.ArgumentParser) -> None:
+    """Add the options of `jaxevent.load`; `run` takes them as `reading`, for `open_recording`."""
+    add_size(one)
     one.add_argument(
         "--stream",
         metavar="NAME",
         help="which camera, of a file that holds several: a topic, left, right or a number",
     )
+    one.set_defaults(reading=("size", "stream"))
+
+
+def open_recording(path: Path, reading: dict[str, Any], **more: Any) -> Any:
+    """Open a recording with the options of `add_reading`; events and images stay in its file."""
+    from jaxevent.io import load
+
+    return load(path, in_memory=False, progress=show_progress(), **reading, **more)
 
 
 def add_output(
@@ -76,6 +86,8 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
     outputs = options.get("outputs", {})
     force = options.get("force", False)
     taken = {name: value for name, value in options.items() if name not in ("outputs", "force")}
+    if "reading" in taken:
+        taken["reading"] = {name: taken.pop(name) for name in taken["reading"]}
     if any(outputs.values()):
         yield {**taken, "force": force}
     elif outputs:

@@ -88,8 +88,7 @@ def _add_attach(parts: Any) -> None:
     )
     one.add_argument("path", metavar="PATH", type=Path, help="a recording with frames")
     one.add_argument("--response", metavar="CSV", type=Path, required=True, help="of its camera")
-    arguments.add_size(one)
-    arguments.add_stream(one)
+    arguments.add_reading(one)
     arguments.add_output(one, "--out", metavar="FILE", required=True, help="the HDF5 file to write")
 
 
@@ -112,8 +111,7 @@ def _add_reference(parts: Any) -> None:
         type=float,
         help="by which it is multiplied, so that the frames' white is 1; default: estimated",
     )
-    arguments.add_size(one)
-    arguments.add_stream(one)
+    arguments.add_reading(one)
     arguments.add_output(one, "--out", metavar="FILE", required=True, help="the HDF5 file to write")
 
 
@@ -172,16 +170,14 @@ def merge(
     )
 
 
-def attach(
-    path: Path, response: Path, size: tuple[int, int] | None, stream: str | None, out: Path
-) -> None:
+def attach(path: Path, response: Path, reading: dict[str, Any], out: Path) -> None:
     import numpy as np
 
-    from jaxevent.io import load, save
+    from jaxevent.io import save
     from jaxevent.io.exposures import read_response
 
     camera = read_response(response)
-    recording = load(path, size, in_memory=False, progress=show_progress(), stream=stream)
+    recording = arguments.open_recording(path, reading)
     if recording.frames is None:
         raise InputError(f"{path}: holds no frames, of whose camera a response could be")
     told = {"response": np.asarray(camera.levels), "certainty": np.asarray(camera.weights)}
@@ -195,16 +191,15 @@ def reference(
     path: Path,
     image: Path,
     scale: float | int | None,
-    size: tuple[int, int] | None,
-    stream: str | None,
+    reading: dict[str, Any],
     out: Path,
 ) -> None:
-    from jaxevent.io import load, save
+    from jaxevent.io import save
     from jaxevent.io.images import read_intensity
     from jaxevent.register import register_still
 
     scene = read_intensity(image)
-    recording = load(path, size, in_memory=False, progress=show_progress(), stream=stream)
+    recording = arguments.open_recording(path, reading)
     name = recording.name
     recording = dataclasses.replace(recording, name=str(path))  # for messages
     found, homographies, factor = register_still(

@@ -15,6 +15,7 @@ def add(commands: Any) -> None:
         "slider_depth.zip slider_depth.h5",
         "stereo.bag left.h5 --stream /davis/left/events",
         "slider_depth.zip small.h5 --compression gzip",
+        "wrapped.h5 whole.h5 --repair unwrap,sort",
     )
     one.add_argument("source", metavar="SRC", type=Path, help="a recording")
     arguments.add_output(one, "target", metavar="DST", help="the HDF5 file to write")
@@ -24,8 +25,13 @@ def add(commands: Any) -> None:
         action="store_true",
         help="read HDF5 that is made of other files; it could name any file of yours",
     )
-    arguments.add_size(one)
-    arguments.add_stream(one)
+    one.add_argument(
+        "--repair",
+        metavar="HOW",
+        help="mend event times that go back: sort (events late by at most 10 ms), drop (outliers), "
+        "unwrap (a counter), part (the longest between resets) or part:N, joined by commas",
+    )
+    arguments.add_reading(one)
 
 
 def run(
@@ -33,13 +39,13 @@ def run(
     target: Path,
     compression: str | None,
     trust: bool,
-    size: tuple[int, int] | None,
-    stream: str | None,
+    repair: str | None,
+    reading: dict[str, Any],
 ) -> None:
-    from jaxevent.io import load, save
+    from jaxevent.io import save
 
-    recording = load(
-        source, size, in_memory=False, progress=show_progress(), stream=stream, trust=trust
-    )
+    recording = arguments.open_recording(source, reading, trust=trust, repair=repair)
     save(recording, target, compression, progress=show_progress())
     print_stored(recording, target)
+    for note in recording.notes:
+        print(f"{target}: {note}")

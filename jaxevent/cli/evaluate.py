@@ -33,8 +33,9 @@ def add(commands: Any) -> None:
         metavar="NAME",
         nargs="+",
         default=[],
-        help="of images, besides those of the file: lpips, hdr_quality, global_ssim, matlab_ssim "
-        "(MATLAB's), authors_ssim and masked_mse (of the AKF's authors)",
+        help="besides those of the file: of images lpips, hdr_quality, global_ssim, matlab_ssim "
+        "(MATLAB's), authors_ssim and masked_mse (of the AKF's authors), or your own: "
+        "package.module:function",
     )
     where = one.add_mutually_exclusive_group()
     where.add_argument(

@@ -20,8 +20,7 @@ def add(commands: Any) -> None:
     )
     one.add_argument("source", metavar="SRC", type=Path, help="a recording")
     arguments.add_output(one, "target", metavar="DST", help="the HDF5 file to write")
-    arguments.add_size(one)
-    arguments.add_stream(one)
+    arguments.add_reading(one)
     steps = one.add_argument_group("steps")
     steps.add_argument("--start", metavar="S", type=float, help="on the recording's clock, in s")
     steps.add_argument("--stop", metavar="S", type=float, help="the first time left out, in s")
@@ -64,8 +63,7 @@ def add(commands: Any) -> None:
 def run(
     source: Path,
     target: Path,
-    size: tuple[int, int] | None,
-    stream: str | None,
+    reading: dict[str, Any],
     start: float | int | None,
     stop: float | int | None,
     hot_pixels: bool,
@@ -82,10 +80,10 @@ def run(
 
     from jaxevent import events
     from jaxevent.errors import InputError
-    from jaxevent.io import load, save
+    from jaxevent.io import save
     from jaxevent.recording import Recording
 
-    recording = load(source, size, in_memory=False, progress=show_progress(), stream=stream)
+    recording = arguments.open_recording(source, reading)
     name = recording.name
     recording = dataclasses.replace(recording, name=str(source))  # for messages
     steps: list[tuple[str, Callable[[Recording], Recording]]] = []

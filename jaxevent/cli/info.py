@@ -12,15 +12,13 @@ def add(commands: Any) -> None:
         commands, run, "Describe a recording.", "slider_depth.zip", "events.npz --size 240,180"
     )
     one.add_argument("path", metavar="PATH", type=Path, help="a recording")
-    arguments.add_size(one)
-    arguments.add_stream(one)
+    arguments.add_reading(one)
 
 
-def run(path: Path, size: tuple[int, int] | None, stream: str | None) -> None:
-    from jaxevent.io import load
+def run(path: Path, reading: dict[str, Any]) -> None:
     from jaxevent.show.describe import describe
 
-    recording = load(path, size, in_memory=False, progress=show_progress(), stream=stream)
+    recording = arguments.open_recording(path, reading)
     lines = [("file", str(path)), *describe(recording, progress=show_progress())]
     width = max(len(name) for name, _ in lines)
     for name, text in lines:

@@ -70,7 +70,7 @@ def add(commands: Any) -> None:
         type=float,
         help="focal length, for a recording without calibration; the centre is the sensor's",
     )
-    arguments.add_size(one)
+    arguments.add_reading(one)
     arguments.add_output(one, "--out", metavar="DIR", required=True, help="folder to write")
 
 
@@ -131,14 +131,13 @@ def run(
     stop: float | int | None,
     flow: bool,
     focal: float | int | None,
-    size: tuple[int, int] | None,
+    reading: dict[str, Any],
     out: Path,
 ) -> None:
     from jaxevent.egomotion import find_model
     from jaxevent.egomotion.choice import choose
     from jaxevent.egomotion.twists import gyro_bias
     from jaxevent.egomotion.twists import imu_rotation as rotation_of
-    from jaxevent.io import load
     from jaxevent.runs.egomotion import find_estimator
     from jaxevent.show.motion import Output
 
@@ -149,7 +148,7 @@ def run(
         raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
     turned = None if imu_rotation is None else rotation_of(imu_rotation)
     output = Output(out, rate, truth, centred, flow)
-    recording = load(path, size, in_memory=False, progress=show_progress())
+    recording = arguments.open_recording(path, reading)
     recording = _with_camera(dataclasses.replace(recording, name=str(path)), focal)
     if not len(recording.events):
         raise InputError(f"{path}: holds no events; choose another recording")

@@ -74,8 +74,7 @@ def add(commands: Any) -> None:
     arguments.add_output(
         one, "--out", metavar="DIR_or_FILE", required=True, help="name in .h5, .mp4 or none"
     )
-    arguments.add_size(one)
-    arguments.add_stream(one)
+    arguments.add_reading(one)
 
 
 _MC = 5e-6  # s of a core that `mc` takes for a pixel of an image: 0.2 for 240x180
@@ -104,13 +103,11 @@ def run(
     start: float | int | None,
     stop: float | int | None,
     params: Path | None,
-    size: tuple[int, int] | None,
-    stream: str | None,
+    reading: dict[str, Any],
     tone: str | None,
     colour: bool,
     out: Path,
 ) -> None:
-    from jaxevent.io import load
     from jaxevent.io.images import read_times
     from jaxevent.methods import find
     from jaxevent.runs.protocols import frame_times
@@ -124,7 +121,7 @@ def run(
     estimator = find(method or "mc", "reconstruction")
     values = estimator.Params() if params is None else estimator.Params.load(params, method)
     asked = None if times is None else read_times(times)
-    recording = load(path, size, in_memory=False, progress=show_progress(), stream=stream)
+    recording = arguments.open_recording(path, reading)
     name = recording.name
     recording = dataclasses.replace(recording, name=str(path))  # for messages
     if at == "frames" and recording.frames is None:

@@ -70,8 +70,7 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--crop", action="store_true", help="cut to a rectangle of pixels that both cameras see"
     )
-    arguments.add_size(one)
-    arguments.add_stream(one)
+    arguments.add_reading(one)
     arguments.add_output(one, "--out", metavar="FILE", required=True, help="the HDF5 file to write")
 
 
@@ -132,12 +131,11 @@ def run(
     exposure: float | int | None,
     white: float | int | None,
     crop: bool,
-    size: tuple[int, int] | None,
-    stream: str | None,
+    reading: dict[str, Any],
     out: Path,
 ) -> None:
     from jaxevent import register as rig
-    from jaxevent.io import load, save
+    from jaxevent.io import save
     from jaxevent.io.output import complete
 
     given = {
@@ -156,7 +154,7 @@ def run(
         white=white,
         progress=show_progress(),
     )
-    recording = load(path, size, in_memory=False, progress=show_progress(), stream=stream)
+    recording = arguments.open_recording(path, reading)
     name = recording.name
     recording = dataclasses.replace(recording, name=str(path))  # for messages
     seen, grid = (recording.width, recording.height), None

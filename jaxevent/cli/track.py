@@ -82,7 +82,7 @@ def add(commands: Any) -> None:
         default="events",
         help="behind the tracks in the video; default: events",
     )
-    arguments.add_size(one)
+    arguments.add_reading(one)
     _add_quantities(one)
     arguments.add_output(one, "--out", metavar="DIR_or_FILE", required=True, help="what to write")
 
@@ -123,7 +123,7 @@ def run(
     start: float | int | None,
     stop: float | int | None,
     background: str,
-    size: tuple[int, int] | None,
+    reading: dict[str, Any],
     pairs: list[tuple[int, int]] | None,
     extent: float | int | None,
     focal: float | int | None,
@@ -133,14 +133,14 @@ def run(
     from jaxevent import methods
     from jaxevent.blob import find
     from jaxevent.blob.finding.found import check_accuracy
-    from jaxevent.io import load, toml
+    from jaxevent.io import toml
     from jaxevent.show.tracks import Output
 
     tracker = methods.find(method, "blob")
     given = None if params is None else tracker.Params.load(params, method)  # told before the work
     each = None if at == "events" else rate
     output = Output(out, each, background, pairs or (), extent, focal, size_factor)
-    recording = load(path, size, in_memory=False, progress=show_progress())
+    recording = arguments.open_recording(path, reading)
     recording = dataclasses.replace(recording, name=str(path))  # for messages
     if not len(recording.events):
         raise InputError(f"{path}: holds no events to track; choose another recording")

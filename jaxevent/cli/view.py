@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxevent.cli import arguments
-from jaxevent.cli.arguments import command, show_progress
+from jaxevent.cli.arguments import command
 from jaxevent.errors import InputError
 
 
@@ -36,8 +36,7 @@ def add(commands: Any) -> None:
         default=10.0,
         help="events that are shown together; default: 10 ms",
     )
-    arguments.add_size(one)
-    arguments.add_stream(one)
+    arguments.add_reading(one)
     arguments.add_output(
         one, "--out", metavar="FILE", help="store it (.rrd) instead of opening the viewer"
     )
@@ -49,14 +48,12 @@ def run(
     start: float | int | None,
     stop: float | int | None,
     window: float | int,
-    size: tuple[int, int] | None,
-    stream: str | None,
+    reading: dict[str, Any],
     out: Path | None,
 ) -> None:
-    from jaxevent.io import load
     from jaxevent.show.viewer import view
 
-    recording = load(path, size, in_memory=False, stream=stream, progress=show_progress())
+    recording = arguments.open_recording(path, reading)
     if start is not None or stop is not None:
         recording = recording[start:stop]
     if not len(recording.events):

@@ -53,7 +53,7 @@ class Known:
 def known(
     recording: Recording,
     model: str | type[Model],
-    source: str | Path = "auto",
+    source: "str | Path | pd.DataFrame" = "auto",
     bias: ArrayLike = (0.0, 0.0, 0.0),
     span: float | int = 0.02,
     *,
@@ -65,7 +65,7 @@ def known(
     Args:
         recording: With poses or an IMU, unless `source` is a table.
         model: See `models`; `Model.known_from` says what tells its motion.
-        source: "poses", "gyro", "auto" (poses, else the gyro), or the path of a table.
+        source: "poses", "gyro", "auto" (poses, else the gyro), a table, or the path of one.
         bias: Taken off the gyro, rad/s.
         span: Time (s) over which velocities are taken from poses.
         rotation: From the gyro's axes to the camera's; see `from_gyro`.
@@ -76,6 +76,8 @@ def known(
             read.
     """
     model = find_model(model)
+    if isinstance(source, pd.DataFrame):
+        return motion_of(source, model, f"{recording.name}: the true motion")
     if source not in ("auto", "poses", "gyro"):
         return read_motion(source, model)
     parts = in_words([part.name for part in model.parts])
@@ -128,6 +130,24 @@ def read_motion(path: str | Path, model: str | type[Model]) -> Known:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
     except ValueError as error:
         raise InputError(f"{path}: is no table ({error}); give columns t and components") from None
+    return motion_of(table, model, str(path), "line", 2)
+
+
+def motion_of(
+    table: pd.DataFrame, model: type[Model], path: str, row: str = "row", first: int = 0
+) -> Known:
+    """The true motion from a table, as `read_motion`.
+
+    Args:
+        table: t (s), the components, and further columns.
+        model: The motion model.
+        path: How messages call the table.
+        row: How they call a row.
+        first: The number of the first row in them.
+
+    Raises:
+        InputError: Columns or numbers are missing, or times do not rise.
+    """
     names = ("t", *model.components)
     for name in names:
         if name not in table.columns:
@@ -139,10 +159,12 @@ def read_motion(path: str | Path, model: str | type[Model]) -> Known:
         numbers = numbers[~(np.asarray(table["lost"], float) > 0)]
     finite = np.isfinite(numbers).all(1)
     if not len(numbers) or not finite.all():
-        line = int(np.argmin(finite)) + 2 if len(numbers) else 2
-        raise InputError(f"{path}: line {line} holds no numbers; give them, or leave the line out")
+        line = int(np.argmin(finite)) + first if len(numbers) else first
+        raise InputError(
+            f"{path}: {row} {line} holds no numbers; give them, or leave the {row} out"
+        )
     t = np.rint(numbers[:, 0] * 1e6).astype(np.int64)
     if (np.diff(t) <= 0).any():
-        line = int(np.argmax(np.diff(t) <= 0)) + 3
-        raise InputError(f"{path}: the time in line {line} does not rise; sort the table by t")
+        line = int(np.argmax(np.diff(t) <= 0)) + 1 + first
+        raise InputError(f"{path}: the time in {row} {line} does not rise; sort the table by t")
     return Known(model, t, numbers[:, 1:])

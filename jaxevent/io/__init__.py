@@ -8,7 +8,7 @@ checked fields, so that every reader accepts the same values and words its error
 """
 
 import contextlib
-import functools
+import dataclasses
 import os
 import zipfile
 from collections.abc import Callable, Iterator
@@ -20,9 +20,12 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
+from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Events, Frames, Recording
 
 __all__ = ["load", "save"]
+
+Reader = Callable[[Path, ReadOptions], Recording]
 
 _BAGS = (b"#ROSBAG", b"\x89MCAP0\r\n", b"SQLite format 3\0")
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -46,6 +49,10 @@ def load(
     progress: bool | None = None,
     stream: str | None = None,
     trust: bool = False,
+    *,
+    frames: str | None = None,
+    time_unit: str | None = None,
+    repair: str | None = None,
 ) -> Recording:
     """Read and check a recording; its format is told by its content, not by its name.
 
@@ -63,6 +70,11 @@ def load(
             "left" or "right" of MVSEC and M3ED, the number of a stream of AEDAT 4.
         trust: Whether HDF5 may be made of other files, by links, external storage or virtual
             datasets. Such a file can have any file read that you may read, or never end.
+        frames: Which images become the frames, of a file that holds several kinds.
+        time_unit: The unit of the event times, "s", "ms", "us" or "ns"; None infers it.
+        repair: How to mend event times that go back: "sort" late events, "drop" outliers, "unwrap"
+            a counter, keep a "part" between resets, or several of them, as in "unwrap,sort"; see
+            `jaxevent.io.disorder`. None refuses such times, and the message says what would help.
 
     Raises:
         InputError: The file is missing, damaged or of another format, or what it holds is not a
@@ -74,12 +86,18 @@ def load(
             f"size = {size} must be two positive numbers of pixels, (width, height), of at most "
             f"{_MOST_PIXELS}"
         )
+    options = ReadOptions(size, in_memory, progress, stream, frames, time_unit, repair)
     with contextlib.ExitStack() as stack:
         if trust:
             from jaxevent.io.hdf5_files import trusting
 
             stack.enter_context(trusting())
-        return _reader(path, in_memory, progress, stream)(path, size).check(str(path))
+        if repair is not None:
+            from jaxevent.io.disorder import parse_repair
+
+            parse_repair(repair)
+        recording = _reader(path, options)(path, options).check(str(path))
+    return dataclasses.replace(recording, notes=(*recording.notes, *options.notes))
 
 
 def save(
@@ -107,9 +125,7 @@ def save(
     hdf5.write(recording, Path(path), compression, progress)
 
 
-def _reader(
-    path: Path, in_memory: bool, progress: bool | None, stream: str | None
-) -> Callable[[Path, tuple[int, int] | None], Recording]:
+def _reader(path: Path, options: ReadOptions) -> Reader:
     with reading(str(path)):
         is_folder, exists, is_file = path.is_dir(), path.exists(), path.is_file()
     if not exists:
@@ -119,31 +135,35 @@ def _reader(
     with reading(str(path)):
         head = b"" if is_folder else _head(path)
     if read := _reader_of_streams(path, head):
-        return functools.partial(read, in_memory=in_memory, progress=progress, stream=stream)
+        return read
     if not is_folder and head.startswith(HDF5_MAGIC) or _later_hdf5(path, is_folder):
-        return _hdf5_reader(path, in_memory, stream)
-    if stream is not None:
-        raise InputError(f"{path}: holds one camera only; leave out stream= or --stream")
+        return _hdf5_reader(path, options)
+    refuse_stream(path, options)
     if is_folder:
         from jaxevent.io import evimo
 
         if evimo.knows(path):
-            return functools.partial(evimo.read, in_memory=in_memory, progress=progress)
+            return evimo.read
         if not (path / "events.txt").is_file():
             raise InputError(f"{path}: the folder holds no events.txt; {READABLE}")
         from jaxevent.io import text
 
-        return functools.partial(text.read, progress=progress)
+        return text.read
     if head.startswith(b"PK"):
-        return _zip_reader(path, progress)
+        return _zip_reader(path)
     # The header of MATLAB v5: 116 bytes of text, 8 of offset, the version 0x0100 and the letters
     # MI as the writing machine ordered both. (v7.3 has 0x0200 there and is HDF5.)
     if head[124:128] in (b"\x00\x01IM", b"\x01\x00MI"):
         from jaxevent.io import mat
 
         return mat.read_v5
-    read = _streamed_reader(path, head)
-    return functools.partial(read, in_memory=in_memory, progress=progress)
+    return _streamed_reader(path, head)
+
+
+def refuse_stream(path: Path, options: ReadOptions) -> None:
+    """Raise `InputError` where a camera of a file is named that holds only one."""
+    if options.stream is not None:
+        raise InputError(f"{path}: holds one camera only; leave out stream= or --stream")
 
 
 def _head(path: Path) -> bytes:
@@ -154,7 +174,7 @@ def _head(path: Path) -> bytes:
     return head
 
 
-def _reader_of_streams(path: Path, head: bytes) -> Callable[..., Recording] | None:
+def _reader_of_streams(path: Path, head: bytes) -> Reader | None:
     """The reader of a format but HDF5 that may hold several cameras; a folder's head is empty."""
     if head.startswith(b"#!AER-DAT4"):
         from jaxevent.io import aedat4
@@ -167,7 +187,7 @@ def _reader_of_streams(path: Path, head: bytes) -> Callable[..., Recording] | No
     return None
 
 
-def _streamed_reader(path: Path, head: bytes) -> Callable[..., Recording]:
+def _streamed_reader(path: Path, head: bytes) -> Reader:
     """The reader of a format that is told by its first bytes and decoded block by block."""
     if head.startswith(b"#!AER-DAT"):
         if not head.startswith(b"#!AER-DAT2"):
@@ -200,9 +220,7 @@ def _streamed_reader(path: Path, head: bytes) -> Callable[..., Recording]:
     raise InputError(f"{path}: the format is not recognised; {READABLE}")
 
 
-def _zip_reader(
-    path: Path, progress: bool | None
-) -> Callable[[Path, tuple[int, int] | None], Recording]:
+def _zip_reader(path: Path) -> Reader:
     with reading(str(path)), zipfile.ZipFile(path) as archive:
         names = archive.namelist()
         unfolded = sum(member.file_size for member in archive.infolist())
@@ -210,7 +228,7 @@ def _zip_reader(
     if any(name.rpartition("/")[2] == "events.txt" for name in names):
         from jaxevent.io import text
 
-        return functools.partial(text.read, progress=progress)
+        return text.read
     if names and all(name.endswith(".npy") for name in names):
         from jaxevent.io import npz
 
@@ -231,9 +249,7 @@ def _later_hdf5(path: Path, is_folder: bool) -> bool:
     return False
 
 
-def _hdf5_reader(
-    path: Path, in_memory: bool, stream: str | None
-) -> Callable[[Path, tuple[int, int] | None], Recording]:
+def _hdf5_reader(path: Path, options: ReadOptions) -> Reader:
     import h5py
 
     from jaxevent.io import hdf5, hdf5_files, hdf5_layouts
@@ -246,12 +262,10 @@ def _hdf5_reader(
         others = not ours and hdf5_layouts.knows(file)
         matlab = hdf5.is_matlab(path, file)
     if others:
-        read = hdf5_layouts.read if in_memory else hdf5_layouts.open_stored
-        return functools.partial(read, stream=stream)
-    if stream is not None:
-        raise InputError(f"{path}: holds one camera only; leave out stream= or --stream")
+        return hdf5_layouts.read
+    refuse_stream(path, options)
     if ours:
-        return hdf5.read if in_memory else hdf5.open_stored
+        return hdf5.read
     if matlab:
         from jaxevent.io import mat
 

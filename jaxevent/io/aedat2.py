@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 from jaxevent.errors import InputError
 from jaxevent.io import reading
 from jaxevent.io.decoded import BLOCK, Columns, DecodedImages, TriggerList, decoded
+from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Frames, Imu, Recording
 
 MAGIC = b"#!AER-DAT2"
@@ -80,13 +81,11 @@ class _Pass:
     end: int
 
 
-def read(
-    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
-) -> Recording:
-    """Read a file; `size` is (width, height). Raises `InputError` for bad input."""
+def read(path: Path, options: ReadOptions) -> Recording:
+    """Read a file. Raises `InputError` for bad input."""
     source = str(path)
     with reading(source):
-        header = _header(path, size)
+        header = _header(path, options.size)
         length = path.stat().st_size - header.start
     if length % 8:
         raise InputError(
@@ -95,7 +94,7 @@ def read(
             f"-s -{length % 8} FILE"
         )
     if header.is_dvs128:
-        return _read_dvs128(path, header, in_memory, progress)
+        return _read_dvs128(path, header, options)
     width, height = header.size
     found: Counter[str] = Counter()
     triggers = TriggerList()
@@ -124,13 +123,13 @@ def read(
             yield here, (t, x, y, a >> 11 & 1 == 1)
 
     seen: set = set()
-    events = decoded(decode, header.size, source, in_memory, progress)
+    events = decoded(decode, header.size, source, options)
     if len(left):
         found["incomplete_imu_samples"] += 1
     frames, incomplete = _frames(path, header, levels)
     if incomplete:
         found["incomplete_frames"] = incomplete
-    if frames is not None and in_memory:
+    if frames is not None and options.in_memory:
         frames = dataclasses.replace(frames, images=np.asarray(frames.images))
     extra = {name: np.array(number) for name, number in sorted(found.items())}
     return Recording(
@@ -144,7 +143,7 @@ def read(
     )
 
 
-def _read_dvs128(path: Path, header: _Header, in_memory: bool, progress: bool | None) -> Recording:
+def _read_dvs128(path: Path, header: _Header, options: ReadOptions) -> Recording:
     triggers = TriggerList()
 
     def decode(state: Any) -> Iterator[tuple[Any, Columns]]:
@@ -160,7 +159,7 @@ def _read_dvs128(path: Path, header: _Header, in_memory: bool, progress: bool | 
             a, t = a[~special], t[~special]
             yield here, (t, 127 - (a >> 1 & 0x7F), 127 - (a >> 8 & 0x7F), a & 1 == 0)
 
-    events = decoded(decode, header.size, str(path), in_memory, progress)
+    events = decoded(decode, header.size, str(path), options)
     return Recording(path.stem, *header.size, events, triggers=triggers.all())
 
 

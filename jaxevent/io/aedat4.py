@@ -33,6 +33,7 @@ from jaxevent.errors import InputError, require
 from jaxevent.io import check_unfolded, reading
 from jaxevent.io import times as microseconds
 from jaxevent.io.decoded import BLOCK, Columns, DecodedImages, TriggerList, decoded
+from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Frames, Imu, Recording, Triggers
 
 MAGIC = b"#!AER-DAT4.0"
@@ -40,16 +41,10 @@ _STANDARD_GRAVITY = 9.80665  # m/s^2
 _COMPRESSED = (b"\x04\x22\x4d\x18", b"\x28\xb5\x2f\xfd")  # the first bytes of LZ4 and Zstandard
 
 
-def read(
-    path: Path,
-    size: tuple[int, int] | None,
-    in_memory: bool = True,
-    progress: bool | None = None,
-    stream: str | None = None,
-) -> Recording:
-    """Read a file; `size` is (width, height). Raises `InputError` for bad input.
+def read(path: Path, options: ReadOptions) -> Recording:
+    """Read a file. Raises `InputError` for bad input.
 
-    `stream` is the number of a stream of events, needed where there are several.
+    `options.stream` is the number of a stream of events, needed where there are several.
     """
     source = str(path)
     with reading(source):
@@ -61,14 +56,14 @@ def read(
         kind: [number for number, stream in streams.items() if stream["type"] == kind]
         for kind in ("events", "frame", "imus", "triggers")
     }
-    number, chosen = _choose(path, of_kind["events"], stream, streams)
+    number, chosen = _choose(path, of_kind["events"], options.stream, streams)
     for kind in ("frame", "imus", "triggers"):
         several = of_kind[kind]
         if len(several) == 1:
             chosen[kind] = several[0]
         elif number is not None and len(several) == len(of_kind["events"]):
             chosen[kind] = several[of_kind["events"].index(number)]
-    frames, rgb, imu, triggers = _others(path, chosen, in_memory)
+    frames, rgb, imu, triggers = _others(path, chosen, options.in_memory)
     extra: dict[str, NDArray] = {} if rgb is None else {"rgb": rgb}
     left_out = [
         f"{number} {stream['type']}"
@@ -78,7 +73,7 @@ def read(
     if left_out:
         extra["streams_left_out"] = np.array(left_out)
     told = streams[number if number is not None else chosen["frame"]]
-    size = size or (int(told["width"]), int(told["height"]))
+    size = options.size or (int(told["width"]), int(told["height"]))
 
     def decode(state: int | None) -> Iterator[tuple[int, Columns]]:
         held: list[NDArray] = []
@@ -95,7 +90,7 @@ def read(
         if held:
             yield first, _columns(held)
 
-    events = decoded(decode, size, source, in_memory, progress)
+    events = decoded(decode, size, source, options)
     return Recording(path.stem, *size, events, frames, imu=imu, extra=extra, triggers=triggers)
 
 

@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from jaxevent.errors import InputError
 from jaxevent.io import reading, times
 from jaxevent.io.decoded import BLOCK, Columns, decoded
+from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Recording
 
 NAMES = {
@@ -47,6 +48,7 @@ NUMPY_MAGIC = b"\x93NUMPY"
 _BYTES = 1 << 24  # of text parsed together: about a million events
 _LONGEST_LINE = 1 << 12
 _SAMPLE = 1 << 16  # events, or 16 times as many bytes of text, that tell order and unit
+_SELDOM = 0.1  # share of events before which times that go back may fall
 _LONGEST = 1_000_000  # seconds of a recording
 _ORDERS = ("txyp", "xypt", "xytp", "ptxy")
 
@@ -75,15 +77,18 @@ def order_of(rows: NDArray, size: tuple[int, int] | None, source: str) -> str:
     def is_place(values: NDArray, count: int) -> bool:
         return bool(((values >= 0) & (values < count) & (values == np.rint(values))).all())
 
-    def fits(order: str, width: int, height: int) -> bool:
+    def fits(order: str, width: int, height: int, falls: float) -> bool:
         t, x, y, p = (rows[:, order.index(name)] for name in "txyp")
-        is_sorted = bool((t[1:] >= t[:-1]).all())
-        return is_sorted and is_p(p) and is_place(x, width) and is_place(y, height)
+        is_sorted = np.count_nonzero(t[1:] < t[:-1]) <= falls * len(t)
+        return bool(is_sorted) and is_p(p) and is_place(x, width) and is_place(y, height)
 
     largest = (1 << 16, 1 << 16)
-    fitting = [order for order in _ORDERS if fits(order, *(size or largest))]
-    # On a sensor too small for them the one order will do, so that the event outside is named.
-    fitting = fitting or [order for order in _ORDERS if fits(order, *largest)]
+    fitting: list[str] = []
+    # On a sensor too small for them the one order will do, so that the event outside is named, and
+    # where no column never falls, one that seldom does, so that the fault of its times is named.
+    for falls in (0.0, _SELDOM):
+        for sides in (size or largest, largest):
+            fitting = fitting or [order for order in _ORDERS if fits(order, *sides, falls)]
     if len(fitting) != 1:
         named = " or ".join(" ".join(order) for order in (fitting or _ORDERS))
         raise InputError(
@@ -127,11 +132,9 @@ def of_records(records: NDArray, source: str) -> dict[str, NDArray]:
     return {key: records[name] for key, name in fields.items()}
 
 
-def read_npy(
-    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
-) -> Recording:
-    """Read an array; `size` is (width, height). Raises `InputError` for bad input."""
-    source = str(path)
+def read_npy(path: Path, options: ReadOptions) -> Recording:
+    """Read an array. Raises `InputError` for bad input."""
+    source, size = str(path), options.size
     with reading(source):
         records = np.load(path, mmap_mode="r", allow_pickle=False)
     plain = records.ndim == 2 and records.shape[1] == 4 and records.dtype.kind in "iuf"
@@ -160,7 +163,7 @@ def read_npy(
             x, y, p = (np.ascontiguousarray(fields[key]) for key in "xyp")
             yield row, (t, x, y, p)
 
-    return Recording(path.stem, *size, decoded(decode, size, source, in_memory, progress))
+    return Recording(path.stem, *size, decoded(decode, size, source, options))
 
 
 def is_text(head: bytes) -> bool:
@@ -171,14 +174,12 @@ def is_text(head: bytes) -> bool:
     )
 
 
-def read_text(
-    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
-) -> Recording:
-    """Read a table of text; `size` is (width, height). Raises `InputError` for bad input."""
+def read_text(path: Path, options: ReadOptions) -> Recording:
+    """Read a table of text. Raises `InputError` for bad input."""
     source = str(path)
     with reading(source), path.open("rb") as file:
         table = _table(file, source)
-    size = size or table.size
+    size = options.size or table.size
     table = _told(path, table, size)
     if size is None:
         raise InputError(
@@ -186,7 +187,7 @@ def read_text(
             "--size"
         )
     decode = functools.partial(_rows, path, table)
-    return Recording(path.stem, *size, decoded(decode, size, source, in_memory, progress))
+    return Recording(path.stem, *size, decoded(decode, size, source, options))
 
 
 class _Table:

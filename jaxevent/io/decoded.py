@@ -8,21 +8,23 @@ pass over a file checks every event; a file that is left on disk is later decode
 events are asked for, at the memory of a few blocks.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.errors import InputError
-from jaxevent.io import checked_events, reading
+from jaxevent.errors import InputError, OrderError
+from jaxevent.io import checked_events, disorder, reading
+from jaxevent.io.options import ReadOptions
 from jaxevent.progress import bar
 from jaxevent.recording import Events, EventSource, Triggers
 
 BLOCK = 1 << 20  # events decoded together: 13 MB
 
-Columns = tuple[NDArray, NDArray, NDArray, NDArray]
-Decoder = Callable[[Any], Iterator[tuple[Any, Columns]]]
+Columns = disorder.Columns
+Decoder = disorder.Decoder
 
 
 class _Block(NamedTuple):
@@ -36,8 +38,7 @@ def decoded(
     decode: Decoder,
     size: tuple[int, int],
     source: str,
-    in_memory: bool = True,
-    progress: bool | None = None,
+    options: ReadOptions,
     origin: int = 0,
 ) -> EventSource:
     """All events of a decoder, checked: `Events` in memory, else `DecodedEvents`.
@@ -45,25 +46,27 @@ def decoded(
     The blocks hold t (int64 us), x, y and p as `checked_events` takes them. `size` is (width,
     height). Raises `InputError` for the first bad event and whatever the decoder finds wrong.
     """
+    if options.repair is not None:
+        decode = _with_repair(decode, source, options, options.repair)
     blocks: list[_Block] = []
     kept: list[Events] = []
     row = 0
     with (
         reading(source),
-        bar(desc="decode", unit=" events", unit_scale=True, progress=progress) as shown,
+        bar(desc="decode", unit=" events", unit_scale=True, progress=options.progress) as shown,
     ):
         for state, (t, x, y, p) in decode(None):
             if not len(t):
                 continue
-            events = checked_events(t, x, y, p, size, source, first_row=row, origin=origin)
+            try:
+                events = checked_events(t, x, y, p, size, source, first_row=row, origin=origin)
+            except OrderError:
+                raise _disorder(decode, source).explain(source) from None
             first, last = int(events.t[0]), int(events.t[-1])
             if blocks and first < blocks[-1].last:
-                raise InputError(
-                    f"{source}: event {row} is at {first} us, earlier than the one before it at "
-                    f"{blocks[-1].last} us; sort the events by time (stable)"
-                )
+                raise _disorder(decode, source).explain(source)
             blocks.append(_Block(state, row, first, last))
-            if in_memory or len(kept) < 2:
+            if options.in_memory or len(kept) < 2:
                 kept.append(events)
             else:
                 kept[1] = events
@@ -71,9 +74,23 @@ def decoded(
             shown.update(len(events))
     if not blocks:
         return Events.empty()
-    if in_memory or len(blocks) <= 2:
+    if options.in_memory or len(blocks) <= 2:
         return _joined(kept)
     return DecodedEvents(decode, blocks, row, (kept[0], kept[1]), size, source, origin)
+
+
+def _with_repair(decode: Decoder, source: str, options: ReadOptions, asked: str) -> Decoder:
+    """A decoder that makes the repairs asked for, with a note of them in the options."""
+    repair = disorder.parse_repair(asked)
+    found = _disorder(decode, source, repair.bound)
+    found.refuse_rest(repair, source)
+    options.notes.append(found.describe_repair(repair))
+    return disorder.repaired(decode, found, repair)
+
+
+def _disorder(decode: Decoder, source: str, bound: int = disorder.BOUND) -> disorder.Disorder:
+    with reading(source):
+        return disorder.examine((columns[0] for _, columns in decode(None)), bound, source)
 
 
 def _joined(pieces: list[Events]) -> Events:
@@ -83,6 +100,32 @@ def _joined(pieces: list[Events]) -> Events:
     for name in ("t", "x", "y", "p"):
         columns.append(np.concatenate([getattr(piece, name) for piece in pieces]))
     return Events(*columns)
+
+
+def from_columns(
+    columns: Columns, size: tuple[int, int], source: str, options: ReadOptions, origin: int = 0
+) -> Events:
+    """The events of whole columns, checked and repaired as those of `decoded`."""
+    whole = dataclasses.replace(options, in_memory=True, progress=False, notes=options.notes)
+    return decoded(lambda _: iter([(None, columns)]), size, source, whole, origin)[:]
+
+
+class Tally:
+    """Counts of what a decoder meets on its first pass; later passes add nothing."""
+
+    def __init__(self):
+        self._counts: dict[str, int] = {}
+        self._places: dict[str, int] = {}
+
+    def add(self, name: str, number: int, place: int) -> None:
+        """Count `number` more in the block at a place of the file, which rises block by block."""
+        if number and place > self._places.get(name, -1):
+            self._places[name] = place
+            self._counts[name] = self._counts.get(name, 0) + number
+
+    def arrays(self) -> dict[str, NDArray]:
+        """The counts that are not 0, by name."""
+        return {name: np.array(number) for name, number in sorted(self._counts.items())}
 
 
 class TriggerList:

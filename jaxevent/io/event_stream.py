@@ -14,7 +14,6 @@ atis.es to the same 1,326,017 events, and the same short files of every byte; it
 word where a file ends inside an event.
 """
 
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,8 @@ import numpy as np
 
 from jaxevent.errors import InputError
 from jaxevent.io import reading
-from jaxevent.io.decoded import BLOCK, Columns, decoded
+from jaxevent.io.decoded import BLOCK, Columns, Tally, decoded
+from jaxevent.io.options import ReadOptions
 from jaxevent.kernels import compiled
 from jaxevent.recording import Recording
 
@@ -32,10 +32,8 @@ _HEADER = 20
 _KINDS = {0: "generic data", 1: "DVS events", 2: "ATIS events", 4: "colour events"}
 
 
-def read(
-    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
-) -> Recording:
-    """Read a file; `size` is (width, height). Raises `InputError` for bad input."""
+def read(path: Path, options: ReadOptions) -> Recording:
+    """Read a file. Raises `InputError` for bad input."""
     with reading(str(path)), path.open("rb") as file:
         head = file.read(_HEADER)
     version, kind = tuple(head[12:15]), head[15] if len(head) > 15 else None
@@ -52,8 +50,8 @@ def read(
     if len(head) < _HEADER:
         raise InputError(f"{path}: ends inside its header; fetch the file again")
     width, height = (int(n) for n in np.frombuffer(head, "<u2", 2, 16))
-    size = size or (width, height)
-    found: Counter[str] = Counter()
+    size = options.size or (width, height)
+    found = Tally()
 
     def decode(state: tuple[int, int] | None) -> Iterator[tuple[Any, Columns]]:
         offset, t = state or (_HEADER, 0)
@@ -64,8 +62,7 @@ def read(
                 state = (offset, t)
                 data = np.frombuffer(rest + piece, np.uint8)
                 columns, count, crossings, used, t = _decode(data, t, kind == 2)
-                if crossings:
-                    found["intensity_events"] += crossings
+                found.add("intensity_events", crossings, offset)
                 offset += used
                 rest = data[used:].tobytes()
                 ts, xs, ys, ps = (column[:count] for column in columns)
@@ -77,9 +74,8 @@ def read(
                 f"-{len(rest)} FILE"
             )
 
-    events = decoded(decode, size, str(path), in_memory, progress)
-    extra = {name: np.array(number) for name, number in found.items()}
-    return Recording(path.stem, *size, events, extra=extra)
+    events = decoded(decode, size, str(path), options)
+    return Recording(path.stem, *size, events, extra=found.arrays())
 
 
 @compiled

@@ -40,6 +40,7 @@ from jaxevent.errors import InputError
 from jaxevent.io import check_unfolded, pinhole, reading, sensor_size, times, vectors, whole_number
 from jaxevent.io.decoded import BLOCK, Columns, DecodedImages, decoded
 from jaxevent.io.images import LUMA
+from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
 
@@ -50,13 +51,11 @@ def knows(folder: Path) -> bool:
 
 def read(
     path: Path,
-    size: tuple[int, int] | None = None,
-    in_memory: bool = True,
-    progress: bool | None = None,
+    options: ReadOptions | None = None,
     meta: Mapping[str, Any] | None = None,
     imu: str | None = None,
 ) -> Recording:
-    """Read a folder; `size` is (width, height).
+    """Read a folder.
 
     With `meta`, the dictionary of dataset_info.npz, there are frames of the classical camera, the
     calibration, the poses of the camera in the world and, in `extra`, the ground truth: `depth`
@@ -67,6 +66,7 @@ def read(
     Raises `InputError` for bad input.
     """
     source = str(path)
+    options = options or ReadOptions()
     meta = {} if meta is None else meta
     parts = {name: _Images(path, name) for name in ("classical", "depth", "mask")}
     extra: dict[str, Any] = dict(_info(path))
@@ -80,15 +80,15 @@ def read(
         for name, part in parts.items():
             t, images = part.at(meta.get("frames", ()))
             if len(t) and name == "classical":
-                images = np.asarray(images) if in_memory else images
+                images = np.asarray(images) if options.in_memory else images
                 frames = Frames(t, images, np.zeros_like(t))
             elif len(t):
                 extra |= {name: images, f"{name}_t": t}
     shapes = [part.shape for part in parts.values() if part.shape is not None]
     told = told or ((shapes[0][1], shapes[0][0]) if shapes else None)
     otherwise = f"{path}: no image tells the sensor's size;"
-    size = sensor_size(size, told, frames=frames, otherwise=otherwise)
-    events = decoded(_decoder(path), size, source, in_memory, progress)
+    size = sensor_size(options.size, told, frames=frames, otherwise=otherwise)
+    events = decoded(_decoder(path), size, source, options)
     return Recording(path.name, *size, events, frames, camera, poses, samples, extra)
 
 

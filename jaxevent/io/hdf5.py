@@ -29,7 +29,7 @@ refused before any memory is asked for.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, OrderError
 from jaxevent.io import (
     check_unfolded,
     checked_events,
@@ -49,8 +49,11 @@ from jaxevent.io import (
     whole_number,
 )
 from jaxevent.io.columns import time_scale
+from jaxevent.io.decoded import decoded
 from jaxevent.io.description import CLOCK
+from jaxevent.io.disorder import Columns, examine
 from jaxevent.io.hdf5_files import array, attribute, dataset, open_file
+from jaxevent.io.options import ReadOptions
 from jaxevent.io.output import complete_hdf5
 from jaxevent.progress import bar
 from jaxevent.recording import (
@@ -193,8 +196,26 @@ class StoredEvents:
         with reading(f"{self._source}: events"):
             t = times(self._t[part], self._source, "event", first_row=part.start) + self._offset
             x, y, p = self._x[part], self._y[part], self._p[part]
-        events = checked_events(t, x, y, p, self._size, self._source, first_row=start - lead)
+        try:
+            events = checked_events(t, x, y, p, self._size, self._source, first_row=start - lead)
+        except OrderError:
+            times_of_blocks = (columns[0] for _, columns in self.decode(None))
+            raise examine(times_of_blocks, source=self._source).explain(self._source) from None
         return events[lead:] if lead else events
+
+    def decode(self, row: int | None) -> Iterator[tuple[int, Columns]]:
+        """Blocks of columns that are not checked, from a row on: a `Decoder`."""
+        for start in range(row or 0, len(self), _BLOCK):
+            part = slice(start, min(start + _BLOCK, len(self)))
+            with reading(f"{self._source}: events"):
+                t = times(self._t[part], self._source, "event", first_row=start) + self._offset
+                yield start, (t, self._x[part], self._y[part], self._p[part])
+
+    def repaired(self, options: ReadOptions) -> EventSource:
+        """These events, with their times repaired as the options say."""
+        if options.repair is None:
+            return self
+        return decoded(self.decode, self._size, self._source, options)
 
     def columns(self, rows: slice, room: EventColumns | None = None) -> EventColumns | None:
         """See `recording.ColumnSource`."""
@@ -288,19 +309,28 @@ class StoredImages:
         return np.asarray(images, dtype)
 
 
-def read(path: Path, size: tuple[int, int] | None) -> Recording:
-    """Read a file into memory; `size` is (width, height). Raises `InputError` for bad input."""
-    with reading(str(path)), open_file(path) as file:
-        return in_memory(_recording(file, path, size))
+def read(path: Path, options: ReadOptions) -> Recording:
+    """Read a file. Raises `InputError` for bad input.
+
+    Unless `options.in_memory`, events and images stay in it: `StoredEvents`, `StoredImages`.
+    """
+    return read_stored(path, options, _recording)
 
 
-def open_stored(path: Path, size: tuple[int, int] | None) -> Recording:
-    """Read all but events and images, which stay in the file: `StoredEvents`, `StoredImages`."""
+def read_stored(
+    path: Path,
+    options: ReadOptions,
+    read_open: Callable[[h5py.File, Path, ReadOptions], Recording],
+) -> Recording:
+    """Read an HDF5 file by `read_open`, and its events and images as `options.in_memory` says."""
     with reading(str(path)):
-        return _recording(open_file(path), path, size)
+        if not options.in_memory:
+            return read_open(open_file(path), path, options)
+        with open_file(path) as file:
+            return _in_memory(read_open(file, path, options))
 
 
-def in_memory(recording: Recording) -> Recording:
+def _in_memory(recording: Recording) -> Recording:
     """The recording with its events and images read from their file."""
     frames = recording.frames
     if frames is not None:
@@ -314,8 +344,8 @@ def is_matlab(path: Path, file: Any) -> bool:
         return stored.read(6) == b"MATLAB" and isinstance(file.get("events"), h5py.Dataset)
 
 
-def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Recording:
-    source = str(path)
+def _recording(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
+    source, size = str(path), options.size
     with reading(source):
         names = ("format", "version", "name", "width", "height")
         held = ((name, attribute(file, name)) for name in names)
@@ -388,7 +418,7 @@ def _recording(file: h5py.File, path: Path, size: tuple[int, int] | None) -> Rec
                 "in integer microseconds"
             )
     table = dataset(file, "ms_to_idx", source) if "ms_to_idx" in file else None
-    events = StoredEvents(columns, size, source, offset, table)
+    events = StoredEvents(columns, size, source, offset, table).repaired(options)
     return Recording(name, *size, events, frames, camera, poses, imu, extra, triggers)
 
 
@@ -471,7 +501,8 @@ def _write_events(
     count = len(events)
     offset = int(events[:1].t[0]) if count else 0
     last_ms = (int(events[count - 1 :].t[0]) - offset) // 1000 if count else -1
-    is_sparse = last_ms >= max(_MOST_MS, 2 * count)
+    # Where times go back, reading the block that does so raises the error.
+    is_sparse = not -1 <= last_ms < max(_MOST_MS, 2 * count)
     file["t_offset"] = np.int64(offset)
     options = _options(count, compression)
     t, x, y, p = (
@@ -494,7 +525,7 @@ def _write_events(
         if ms_to_idx is None:
             continue
         # The milliseconds that begin after the last block and not after this one's last event.
-        end = int(since[-1]) // 1000 + 1
+        end = min(int(since[-1]) // 1000, last_ms) + 1
         for first in range(ms, end, _BLOCK):
             begin = np.arange(first, min(first + _BLOCK, end))
             ms_to_idx[first : first + len(begin)] = row + np.searchsorted(since, 1000 * begin)

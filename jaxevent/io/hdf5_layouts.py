@@ -33,6 +33,7 @@ from jaxevent.io import (
     ecf,
     pinhole,
     reading,
+    refuse_stream,
     sensor_size,
     times,
     vectors,
@@ -40,8 +41,9 @@ from jaxevent.io import (
 )
 from jaxevent.io.columns import find, order_of
 from jaxevent.io.decoded import DecodedImages
-from jaxevent.io.hdf5 import Column, Microseconds, StoredEvents, StoredImages, in_memory
-from jaxevent.io.hdf5_files import array, attribute, dataset, filters_of, open_file
+from jaxevent.io.hdf5 import Column, Microseconds, StoredEvents, StoredImages, read_stored
+from jaxevent.io.hdf5_files import array, attribute, dataset, filters_of
+from jaxevent.io.options import ReadOptions
 from jaxevent.io.truth import read_poses
 from jaxevent.recording import Frames, Imu, Recording, Triggers
 
@@ -56,33 +58,24 @@ def knows(file: Any) -> bool:
     return any(_fields(file, name) is not None for name in _GROUPS)
 
 
-def read(path: Path, size: tuple[int, int] | None, stream: str | None = None) -> Recording:
-    """Read a file into memory; `size` is (width, height). Raises `InputError` for bad input.
+def read(path: Path, options: ReadOptions) -> Recording:
+    """Read a file. Raises `InputError` for bad input.
 
-    `stream` is "left" or "right" of a file with two cameras.
+    Unless `options.in_memory`, events and images stay in it. `options.stream` is "left" or "right"
+    of a file with two cameras.
     """
-    with reading(str(path)), open_file(path) as file:
-        return in_memory(_recording(file, path, size, stream))
+    return read_stored(path, options, _recording)
 
 
-def open_stored(path: Path, size: tuple[int, int] | None, stream: str | None = None) -> Recording:
-    """Read all but events and images, which stay in the file."""
-    with reading(str(path)):
-        return _recording(open_file(path), path, size, stream)
-
-
-def _recording(
-    file: Any, path: Path, size: tuple[int, int] | None, stream: str | None
-) -> Recording:
-    source = str(path)
+def _recording(file: Any, path: Path, options: ReadOptions) -> Recording:
+    source, size, stream = str(path), options.size, options.stream
     for name in _SIDES:
         group = file.get(name)
         if isinstance(group, h5py.Group):
             side = _side(path, group, stream)
             read = _m3ed if name == "prophesee" else _mvsec
-            return read(file, path, size, f"{name}/{side}")
-    if stream is not None:
-        raise InputError(f"{path}: holds one camera only; leave out stream= or --stream")
+            return read(file, path, options, f"{name}/{side}")
+    refuse_stream(path, options)
     if not _is_plain(file):
         with reading(source):
             name = next(name for name in _GROUPS if _fields(file, name) is not None)
@@ -94,7 +87,7 @@ def _recording(
     otherwise = f"{path}: neither an attribute nor an image tells the sensor's size;"
     size = sensor_size(size, told, frames=frames, otherwise=otherwise)
     columns = columns or _plain_columns(file, size, source)
-    stored = StoredEvents(columns, size, source)
+    stored = StoredEvents(columns, size, source).repaired(options)
     return Recording(path.stem, *size, stored, frames, triggers=_triggers(file, source))
 
 
@@ -147,8 +140,8 @@ def _side(path: Path, group: Any, stream: str | None) -> str:
     return str(stream)
 
 
-def _m3ed(file: Any, path: Path, size: tuple[int, int] | None, group: str) -> Recording:
-    source = str(path)
+def _m3ed(file: Any, path: Path, options: ReadOptions, group: str) -> Recording:
+    source, size = str(path), options.size
     columns = _columns(file, group, source)
     camera = None
     if f"{group}/calib/intrinsics" in file:
@@ -163,7 +156,7 @@ def _m3ed(file: Any, path: Path, size: tuple[int, int] | None, group: str) -> Re
     table = None
     if f"{group}/ms_map_idx" in file:
         table = dataset(file, f"{group}/ms_map_idx", source)
-    events = StoredEvents(columns, size, source, 0, table)
+    events = StoredEvents(columns, size, source, 0, table).repaired(options)
     poses = read_poses(path, group)
     return Recording(path.stem, *size, events, camera=camera, poses=poses)
 
@@ -194,8 +187,8 @@ class _Part:
         return self._whole.fields(self._key)[rows]
 
 
-def _mvsec(file: Any, path: Path, size: tuple[int, int] | None, group: str) -> Recording:
-    source = str(path)
+def _mvsec(file: Any, path: Path, options: ReadOptions, group: str) -> Recording:
+    source, size = str(path), options.size
     whole = dataset(file, f"{group}/events", source)
     if whole.ndim != 2 or whole.shape[1] != 4:
         raise InputError(
@@ -218,7 +211,7 @@ def _mvsec(file: Any, path: Path, size: tuple[int, int] | None, group: str) -> R
         imu = Imu(stamps, values[:, 3:], values[:, :3])
     otherwise = f"{path}: has no {group}/image_raw to tell the sensor's size;"
     size = sensor_size(size, frames=frames, otherwise=otherwise)
-    events = StoredEvents(columns, size, source)
+    events = StoredEvents(columns, size, source).repaired(options)
     poses = read_poses(path, group)
     return Recording(path.stem, *size, events, frames, poses=poses, imu=imu)
 

@@ -23,7 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.io import check_unfolded, checked_events, reading, sensor_size, times
+from jaxevent.io import check_unfolded, reading, sensor_size, times
+from jaxevent.io.decoded import from_columns
+from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Events, Frames, Recording
 
 _MATRIX, _COMPRESSED = 14, 15  # types of elements
@@ -32,14 +34,14 @@ _NUMBERS = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13}
 _CLASSES = range(6, 16)  # of arrays: double, single and the integers
 
 
-def read_v5(path: Path, size: tuple[int, int] | None) -> Recording:
-    """Read a v5 file; `size` is (width, height). Raises `InputError` for bad input."""
+def read_v5(path: Path, options: ReadOptions) -> Recording:
+    """Read a v5 file. Raises `InputError` for bad input."""
     import scipy.io
 
     with reading(str(path)):
         variables = scipy.io.loadmat(_unpacked(path))
     return _recording(
-        path, size, {name: v for name, v in variables.items() if not name.startswith("__")}
+        path, options, {name: v for name, v in variables.items() if not name.startswith("__")}
     )
 
 
@@ -113,8 +115,8 @@ def _is_numeric(body: memoryview, order: str, source: str) -> bool:
     return True
 
 
-def read_v73(path: Path, size: tuple[int, int] | None) -> Recording:
-    """Read a v7.3 file; `size` is (width, height). Raises `InputError` for bad input."""
+def read_v73(path: Path, options: ReadOptions) -> Recording:
+    """Read a v7.3 file. Raises `InputError` for bad input."""
     import h5py
 
     from jaxevent.io import hdf5_files
@@ -132,10 +134,10 @@ def read_v73(path: Path, size: tuple[int, int] | None) -> Recording:
                     variables[name] = np.zeros(stored.astype(int)) if empty else stored.T
                     held = sum(value.nbytes for value in variables.values())
                     check_unfolded(held, path.stat().st_size, str(path))
-    return _recording(path, size, variables)
+    return _recording(path, options, variables)
 
 
-def _recording(path: Path, size: tuple[int, int] | None, variables: dict) -> Recording:
+def _recording(path: Path, options: ReadOptions, variables: dict) -> Recording:
     arrays: dict[str, NDArray] = {
         name: value
         for name, value in variables.items()
@@ -148,8 +150,8 @@ def _recording(path: Path, size: tuple[int, int] | None, variables: dict) -> Rec
     columns = arrays.pop("events")
     frames = _frames(path, arrays) if "image" in arrays else None
     otherwise = f"{path}: has no image to tell the sensor's size;"
-    size = sensor_size(size, frames=frames, otherwise=otherwise)
-    events = _events(path, columns, size)
+    size = sensor_size(options.size, frames=frames, otherwise=otherwise)
+    events = _events(path, columns, size, options)
     extra = {name: _squeeze(value) for name, value in arrays.items() if name != "HDR_mat"}
     if "HDR_mat" in arrays:
         number = 0 if frames is None else len(frames)
@@ -157,7 +159,7 @@ def _recording(path: Path, size: tuple[int, int] | None, variables: dict) -> Rec
     return Recording(path.stem, *size, events, frames, extra=extra)
 
 
-def _events(path: Path, columns: NDArray, size: tuple[int, int]) -> Events:
+def _events(path: Path, columns: NDArray, size: tuple[int, int], options: ReadOptions) -> Events:
     source = f"{path}: events"
     if columns.size == 0:
         return Events.empty()
@@ -166,7 +168,8 @@ def _events(path: Path, columns: NDArray, size: tuple[int, int]) -> Events:
             f"{source} has shape {columns.shape}; store it as N x 4 (t in us, x, y, p)"
         )
     t, x, y, p = columns.T if columns.shape[1] == 4 else columns
-    return checked_events(times(t, source, "event", scale=1.0), x, y, p, size, source, origin=1)
+    timed = times(t, source, "event", scale=1.0), x, y, p
+    return from_columns(timed, size, source, options, origin=1)
 
 
 def _frames(path: Path, arrays: dict[str, NDArray]) -> Frames | None:

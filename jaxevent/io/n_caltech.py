@@ -18,6 +18,7 @@ import numpy as np
 
 from jaxevent.errors import InputError
 from jaxevent.io.decoded import BLOCK, Columns, decoded
+from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Recording
 
 _OVERFLOW_ROW, _OVERFLOW = 240, 1 << 13
@@ -33,17 +34,16 @@ def is_plausible(path: Path) -> bool:
     return len(t) >= _FEWEST and bool((t[1:] >= t[:-1]).all())
 
 
-def read(
-    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
-) -> Recording:
-    """Read a file; `size` is (width, height). Raises `InputError` for bad input."""
+def read(path: Path, options: ReadOptions) -> Recording:
+    """Read a file. Raises `InputError` for bad input."""
+    size = options.size
     if size is None:
         raise InputError(
             f"{path}: has no header, but could be a .bin of N-Caltech101 or N-MNIST; if so give "
             "size=(width, height) or --size"
         )
     decode = functools.partial(_events, path)
-    return Recording(path.stem, *size, decoded(decode, size, str(path), in_memory, progress))
+    return Recording(path.stem, *size, decoded(decode, size, str(path), options))
 
 
 def _events(path: Path, state: tuple[int, int] | None) -> Iterator[tuple[Any, Columns]]:

@@ -20,13 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.io import checked_events, pinhole, reading, sensor_size, times, vectors, whole_number
+from jaxevent.io import pinhole, reading, sensor_size, times, vectors, whole_number
 from jaxevent.io.columns import find, of_records, time_scale
+from jaxevent.io.decoded import from_columns
+from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Frames, Imu, Recording
 
 
-def read(path: Path, size: tuple[int, int] | None) -> Recording:
-    """Read an archive; `size` is (width, height). Raises `InputError` for bad input."""
+def read(path: Path, options: ReadOptions) -> Recording:
+    """Read an archive. Raises `InputError` for bad input."""
     arrays: dict[str, NDArray] = {}
     with reading(str(path)), np.load(path, allow_pickle=False) as archive:
         names = archive.files
@@ -54,14 +56,14 @@ def read(path: Path, size: tuple[int, int] | None) -> Recording:
     frames = _frames(path, arrays, take) if "frames" in arrays else None
     stored = {name: arrays.pop(name) for name in ("width", "height") if name in arrays}
     told = None
-    if size is None and len(stored) == 2:
+    if options.size is None and len(stored) == 2:
         width, height = (whole_number(value, str(path), name) for name, value in stored.items())
         told = (width, height)
     otherwise = f"{path}: has no width and height and no frames; add them or"
-    size = sensor_size(size, told, frames=frames, otherwise=otherwise)
+    size = sensor_size(options.size, told, frames=frames, otherwise=otherwise)
     source = str(path)
     t = times(t, source, "event", time_scale(t, source))
-    events = checked_events(t, x, y, p, size, source)
+    events = from_columns((t, x, y, p), size, source, options)
     imu = None
     if "imu_t" in arrays:
         imu_t, gyro, acc = take("imu_t", "gyro", "acc")

@@ -14,8 +14,8 @@ here. Events that come before the file's first time (or first row) cannot be pla
 out and counted in `extra["events_without_time"]`, where there are any. External triggers are kept
 in `Recording.triggers`, those before the first time counted as `triggers_without_time`. A DAT file
 holds events or triggers: of NAME_cd.dat and NAME_td.dat, triggers are read from NAME_trigger.dat
-where that is beside it, as Metavision's tools write them. A word of a type that the format does not
-define means damage.
+where that is beside it, as Metavision's tools write them. Words of types that a format reserves are
+skipped and counted in `extra["reserved_words"]`; many different ones mean damage.
 
 Decoders. EVT2, EVT2.1 and DAT have words of one length and are decoded here by NumPy: EVT2 and DAT
 at 56 million events/s, checks included. For EVT3 the package evt3 (MIT) is taken: 48 million
@@ -31,7 +31,6 @@ all 1,218,618 events but for a constant time, EVT2 with an unpacked copy (spinni
 
 import functools
 import re
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -41,11 +40,15 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, require
 from jaxevent.io import companions, reading
-from jaxevent.io.decoded import BLOCK, Columns, Decoder, TriggerList, decoded
+from jaxevent.io.decoded import BLOCK, Columns, Decoder, Tally, TriggerList, decoded
+from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Recording
 
 _LONGEST_HEADER = 1 << 16
 _DAT_TRIGGERS = 14  # the type of a DAT file's records
+_EVT2_TYPES = (0, 1, 8, 10, 14, 15)
+_EVT3_TYPES = (0, 2, 3, 4, 5, 6, 7, 8, 10, 14, 15)
+_MOST_RESERVED = 16  # different values of words of other types in a block
 _SIZES = (  # of sensors whose files may not tell their size, by the name of Metavision's plugin
     ("gen31", (640, 480)),
     ("gen3", (640, 480)),
@@ -56,10 +59,8 @@ _SIZES = (  # of sensors whose files may not tell their size, by the name of Met
 )
 
 
-def read(
-    path: Path, size: tuple[int, int] | None, in_memory: bool = True, progress: bool | None = None
-) -> Recording:
-    """Read a RAW or DAT file; `size` is (width, height). Raises `InputError` for bad input."""
+def read(path: Path, options: ReadOptions) -> Recording:
+    """Read a RAW or DAT file. Raises `InputError` for bad input."""
     with reading(str(path)):
         header, start = _header(path)
         stated = header.get("format", "").partition(";")[0].upper()
@@ -67,7 +68,7 @@ def read(
             header.get("evt", ""), ""
         )
         length = path.stat().st_size
-        found: Counter[str] = Counter()
+        found = Tally()
         triggers = TriggerList()
         if version == "EVT2":
             decode = functools.partial(_evt2, path, start, found, triggers)
@@ -90,15 +91,14 @@ def read(
                 "convert it with Metavision's tools"
             )
         _whole_words(path, length - start, width)
-        size = size or _size(header)
+        size = options.size or _size(header)
     if size is None:
         raise InputError(
             f"{path}: the header does not tell the sensor's size; give size=(width, height) or "
             "--size"
         )
-    events = decoded(decode, size, str(path), in_memory, progress)
-    extra = {name: np.array(number) for name, number in sorted(found.items())}
-    return Recording(path.stem, *size, events, extra=extra, triggers=triggers.all())
+    events = decoded(decode, size, str(path), options)
+    return Recording(path.stem, *size, events, extra=found.arrays(), triggers=triggers.all())
 
 
 def _header(path: Path) -> tuple[dict[str, str], int]:
@@ -164,18 +164,32 @@ def _words_from(path: Path, start: int, offset: int | None) -> Iterator[tuple[in
         yield at, at, words
 
 
-def _refuse_undefined(
-    source: Path | str, kind: NDArray, defined: tuple[int, ...], offset: int, width: int
-):
+def _count_reserved(
+    source: Path | str,
+    words: NDArray,
+    kind: NDArray[np.uint8],
+    defined: tuple[int, ...],
+    offset: int,
+    found: Tally,
+) -> None:
+    """Count words of types that a format reserves, which decoders skip.
+
+    Padding and what newer firmware adds repeat a few values, damaged bytes take any: raises
+    `InputError` for more than `_MOST_RESERVED` of them. `offset` is that of the words in bytes.
+    """
     known = np.zeros(16, bool)
     known[list(defined)] = True
-    good = known[kind]
-    if not good.all():
-        row = int(np.argmin(good))
+    reserved = ~known[kind]
+    if not reserved.any():
+        return
+    if len(np.unique(words[reserved])) > _MOST_RESERVED:
+        row = int(np.argmax(reserved))
         raise InputError(
-            f"{source}: the word at byte {offset + row * width} has the type {int(kind[row]):#x}, "
-            "which the format does not define; the file is damaged, so fetch it again"
+            f"{source}: the word at byte {offset + row * words.itemsize} has the type "
+            f"{int(kind[row]):#x}, which the format reserves, and so have many others of different "
+            "values; the file is damaged, so fetch it again"
         )
+    found.add("reserved_words", int(np.count_nonzero(reserved)), offset)
 
 
 def _continued(values: NDArray[np.int64], before: int | None, bits: int) -> NDArray[np.int64]:
@@ -203,23 +217,23 @@ def _timed(
 
 
 def _evt2(
-    path: Path, start: int, found: Counter, triggers: TriggerList, state: Any
+    path: Path, start: int, found: Tally, triggers: TriggerList, state: Any
 ) -> Iterator[tuple[Any, Columns]]:
     begin, before = state or (start, None)
     for offset, words in _words(path, begin, "<u4", BLOCK):
         state = (offset, before)
         kind = (words >> 28).astype(np.uint8)
-        _refuse_undefined(path, kind, (0, 1, 8, 10, 14, 15), offset, 4)
+        _count_reserved(path, words, kind, _EVT2_TYPES, offset, found)
         is_high = kind == 8
         high = _continued((words[is_high] & 0xFFFFFFF).astype(np.int64), before, 28)
         chosen = np.flatnonzero(kind <= 1)
         t, untimed = _timed(is_high, high, chosen, before)
         if untimed:
-            found["events_without_time"] += untimed
+            found.add("events_without_time", untimed, offset)
             chosen, t = chosen[untimed:], t[untimed:]
         at = np.flatnonzero(kind == 10)
         when, early = _timed(is_high, high, at, before)
-        found.update({"triggers_without_time": early} if early else {})
+        found.add("triggers_without_time", early, offset)
         signals = words[at[early:]]
         when = when[early:] << 6 | (signals >> 22 & 0x3F).astype(np.int64)
         triggers.add(offset, when, signals & 1, signals >> 8 & 0x1F)
@@ -240,7 +254,7 @@ def _halves_swapped(path: Path, start: int, stated: str) -> bool:
     fits = []
     for half in (words[1::2], words[0::2]):
         kinds = set((half >> 28).tolist())
-        fits.append(8 in kinds and kinds <= {0, 1, 8, 10, 14, 15})
+        fits.append(8 in kinds and kinds <= set(_EVT2_TYPES))
     if fits[0] == fits[1]:
         raise InputError(
             f"{path}: the order of the halves of its EVT2.1 words cannot be told; add "
@@ -250,7 +264,7 @@ def _halves_swapped(path: Path, start: int, stated: str) -> bool:
 
 
 def _evt21(
-    path: Path, start: int, halves_swapped: bool, found: Counter, triggers: TriggerList, state: Any
+    path: Path, start: int, halves_swapped: bool, found: Tally, triggers: TriggerList, state: Any
 ) -> Iterator[tuple[Any, Columns]]:
     begin, before = state or (start, None)
     # A word may hold 32 events.
@@ -259,18 +273,19 @@ def _evt21(
         if halves_swapped:
             words = words << 32 | words >> 32
         kind = (words >> 60).astype(np.uint8)
-        _refuse_undefined(path, kind, (0, 1, 8, 10, 14, 15), offset, 8)
+        _count_reserved(path, words, kind, _EVT2_TYPES, offset, found)
         is_high = kind == 8
         high = _continued((words[is_high] >> 32 & 0xFFFFFFF).astype(np.int64), before, 28)
         chosen = np.flatnonzero(kind <= 1)
         t, untimed = _timed(is_high, high, chosen, before)
         mask = (words[chosen] & 0xFFFFFFFF).astype("<u4")
         if untimed:
-            found["events_without_time"] += int(np.bitwise_count(mask[:untimed]).sum())
+            count = int(np.bitwise_count(mask[:untimed]).sum())
+            found.add("events_without_time", count, offset)
             chosen, mask, t = chosen[untimed:], mask[untimed:], t[untimed:]
         at = np.flatnonzero(kind == 10)
         when, early = _timed(is_high, high, at, before)
-        found.update({"triggers_without_time": early} if early else {})
+        found.add("triggers_without_time", early, offset)
         signals = words[at[early:]]
         when = when[early:] << 6 | (signals >> 54 & 0x3F).astype(np.int64)
         triggers.add(offset, when, signals >> 32 & 1, signals >> 40 & 0x1F)
@@ -380,7 +395,7 @@ def _moved_base(base: int, kind: NDArray) -> int:
 def evt3_events(
     source: str,
     words_from: Callable[[Any], Iterator[tuple[int, Any, NDArray]]],
-    found: Counter,
+    found: Tally,
     triggers: TriggerList,
     state: Any,
 ) -> Iterator[tuple[Any, Columns]]:
@@ -403,7 +418,7 @@ def evt3_events(
     for offset, place, words in words_from(begin):
         told = dict(last)
         kind = (words >> 12).astype(np.uint8)
-        _refuse_undefined(source, kind, (0, 2, 3, 4, 5, 6, 7, 8, 10, 14, 15), offset, 2)
+        _count_reserved(source, words, kind, _EVT3_TYPES, offset, found)
         data = words & 0xFFF
         data[kind == 5] &= 0xFF
         numbers = np.where(kind == 2, 1, 0).astype(np.uint8)
@@ -425,7 +440,7 @@ def evt3_events(
         if 3 in last:
             last[3] = _moved_base(last[3], kind)
         if unplaced.any():
-            found["events_without_time"] += int(numbers[unplaced].sum())
+            found.add("events_without_time", int(numbers[unplaced].sum()), offset)
             numbers[unplaced] = 0
             words = np.where(unplaced, np.uint16(0xE000), words)
         if state is None:

@@ -27,6 +27,7 @@ from jaxevent.io import pinhole, reading, sensor_size
 from jaxevent.io.bags import Bag
 from jaxevent.io.decoded import DecodedImages, decoded
 from jaxevent.io.images import LUMA
+from jaxevent.io.options import ReadOptions
 from jaxevent.io.ros_events import ARRAYS, PACKET, event_topic
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
@@ -42,36 +43,30 @@ _CHANNELS = {
 }
 
 
-def read(
-    path: Path,
-    size: tuple[int, int] | None,
-    in_memory: bool = True,
-    progress: bool | None = None,
-    stream: str | None = None,
-) -> Recording:
-    """Read a bag; `size` is (width, height). Raises `InputError` for bad input.
+def read(path: Path, options: ReadOptions) -> Recording:
+    """Read a bag. Raises `InputError` for bad input.
 
-    `stream` is the topic of the events, needed where there are several.
+    `options.stream` is the topic of the events, needed where there are several.
     """
     source = str(path)
     with reading(source):
         bag = Bag(path)
-    topic = _choose(path, bag.topics(*ARRAYS, PACKET), stream)
+    topic = _choose(path, bag.topics(*ARRAYS, PACKET), options.stream)
     chosen = {kind: bag.beside(topic, kind) for kind in (_IMAGE, _IMU, _POSE, _CAMERA)}
     with reading(source):
-        frames, colours = _frames(path, bag, chosen[_IMAGE], in_memory)
+        frames, colours = _frames(path, bag, chosen[_IMAGE], options.in_memory)
         imu = _imu(bag, chosen[_IMU])
         poses = _poses(bag, chosen[_POSE])
         camera = _camera(bag, chosen[_CAMERA])
         found = event_topic(bag, topic)
     otherwise = f"{path}: the events of {topic} do not tell the sensor's size;"
-    size = sensor_size(size, found.size, frames=frames, otherwise=otherwise)
-    events = decoded(found.decode, size, source, in_memory, progress)
+    size = sensor_size(options.size, found.size, frames=frames, otherwise=otherwise)
+    events = decoded(found.decode, size, source, options)
     left_out = sorted(
         {topic for kind in chosen for topic in bag.topics(kind)} - set(chosen.values()) - {None}
     )
     left_out += [other for other in bag.topics(*ARRAYS, PACKET) if other != topic]
-    extra = {name: np.array(number) for name, number in sorted(found.untimed.items())}
+    extra: dict[str, Any] = dict(found.untimed.arrays())
     extra |= {"topics_left_out": np.array(left_out)} if left_out else {}
     extra |= {} if colours is None else {"rgb": colours}
     triggers = found.triggers()

@@ -21,7 +21,6 @@ topic are then on the same clock, but for the drift of the camera's.
 import dataclasses
 import functools
 import struct
-from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -30,7 +29,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, require
 from jaxevent.io.bags import Bag, Place
-from jaxevent.io.decoded import BLOCK, Columns, Decoder, TriggerList
+from jaxevent.io.decoded import BLOCK, Columns, Decoder, Tally, TriggerList
 from jaxevent.io.prophesee import evt3_events
 from jaxevent.recording import Triggers
 
@@ -64,13 +63,13 @@ class EventTopic:
 
     decode: Decoder
     size: tuple[int, int] | None
-    untimed: Counter[str]
+    untimed: Tally
     triggers: Callable[[], Triggers | None]
 
 
 def event_topic(bag: Bag, topic: str) -> EventTopic:
     """Read what is needed before the events of a topic. Raises `InputError` for bad messages."""
-    found: Counter[str] = Counter()
+    found = Tally()
     if bag.kind(topic) != PACKET:
         decode = functools.partial(_arrays, bag, topic)
         return EventTopic(decode, _size(bag, topic), found, lambda: None)
@@ -190,7 +189,7 @@ def _mono_columns(held: list[tuple[NDArray, NDArray]]) -> Columns:
 class _Evt3Packets:
     """The words of evt3 packets, one after the other, on the clock of the first header (us)."""
 
-    def __init__(self, bag: Bag, topic: str, stamp: int, found: Counter):
+    def __init__(self, bag: Bag, topic: str, stamp: int, found: Tally):
         self._bag, self._topic, self._stamp, self._found = bag, topic, stamp, found
         self._list = TriggerList()
         self._shift: int | None = None

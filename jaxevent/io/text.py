@@ -24,16 +24,18 @@ from numpy.typing import NDArray
 from tqdm.utils import CallbackIOWrapper
 
 from jaxevent.errors import InputError
-from jaxevent.io import check_unfolded, checked_events, pinhole, reading, sensor_size, times
+from jaxevent.io import check_unfolded, pinhole, reading, sensor_size, times
+from jaxevent.io.decoded import from_columns
 from jaxevent.io.images import kept_colours, read_grey_and_colour
+from jaxevent.io.options import ReadOptions
 from jaxevent.progress import bar
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
 
-def read(path: Path, size: tuple[int, int] | None, progress: bool | None = None) -> Recording:
-    """Read a folder or zip; `size` is (width, height). Raises `InputError` for bad input."""
+def read(path: Path, options: ReadOptions) -> Recording:
+    """Read a folder or zip. Raises `InputError` for bad input."""
     if path.is_dir():
-        return _read(path, path, size, progress)
+        return _read(path, path, options)
     with reading(str(path)), zipfile.ZipFile(path) as archive:
         inside = [
             name
@@ -46,28 +48,27 @@ def read(path: Path, size: tuple[int, int] | None, progress: bool | None = None)
                 "make a zip of one recording"
             )
         root = zipfile.Path(archive, inside[0].removesuffix("events.txt"))
-        return _read(path, root, size, progress)
+        return _read(path, root, options)
 
 
-def _read(
-    path: Path, root: Path | zipfile.Path, size: tuple[int, int] | None, progress: bool | None
-) -> Recording:
+def _read(path: Path, root: Path | zipfile.Path, options: ReadOptions) -> Recording:
     source = f"{path}: events.txt"
     frames, colours = _frames(path, root)
     columns, header = _table(
-        root / "events.txt", source, "t x y p", header="width height", progress=progress
+        root / "events.txt", source, "t x y p", header="width height", progress=options.progress
     )
     otherwise = (
         f"{source}: neither a first line 'width height' nor an image tells the sensor's size;"
     )
-    size = sensor_size(size, header, frames=frames, otherwise=otherwise)
+    size = sensor_size(options.size, header, frames=frames, otherwise=otherwise)
     t, x, y, p = columns
     if len(t) > 1 and (t == np.rint(t)).all() and t[0] != t[-1]:
         raise InputError(
             f"{source}: all times are whole numbers, but those of this layout are seconds; write "
             "seconds with decimals, or load a table with the line 't x y p' before events in us"
         )
-    events = checked_events(times(t, source, "event"), x, y, p, size, source)
+    columns = times(t, source, "event"), x, y, p
+    events = from_columns(columns, size, source, options)
 
     poses = imu = camera = None
     if (root / "groundtruth.txt").is_file():

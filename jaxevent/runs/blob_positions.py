@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from jaxevent.blob import Tracker, TrackerParams
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording
-from jaxevent.runs.config import Check
+from jaxevent.runs.config import Check, Tables, is_table, table_files, table_of
 
 
 def _is_seed(value: Any) -> bool:
@@ -36,7 +36,7 @@ SETTINGS: Mapping[str, Check] = {
         "a list of [x, y, size], in px, or [x, y, size, t], t in s",
     ),
     "positions": (
-        lambda value: isinstance(value, str) and value != "",
+        is_table,
         'the name of tables beside the recordings, as "*.csv"',
     ),
 }
@@ -70,6 +70,21 @@ def read_positions(path: str | Path) -> Known:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
     except ValueError as error:
         raise InputError(f"{path}: is no table ({error}); give columns t, x, y") from None
+    return positions_of(table, str(path), "line", 2)
+
+
+def positions_of(table: pd.DataFrame, path: str, row_name: str = "row", first: int = 0) -> Known:
+    """Positions from a table of the columns that the text of this module describes.
+
+    Args:
+        table: t (s), x, y (px), and further columns.
+        path: How messages call it.
+        row_name: How messages call a row.
+        first: The number of the first row in messages.
+
+    Raises:
+        InputError: Columns or numbers are missing.
+    """
     missing = [name for name in ("t", "x", "y") if name not in table.columns]
     if missing:
         raise InputError(f"{path}: has no column {missing[0]!r}; give the columns t (s), x, y (px)")
@@ -82,8 +97,8 @@ def read_positions(path: str | Path) -> Known:
         if not good.all():
             row = int(np.argmin(good))
             raise InputError(
-                f"{path}: {name} is {str(table[name][row])[:40]!r} in line {row + 2}; give a "
-                "number, or leave the line out"
+                f"{path}: {name} is {str(table[name][row])[:40]!r} in {row_name} {row + first}; "
+                f"give a number, or leave the {row_name} out"
             )
     if not len(table):
         raise InputError(f"{path}: holds no positions; give lines of t, x, y")
@@ -104,7 +119,7 @@ class Targets:
     """What a configuration says of the targets: seeds, and the name of tables of positions."""
 
     seeds: tuple[tuple[float, ...], ...] | None
-    positions: str | None
+    positions: str | Tables | None
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> "Targets":
@@ -117,29 +132,33 @@ class Targets:
         """The tables beside a recording."""
         if self.positions is None:
             return []
-        name = recording.name if recording.is_dir() else recording.stem
-        return [recording.with_name(self.positions.replace("*", name))]
+        return table_files(self.positions, str(recording))
 
     def known(self, recording: Recording) -> Known | None:
         """The positions of a recording, those in the time of its events."""
-        for path in self.files(Path(recording.name)):
-            known = read_positions(path)
-            targets = known.xi.shape[1]
-            if self.seeds is not None and len(self.seeds) != targets:
-                raise InputError(
-                    f"{path}: holds {targets} targets, but there are {len(self.seeds)} seeds; "
-                    "give one for each, by rising id, or leave out the seeds"
-                )
-            first, stop = span_of_events(recording)
-            inside = (first <= known.t) & (known.t < stop)
-            if not inside.any():
-                raise InputError(
-                    f"{path}: no position is within {first * 1e-6:g} to {stop * 1e-6:g} s, the "
-                    f"events' time in {recording.name}; times are seconds on its clock"
-                )
-            more = {name: value[inside] for name, value in known.more.items()}
-            return Known(known.t[inside], known.xi[inside], more, known.id)
-        return None
+        if self.positions is None:
+            return None
+        table = table_of(self.positions, recording.name)
+        if isinstance(table, Path):
+            path, known = str(table), read_positions(table)
+        else:
+            path = f"{recording.name}: positions"
+            known = positions_of(table, path)
+        targets = known.xi.shape[1]
+        if self.seeds is not None and len(self.seeds) != targets:
+            raise InputError(
+                f"{path}: holds {targets} targets, but there are {len(self.seeds)} seeds; "
+                "give one for each, by rising id, or leave out the seeds"
+            )
+        first, stop = span_of_events(recording)
+        inside = (first <= known.t) & (known.t < stop)
+        if not inside.any():
+            raise InputError(
+                f"{path}: no position is within {first * 1e-6:g} to {stop * 1e-6:g} s, the "
+                f"events' time in {recording.name}; times are seconds on its clock"
+            )
+        more = {name: value[inside] for name, value in known.more.items()}
+        return Known(known.t[inside], known.xi[inside], more, known.id)
 
     def first_seeds(self, known: Known | None, params: TrackerParams) -> list[Any] | None:
         """Where tracking of a whole recording begins; None: tracks are born."""

@@ -14,6 +14,7 @@ Settings beside `protocol = "tracks"`:
     pairs = [[0, 1]]                    # ids of targets at one depth, which tell time to contact
     extent = 0.24                       # m, of the targets; with `focal` it tells their range
     focal = 1000.0                      # px
+    metrics = ["mypackage.mymodule:function"]  # of one's own: `jaxevent.runs.own`
     size_factor = 0.25                  # lambda over the diameter in the image; omitted: 0.354
 
 Positions are as in `jaxevent.runs.blob_positions`. With "found", numbers of `params` that are not
@@ -47,9 +48,15 @@ from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording
 from jaxevent.runs.blob_positions import SETTINGS, Known, Targets
-from jaxevent.runs.config import Check
+from jaxevent.runs.config import METRICS, Check
 from jaxevent.runs.family import Protocol
+from jaxevent.runs.own import Function, find_metrics, own_names
 
+# Measures that rows have in any case.
+MEASURES = (
+    "rmse", "median", "covered", "tracks", "missed", "false", "switches", "mota", "idf1", "hota",
+    "velocity", "size", "theta", "inverse_ttc", "range",
+)  # fmt: skip
 BEGINS = ("positions", "found", "born")
 REACH = 10.0  # px
 
@@ -72,6 +79,7 @@ class TrackProtocol(Protocol):
         **SETTINGS,
         "begin": (lambda value: value in BEGINS, '"positions", "found" or "born"'),
         "smooth": (lambda value: type(value) is bool, "true or false"),
+        "metrics": METRICS,
         "pairs": (_are_pairs, "a list of [id, id], two targets each"),
         **{
             name: (_above_0, "a number above 0")
@@ -84,6 +92,7 @@ class TrackProtocol(Protocol):
             raise InputError(
                 'the positions are not given; add positions = "*.csv", tables beside the recordings'
             )
+        find_metrics(options.get("metrics", ()), MEASURES)
         if "seeds" in options and options.get("begin", "positions") != "positions":
             raise InputError(
                 f"tracks begin at the seeds or are {options['begin']}; leave out one of them"
@@ -99,8 +108,8 @@ class TrackProtocol(Protocol):
     def score(
         self,
         recording: Recording,
-        method: Tracker,
-        params: TrackerParams,
+        method: Tracker | Function,
+        params: TrackerParams | None,
         options: Mapping[str, Any],
         progress: bool | None = None,
     ) -> dict[str, Any]:
@@ -109,12 +118,21 @@ class TrackProtocol(Protocol):
         assert known is not None
         begin = options.get("begin", "positions")
         clock = time.perf_counter()
-        tracks = _tracked(recording, method, params, begin, targets, known, options, progress)
-        mean, covariance = _states(tracks, known.t)
+        metrics = find_metrics(options.get("metrics", ()), MEASURES)
+        noise = None
+        if isinstance(method, Function):
+            mean, covariance = _of_function(recording, method, known.t)
+        else:
+            params = params or method.Params()
+            tracks = _tracked(recording, method, params, begin, targets, known, options, progress)
+            mean, covariance = _states(tracks, known.t)
+            noise = float(tracks.params.Q_lambda)
         seconds = time.perf_counter() - clock
         told = score_tracks(known.xi, mean[..., :2], options.get("reach", REACH))
         own = told.match
-        if begin == "positions":  # whose a track is needs no matching
+        if begin == "positions" and not isinstance(
+            method, Function
+        ):  # whose a track is needs no matching
             own = np.where(np.isfinite(mean[..., 0]), np.arange(mean.shape[1]), -1)
         given = np.isfinite(known.xi).all(2)
         distance = np.linalg.norm(_taken(mean, own)[..., :2] - known.xi, axis=2)[given]
@@ -125,7 +143,16 @@ class TrackProtocol(Protocol):
             "median": float(np.median(distance[alive])) if alive.any() else None,
             "covered": float(alive.mean()),
             **{name: getattr(told, name) for name in names},
-            **_errors(tracks, known, _taken(mean, own), _taken(covariance, own), options),
+            **_errors(
+                known,
+                _taken(mean, own),
+                _taken(covariance, own),
+                options,
+                noise=noise,
+                recording=recording.name,
+            ),
+            **{m.name: m(_taken(mean, own)[..., :2], known.xi, recording.name) for m in metrics},
+            **own_names(metrics),
             "times": len(distance),
             "events": len(recording.events),
             "seconds": seconds,
@@ -188,14 +215,33 @@ def _rms(error: NDArray) -> float | None:
     return float(np.sqrt(np.mean(known**2))) if len(known) else None
 
 
+def _of_function(
+    recording: Recording, method: Function, times: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """States that a function estimates and their covariances, as `_states`; NaN where unknown."""
+    mean, covariance, _ = method.estimate(recording, times, [(-1, 2), (-1, 8)])
+    states = np.full((*mean.shape[:2], 8), np.nan)
+    states[..., : mean.shape[2]] = mean
+    full = np.full((*mean.shape[:2], 8, 8), np.nan)
+    if covariance is not None and covariance.shape == full.shape:
+        full = covariance
+    return states, full
+
+
 def _errors(
-    tracks: Tracks,
     known: Known,
     mean: NDArray[np.float64],
     covariance: NDArray[np.float64],
     options: Mapping[str, Any],
+    *,
+    noise: float | None,
+    recording: str,
 ) -> dict[str, float | None]:
-    """Of what is known beside positions; `mean` (times, targets, 8) is that of targets' tracks."""
+    """Errors of what is known beside positions.
+
+    `mean` (times, targets, 8) is that of targets' tracks; `noise` is Q_lambda, None where the
+    method has none.
+    """
     more, out = known.more, {}
     if {"vx", "vy"} <= more.keys():
         out["velocity"] = _rms(np.hypot(mean[..., 2] - more["vx"], mean[..., 3] - more["vy"]))
@@ -214,16 +260,20 @@ def _errors(
         )
         out["range"] = _rms(np.asarray(value) / more["range"] - 1)
     if "inverse_ttc" in more:
-        out["inverse_ttc"] = _rms(_closing(tracks, known, mean, covariance, options))
+        out["inverse_ttc"] = _rms(
+            _closing(known, mean, covariance, options, noise=noise, recording=recording)
+        )
     return out
 
 
 def _closing(
-    tracks: Tracks,
     known: Known,
     mean: NDArray[np.float64],
     covariance: NDArray[np.float64],
     options: Mapping[str, Any],
+    *,
+    noise: float | None,
+    recording: str,
 ) -> NDArray[np.float64]:
     """Errors of 1 / TTC, of pairs and of the other targets' growth."""
     truth, errors, ids = known.more["inverse_ttc"], [], known.id.tolist()
@@ -232,7 +282,7 @@ def _closing(
     for pair in options.get("pairs", []):
         if not set(pair) <= set(ids):
             raise InputError(
-                f"{tracks.recording.name}: the pair {pair} is not two of the targets known, "
+                f"{recording}: the pair {pair} is not two of the targets known, "
                 f"{', '.join(map(str, ids))}"
             )
         a, b = (ids.index(one) for one in pair)
@@ -241,8 +291,7 @@ def _closing(
         errors.append(np.where(seen, np.asarray(value), np.nan) - truth[:, [a, b]].mean(1))
         paired |= {a, b}
     since = jnp.asarray((known.t - known.t[0]) * 1e-6)
-    noise = float(tracks.params.Q_lambda)
-    for k in set(range(len(ids))) - paired:
+    for k in set(range(len(ids))) - paired if noise is not None else ():
         seen = np.isfinite(mean[:, k, 0])
         if seen.any():
             value, _ = growth(since, x[:, k], P[:, k], jnp.asarray(seen), Q_lambda=noise)

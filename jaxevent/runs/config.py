@@ -1,21 +1,113 @@
 """What configurations of `evaluate` and `fit` share: recordings, methods, parameters, checks."""
 
 import contextlib
+import dataclasses
 import glob
 import math
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from jaxevent import datasets
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters, nearest, read_toml
+from jaxevent.recording import Recording
+from jaxevent.shown import a_kind
 
 P = TypeVar("P", bound=Parameters)
 
 Check = tuple[Callable[[Any], bool], str]  # of a setting: what is accepted, and how to say so
+
+
+class Named(NamedTuple):
+    """A recording, or its path, with the name that results give it."""
+
+    name: str
+    recording: "Recording | str"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Tables:
+    """Tables of what is true, given in Python: one of all recordings, or by a recording's name.
+
+    A table is a pandas DataFrame or the path of a file.
+    """
+
+    given: Any
+
+    @classmethod
+    def of(cls, given: Any) -> "Tables | str":
+        """Make them of a table, or of a mapping from recordings' names; a text stays one."""
+        if isinstance(given, str):
+            return given
+        if isinstance(given, os.PathLike):
+            return cls(Path(given))
+        if isinstance(given, Mapping) and not any(map(is_column, given.values())):
+            return cls({str(name): _table(one) for name, one in given.items()})
+        return cls(_table(given))
+
+    def find(self, recording: str) -> Any:
+        """The table of the recording of that name; raises `InputError` where there is none."""
+        if not isinstance(self.given, dict):
+            return self.given
+        for name in (recording, known_as(Path(recording))):
+            if name in self.given:
+                return self.given[name]
+        raise InputError(
+            f"{recording}: no table of what is true has this name; {nearest(recording, self.given)}"
+        )
+
+
+def table_of(given: Tables | str, recording: str) -> Any:
+    """The table of what is true of the recording of that name: a DataFrame, or the path of a file.
+
+    A text is the name of files beside recordings, * being their names without suffix.
+    """
+    if isinstance(given, Tables):
+        return given.find(recording)
+    path = Path(recording)
+    return path.with_name(given.replace("*", known_as(path)))
+
+
+def table_files(given: Tables | str, recording: str) -> list[Path]:
+    """The file of a recording's table, if it is in one."""
+    table = table_of(given, recording)
+    return [table] if isinstance(table, Path) else []
+
+
+def is_table(value: Any) -> bool:
+    return isinstance(value, Tables) or (isinstance(value, str) and value != "")
+
+
+def is_column(value: Any) -> bool:
+    """Tell whether a value of a mapping is a column of numbers rather than a table."""
+    return not (isinstance(value, str | os.PathLike | Mapping) or hasattr(value, "columns")) and (
+        not hasattr(value, "to_dataframe")
+    )
+
+
+def _table(given: Any) -> Any:
+    import pandas as pd
+
+    if isinstance(given, str | os.PathLike):
+        return Path(given)
+    for method in ("to_dataframe", "to_pandas"):
+        if hasattr(given, method):
+            given = getattr(given, method)()
+    try:
+        return pd.DataFrame(given).reset_index(drop=True)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"what is true is {a_kind(given)} that is no table ({error}); give a "
+            "DataFrame, the path of a CSV file, or a mapping from recordings' names to them"
+        ) from None
+
+
+def known_as(path: Path) -> str:
+    """Return the name of a recording in other programs' results: that of its file, no suffix."""
+    return path.name if path.is_dir() else path.stem
 
 
 def is_text(value: Any) -> bool:
@@ -38,8 +130,20 @@ POSITIVE = (lambda value: is_number(value) and value > 0, "a positive number")
 NOT_NEGATIVE = (lambda value: is_number(value) and value >= 0, "a number, 0 or more")
 NATURAL = (is_natural, "a whole number, 1 or more")
 NAME = (is_text, "text")
-PATHS = (is_texts, 'a list of paths, as ["file.zip"]')
+PATHS = (
+    lambda value: (
+        isinstance(value, list)
+        and all(is_text(one) or isinstance(one, Recording | Named) for one in value)
+    ),
+    'a list of paths, as ["file.zip"]',
+)
 
+
+def is_metrics(value: Any) -> bool:
+    return isinstance(value, list) and all(is_text(one) or callable(one) for one in value)
+
+
+METRICS = (is_metrics, 'a list of names, as ["lpips"], or of "package.module:function"')
 STREAM = (is_text, 'the name of a camera, as "left"')
 SIZE: Check = (
     lambda value: isinstance(value, list) and len(value) == 2 and all(map(is_natural, value)),
@@ -63,35 +167,64 @@ def one_of(value: str, what: str, known: Sequence[str]) -> str:
     return value
 
 
-def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path]]:
-    """Recordings as given and their paths, of paths and globs relative to `folder`.
+def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path | Recording]]:
+    """Recordings by name: objects, or the paths of those given by paths and globs.
 
-    "NAME:FOLDER" stands for all recordings of a data set of `jaxevent.datasets`. $NAME is expanded.
-    Raises `InputError` for what is not there.
+    Paths are relative to `folder` and named as they are given. "NAME:FOLDER" stands for all
+    recordings of a data set of `jaxevent.datasets`. $NAME is expanded. Objects have their own
+    names; further ones of a name get a number. Raises `InputError` for what is not there.
     """
-    if not (isinstance(given, list) and given and all(isinstance(one, str) for one in given)):
+    if not (given and PATHS[0](given)):
         raise InputError('recordings is missing or not a list; give recordings = ["file.zip", ...]')
-    found: dict[Path, str] = {}
-    for text in given:
-        expanded = os.path.expanduser(os.path.expandvars(text))
-        unset = re.search(r"\$(\w+|\{[^}]*\})", expanded)
-        if unset and not (folder / expanded).exists():
-            name = unset.group(1).strip("{}")
-            raise InputError(f"the recording {text!r} needs the variable {name}, which is not set")
-        name, rest = _data_set(expanded, folder)
-        if name:
-            for one, path in datasets.open(name, folder / rest).paths.items():
-                found.setdefault(path, f"{name}:{one}")
+    found: dict[Any, tuple[str, Path | Recording]] = {}
+    for one in given:
+        name, what = one if isinstance(one, Named) else (None, one)
+        if isinstance(what, Recording):
+            found.setdefault((id(what), name), (name or what.name or "recording", what))
             continue
-        if not glob.has_magic(expanded) or (folder / expanded).exists():
-            found.setdefault(folder / expanded, text)
-            continue
-        matches = sorted(glob.glob(expanded, root_dir=folder, recursive=True))
-        if not matches:
-            raise InputError(f"no recording matches {text!r} in {folder}; correct the pattern")
-        for match in matches:
-            found.setdefault(folder / match, match)
-    return [(text, path) for path, text in found.items()]
+        paths = _find_paths(what, folder)
+        if name is not None and len(paths) > 1:
+            raise InputError(
+                f"{len(paths)} recordings are called {name!r}, those of {what!r}; give each a name"
+            )
+        for path, text in paths.items():
+            found.setdefault(path, (name or text, path))
+    return _told_apart(list(found.values()))
+
+
+def _told_apart(
+    recordings: list[tuple[str, Path | Recording]],
+) -> list[tuple[str, Path | Recording]]:
+    """The recordings with names that differ: the second of a name is "name (2)"."""
+    taken: set[str] = set()
+    found: list[tuple[str, Path | Recording]] = []
+    for name, recording in recordings:
+        other, number = name, 1
+        while other in taken:
+            number += 1
+            other = f"{name} ({number})"
+        taken.add(other)
+        found.append((other, recording))
+    return found
+
+
+def _find_paths(text: str, folder: Path) -> dict[Path, str]:
+    """The paths that a text of a configuration stands for, and what each is called."""
+    expanded = os.path.expanduser(os.path.expandvars(text))
+    unset = re.search(r"\$(\w+|\{[^}]*\})", expanded)
+    if unset and not (folder / expanded).exists():
+        name = unset.group(1).strip("{}")
+        raise InputError(f"the recording {text!r} needs the variable {name}, which is not set")
+    name, rest = _data_set(expanded, folder)
+    if name:
+        paths = datasets.open(name, folder / rest).paths
+        return {path: f"{name}:{one}" for one, path in paths.items()}
+    if not glob.has_magic(expanded) or (folder / expanded).exists():
+        return {folder / expanded: text}
+    matches = sorted(glob.glob(expanded, root_dir=folder, recursive=True))
+    if not matches:
+        raise InputError(f"no recording matches {text!r} in {folder}; correct the pattern")
+    return {folder / match: match for match in matches}
 
 
 def _data_set(text: str, folder: Path) -> tuple[str, str]:
@@ -101,8 +234,11 @@ def _data_set(text: str, folder: Path) -> tuple[str, str]:
     return (name, rest) if known else ("", text)
 
 
-def from_anywhere(given: str) -> str:
+def from_anywhere(given: Any) -> Any:
     """A recording as given in the working directory, named so that any configuration finds it."""
+    if isinstance(given, Recording | Named):
+        return given
+    given = os.fspath(given)
     name, rest = _data_set(given, Path.cwd())
     path = str(Path(rest).expanduser().absolute())
     return f"{name}:{path}" if name else path
@@ -136,6 +272,13 @@ def read_params(kind: type[P], name: str, given: Any, folder: Path) -> P:
 
     if isinstance(given, str):
         return load_file(given)
+    if isinstance(given, Parameters):
+        if type(given) is not kind:
+            raise InputError(
+                f"params are {type(given).__module__}.{type(given).__name__}, not those of the "
+                f"method {name!r}; give {kind.__module__}.{kind.__name__}"
+            )
+        return given
     if not isinstance(given, dict):
         raise InputError(f"params is {given!r}; give a table or the path of a TOML file")
     values = dict(given)

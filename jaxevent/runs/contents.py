@@ -1,4 +1,4 @@
-"""What recordings hold: hashes of files, kept, and the recording that was last loaded."""
+"""Contents of recordings: hashes of files, kept, and of objects; the recording last loaded."""
 
 import contextlib
 import dataclasses
@@ -6,16 +6,21 @@ import hashlib
 import json
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import pandas as pd
 
 from jaxevent.errors import InputError
 from jaxevent.io import load
 from jaxevent.io.companions import companions
 from jaxevent.io.output import complete
+from jaxevent.parameters import Parameters
 from jaxevent.progress import bar
-from jaxevent.recording import Recording
+from jaxevent.recording import EventSource, Recording
+from jaxevent.shown import a_kind
 
 
 class Opened(threading.local):
@@ -72,6 +77,7 @@ class Contents:
             self.known = dict(json.loads(cache.read_bytes()))
         self.used: dict[str, list] = {}
         self.now: dict[Path, str] = {}
+        self.objects: dict[int, tuple[Recording, str]] = {}  # held, so that no id is used again
 
     def of(self, path: Path) -> str:
         """The hash of a file, or of all names and files in a folder; raises OSError."""
@@ -85,6 +91,13 @@ class Contents:
             else:
                 self.now[path] = hashes[0]
         return self.now[path]
+
+    def of_object(self, recording: Recording) -> str:
+        """The hash of a recording's content; raises `InputError`."""
+        known = self.objects.get(id(recording))
+        if known is None:
+            known = self.objects[id(recording)] = recording, digest(recording)
+        return known[1]
 
     def _of_file(self, file: Path) -> str:
         name, size, changed = _stamp(file)
@@ -116,6 +129,72 @@ class Contents:
             self.cache.parent.mkdir(exist_ok=True)
             with complete(self.cache) as partial:
                 partial.write_text(json.dumps(known))
+
+
+ROWS = 1 << 20  # events that are hashed at once
+IMAGES = 64  # images that are hashed at once
+
+
+def digest(thing: Any) -> str:
+    """A hash of what recordings and settings hold: numbers, text, arrays, tables, dataclasses.
+
+    Names of recordings do not count. Events and images in a file are read piece by piece. Raises
+    `InputError` for anything else.
+    """
+    whole = hashlib.blake2b(digest_size=16)
+    _feed(thing, whole.update)
+    return whole.hexdigest()
+
+
+def _feed(thing: Any, update: Callable[[Any], None]) -> None:
+    """Feed a hash a value, with its kind and its length, so that no two values feed the same."""
+
+    def begin(kind: str, *about: Any) -> None:
+        update(f"{kind} {' '.join(map(repr, about))};".encode())
+
+    if thing is None or isinstance(thing, str | bool | int | float | np.generic):
+        begin(type(thing).__name__, thing)
+    elif isinstance(thing, list | tuple):
+        begin("list", len(thing))
+        for one in thing:
+            _feed(one, update)
+    elif isinstance(thing, pd.DataFrame):
+        _feed({str(name): thing[name].to_numpy() for name in thing.columns}, update)
+    elif isinstance(thing, EventSource):
+        begin("events", len(thing))
+        for first in range(0, len(thing), ROWS):
+            part = thing[first : first + ROWS]
+            for column in (part.t, part.x, part.y, part.p):
+                update(np.ascontiguousarray(column).data)
+    elif isinstance(thing, type):
+        begin("class", thing.__module__, thing.__qualname__)
+    elif isinstance(thing, Parameters):
+        begin(type(thing).__qualname__)
+        _feed(thing.values(), update)
+    elif dataclasses.is_dataclass(thing):
+        begin(type(thing).__qualname__)
+        for field in dataclasses.fields(thing):
+            if not (isinstance(thing, Recording) and field.name == "name"):
+                begin(field.name)
+                _feed(getattr(thing, field.name), update)
+    elif isinstance(thing, Mapping):
+        begin("mapping", len(thing))
+        for name in sorted(thing, key=repr):
+            begin("key", name)
+            _feed(thing[name], update)
+    elif hasattr(thing, "shape") and hasattr(thing, "dtype"):
+        begin("array", str(thing.dtype), tuple(thing.shape))
+        if len(thing.shape) == 0 or np.dtype(thing.dtype).kind == "O":
+            _feed(np.asarray(thing).tolist(), update)
+            return
+        rows = ROWS if len(thing.shape) == 1 else IMAGES
+        for first in range(0, thing.shape[0], rows):
+            update(np.ascontiguousarray(thing[first : first + rows]).tobytes())
+    else:
+        raise InputError(
+            f"{a_kind(thing)} in a recording or a setting has no content that can be "
+            "compared; remove it"
+        )
 
 
 def fingerprint(path: Path, update: Callable[[bytes], None]) -> None:

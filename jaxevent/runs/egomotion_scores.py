@@ -13,6 +13,7 @@ Settings beside `protocol = "motion"`:
     smooth = false                      # a backward pass, of methods that have one
     gyro = false                        # tell the gyro to methods that take it
     seed = 0
+    metrics = ["mypackage.mymodule:function"]  # of one's own: `jaxevent.runs.own`
 
 A row has the errors of `scores.motion_errors` at 200 times per second, without those at which the
 motion was lost: `lost`, their share of all after it was first found, `startup` (s) later.
@@ -21,7 +22,7 @@ of general motion, its error in degrees; None where lost.
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +32,24 @@ from numpy.typing import NDArray
 from jaxevent.egomotion.comparison import by_part, compare
 from jaxevent.egomotion.estimator import RATE, MotionEstimator
 from jaxevent.egomotion.models import Model, find_model
+from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.truth import Known, known
 from jaxevent.egomotion.twists import from_gyro, imu_rotation
 from jaxevent.errors import InputError
+from jaxevent.estimator import Estimate
 from jaxevent.parameters import Parameters
-from jaxevent.recording import Recording
-from jaxevent.runs.config import NOT_NEGATIVE, POSITIVE, Check
+from jaxevent.recording import Recording, Times
+from jaxevent.runs.config import (
+    METRICS,
+    NOT_NEGATIVE,
+    POSITIVE,
+    Check,
+    is_table,
+    table_files,
+    table_of,
+)
 from jaxevent.runs.family import Protocol
+from jaxevent.runs.own import Function, Metric, find_metrics, own_names
 
 
 def _vector(value: Any) -> bool:
@@ -55,7 +67,7 @@ def _flag(value: Any) -> bool:
 SETTINGS: dict[str, Check] = {
     "model": (lambda value: isinstance(value, str), 'a name, as "planar" or "rotation"'),
     "truth": (
-        lambda value: isinstance(value, str) and value != "",
+        is_table,
         'the name of tables beside the recordings, as "*.csv", or "poses", "gyro"',
     ),
     "gyro_bias": (_vector, "three numbers, rad/s"),
@@ -69,9 +81,16 @@ SETTINGS: dict[str, Check] = {
     "smooth": (_flag, "true or false"),
     "gyro": (_flag, "true or false"),
     "seed": (lambda value: type(value) is int and value >= 0, "a whole number, 0 or more"),
+    "metrics": METRICS,
 }
+# Measures that rows have in any case.
+MEASURES = (
+    "AEE", "AEE_rel", "AAE_U", "AAE_T", "AAE_Omega", "AME", "AME_rel", "AME_N", "vector_error",
+    "outliers", "lost", "startup",
+)  # fmt: skip
 
 
+RECORDED = ("poses", "gyro")  # truth that recordings hold themselves
 OF_TRUTH = ("gyro_bias", "imu_rotation", "depth")  # settings that say what is true
 
 
@@ -94,14 +113,16 @@ def check(options: Mapping[str, Any]) -> None:
 def files(path: Path, options: Mapping[str, Any]) -> list[Path]:
     """Further files that a row of the recording depends on."""
     truth = options["truth"]
-    if truth in ("poses", "gyro"):
+    if isinstance(truth, str) and truth in RECORDED:
         return []
-    return [path.with_name(truth.replace("*", path.name if path.is_dir() else path.stem))]
+    return table_files(truth, str(path))
 
 
 def true_motion(recording: Recording, options: Mapping[str, Any]) -> Known:
     """What is true of the motion of a recording, whose name is its path."""
-    source = (files(Path(recording.name), options) or [options["truth"]])[0]
+    source = options["truth"]
+    if not (isinstance(source, str) and source in RECORDED):
+        source = table_of(source, recording.name)
     return known(
         recording,
         model_of(options),
@@ -128,6 +149,7 @@ class MotionProtocol(Protocol):
 
     def check(self, options: Mapping[str, Any]) -> None:
         check(options)
+        find_metrics(options.get("metrics", ()), MEASURES)
 
     def check_method(self, method: MotionEstimator, options: Mapping[str, Any]) -> None:
         method.find_model(model_of(options))
@@ -138,8 +160,8 @@ class MotionProtocol(Protocol):
     def score(
         self,
         recording: Recording,
-        method: MotionEstimator,
-        params: Parameters,
+        method: MotionEstimator | Function,
+        params: Parameters | None,
         options: Mapping[str, Any],
         progress: bool | None = None,
     ) -> dict[str, Any]:
@@ -148,23 +170,7 @@ class MotionProtocol(Protocol):
         if not len(recording.events):
             raise InputError(f"{recording.name}: holds no events; choose another recording")
         truth = true_motion(recording, options)
-        settings: dict[str, Any] = {}
-        if options.get("smooth", False) and "smooth" in method.options:
-            settings["smooth"] = True
-        if options.get("gyro", False) and "gyro" in method.options:
-            if recording.imu is None:
-                raise InputError(f"{recording.name}: holds no IMU; leave out gyro = true")
-            settings["gyro"] = from_gyro(recording.imu, bias, _rotation(options))
-        clock = time.perf_counter()
-        motion = method.estimate(
-            recording,
-            params,
-            model=model,
-            seed=options.get("seed", 0),
-            progress=progress,
-            **settings,
-        )
-        seconds = time.perf_counter() - clock
+        metrics = find_metrics(options.get("metrics", ()), MEASURES)
         first, last = int(recording.events[:1].t[0]), int(recording.events[-1:].t[0])
         begin = first + round(options.get("settle", 0.0) * 1e6)
         times = np.arange(begin, last + 1, round(1e6 / RATE))
@@ -174,6 +180,19 @@ class MotionProtocol(Protocol):
                 f"{recording.name}: its events and the true motion are not of one time; times are "
                 "seconds on the recording's clock"
             )
+        clock = time.perf_counter()
+        if isinstance(method, Function):
+            motion = _of_function(recording, method, times, model)
+        else:
+            motion = method.estimate(
+                recording,
+                params,
+                model=model,
+                seed=options.get("seed", 0),
+                progress=progress,
+                **_settings(recording, method, options, bias),
+            )
+        seconds = time.perf_counter() - clock
         centred = options.get("centred", False)
         found = compare(motion, truth, times, start=first, centred=centred)
         mean, _, valid = motion(times, centred=centred)
@@ -188,6 +207,8 @@ class MotionProtocol(Protocol):
         return {
             "model": options.get("model", "planar"),
             **{k: float(v) if np.isfinite(v) else None for k, v in found.figures.items()},
+            **_own(metrics, mean[valid], truth(times)[valid], recording.name),
+            **own_names(metrics),
             "lost": found.lost,
             "startup": found.startup,
             "times": len(times),
@@ -198,3 +219,48 @@ class MotionProtocol(Protocol):
                 **{name: listed(values) for name, values in each.items()},
             },
         }
+
+
+def _settings(
+    recording: Recording,
+    method: MotionEstimator,
+    options: Mapping[str, Any],
+    bias: NDArray[np.float64],
+) -> dict[str, Any]:
+    """Return those of the protocol's settings that the method's `estimate` takes."""
+    settings: dict[str, Any] = {}
+    if options.get("smooth", False) and "smooth" in method.options:
+        settings["smooth"] = True
+    if options.get("gyro", False) and "gyro" in method.options:
+        if recording.imu is None:
+            raise InputError(f"{recording.name}: holds no IMU; leave out gyro = true")
+        settings["gyro"] = from_gyro(recording.imu, bias, _rotation(options))
+    return settings
+
+
+class SampledMotion(Motion):
+    """A motion that is known at the times of its estimates alone: nothing is interpolated."""
+
+    def __call__(
+        self, times: Times, *, centred: bool = False, extrapolate: bool = False
+    ) -> Estimate:
+        rows = np.searchsorted(self.t, np.asarray(times))
+        return Estimate(self.mean[rows], self.covariance[rows], self.valid[rows])
+
+
+def _of_function(
+    recording: Recording, method: Function, times: NDArray[np.int64], model: type[Model]
+) -> Motion:
+    """The motion that a function estimates at `times` (us); lost where it is NaN."""
+    d = len(model.components)
+    mean, covariance, _ = method.estimate(recording, times, [(d,)])
+    if covariance is None or covariance.shape != (len(times), d, d):
+        covariance = np.full((len(times), d, d), np.nan)
+    return SampledMotion.of(model, times, mean, covariance, np.isfinite(mean).all(1))
+
+
+def _own(
+    metrics: Sequence[Metric], mean: NDArray, truth: NDArray, recording: str
+) -> dict[str, float | None]:
+    """The metrics of the user's own; None where no motion was found."""
+    return {one.name: one(mean, truth, recording) if len(mean) else None for one in metrics}

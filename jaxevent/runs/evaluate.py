@@ -5,7 +5,8 @@
     protocol = "held-out"                           # or "reference", "motion" or "tracks"
     size = [240, 180]                               # only for recordings that do not tell it
     stream = "left"                                 # only for files of several cameras
-    metrics = ["authors_ssim"]                      # of images; further ones, named in MEASURES
+    metrics = ["authors_ssim"]                      # further ones: of images those in MEASURES; of
+                                                    # your own: "package.module:function"
     optional_metrics = ["lpips"]                    # of them those whose extra is installed
     gap = 4                                         # with "held-out": every 4th frame is given,
                                                     # the others are hidden; omitted: 2
@@ -14,7 +15,8 @@
 
     [[method]]
     name = "akf"                                    # a key of jaxevent.METHODS, or of your own:
-                                                    # "package.module:object"
+                                                    # "package.module:object", an Estimator or
+                                                    # a function: see jaxevent.runs.own
     params = { c_on = 0.08, clock_offset = 0.0075 } # or the path of a TOML file; omitted: defaults
                                                     # { file = "PATH", c_on = 0.08 }: both
     label = "akf, by hand"                          # in the table; omitted: the name
@@ -48,8 +50,9 @@ the measures of whole images such pixels count as right; regions and mean errors
 Each recording with each method is a task (`jaxevent.runs.tasks`). With a folder for the results,
 what is finished stays in its folder tasks, under a key made of the content of the recording,
 method, parameters, protocol and metrics: an evaluation that was stopped, or to which recordings or
-methods were added, computes only what is missing. Remove the folder tasks to compute everything
-again.
+methods were added, computes only what is missing. The key of a method or a metric of your own holds
+the content of its module's file; one that was made in a notebook has none and is computed each
+time. Remove the folder tasks to compute everything again.
 """
 
 import contextlib
@@ -59,7 +62,7 @@ import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, overload
 
 import jax.numpy as jnp
 
@@ -67,24 +70,40 @@ import jaxevent
 from jaxevent.devices import double_precision
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
+from jaxevent.io import toml
 from jaxevent.io.companions import companions
 from jaxevent.io.output import values_of
-from jaxevent.methods import find
 from jaxevent.parameters import Parameters, read_toml
+from jaxevent.recording import Recording
+from jaxevent.runs.calls import (
+    CALLED,
+    Forms,
+    PathLike,
+    described,
+    method_name,
+    methods_of,
+    metrics_of,
+    point,
+    recordings_of,
+    settings_of,
+)
 from jaxevent.runs.config import (
     NAME,
     SIZE,
     STREAM,
     Check,
+    Tables,
     check,
     find_recordings,
+    known_as,
     named_files,
     read_params,
 )
-from jaxevent.runs.contents import Contents, Opened
-from jaxevent.runs.families import find_protocol
+from jaxevent.runs.contents import Contents, Opened, digest
+from jaxevent.runs.families import family_of, find_protocol
 from jaxevent.runs.family import Protocol, Source
-from jaxevent.runs.results import check_folder, results, write_rows
+from jaxevent.runs.own import Function, Metric, code_of, find_method, import_path
+from jaxevent.runs.results import Evaluation, check_folder, results, write_rows
 from jaxevent.runs.tasks import Outcome, Place, Task, run
 from jaxevent.show.report import write_parquet
 
@@ -96,74 +115,206 @@ FILES = ("report.html", "results.json", "results.md", "results.parquet", "config
 _opened = Opened()
 
 
+@overload
 def evaluate(
-    config: str | Path,
-    out: str | Path | None = None,
+    config: PathLike,
+    out: PathLike | None = None,
     progress: bool | None = None,
     *,
+    metrics: Any = (),
     workers: int | None = None,
-    cluster: str | None = None,
-    scheduler_file: str | Path | None = None,
+    cluster: Any = None,
+    scheduler_file: PathLike | None = None,
     retries: int = 2,
     replace: bool = True,
-    metrics: Sequence[str] = (),
-) -> list[dict[str, Any]]:
-    """Run an evaluation that a TOML file describes: a row per recording and method, as of `score`.
+) -> Evaluation: ...
 
-    The file's layout is in the text of this module. In a row, `recording` is the path as the file
-    gives it and `method` is the label. Where a method cannot be run on a recording, the row has
-    only those, `params` and `error`, a sentence; and `skipped`, true, if only an extra of jaxevent
-    is missing. Rows do not depend on where they are computed, but
-    for `seconds`.
+
+@overload
+def evaluate(
+    recordings: Any,
+    methods: Any,
+    *,
+    metrics: Any = (),
+    protocol: str | None = None,
+    out: PathLike | None = None,
+    progress: bool | None = None,
+    workers: int | None = None,
+    cluster: Any = None,
+    scheduler_file: PathLike | None = None,
+    retries: int = 2,
+    replace: bool = True,
+    **settings: Any,
+) -> Evaluation: ...
+
+
+def evaluate(*arguments: Any, **settings: Any) -> Evaluation:
+    """Compare methods with what is known of recordings: a row per recording and method.
+
+        evaluate("config.toml", out)
+        evaluate([recording, "file.h5"], ["akf", (aks, aks.Params(c_on=0.2))], metrics=["lpips"])
+
+    The first form runs what a TOML file describes; its layout is in the text of this module. The
+    second takes the same as Python objects.
+
+    A row has the numbers that `score` describes. In it, `recording` is the path as it was given, or
+    a `Recording`'s name, and `method` is the label. Where a method cannot be run on a recording,
+    the row has only those, `params` and `error`, a sentence; and `skipped`, true, if only an extra
+    of jaxevent is missing. Rows do not depend on where they are computed, but for `seconds`.
 
     Args:
         config: The TOML file.
+        recordings: A `Recording` or a path, a list of them, what `jaxevent.datasets.open` gives, or
+            a mapping from names. Of recordings with the same name the second is called "name (2)".
+        methods: A method, a list of methods, or a mapping from labels. A method is a name, an
+            `Estimator`, a function `method(recording, times)` (see `jaxevent.runs.own`), a pair
+            (method, params), or a mapping with the keys of a [[method]].
+        metrics: Further metrics, besides those of the file: names, functions
+            `metric(estimate, truth)` of one's own, pairs (name, function), or a mapping from names.
+        protocol: What methods are given and compared with; omitted, the first of the methods'
+            family: "held-out", "tracks" or "motion".
         out: A folder for results.json ({"rows": [...]}), results.md (the table), report.html (one
             page that opens anywhere), results.parquet (a line per row; only where the extra
-            "parquet" is installed), config.toml (the file as it was run) and tasks (finished rows,
-            which are not computed again); made if missing. Existing results are replaced at the
-            end.
+            "parquet" is installed), config.toml (the file as it was run, or the call) and tasks
+            (finished rows, which are not computed again); made if missing. Existing results are
+            replaced at the end.
         progress: Whether bars are shown; None: where somebody looks on.
         workers: Compute in so many processes instead of this one.
-        cluster: Compute on the Dask cluster whose scheduler has this address. Its workers need the
-            same version of jaxevent, and to find recordings by the same paths; those with one
-            thread each serve best.
+        cluster: Compute on a Dask cluster: the address of its scheduler, a `distributed.Client`, or
+            a cluster object as `distributed.LocalCluster`. Its workers need the same version of
+            jaxevent, and to find recordings by the same paths; those with one thread each serve
+            best.
         scheduler_file: The same, of the scheduler that wrote this file.
         retries: How often a task is tried again whose process dies or that fails for another reason
             than bad input.
         replace: Whether files in `out` may be replaced that are not of an evaluation.
-        metrics: Further metrics besides those of the file, which config.toml then tells too.
+        **settings: The other settings of a configuration, as `gap=4` or `positions="*.csv"`.
+            `positions` and `truth` also take a DataFrame, or a mapping from recordings' names to
+            them.
+
+    Returns:
+        The rows, as a list that shows itself as a table; see `Evaluation`.
 
     Raises:
-        InputError: The file or a parameter cannot be used, `out` not be written or only over other
-            files, the cluster not be reached; or not a single row could be computed.
+        InputError: The file, an argument or a parameter cannot be used, `out` not be written or
+            only over other files, the cluster not be reached; or no row could be computed.
     """
-    plan = read_plan(Path(config), metrics)
+    if FORMS.is_config(arguments, settings):
+        return _evaluate_file(*arguments, **settings)
+    return _evaluate_objects(*arguments, **settings)
+
+
+FORMS = Forms(
+    'jaxevent.evaluate(recording, ["akf"])',
+    ("config", "out", "progress", "metrics", "workers", "cluster", "scheduler_file", "retries",
+     "replace"),
+    ("recordings", "methods", "protocol"),
+)  # fmt: skip
+
+
+def _evaluate_file(
+    config: PathLike,
+    out: PathLike | None = None,
+    progress: bool | None = None,
+    *,
+    metrics: Any = (),
+    **where: Any,
+) -> Evaluation:
+    path, further = Path(config), metrics_of(metrics)
+    plan = read_plan(path, further)
+    text = path.read_bytes()
+    if further:
+        names = ", ".join(described(further))
+        text = f"# With the further metrics {names}.\n".encode() + text
+    return _evaluate(plan, Origin(path.name, text, plan.inputs(path)), out, progress, **where)
+
+
+def _evaluate_objects(
+    recordings: Any = None,
+    methods: Any = None,
+    *,
+    metrics: Any = (),
+    protocol: str | None = None,
+    out: PathLike | None = None,
+    progress: bool | None = None,
+    workers: int | None = None,
+    cluster: Any = None,
+    scheduler_file: PathLike | None = None,
+    retries: int = 2,
+    replace: bool = True,
+    **settings: Any,
+) -> Evaluation:
+    if methods is None:
+        raise InputError(f"no method is given; give a recording and methods, as {FORMS.example}")
+    table = settings_of({**settings, "protocol": protocol})
+    for name in ("positions", "truth"):
+        if name in table:
+            table[name] = Tables.of(settings[name])
+    table |= {"recordings": recordings_of(recordings), "method": methods_of(methods)}
+    further = metrics_of(metrics)
+    if further:
+        table["metrics"] = further
+    plan = plan_of(table, Path())
+    text = CALLED + toml.dump(described(table))
+    return _evaluate(
+        plan,
+        Origin("evaluation", text.encode(), plan.inputs()),
+        out,
+        progress,
+        workers=workers,
+        cluster=cluster,
+        scheduler_file=scheduler_file,
+        retries=retries,
+        replace=replace,
+    )
+
+
+class Origin(NamedTuple):
+    """Title and text of a configuration or a call, and the files that it reads."""
+
+    title: str
+    text: bytes
+    files: list[Path]
+
+
+def _evaluate(
+    plan: "Plan",
+    source: Origin,
+    out: PathLike | None,
+    progress: bool | None,
+    *,
+    workers: int | None = None,
+    cluster: Any = None,
+    scheduler_file: PathLike | None = None,
+    retries: int = 2,
+    replace: bool = True,
+) -> Evaluation:
+    """Compute the rows of a plan; see `evaluate`."""
     if out is not None:
         own = (Path(out) / "tasks").is_dir()
-        check_folder(Path(out), FILES, plan.inputs(Path(config)), replace=replace, own=own)
+        check_folder(Path(out), FILES, source.files, replace=replace, own=own)
     place = Place(workers, cluster, None if scheduler_file is None else Path(scheduler_file))
     with contextlib.ExitStack() as stack:
-        text = Path(config).read_bytes()
-        if metrics:
-            text = f"# With the further metrics {', '.join(metrics)}.\n".encode() + text
         write = None if out is None else stack.enter_context(results(Path(out)))
         folder = None if out is None else Path(out) / "tasks"
         stack.callback(_opened.clear)
         tasks = _tasks(plan, folder, progress, place == Place())
+        if place.workers is not None:
+            for task in tasks:
+                task.check_sendable()
         outcomes = run(_compute, tasks, folder, place, retries=retries, progress=progress)
         rows = _rows(plan, outcomes)
         if write is not None and out is not None:
             from jaxevent.show.page import page
 
-            write("config.toml", text)
+            write("config.toml", source.text)
             write_rows(rows, write)
             pictures = [(o.result or {}).get("picture") for o in outcomes]
             hosts = sorted({o.host for o in outcomes if o.host})
-            html = page(rows, pictures, plan.name, text.decode(), hosts, Path(config).name)
+            html = page(rows, pictures, plan.name, source.text.decode(), hosts, source.title)
             write("report.html", html.encode())
             write_parquet(Path(out) / "results.parquet", rows)
-    return rows
+    return Evaluation(rows)
 
 
 def _rows(plan: "Plan", outcomes: list[Outcome]) -> list[dict[str, Any]]:
@@ -192,10 +343,9 @@ def _tasks(plan: "Plan", folder: Path | None, progress: bool | None, here: bool)
     contents = None if folder is None else Contents(folder / "contents", progress)
     double = jnp.result_type(float) == jnp.float64
     tasks: list[Task] = []
-    for (given, path), entry in itertools.product(plan.recordings, plan.methods):
-        path = path.absolute()
+    for (given, recording), entry in itertools.product(plan.recordings, plan.methods):
         about = {
-            "method": entry.name,
+            "method": entry.sent,
             "params": entry.settings(),
             "protocol": plan.name,
             "options": {**plan.options, **entry.own},
@@ -208,24 +358,59 @@ def _tasks(plan: "Plan", folder: Path | None, progress: bool | None, here: bool)
         if contents is not None:
             # What cannot be read has no key; computing it says why.
             with contextlib.suppress(OSError, InputError):
-                whole = {**about, "content": contents.of(path)}
-                files = [*companions(path), *plan.protocol.files(path, plan.options)]
-                if isinstance(entry.method, Source):
-                    files = [*files, *entry.method.files(_name(path))]
-                    whole["params"] = entry.method.values()
-                whole["files"] = [contents.of(file) for file in files]
-                text = json.dumps(whole, sort_keys=True)
-                key = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
-        arguments = {"path": str(path), **about, "progress": progress if here else False}
+                key = _key(plan, contents, (given, recording), entry, about)
+        if isinstance(recording, Recording):
+            sent: Any = dataclasses.replace(recording, name=given)
+        else:
+            sent = str(recording.absolute())
+        arguments = {"recording": sent, **about, "progress": progress if here else False}
         tasks.append(Task(f"{given}, {entry.label}", arguments, key))
     if contents is not None:
         contents.save()
     return tasks
 
 
+def _key(
+    plan: "Plan",
+    contents: Contents,
+    recording: "tuple[str, Path | Recording]",
+    entry: "Entry",
+    about: Mapping[str, Any],
+) -> str | None:
+    """The key of all that a row depends on.
+
+    None where a method or a metric is an object that no module holds: what it computes may change.
+    """
+    objects = [entry.sent, *plan.options.get("metrics", ())]
+    named = [one for one in objects if isinstance(one, str)]
+    if len(named) < len(objects):
+        return None
+    code = [code_of(one) for one in named if ":" in one]
+    if None in code:
+        return None
+    whole = {**about, **({"code": code} if code else {})}
+    given, what = recording
+    if isinstance(what, Recording):
+        path = Path(given)
+        whole["content"] = contents.of_object(what)
+        files = plan.protocol.files(path, plan.options)
+    else:
+        path = what.absolute()
+        whole["content"] = contents.of(path)
+        files = [*companions(path), *plan.protocol.files(path, plan.options)]
+    if isinstance(entry.method, Source):
+        files = [*files, *entry.method.files(known_as(path))]
+        whole["params"] = entry.method.values()
+        # Images of other programs are found by the recording's name.
+        whole |= {"name": given} if isinstance(what, Recording) else {}
+    whole["files"] = [contents.of(file) for file in files]
+    text = json.dumps(whole, sort_keys=True, default=digest)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
 def _compute(
-    path: str,
-    method: str,
+    recording: str | Recording,
+    method: str | Estimator | Function,
     params: dict[str, Any],
     protocol: str,
     options: dict[str, Any],
@@ -238,43 +423,42 @@ def _compute(
     """The task: {"row", "picture"} of a recording and a method, on whichever machine."""
     from jaxevent.show.page import picture
 
+    path = recording if isinstance(recording, str) else recording.name
     mine = f"{jaxevent.__version__}, results {RESULTS_VERSION}"
     if version != mine:
         raise InputError(
             f"{path}: this worker has jaxevent {mine}, not {version}; install the same everywhere"
         )
     kind, family = find_protocol(protocol)
-    if method in kind.sources:
+    source: Any = None
+    if isinstance(method, str) and method in kind.sources:
         source = kind.sources[method](**params)
-        known = source.row(_name(Path(path)))
+        known = source.row(known_as(Path(path)))
         if known is not None:
             row = {"method": method, **known, "params": source.values()}
             return {"row": row, "picture": None}
     with double_precision(double):
-        recording = _opened.load(Path(path), size, stream, progress)
-        if method in kind.sources:
-            source, values = kind.sources[method](**params), None
+        if isinstance(recording, str):
+            recording = _opened.load(Path(recording), size, stream, progress)
+        values, told = None, {}
+        if source is not None:
             told = source.values()
         else:
-            source = find(method, family)
-            values = source.Params.of(params)
-            told = values_of(values)
+            source = find_method(method, family)
+            if isinstance(source, Estimator):
+                values = source.Params.of(params)
+                told = values_of(values)
         row = kind.score(recording, source, values, options, progress)
         sample = row.pop("sample", None)
-    row = {"recording": recording.name, "method": method, **row, "params": told}
+    row = {"recording": recording.name, "method": source.name, **row, "params": told}
     return {"row": row, "picture": None if sample is None else picture(sample)}
-
-
-def _name(path: Path) -> str:
-    """How other programs' results call a recording: its name without suffix."""
-    return path.name if path.is_dir() else path.stem
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
     """A checked configuration: recordings (as given, path), methods and how they are scored."""
 
-    recordings: list[tuple[str, Path]]
+    recordings: list[tuple[str, Path | Recording]]
     methods: list["Entry"]
     name: str
     protocol: Protocol
@@ -282,17 +466,20 @@ class Plan:
     size: tuple[int, int] | None
     stream: str | None
 
-    def inputs(self, config: Path) -> list[Path]:
+    def inputs(self, config: Path | None = None) -> list[Path]:
         """All files that are read, and can be."""
-        found = [config, *named_files(config)]
-        for _, path in self.recordings:
-            found.append(path)
+        found = [] if config is None else [config, *named_files(config)]
+        for name, path in self.recordings:
+            if isinstance(path, Recording):
+                path = Path(name)
+            else:
+                found.append(path)
             with contextlib.suppress(OSError, InputError):
                 found += self.protocol.files(path, self.options)
             for entry in self.methods:
                 if isinstance(entry.method, Source):
                     with contextlib.suppress(OSError, InputError):
-                        found += entry.method.files(_name(path))
+                        found += entry.method.files(known_as(path))
         return found
 
 
@@ -301,50 +488,67 @@ class Entry:
     """A method of a configuration with one set of parameters; a `Source` has none."""
 
     label: str
-    name: str  # as the registry, or the protocol's sources, find it
-    method: Estimator | Source
+    sent: str | Estimator | Function  # what any process finds the method by, else the method
+    method: Estimator | Function | Source
     params: Parameters | None
     own: dict[str, Any]  # settings of the protocol that this method has for itself
 
     def settings(self) -> dict[str, Any]:
         """What `_compute` makes it from again."""
-        return dict(vars(self.method)) if self.params is None else self.params.values()
+        if isinstance(self.method, Source):
+            return dict(vars(self.method))
+        return {} if self.params is None else self.params.values()
 
     def shown(self) -> dict[str, Any]:
         """The parameters as a row shows them."""
         if isinstance(self.method, Source):
             return self.method.values()
-        assert self.params is not None
-        return values_of(self.params)
+        return {} if self.params is None else values_of(self.params)
 
 
-def read_plan(config: Path, metrics: Sequence[str] = ()) -> Plan:
+def read_plan(config: Path, metrics: Sequence[str | Metric] = ()) -> Plan:
     """Read and check a configuration; raises `InputError` naming the file and the setting.
 
     `metrics` are added to those that it names.
     """
     table = read_toml(config)
     try:
-        name = table.get("protocol", "held-out")
-        protocol, family = find_protocol(name)
-        anything: Check = (lambda value: True, "")
-        known = {"recordings": anything, "protocol": NAME, "size": SIZE, "stream": STREAM}
-        check(table, {**known, "method": anything, **protocol.settings})
-        options = {key: table[key] for key in protocol.settings if key in table}
-        if metrics:
-            if "metrics" not in protocol.settings:
-                raise InputError(f"the protocol {name!r} has no further metrics; omit --metrics")
-            options["metrics"] = list(dict.fromkeys([*options.get("metrics", ()), *metrics]))
-        protocol.check(options)
-        options = protocol.available(options)
-        size = table.get("size")
-        recordings = find_recordings(table.get("recordings"), config.parent)
-        methods = _methods(table.get("method"), config.parent, protocol, family, options)
-        size = None if size is None else (size[0], size[1])
-        stream = table.get("stream")
-        return Plan(recordings, methods, name, protocol, options, size, stream)
+        return plan_of(table, config.parent, metrics)
     except InputError as error:
         raise InputError(f"{config}: {error}") from None
+
+
+def plan_of(table: Mapping[str, Any], folder: Path, metrics: Sequence[str | Metric] = ()) -> Plan:
+    """Check the table of a configuration, in which paths are relative to `folder`.
+
+    `metrics` are added to those that it names. Raises `InputError` naming the setting.
+    """
+    name = table.get("protocol") or _usual_protocol(table)
+    protocol, family = find_protocol(name)
+    anything: Check = (lambda value: True, "")
+    known = {"recordings": anything, "protocol": NAME, "size": SIZE, "stream": STREAM}
+    check(table, {**known, "method": anything, **protocol.settings})
+    options = {key: table[key] for key in protocol.settings if key in table}
+    if metrics:
+        options["metrics"] = list(dict.fromkeys([*options.get("metrics", ()), *metrics]))
+    protocol.check(options)
+    options = protocol.available(options)
+    size = table.get("size")
+    recordings = find_recordings(table.get("recordings"), folder)
+    methods = _methods(table.get("method"), folder, protocol, family, options)
+    size = None if size is None else (size[0], size[1])
+    return Plan(recordings, methods, name, protocol, options, size, table.get("stream"))
+
+
+def _usual_protocol(table: Mapping[str, Any]) -> str:
+    """The first protocol of the family of the first method that is an estimator."""
+    given = table.get("method")
+    for one in given if isinstance(given, list) else ():
+        with contextlib.suppress(InputError):
+            method = find_method(one["name"]) if isinstance(one, dict) and "name" in one else None
+            if isinstance(method, Estimator):
+                return next(iter(family_of(method).protocols))
+    return "held-out"
 
 
 def _methods(
@@ -375,18 +579,30 @@ def _entries(
     rest = dict(table)
     name = rest.pop("name", None)
     label = rest.pop("label", name)
-    if not isinstance(name, str) or not isinstance(label, str):
+    if label is name and not isinstance(name, str) and name is not None:
+        label = method_name(name)
+    if name is None or not isinstance(label, str):
         raise InputError('name and label must be text; give name = "akf"')
     own = {key: rest.pop(key) for key in protocol.own if key in rest}
     check(own, protocol.own)
     ending = protocol.label({**options, **own})
-    if name in protocol.sources:
+    if isinstance(name, str) and name in protocol.sources:
         source = protocol.sources[name].of(rest, folder.absolute())
         yield Entry(label + ending, name, source, None, own)
         return
     anything: Check = (lambda value: True, "")
     check(rest, {**dict.fromkeys(("name", "params", "label", "grid"), anything), **protocol.own})
-    method = find(name, family)
+    method = find_method(name, family)
+    sent = name if isinstance(name, str) else import_path(method) or method
+    if isinstance(method, Function):
+        for setting in ("params", "grid"):
+            if rest.get(setting):
+                raise InputError(
+                    f"{method.name!r} is a function and has no {setting}; omit it, or make an "
+                    "Estimator"
+                )
+        yield Entry(label + ending, sent, method, None, own)
+        return
     protocol.check_method(method, options)
     params = read_params(method.Params, method.name, rest.get("params", {}), folder)
     grid = rest.get("grid", {})
@@ -394,13 +610,8 @@ def _entries(
         raise InputError(f"grid is {grid!r}; give a table of lists, as {{ c_on = [0.05, 0.1] }}")
     if "preset" in grid:
         raise InputError("a preset cannot be in a grid; add a [[method]] for each preset")
-    for values in itertools.product(*grid.values()):
-        point = dict(zip(grid, values, strict=True))
-        said = "".join(
-            f", {key} {value:g}"
-            if isinstance(value, int | float) and not isinstance(value, bool)
-            else f", {key} {value}"
-            for key, value in point.items()
-        )
-        chosen = method.Params.of({**params.values(), **point}) if point else params
-        yield Entry(f"{label}{said}{ending}", name, method, chosen, own)
+    for combination in itertools.product(*grid.values()):
+        values = dict(zip(grid, combination, strict=True))
+        said = "".join(f", {point(key, value)}" for key, value in values.items())
+        chosen = method.Params.of({**params.values(), **values}) if values else params
+        yield Entry(f"{label}{said}{ending}", sent, method, chosen, own)

@@ -45,11 +45,12 @@ import contextlib
 import csv
 import dataclasses
 import io
+import json
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import jax
 
@@ -59,11 +60,22 @@ from jaxevent.io import load, toml
 from jaxevent.progress import stage
 from jaxevent.recording import Recording
 from jaxevent.runs import findings
+from jaxevent.runs.calls import (
+    CALLED,
+    Forms,
+    PathLike,
+    described,
+    recordings_of,
+    settings_of,
+)
 from jaxevent.runs.checkpoint import finished_rows, restore, save
+from jaxevent.runs.config import Tables
+from jaxevent.runs.contents import digest
 from jaxevent.runs.family import Sources
-from jaxevent.runs.fit_config import Plan, Task, read_plan
-from jaxevent.runs.results import alone, check_folder, results, write_rows
+from jaxevent.runs.fit_config import Plan, Task, plan_of, read_plan
+from jaxevent.runs.results import Fits, alone, check_folder, results, write_rows
 from jaxevent.show import plot_losses
+from jaxevent.shown import a_kind
 from jaxevent.splits import SPLITS
 from jaxevent.tuning import Fitted, Run, optimise
 
@@ -76,15 +88,44 @@ DIVERGED = (
 PERIOD = 2.0  # s between checkpoints
 
 
+@overload
 def fit(
-    config: str | Path,
-    out: str | Path,
-    recordings: Sequence[str | Path] | None = None,
+    config: PathLike,
+    out: PathLike,
+    recordings: Sequence[Any] | None = None,
     resume: bool = False,
     progress: bool | None = None,
     replace: bool = True,
-) -> list[dict[str, Any]]:
-    """Run a fit that a TOML file describes; its layout is in the text of this module.
+) -> Fits: ...
+
+
+@overload
+def fit(
+    recordings: Any,
+    method: Any,
+    *,
+    fit: Sequence[str] = (),
+    search: Mapping[str, Sequence[float | int]] | None = None,
+    params: Any = None,
+    validation: Any = None,
+    test: Any = None,
+    out: PathLike | None = None,
+    resume: bool = False,
+    progress: bool | None = None,
+    replace: bool = True,
+    **settings: Any,
+) -> Fits: ...
+
+
+def fit(*arguments: Any, **settings: Any) -> Fits:
+    """Fit parameters of methods to recordings.
+
+        fit("config.toml", "fitted")
+        fitted = fit(recording, akf, fit=["c_on", "c_off"])
+        fitted.params.c_on
+
+    The first form runs what a TOML file describes; its layout is in the text of this module. The
+    second fits one method and takes the same as Python objects.
 
     Writes the folder `out`, made if missing: params.toml (a table of physical values for each
     method), results.json ({"rows": [...], "found": [...], "gains": [...]}), results.md, loss.csv,
@@ -97,57 +138,154 @@ def fit(
 
     Args:
         config: The TOML file.
-        out: The folder; earlier results in it are replaced at the end.
-        recordings: To be fitted to instead of those in the file, relative to the working directory.
+        recordings: To be fitted to: a `Recording` or a path, a list of them, or a mapping from
+            names. With a file, a list in place of the file's.
+        method: A name, an `Estimator`, or "package.module:object".
+        fit: Names of parameters to fit by gradient.
+        search: Names of parameters to search, each with (from, to, number of points).
+        params: To start from: the method's `Params`, a mapping, or the path of a TOML file.
+        validation: Recordings for early stopping; omitted, a share of the images or windows.
+        test: Recordings that are only scored; omitted, likewise.
+        out: The folder; earlier results in it are replaced at the end. Omitted, of objects, nothing
+            is written.
         resume: Go on from the checkpoint in `out`. Where the run had not got to the first one, it
             starts; where it had ended, its rows are returned.
         progress: Whether bars are shown; None: where somebody looks on.
         replace: Whether files in `out` may be replaced that are not of the fit that goes on.
+        **settings: The other settings of a configuration, as `iterations=100` or `window=0.5`.
+            `positions` and `truth` also take a DataFrame, or a mapping from recordings' names to
+            them.
 
     Returns:
-        Rows as `evaluate.score` gives them, of the recordings and images of each split: `split` is
-        "fit", "validation" or "test", `method` the label, with ", before" for the start values.
-        Where the steps led away, so that the best that was seen counts, `warning` says so.
-        Those of the tracker are described in `jaxevent.runs.blob`.
+        Rows as `evaluate.score` gives them, of the recordings and images of each split, with the
+        fitted `params`: see `Fits`. `split` is "fit", "validation" or "test", `method` the label,
+        with ", before" for the start values. Where the steps led away, so that the best that was
+        seen counts, `warning` says so. Those of the tracker are described in `jaxevent.runs.blob`.
 
     Raises:
         InputError: The file, a recording or a parameter cannot be used, `out` cannot be written,
             holds another run's checkpoint or is written by another process.
     """
-    out = Path(out)
+    if FORMS.is_config(arguments, settings):
+        return _fit_file(*arguments, **settings)
+    return _fit_objects(*arguments, **settings)
+
+
+FORMS = Forms(
+    'jaxevent.fit(recording, akf, fit=["c_on"])',
+    ("config", "out", "recordings", "resume", "progress", "replace"),
+    ("method", "fit", "search", "params"),
+)
+
+
+def _fit_file(
+    config: PathLike,
+    out: PathLike | None = None,
+    recordings: Sequence[Any] | None = None,
+    resume: bool = False,
+    progress: bool | None = None,
+    replace: bool = True,
+) -> Fits:
+    if out is None:
+        raise InputError(f"{config}: out is missing; give the folder of the results")
     plan = devices.in_step(lambda: read_plan(Path(config), recordings))
+    return _fit(plan, Path(out), resume, progress, replace)
+
+
+def _fit_objects(
+    recordings: Any = None,
+    method: Any = None,
+    *,
+    out: PathLike | None = None,
+    resume: bool = False,
+    progress: bool | None = None,
+    replace: bool = True,
+    **settings: Any,
+) -> Fits:
+    if method is None:
+        raise InputError(f"no method is given; give a recording and one, as {FORMS.example}")
+    if isinstance(method, list | dict | type):
+        raise InputError(
+            f"the method is {a_kind(method)}; give one Estimator, or its name, and fit others apart"
+        )
+    given = settings_of(settings)
+    for name in ("positions", "truth"):
+        if name in given:
+            given[name] = Tables.of(settings[name])
+    entry = {"name": method, **{k: given.pop(k) for k in ENTRY if k in given}}
+    table = {"recordings": recordings_of(recordings), **given, "method": [entry]}
+    for split in ("validation", "test"):
+        if split in table:
+            table[split] = recordings_of(settings[split])
+    if resume and out is None:
+        raise InputError("resume goes on from the checkpoint in out; give out")
+    text = CALLED + toml.dump(described(table))
+    plan = devices.in_step(lambda: plan_of(table, Path(), None, text.encode()))
+    if out is None:
+        return _fit(plan, None, resume, progress, replace)
+    # By these lines `resume` knows the recordings of a run that had ended.
+    lines = [
+        f"# {toml.text(name)} holds {digest(recording)}\n"
+        for split in SPLITS
+        for name, recording in plan.recordings[split]
+        if isinstance(recording, Recording)
+    ]
+    plan = dataclasses.replace(plan, text="".join(lines).encode() + plan.text)
+    return _fit(plan, Path(out), resume, progress, replace)
+
+
+ENTRY = ("fit", "search", "params", "label", "prior")  # settings of a method, not of the file
+
+
+def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, replace: bool) -> Fits:
+    """Fit the methods of a plan; see `fit`."""
     progress = progress if devices.first() else False
     with contextlib.ExitStack() as held:
-        rows = devices.by_first(lambda: _ended_before(out, plan, resume, replace, held))
-        if rows is not None:
-            return rows
-        sources, digest = devices.in_step(lambda: (_sources(plan, progress), plan.digest()))
-        if len(set(devices.gathered(digest))) > 1:
+        if out is not None:
+            rows = devices.by_first(lambda: _ended_before(out, plan, resume, replace, held))
+            if rows is not None:
+                return _finished(rows, out, plan)
+        sources = devices.in_step(lambda: _sources(plan, progress))
+        key = ""
+        if out is not None or jax.process_count() > 1:
+            key = devices.in_step(plan.digest)
+        if len(set(devices.gathered(key))) > 1:
             raise InputError(
-                f"{config}: the processes see different configurations or recordings; give all the "
-                "same"
+                f"{plan.where()}the processes see different configurations or recordings; give all "
+                "the same"
             )
-        done, found, write = _fit_tasks(plan, sources, digest, out, progress, held)
+        done, found, write = _fit_tasks(plan, sources, key, out, progress, held)
         rows = _score(plan, done, sources, progress)
-        if not devices.first():
-            return rows
+        params = {t.label: one.params for t, one in zip(plan.tasks, done, strict=True)}
         gained = findings.gains(plan.tasks, unseen(rows))
+        fits = Fits(rows, params, found, gained, _text(plan.tasks, rows, found, gained))
+        if out is None or not devices.first():
+            return fits
         write("config.toml", plan.text)
         write("loss.csv", _losses(plan.tasks, done).encode())
         try:
             write("loss.png", _curves(plan.tasks, done))
         except MissingExtra:
             (out / "loss.png").unlink(missing_ok=True)  # that of a run before
-        write_rows(
-            rows,
-            write,
-            lambda rows: _results(plan.tasks, unseen(rows)) + findings.text(found, gained),
-            found=found,
-            gains=gained,
-        )
+        write_rows(rows, write, lambda _: fits.table(), found=found, gains=gained)
         write("params.toml", _tables(plan.tasks, done).encode())
         (out / CHECKPOINT).unlink()
-    return rows
+    return fits
+
+
+def _text(tasks: Sequence[Task], rows: Any, found: Any, gained: Any) -> str:
+    """results.md: the scores that no fit saw, what was found, and the gain."""
+    return _results(tasks, unseen(rows)) + findings.text(found, gained)
+
+
+def _finished(rows: list[dict[str, Any]], out: Path, plan: Plan) -> Fits:
+    """Read the result of a run that had ended from its folder."""
+    kept = json.loads((out / "results.json").read_bytes())
+    params = {
+        task.label: task.method.Params.load(out / "params.toml", task.label) for task in plan.tasks
+    }
+    found, gained = kept.get("found", []), kept.get("gains", [])
+    return Fits(rows, params, found, gained, _text(plan.tasks, rows, found, gained))
 
 
 def _ended_before(
@@ -174,26 +312,26 @@ def _ended_before(
 def _fit_tasks(
     plan: Plan,
     sources: Sources,
-    digest: str,
-    out: Path,
+    key: str,
+    out: Path | None,
     progress: bool | None,
     held: contextlib.ExitStack,
 ) -> tuple[list[Fitted], list[dict[str, Any]], Any]:
-    """Fit all methods, from the checkpoint in the folder on.
+    """Fit all methods, from the checkpoint in the folder on, if there is a folder.
 
     Gives the fits, rows about what they found, and the function that writes to the folder.
 
     The folder is made if missing, and then held until the stack is closed. Raises `InputError`
     naming the method.
     """
-    checkpoint, saved = out / CHECKPOINT, -math.inf
+    saved = -math.inf
     done: list[Fitted] = []
     found: list[dict[str, Any]] = []
     run: Run | None = None
     write: Any = None
     with contextlib.ExitStack() as new:
 
-        def open_folder() -> bytes | None:
+        def open_folder(out: Path) -> bytes | None:
             """The checkpoint in the folder."""
             nonlocal write
             # `results` removes a folder that it made if the block raises. At the first checkpoint
@@ -202,19 +340,23 @@ def _fit_tasks(
             write = new.enter_context(results(out))
             if missing:
                 held.enter_context(alone(out))
+            checkpoint = out / CHECKPOINT
             content = checkpoint.read_bytes() if checkpoint.exists() else None
             for remains in out.glob(".*.part"):  # of a write during which the run was killed
                 remains.unlink(missing_ok=True)
             return content
 
-        content = devices.by_first(open_folder)
-        if content is not None:
-            done, run = restore(content, checkpoint, digest, plan)
+        if out is not None:
+            content = devices.by_first(lambda: open_folder(out))
+            if content is not None:
+                done, run = restore(content, out / CHECKPOINT, key, plan)
 
         def keep(run: Run | None, certain: bool) -> None:
             nonlocal saved
+            if out is None:
+                return
             if devices.first() and (certain or time.monotonic() - saved > PERIOD):
-                save(checkpoint, digest, done, run)
+                save(out / CHECKPOINT, key, done, run)
                 saved = time.monotonic()
             new.close()
 
@@ -231,7 +373,7 @@ def _fit_tasks(
                     done.append(one)
                     keep(None, True)
             except InputError as error:
-                raise InputError(f"{plan.config}: {task.label}: {error}") from None
+                raise InputError(f"{plan.where()}{task.label}: {error}") from None
             with stage(f"{task.label}: intervals", progress):
                 found += findings.find(task, done[number], problem)
         new.close()
@@ -290,12 +432,14 @@ def unseen(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _sources(plan: Plan, progress: bool | None) -> Sources:
     return {
-        split: [(given, _load(path, plan, progress)) for given, path in plan.recordings[split]]
+        split: [(given, _load(given, one, plan, progress)) for given, one in plan.recordings[split]]
         for split in SPLITS
     }
 
 
-def _load(path: Path, plan: Plan, progress: bool | None) -> Recording:
+def _load(given: str, path: Path | Recording, plan: Plan, progress: bool | None) -> Recording:
+    if isinstance(path, Recording):
+        return dataclasses.replace(path, name=given)
     recording = load(path, plan.size, in_memory=False, progress=progress, stream=plan.stream)
     return dataclasses.replace(recording, name=str(path))  # for messages
 

@@ -12,8 +12,10 @@ import jax.numpy as jnp
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
 from jaxevent.io import toml
-from jaxevent.methods import find
 from jaxevent.parameters import Parameters, read_toml
+from jaxevent.recording import Recording
+from jaxevent.runs import contents
+from jaxevent.runs.calls import described
 from jaxevent.runs.config import (
     NAME,
     NATURAL,
@@ -27,13 +29,14 @@ from jaxevent.runs.config import (
     find_recordings,
     from_anywhere,
     is_number,
+    is_text,
     is_texts,
     named_files,
     read_params,
 )
-from jaxevent.runs.contents import fingerprint
 from jaxevent.runs.families import HOMES, family_of, find_family
 from jaxevent.runs.family import Goal, Shares
+from jaxevent.runs.own import Function, find_method
 from jaxevent.splits import SPLITS
 from jaxevent.tuning import Interval, Loss, Settings, begin, with_prior
 
@@ -54,11 +57,14 @@ class Task:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """A checked configuration; recordings are (as given, path) by split."""
+    """A checked configuration; recordings are (name, path or object) by split.
 
-    config: Path
+    `config` is None of a call from Python.
+    """
+
+    config: Path | None
     text: bytes
-    recordings: Mapping[str, list[tuple[str, Path]]]
+    recordings: Mapping[str, list[tuple[str, Path | Recording]]]
     tasks: list[Task]
     size: tuple[int, int] | None
     stream: str | None
@@ -67,14 +73,21 @@ class Plan:
 
     def inputs(self) -> list[Path]:
         """All files that are read, and can be."""
-        found = [self.config, *named_files(self.config)]
+        found = [] if self.config is None else [self.config, *named_files(self.config)]
         for split in SPLITS:
-            for _, path in self.recordings[split]:
-                found.append(path)
+            for name, path in self.recordings[split]:
+                if isinstance(path, Recording):
+                    path = Path(name)
+                else:
+                    found.append(path)
                 for task in self.tasks:
                     with contextlib.suppress(OSError, InputError):
                         found += task.goal.files(path)
         return found
+
+    def where(self) -> str:
+        """The beginning of a message: the file, if there is one."""
+        return "" if self.config is None else f"{self.config}: "
 
     def digest(self) -> str:
         """A number that changes with the configuration, the recordings and the precision."""
@@ -84,11 +97,16 @@ class Plan:
         for split in SPLITS:
             for given, path in self.recordings[split]:
                 digest.update(f"{split} {given}".encode())
-                files = [path] if path.is_file() else sorted(path.rglob("*"))
+                files: list[Path] = []
+                if isinstance(path, Recording):
+                    digest.update(contents.digest(path).encode())
+                    path = Path(given)
+                else:
+                    files += [path] if path.is_file() else sorted(path.rglob("*"))
                 for task in self.tasks:
                     files += task.goal.files(path)
                 for file in filter(Path.is_file, files):
-                    fingerprint(file, digest.update)
+                    contents.fingerprint(file, digest.update)
         return digest.hexdigest()
 
 
@@ -139,9 +157,12 @@ _METHOD: dict[str, Check] = {
         ),
         "a table of name = [believed value, standard deviation of its logarithm]",
     ),
-    "name": NAME,
+    "name": (lambda value: is_text(value) or isinstance(value, Estimator), "text"),
     "label": NAME,
-    "params": (lambda value: isinstance(value, str | dict), "a table or the path of a TOML file"),
+    "params": (
+        lambda value: isinstance(value, str | dict | Parameters),
+        "a table or the path of a TOML file",
+    ),
     "fit": (is_texts, 'a list of names, as ["c_on", "c_off"]'),
     "search": (
         lambda value: (
@@ -156,71 +177,96 @@ _METHOD: dict[str, Check] = {
 }
 
 
-def read_plan(config: Path, recordings: Sequence[str | Path] | None = None) -> Plan:
+def read_plan(config: Path, recordings: Sequence[Any] | None = None) -> Plan:
     """Read and check a configuration; raises `InputError` naming the file and the setting.
 
     `recordings` take the place of those that it names, written like them but relative to the
     working directory.
     """
     table: dict[str, Any] = read_toml(config)
+    text = config.read_bytes()
     try:
-        families = {name: find_family(name) for name in HOMES}
-        further = {k: v for one in families.values() for k, v in one.fit_settings.items()}
-        check(table, {**_COMMON, **further})
-        text = config.read_bytes()
-        folders = dict.fromkeys(SPLITS, config.parent)
         if recordings:
-            table = {**table, "recordings": [from_anywhere(str(one)) for one in recordings]}
-            text = toml.dump(table).encode()
-        found = {
-            split: find_recordings(table[key], folders[split]) if table.get(key) else []
-            for split, key in zip(SPLITS, ("recordings", "validation", "test"), strict=True)
-        }
-        if not found["fit"]:
-            raise InputError('no recording is given; add recordings = ["file.zip"]')
-        places = [path.resolve() for split in SPLITS for _, path in found[split]]
-        twice = [path for path in places if places.count(path) > 1]
-        if twice:
-            raise InputError(f"{twice[0]} is in two of recordings, validation and test; choose one")
-        apart = bool(found["validation"] or found["test"])
-        if apart and "split" in table:
-            raise InputError("split is for configurations without validation and test; omit it")
-        if not table.get("method"):
-            raise InputError('no method is given; add [[method]] with name = "akf"')
-        tasks: list[Task] = []
-        for number, entry in enumerate(table["method"], 1):
-            try:
-                tasks.append(_task(entry, table, config.parent))
-            except InputError as error:
-                raise InputError(f"method {number}: {error}") from None
-        labels = [task.label for task in tasks]
-        for label in labels:
-            if labels.count(label) > 1:
-                raise InputError(f"two methods are called {label!r}; give them different labels")
-        used = {k for task in tasks for k in family_of(task.method).fit_settings}
-        for name in table:
-            if name in further and name not in used:
-                raise InputError(f"{name} is a setting of none of these methods; omit it")
-        size = table.get("size")
-        return Plan(
-            config,
-            text,
-            found,
-            tasks,
-            None if size is None else (size[0], size[1]),
-            table.get("stream"),
-            None if apart else tuple(table.get("split", (2, 1, 1))),
-            table.get("window"),
-        )
+            table = {**table, "recordings": [from_anywhere(one) for one in recordings]}
+            text = toml.dump(described(table)).encode()
+        return plan_of(table, config.parent, config, text)
     except InputError as error:
         raise InputError(f"{config}: {error}") from None
 
 
+def plan_of(table: Mapping[str, Any], folder: Path, config: Path | None, text: bytes) -> Plan:
+    """Check the table of a configuration, in which paths are relative to `folder`.
+
+    Args:
+        table: As a file has it; recordings, methods and parameters may be objects.
+        folder: To which paths are relative.
+        config: The file; None of a call from Python.
+        text: The configuration as results keep it.
+
+    Raises:
+        InputError: A setting cannot be used; the message names it.
+    """
+    families = {name: find_family(name) for name in HOMES}
+    further = {k: v for one in families.values() for k, v in one.fit_settings.items()}
+    check(table, {**_COMMON, **further})
+    found = {
+        split: find_recordings(table[key], folder) if table.get(key) else []
+        for split, key in zip(SPLITS, ("recordings", "validation", "test"), strict=True)
+    }
+    if not found["fit"]:
+        raise InputError('no recording is given; add recordings = ["file.zip"]')
+    given = [one for split in SPLITS for one in found[split]]
+    keys = [id(one) if isinstance(one, Recording) else one.resolve() for _, one in given]
+    for (name, _), key in zip(given, keys, strict=True):
+        if keys.count(key) > 1:
+            raise InputError(
+                f"{key if isinstance(key, Path) else name} is in two of recordings, validation and "
+                "test; choose one"
+            )
+    apart = bool(found["validation"] or found["test"])
+    if apart and "split" in table:
+        raise InputError("split is for configurations without validation and test; omit it")
+    if not table.get("method"):
+        raise InputError('no method is given; add [[method]] with name = "akf"')
+    tasks: list[Task] = []
+    for number, entry in enumerate(table["method"], 1):
+        try:
+            tasks.append(_task(entry, table, folder))
+        except InputError as error:
+            where = "" if config is None else f"method {number}: "
+            raise InputError(f"{where}{error}") from None
+    labels = [task.label for task in tasks]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise InputError(f"two methods are called {label!r}; give them different labels")
+    used = {k for task in tasks for k in family_of(task.method).fit_settings}
+    for name in table:
+        if name in further and name not in used:
+            raise InputError(f"{name} is a setting of none of these methods; omit it")
+    size = table.get("size")
+    return Plan(
+        config,
+        text,
+        found,
+        tasks,
+        None if size is None else (size[0], size[1]),
+        table.get("stream"),
+        None if apart else tuple(table.get("split", (2, 1, 1))),
+        table.get("window"),
+    )
+
+
 def _task(entry: Mapping[str, Any], table: Mapping[str, Any], folder: Path) -> Task:
     name = entry.get("name")
-    if not isinstance(name, str):
+    if name is None:
         raise InputError('a method has no name; give name = "akf"')
-    method = find(name)
+    method = find_method(name)
+    if isinstance(method, Function):
+        raise InputError(
+            f"the method {method.name!r} is a function and has no parameters to fit; make an "
+            "Estimator"
+        )
+    name = name if isinstance(name, str) else method.name
     family = family_of(method)
     check(entry, {**_METHOD, **{k: family.fit_settings[k] for k in family.own}})
     params = read_params(method.Params, name, entry.get("params", {}), folder)

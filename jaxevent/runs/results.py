@@ -4,16 +4,90 @@ import contextlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxevent.errors import InputError
 from jaxevent.io.output import complete
 from jaxevent.io.places import check, locked
-from jaxevent.show.report import markdown_table
+from jaxevent.parameters import Parameters
+from jaxevent.show.report import flatten, markdown_table, means
+
+if TYPE_CHECKING:
+    import pandas
 
 Write = Callable[[str, bytes], None]
+
+
+class Rows(list[dict[str, Any]]):
+    """Rows of results: a list of dicts that shows itself as a table."""
+
+    def __repr__(self) -> str:
+        return self.table()
+
+    def table(self) -> str:
+        """The rows as a Markdown table, aligned as plain text too."""
+        return markdown_table(self)
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The rows as a pandas table; nested names are joined by dots, lists are left out."""
+        import pandas
+
+        flat = [flatten(row) for row in self]
+        return pandas.DataFrame(
+            [{k: v for k, v in row.items() if not isinstance(v, list)} for row in flat]
+        )
+
+
+class Evaluation(Rows):
+    """Rows of `evaluate`, with the means of each method over recordings."""
+
+    def means(self) -> "pandas.DataFrame":
+        """The means over recordings: a line for each method, with the number of recordings.
+
+        NaN where no recording has the number.
+        """
+        import pandas
+
+        return pandas.DataFrame(means(self)).set_index("method")
+
+
+class Fits(Rows):
+    """Rows of `fit`, scores before and after, with the parameters that were found.
+
+    Attributes:
+        params_by_method: The fitted `Params` of each method, by label.
+        found: A dict for each number that was fitted: `method`, `parameter`, `unit`, `start`,
+            `found`, the ends `low` and `high` of its interval, `interval` in words, `remark`.
+        gains: A dict for each method: its error `before` and `after`, by `measure`.
+    """
+
+    def __init__(
+        self,
+        rows: Iterable[dict[str, Any]],
+        params: Mapping[str, Parameters],
+        found: list[dict[str, Any]],
+        gains: list[dict[str, Any]],
+        text: str,
+    ):
+        super().__init__(rows)
+        self.params_by_method, self.found, self.gains = dict(params), found, gains
+        self._text = text
+
+    @property
+    def params(self) -> Any:
+        """The fitted `Params`; raises `InputError` where several methods were fitted."""
+        if len(self.params_by_method) > 1:
+            labels = ", ".join(map(repr, self.params_by_method))
+            raise InputError(
+                f"several methods were fitted; choose one, as params_by_method[...] of {labels}"
+            )
+        return next(iter(self.params_by_method.values()))
+
+    def table(self) -> str:
+        """The scores of data that no fit saw, what was found and the gain, as Markdown."""
+        return self._text
 
 
 def check_folder(

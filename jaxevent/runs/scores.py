@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,13 +29,13 @@ from jaxevent.metrics import (
     regions,
     ssim,
 )
-from jaxevent.parameters import nearest
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.recording import Frames, Recording
-from jaxevent.runs.config import is_texts, one_of
+from jaxevent.runs.config import METRICS, is_texts, known_as, one_of
 from jaxevent.runs.external import External, Normalise, check_normalise, fit_brightness
 from jaxevent.runs.family import Protocol
+from jaxevent.runs.own import Function, Metric, find_metrics, own_names
 from jaxevent.runs.protocols import (
     A_GAP,
     GAP,
@@ -59,11 +59,39 @@ MEASURES: dict[str, Callable[..., NDArray[np.float64]]] = {
 }
 
 
-def check_measures(names: Iterable[str]) -> None:
-    """Raise `InputError` for unknown measures and for those whose extra is missing."""
+# Those that every image has, of a protocol by its name.
+ALWAYS = {
+    "held-out": ("mse", "ssim"),
+    "reference": ("mse", "ssim", "log_mse", "log_ssim"),
+}
+
+
+class Measures(NamedTuple):
+    """Measures of images beyond those of `ALWAYS`: names in `MEASURES`, and the user's own."""
+
+    names: tuple[str, ...]
+    own: tuple[Metric, ...]
+
+    @classmethod
+    def of(cls, given: Iterable[str | Metric | Callable], protocol: str) -> "Measures":
+        """Those that are given; raises `InputError` for unknown ones and missing extras."""
+        given, always = list(given), ALWAYS.get(protocol, ())
+        own = find_metrics(given, [*MEASURES, *always])
+        names = [one for one in given if isinstance(one, str) and one in MEASURES]
+        check_extras(names)
+        return cls(tuple(dict.fromkeys(names)), tuple(own))
+
+    def of_own(self, image: NDArray, truth: NDArray, recording: str) -> dict[str, float]:
+        """The numbers of the user's own metrics."""
+        return {metric.name: metric(image, truth, recording) for metric in self.own}
+
+
+NONE_FURTHER = Measures((), ())
+
+
+def check_extras(names: Iterable[str]) -> None:
+    """Raise `InputError` for measures whose extra is missing."""
     for name in names:
-        if name not in MEASURES:
-            raise InputError(f"there is no metric {name!r}; {nearest(name, MEASURES)}")
         if name == "lpips":
             lpips_weights()
         if name == "hdr_quality":
@@ -80,22 +108,28 @@ def hidden_scores(
     image: NDArray,
     variance: NDArray | None,
     truth: Frames,
-    names: Iterable[str],
     I0: float,
     moving: NDArray[np.bool_] | None,
+    *,
+    measures: Measures = NONE_FURTHER,
+    recording: str = "",
 ) -> Scores:
     """The scores of an image in the place of a hidden frame, a `Frames` of one; see `score`.
 
-    `names` are those of further measures; `variance` is that of ln(I + I0), None where none is
-    judged; `moving` is where something moves, None where that is not asked.
+    `variance` is that of ln(I + I0), None where none is judged; `moving` is where something moves,
+    None where that is not asked; `recording` is the name for messages.
     """
     shown, true = np.clip(image, 0, 1), truth.intensity[0]
-    measures = {"mse": mse, "ssim": ssim, **{name: MEASURES[name] for name in names}}
+    known = {"mse": mse, "ssim": ssim, **{name: MEASURES[name] for name in measures.names}}
     broken = not np.isfinite(shown).all()
     scores: Scores = {
-        name: math.nan if broken else float(measure(shown, true))
-        for name, measure in measures.items()
+        name: math.nan if broken else float(measure(shown, true)) for name, measure in known.items()
     }
+    scores |= (
+        {metric.name: math.nan for metric in measures.own}
+        if broken
+        else measures.of_own(shown, true, recording)
+    )
     if variance is not None:
         # A black or clipped pixel tells a bound of the intensity, not the intensity.
         grey = np.asarray(truth.images)[0]
@@ -137,9 +171,11 @@ def _hdr_measures(
     image: NDArray,
     variance: NDArray | None,
     truth: NDArray[np.float64],
-    names: Iterable[str],
     clip: tuple[float, float],
     I0: float,
+    *,
+    measures: Measures,
+    recording: str,
 ) -> Scores:
     """The scores of an image against an HDR reference, NaN where there is none."""
     known = np.isfinite(truth)
@@ -157,11 +193,15 @@ def _hdr_measures(
         "log_mse": float(log_mse(shown, covered, where=known)),
         "log_ssim": float(log_ssim(shown, covered)),
     }
-    for name in names:
+    for name in measures.names:
         pair = (shown, covered)
         if name == "lpips":  # it looks at what a display shows
             pair = tuple(np.clip(part, 0, 1) for part in log_display(shown, covered))
         scores[name] = float(MEASURES[name](*pair))
+    if not broken:
+        scores |= measures.of_own(shown, covered, recording)
+    else:
+        scores |= {metric.name: math.nan for metric in measures.own}
     parts: dict[str, dict[str, float | int]] = {
         name: {
             "pixels": int(mask.sum()),
@@ -277,11 +317,11 @@ def _frame_before(given: Recording, t: int) -> NDArray[np.float32] | None:
 
 def score(
     recording: Recording,
-    method: ImageEstimator | External,
+    method: ImageEstimator | External | Function,
     params: FrameParams | None = None,
     protocol: str = "held-out",
     *,
-    metrics: Iterable[str] = (),
+    metrics: Iterable[str | Metric | Callable] = (),
     normalise: Normalise = "none",
     gap: int = GAP,
     moving: bool = False,
@@ -290,12 +330,13 @@ def score(
     """Reconstruct the images that `protocol` asks for, and compare: one row of a table of results.
 
     Memory does not grow with the recording's length. With "held-out" intensities are clipped to
-    [0, 1] before they are compared. `mse`, `ssim` and those of `metrics` (names in `MEASURES`) are
-    means over the images. `seconds` is the time of reconstructing and reading images, with
-    compilation but without scoring. What is not a number is None. `per_frame` lists t (us, as
-    stamped) and every measure of every image. "authors_ssim" and "masked_mse" are what the
-    programs of the AKF's authors compute (Wang et al., TPAMI 2023: the whole image as one window;
-    pixels without reference count as right), "matlab_ssim" is MATLAB's `ssim`.
+    [0, 1] before they are compared. `mse`, `ssim` and those of `metrics` (names in `MEASURES`, or
+    functions of one's own: see `jaxevent.runs.own`) are means over the images. `seconds` is the
+    time of reconstructing and reading images, with compilation but without scoring. What is not a
+    number is None. `per_frame` lists t (us, as stamped) and every measure of every image.
+    "authors_ssim" and "masked_mse" are what the programs of the AKF's authors compute (Wang et
+    al., TPAMI 2023: the whole image as one window; pixels without reference count as right),
+    "matlab_ssim" is MATLAB's `ssim`.
 
     With "held-out" every `gap`-th frame is given and all others are hidden; a gap other than 2 is
     in the row. With `moving` rows have also `moving`: the `share` of pixels where something moves,
@@ -328,23 +369,24 @@ class Asked:
     """What is asked of a method, and how its images are scored; see `score`."""
 
     protocol: str = "held-out"
-    metrics: tuple[str, ...] = ()
+    metrics: tuple[str | Metric | Callable, ...] = ()
     normalise: str = "none"
     gap: int = GAP
     moving: bool = False
+    measures: Measures = dataclasses.field(init=False)
 
     def __post_init__(self):
         check_normalise(self.normalise)
-        check_measures(self.metrics)
         if self.moving and self.protocol != "held-out":
             raise InputError(f"the protocol {self.protocol!r} gives all frames; omit moving")
+        object.__setattr__(self, "measures", Measures.of(self.metrics, self.protocol))
 
 
 class ImageProtocol(Protocol):
     """A protocol that asks for images; its name is a key of `protocols.PROTOCOLS`."""
 
     settings = {
-        "metrics": (is_texts, 'a list of names, as ["lpips"]'),
+        "metrics": METRICS,
         "optional_metrics": (is_texts, 'a list of names, as ["lpips"]'),
     }
     own = {"normalise": (lambda value: value in get_args(Normalise), "'none' or 'affine'")}
@@ -354,7 +396,7 @@ class ImageProtocol(Protocol):
         self.name = name
 
     def check(self, options: Mapping[str, Any]) -> None:
-        check_measures(options.get("metrics", ()))
+        Measures.of(options.get("metrics", ()), self.name)
         for name in options.get("optional_metrics", ()):
             one_of(name, "metric", list(MEASURES))
 
@@ -363,7 +405,7 @@ class ImageProtocol(Protocol):
         names = list(found.get("metrics", ()))
         for name in found.pop("optional_metrics", ()):
             with contextlib.suppress(InputError):
-                check_measures([name])
+                check_extras([name])
                 names.append(name)
         return {**found, "metrics": list(dict.fromkeys(names))} if names else found
 
@@ -376,7 +418,7 @@ class ImageProtocol(Protocol):
     def score(
         self,
         recording: Recording,
-        method: ImageEstimator | External,
+        method: ImageEstimator | External | Function,
         params: FrameParams | None,
         options: Mapping[str, Any],
         progress: bool | None = None,
@@ -393,7 +435,7 @@ class ImageProtocol(Protocol):
                 options.get("moving", False),
             ),
             progress,
-            _known_as(Path(recording.name)),
+            known_as(Path(recording.name)),
         )
         return {**row, "sample": sample}
 
@@ -408,14 +450,9 @@ class HeldOut(ImageProtocol):
     }
 
 
-def _known_as(path: Path) -> str:
-    """How other programs' results call a recording: its name without suffix."""
-    return path.name if path.is_dir() else path.stem
-
-
 def score_and_sample(
     recording: Recording,
-    method: ImageEstimator | External,
+    method: ImageEstimator | External | Function,
     params: FrameParams | None,
     asked: Asked,
     progress: bool | None,
@@ -423,7 +460,8 @@ def score_and_sample(
 ) -> tuple[dict[str, Any], Sample | None]:
     """As `score`, with the middle one of the images; `name` is by which images are found."""
     given, hidden = divide(recording, asked.protocol, asked.gap)
-    names, normalise = asked.metrics, asked.normalise
+    measures, normalise = asked.measures, asked.normalise
+    named: dict[str, Any] = {"measures": measures, "recording": recording.name}
     hdr = hidden if isinstance(hidden, Reference) else None
     clock = time.perf_counter()
     seconds, estimated = 0.0, False  # whether the method estimates a variance
@@ -431,6 +469,9 @@ def score_and_sample(
     if isinstance(method, External):
         estimates = _external(given, hidden, method, name or recording.name)
         values, I0 = method.values(), 0.0
+    elif isinstance(method, Function):
+        estimates = _of_function(given, hidden, method)
+        values, I0 = {}, 0.0
     else:
         chosen: FrameParams = params or method.Params()
         estimates = _estimates(given, hidden, method, chosen, progress)
@@ -450,9 +491,9 @@ def score_and_sample(
             P = variance if estimated else None
             if hdr is None:
                 where = moves(given, row, asked.gap) if asked.moving else None
-                scores.append(hidden_scores(image, P, frame, names, I0, where))
+                scores.append(hidden_scores(image, P, frame, I0, where, **named))
             else:
-                scores.append(_hdr_measures(image, P, truth, names, hdr.clip, I0))
+                scores.append(_hdr_measures(image, P, truth, hdr.clip, I0, **named))
             t.append(int(hidden.t[row]))
             if row == len(hidden) // 2:
                 sample = Sample(
@@ -473,6 +514,7 @@ def score_and_sample(
         "seconds": None if external else seconds,
         **({} if normalise == "none" else {"normalise": normalise}),
         **({} if asked.gap == GAP else {"gap": asked.gap}),
+        **own_names(measures.own),
         "params": values,
         "per_frame": per_frame,
     }
@@ -506,6 +548,20 @@ def _estimates(
     for times, told in video.batches(frame_times(hidden, params), extrapolate=True):
         yield first, told.mean, told.covariance
         first += len(times)
+
+
+def _of_function(given: Recording, hidden: Frames, method: Function) -> Estimates:
+    shape = (given.height, given.width)
+    found = method.estimate(given, hidden.t, [shape])
+    variance = found.covariance
+    if variance is None:
+        variance = np.full(found.mean.shape, np.nan)
+    elif variance.shape != found.mean.shape:
+        raise InputError(
+            f"{given.name}: the method {method.name!r} returned variances of shape "
+            f"{variance.shape}; return those of all pixels, {found.mean.shape}"
+        )
+    yield 0, found.mean, variance
 
 
 def _external(given: Recording, hidden: Frames, method: External, name: str) -> Estimates:

@@ -15,6 +15,7 @@ import json
 import multiprocessing
 import multiprocessing.connection
 import os
+import pickle
 import queue
 import signal
 import socket
@@ -32,6 +33,7 @@ from jaxevent import cache
 from jaxevent.devices import double_precision, local
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.progress import bar
+from jaxevent.shown import a_kind
 
 CONNECT = 30  # s that a scheduler has to answer
 LEAVE = 5  # s that a process has to end
@@ -47,6 +49,18 @@ class Task:
     name: str
     arguments: Mapping[str, Any]
     key: str | None = None
+
+    def check_sendable(self) -> None:
+        """Raise `InputError` if the arguments cannot be sent to another process."""
+        try:
+            pickle.dumps(self.arguments)
+        except Exception as error:  # whatever objects raise that are not to be pickled
+            reason = " ".join(str(error).split())
+            raise InputError(
+                f"{self.name}: cannot be sent to other processes ({reason}); give the path of a "
+                "recording that stays in its file, define methods and metrics in a module, or "
+                "leave out workers"
+            ) from None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,12 +83,13 @@ class Place:
     Of several devices of this process each has a task at a time; of too few tasks for that, each
     may use all. Processes take one device each, in turn.
 
-    `cluster` is the address of its scheduler, `scheduler_file` the file that tells it. Raises
-    `InputError` if more than one is given, for less than one worker and without the extra.
+    `cluster` is the address of its scheduler, a `distributed.Client` or a cluster object;
+    `scheduler_file` is the file that tells the address. Raises `InputError` if more than one is
+    given, for less than one worker and without the extra.
     """
 
     workers: int | None = None
-    cluster: str | None = None
+    cluster: Any = None
     scheduler_file: Path | None = None
 
     def __post_init__(self):
@@ -85,6 +100,15 @@ class Place:
             raise InputError(f"{self.workers} workers cannot work; give at least 1")
         if self.remote:
             require("distributed", "cluster")
+        if self.cluster is not None and not (
+            isinstance(self.cluster, str)
+            or hasattr(self.cluster, "submit")
+            or isinstance(getattr(self.cluster, "scheduler_address", None), str)
+        ):
+            raise InputError(
+                f"the cluster is {a_kind(self.cluster)}; give the address of a Dask "
+                "scheduler, as HOST:PORT, a distributed.Client or a cluster"
+            )
 
     @property
     def remote(self) -> bool:
@@ -402,11 +426,17 @@ def _on_cluster(
     place: Place,
 ) -> Records:
     distributed = require("distributed", "cluster")
-    address = place.cluster or str(place.scheduler_file)
+    given = place.cluster
+    if hasattr(given, "submit"):  # a Client stays its owner's
+        yield from _by_client(given, str(given), function, tasks, folder, retries)
+        return
+    if given is not None and not isinstance(given, str):
+        given = given.scheduler_address
+    address = given or str(place.scheduler_file)
     if place.scheduler_file is not None and not place.scheduler_file.is_file():
         raise InputError(f"{address}: there is no such scheduler file; start a scheduler with it")
-    where: dict[str, Any] = {"address": place.cluster}
-    if place.cluster is None:
+    where: dict[str, Any] = {"address": given}
+    if given is None:
         where = {"scheduler_file": address}
     try:
         client = distributed.Client(**where, timeout=CONNECT, set_as_default=False)
@@ -416,18 +446,34 @@ def _on_cluster(
             f"{address}: no Dask scheduler answers ({reason}); start one or correct the address"
         ) from None
     with client:
-        numbers = {}
-        for number, task in enumerate(tasks):
-            key = None if task.key is None else f"jaxevent-{task.key}"
+        yield from _by_client(client, address, function, tasks, folder, retries)
+
+
+def _by_client(
+    client: Any,
+    address: str,
+    function: Callable[..., Any],
+    tasks: Sequence[Task],
+    folder: Path | None,
+    retries: int,
+) -> Records:
+    distributed = require("distributed", "cluster")
+    numbers = {}
+    for number, task in enumerate(tasks):
+        key = None if task.key is None else f"jaxevent-{task.key}"
+        try:
             future = client.submit(
                 attempt, function, task, folder, key=key, pure=False, retries=retries
             )
-            numbers[future] = number
-        for future in distributed.as_completed(list(numbers), loop=client.loop):
-            if future.cancelled():
-                raise InputError(
-                    f"{address}: the scheduler lost tasks or went away; run the same again, "
-                    "finished tasks are kept"
-                )
-            error = future.exception()
-            yield numbers[future], future.result() if error is None else _said(error)
+        except (TypeError, pickle.PicklingError):
+            task.check_sendable()
+            raise
+        numbers[future] = number
+    for future in distributed.as_completed(list(numbers), loop=client.loop):
+        if future.cancelled():
+            raise InputError(
+                f"{address}: the scheduler lost tasks or went away; run the same again, "
+                "finished tasks are kept"
+            )
+        error = future.exception()
+        yield numbers[future], future.result() if error is None else _said(error)

@@ -51,6 +51,8 @@ def describe(recording: Recording, progress: bool | None = None) -> list[tuple[s
     lines.append(("ground truth", _truth(recording, recording.extra)))
     for name, values in recording.extra.items():
         lines.append((f"extra {name}", _value(values)))
+    lines += [(name, f"none: {why}") for name, why in recording.left_out.items()]
+    lines += [("note", text) for text in recording.notes]
     return lines
 
 

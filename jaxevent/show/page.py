@@ -19,10 +19,12 @@ import jaxevent
 from jaxevent.errors import install_command
 from jaxevent.metrics import LOG_OFFSET, MEANINGS
 from jaxevent.show.report import (
+    WORK,
     Column,
     columns_of,
     display_limits,
-    find,
+    mean_of,
+    means,
     number,
     short_names,
     tone_map,
@@ -38,7 +40,6 @@ WIDTH = 4.5  # inches of a plot: 27 rem of the page
 LABEL = 18  # letters of a line of a method's label in a plot
 # Errors shown in full colour: of intensity, and of ln(I + 0.003) against an HDR reference.
 FULL = {False: 0.1, True: 1.0}
-WORK = {"frames", "missing", "seconds", "times"}  # of these no method is best
 HIGHER = {  # of these more is better
     "ssim", "log_ssim", "global_ssim", "authors_ssim", "matlab_ssim", "hdr_quality", "covered",
     "mota", "idf1", "hota",
@@ -83,15 +84,15 @@ def page(
     columns, names = columns_of(done), short_names(recordings)
     hdr = any("log_mse" in row for row in done)
     now = datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
-    counts = [len(_measured(done, method, columns)) for method in methods]
+    counts = {one["recordings"] for one in means(rows)}
     values: dict[str, Any] = {
         "title": title,
         "about": f"{len(recordings)} {plural('recording', len(recordings))}, {len(methods)} "
         f"{plural('method', len(methods))}, protocol {protocol}, {now}",
-        "meaning": {title: MEANINGS[place] for title, place, _, _ in columns},
+        "meaning": {title: MEANINGS[place] for title, place, _, _ in columns if place in MEANINGS},
         "failures": _failures(rows, names),
-        "means": _means(done, methods, columns),
-        "unequal": len(set(counts)) > 1,
+        "means": _means(rows, columns),
+        "unequal": len(counts) > 1,
         "strips": _strips(rows, pictures, recordings, names),
         "full": f"{FULL[hdr]:g}",
         "unit": "ln(I + 0.003)" if hdr else "intensity",
@@ -107,9 +108,9 @@ def page(
     if importlib.util.find_spec("matplotlib") is None:
         values["missing_plots"] = install_command("plot")
     else:
-        means, over_time = _plotted(done)
-        values["points"] = _points(done, methods, means)
-        values["boxes"] = _boxes(done, methods, [*means, over_time])
+        plotted, over_time = _plotted(done)
+        values["points"] = _points(done, methods, plotted)
+        values["boxes"] = _boxes(done, methods, [*plotted, over_time])
         values["curves"] = _curves(done, recordings, methods, over_time, names)
     templates = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True,
@@ -203,48 +204,29 @@ def _failures(
     return parts
 
 
-def _mean(rows: Sequence[Mapping[str, Any]], place: str) -> float | None:
-    """Over the rows that have that number."""
-    values = [find(row, place) for row in rows]
-    values = [float(value) for value in values if value is not None]
-    return float(np.mean(values)) if values else None
+def _means(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> Table:
+    """The means of each method, the best of every measure marked.
 
-
-def _measured(
-    rows: Sequence[Mapping[str, Any]], method: str, columns: Sequence[Column]
-) -> list[Mapping[str, Any]]:
-    """The rows of a method that have any of the numbers but those of work."""
-    places = [place for _, place, _, _ in columns if place not in WORK]
-    return [
-        row
-        for row in rows
-        if row["method"] == method and any(find(row, place) is not None for place in places)
-    ]
-
-
-def _means(
-    rows: Sequence[Mapping[str, Any]], methods: Sequence[str], columns: Sequence[Column]
-) -> Table:
-    measures = [column for column in columns if column[1] not in ("frames", "missing")]
-    mine = {method: _measured(rows, method, columns) for method in methods}
-    most = max(map(len, mine.values()))
-    means = {
-        place: [_mean(mine[method], place) for method in methods] for _, place, _, _ in measures
-    }
+    Whether more is better of a metric of the user's own is not known, so none of them is marked.
+    """
+    found = means(rows)
+    measures = [column for column in columns if column[1] in found[0]]
+    unmarked = WORK.union(*(row.get("own_metrics", ()) for row in rows))
+    most = max(one["recordings"] for one in found)
     lines = []
-    for i, method in enumerate(methods):
-        cells = [Cell(method, "left"), Cell(str(len(mine[method])))]
+    for one in found:
+        cells = [Cell(one["method"], "left"), Cell(str(one["recordings"]))]
         for _, place, factor, digits in measures:
-            value = means[place][i]
+            value = one[place]
             others = [
-                mean
-                for mean, other in zip(means[place], methods, strict=True)
-                if mean is not None and len(mine[other]) == most
+                other[place]
+                for other in found
+                if other[place] is not None and other["recordings"] == most
             ]
             best = others and value == (max if place in HIGHER else min)(others)
-            marked = best and len(others) > 1 and len(mine[method]) == most and place not in WORK
+            marked = best and len(others) > 1 and one["recordings"] == most
             cell = number({"mean": value}, "mean", factor, digits)
-            cells.append(Cell(cell, "best" if marked else ""))
+            cells.append(Cell(cell, "best" if marked and place not in unmarked else ""))
         lines.append(cells)
     return ["method", "recordings", *(title for title, _, _, _ in measures)], lines, 1
 
@@ -352,7 +334,7 @@ def _points(
     for measure in measures:
         figure, axis = _panel(methods)
         values = [
-            _mean([row for row in rows if row["method"] == method], measure) for method in methods
+            mean_of([row for row in rows if row["method"] == method], measure) for method in methods
         ]
         places = [math.nan if value is None else value for value in values]
         colours = [_colour(i) for i in range(len(methods))]
@@ -393,7 +375,8 @@ def _boxes(
     A box reaches from the first to the third quartile, the line in it is the median, whiskers
     reach to the last value within 1.5 times the box's length. Further metrics have plots too.
     """
-    further = [name for row in rows for name in _series(row) if name in NAMES]
+    own = {name for row in rows for name in row.get("own_metrics", ())}
+    further = [name for row in rows for name in _series(row) if name in NAMES or name in own]
     plots = []
     for measure in dict.fromkeys([*measures, *further]):
         lists = [
@@ -412,10 +395,10 @@ def _boxes(
         )  # fmt: skip
         for i, box in enumerate(drawn["boxes"]):
             box.set(facecolor=_colour(i), alpha=0.6)
-        if measure not in HIGHER and all((one > 0).all() for one in columns):
+        if measure not in HIGHER | own and all((one > 0).all() for one in columns):
             axis.set_xscale("log")
             _label_plainly(axis.xaxis)
-        axis.set_xlabel(NAMES[measure])
+        axis.set_xlabel(NAMES.get(measure, measure))
         plots.append(_plot(figure))
     return plots
 

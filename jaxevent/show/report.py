@@ -346,14 +346,62 @@ COLUMNS: list[Column] = [
 ]
 
 
+WORK = {"frames", "missing", "seconds", "times"}  # columns that measure no quality
+
+
 def columns_of(rows: Sequence[Mapping[str, Any]]) -> list[Column]:
-    """Those of `COLUMNS` that any of the rows has, and of images those of `ALWAYS`."""
+    """Those of `COLUMNS` that any of the rows has, and of images those of `ALWAYS`.
+
+    Metrics of the user's own, which rows name in `own_metrics`, follow the other measures.
+    """
     always = set() if any("per_time" in row for row in rows) else ALWAYS
-    return [
+    known = [
         column
         for column in COLUMNS
         if column[1] in always or any(find(row, column[1]) is not None for row in rows)
     ]
+    own = dict.fromkeys(name for row in rows for name in row.get("own_metrics", ()))
+    work = next((i for i, column in enumerate(known) if column[1] in WORK), len(known))
+    return [*known[:work], *((name, name, 1, 4) for name in own), *known[work:]]
+
+
+def mean_of(rows: Sequence[Mapping[str, Any]], place: str) -> float | None:
+    """The mean of a number over the rows that have it."""
+    values = [find(row, place) for row in rows]
+    values = [float(value) for value in values if value is not None]
+    return float(np.mean(values)) if values else None
+
+
+def measured(
+    rows: Sequence[Mapping[str, Any]], method: str, columns: Sequence[Column]
+) -> list[Mapping[str, Any]]:
+    """The rows of a method that have a number in any column that measures quality."""
+    places = [place for _, place, _, _ in columns if place not in WORK]
+    return [
+        row
+        for row in rows
+        if row["method"] == method and any(find(row, place) is not None for place in places)
+    ]
+
+
+def means(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The means of each method over recordings, by column.
+
+    Args:
+        rows: Of an evaluation; those with an error do not count.
+
+    Returns:
+        For each method `method`, `recordings`, how many rows count, and for each of `columns_of`
+        the mean, at the column's place in a row; None where no row has the number.
+    """
+    done = [row for row in rows if "error" not in row]
+    columns = [column for column in columns_of(done) if column[1] not in ("frames", "missing")]
+    found = []
+    for method in dict.fromkeys(row["method"] for row in rows):
+        mine = measured(done, method, columns)
+        numbers = {place: mean_of(mine, place) for _, place, _, _ in columns}
+        found.append({"method": method, "recordings": len(mine), **numbers})
+    return found
 
 
 def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
@@ -362,8 +410,8 @@ def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
     Each row has the keys recording, method and, of images, mse, ssim, frames and seconds. Others of
     `COLUMNS` get columns where a row has them; what is not there is not shown. A number that is
     None, NaN or absent appears as "-". MSE is multiplied by 100 where its column says so; seconds
-    are those of computing. What the columns mean follows the table, then the `error` of rows that
-    have one, each once.
+    are those of computing. Of several recordings the means of each method follow. Then come the
+    columns' meanings and the `error` of rows that have one, each once.
     """
     rows = list(rows)
     errors = [
@@ -378,7 +426,23 @@ def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
         f"\n{how} ({errors.count((how, one))}): {one}\n" for how, one in dict.fromkeys(errors)
     )
     columns = columns_of(rows)
-    return aligned(rows, columns) + (legend(columns) if rows else "") + said
+    return aligned(rows, columns) + _table_of_means(rows) + (legend(columns) if rows else "") + said
+
+
+def _table_of_means(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A Markdown table of each method's means; empty where no method has several recordings."""
+    found = means(rows)
+    if all(row["recordings"] < 2 for row in found):
+        return ""
+    columns = [column for column in columns_of(rows) if column[1] in found[0]]
+    table = [["mean of", "recordings", *(title for title, _, _, _ in columns)]]
+    for row in found:
+        numbers = [
+            number({"mean": row[place]}, "mean", factor, digits)
+            for _, place, factor, digits in columns
+        ]
+        table.append([row["method"], str(row["recordings"]), *numbers])
+    return "\n" + lay_out(table, (0,))
 
 
 def legend(columns: Sequence[Column]) -> str:
@@ -449,6 +513,20 @@ def find(row: Mapping[str, Any], path: str) -> Any:
     return value
 
 
+def flatten(row: Mapping[str, Any]) -> dict[str, Any]:
+    """The row with nested names joined by dots, those of the outermost level first."""
+    flat: dict[str, Any] = {}
+    pending = [("", row)]
+    while pending:
+        prefix, table = pending.pop(0)
+        for key, value in table.items():
+            if isinstance(value, Mapping):
+                pending.append((f"{prefix}{key}.", value))
+            else:
+                flat[f"{prefix}{key}"] = value
+    return flat
+
+
 def write_parquet(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write rows as Parquet, a line per row; nested names are joined by dots.
 
@@ -462,17 +540,7 @@ def write_parquet(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         path.unlink(missing_ok=True)
         return
 
-    flat: list[dict[str, Any]] = []
-    for row in rows:
-        flat.append({})
-        pending = [("", row)]
-        while pending:
-            prefix, table = pending.pop(0)
-            for key, value in table.items():
-                if isinstance(value, Mapping):
-                    pending.append((f"{prefix}{key}.", value))
-                else:
-                    flat[-1][f"{prefix}{key}"] = value
+    flat = [flatten(row) for row in rows]
 
     def kind(values: list[Any]) -> pyarrow.DataType | None:
         kinds = {type(value) for value in values}

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from jaxevent import io
 from jaxevent.errors import InputError
 from jaxevent.io import evimo
+from jaxevent.io.options import ReadOptions
 from jaxevent.recording import Events
 
 SIZE = (40, 30)
@@ -52,7 +53,9 @@ def test_events_and_numbers_are_read_without_the_pickle(folder, in_memory, monke
 
 @pytest.mark.parametrize("in_memory", [True, False])
 def test_who_trusts_the_pickle_gets_the_truth(folder, in_memory):
-    recording = evimo.read(folder, in_memory=in_memory, meta=META, imu="/prophesee/left/imu")
+    recording = evimo.read(
+        folder, ReadOptions(in_memory=in_memory), meta=META, imu="/prophesee/left/imu"
+    )
     recording.check()
     check_events(recording.events)
     assert recording.camera.fx == 30 and recording.camera.distortion[2:4] == (0.001, 0.002)
@@ -75,7 +78,7 @@ def test_it_can_be_stored_and_columns_may_be_arrays_of_one(folder, tmp_path):
     for name in "tp":
         file = folder / f"dataset_events_{name}.npy"
         np.save(file, np.load(file)[:, None])
-    io.save(evimo.read(folder, in_memory=False, meta=META), tmp_path / "a.h5")
+    io.save(evimo.read(folder, ReadOptions(in_memory=False), meta=META), tmp_path / "a.h5")
     back = io.load(tmp_path / "a.h5")
     check_events(back.events)
     np.testing.assert_array_equal(back.extra["mask"], [DEPTHS[2], DEPTHS[4]])
@@ -159,7 +162,7 @@ def test_damaged_files_are_refused_or_read(name, place, how, value, tmp_path_fac
     file.write_bytes(content[:at] + new + after)
     for in_memory in (True, False):
         try:
-            recording = evimo.read(folder, in_memory=in_memory, meta=META).check()
+            recording = evimo.read(folder, ReadOptions(in_memory=in_memory), meta=META).check()
             np.asarray(recording.extra.get("depth", 0))
         except InputError as error:
             assert str(folder) in str(error) and "\n" not in str(error)

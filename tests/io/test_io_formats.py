@@ -289,18 +289,27 @@ def test_evt3_keeps_what_comes_before_its_first_time(tmp_path):
 # Prophesee
 
 
-def test_words_that_no_format_defines_are_refused(tmp_path):
+@pytest.mark.parametrize("in_memory", [True, False])
+def test_reserved_words_are_skipped_and_counted_unless_many_differ(tmp_path, in_memory):
     pytest.importorskip("evt3")
     events = formats.events_of(0, 40, SIZE)
+    path = tmp_path / "a.raw"
     for name, width in (("evt2", 4), ("evt21", 8), ("evt3", 2)):
-        content = bytearray(WRITERS[name](events, SIZE))
+        content = WRITERS[name](events, SIZE)
         start = content.index(b"% end\n") + 6
-        content[start + 9 * width - 1] = 0xB0
-        (tmp_path / "a.raw").write_bytes(content)
+        words = [content[at : at + width] for at in range(start, len(content), width)]
+        padding = [bytes([0x99] * width)] * 3
+        padded = [words[0], *padding, *(w for word in words[1:] for w in (word, *padding[:1]))]
+        path.write_bytes(content[:start] + b"".join(padded))
+        got = load(path, in_memory=in_memory)
+        assert list(formats.rows(got.events[:])) == list(formats.rows(events))
+        assert got.extra == {"reserved_words": 3 + len(words) - 1}
+        differ = b"".join(bytes([n] * (width - 1)) + b"\xb0" for n in range(17))
+        path.write_bytes(content[: start + 8 * width] + differ + content[start + 8 * width :])
         message = f"the word at byte {start + 8 * width} has the type 0xb"
         with pytest.raises(InputError, match=message):
-            load(tmp_path / "a.raw")
-        (tmp_path / "a.raw").write_bytes(content[:-1])
+            load(path)
+        path.write_bytes(content[:-1])
         with pytest.raises(InputError, match=rf"drop these bytes: truncate -s -{width - 1} FILE"):
             load(tmp_path / "a.raw")
 

@@ -351,7 +351,7 @@ def test_workers_and_client_of_a_cluster_may_die(several, tmp_path, float32, mon
     monkeypatch.setattr("jaxevent.show.page.page", lambda *arguments: "")
     folder, expected = several
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL
+        n_workers=2, threads_per_worker=1, dashboard_address=":0", silence_logs=logging.CRITICAL
     ) as cluster:
         address = cluster.scheduler_address
         out = killed_twice(folder, tmp_path / "out", "--cluster", address)

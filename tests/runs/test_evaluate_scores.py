@@ -205,7 +205,7 @@ def test_of_a_pair_without_tracks_no_contact_is_told(cars):
         (MOTION.replace('truth = "*.csv"', ""), "true motion is not given"),
         (MOTION.replace('truth = "*.csv"', 'truth = "*.csv"\nmodel = "planer"'), "planar"),
         (MOTION.replace("settle = 0.1", "settle = -1"), "settle is '-1'"),
-        (MOTION.replace("settle = 0.1", "metrics = ['lpips']"), "no setting 'metrics'"),
+        (MOTION.replace("settle = 0.1", "metrics = ['lpips']"), "there is no metric 'lpips'"),
         (MOTION.replace("planes", "akf", 1), "'akf' is of reconstruction"),
         (MOTION.replace("*.csv", "*.txt"), "wall.txt: cannot be read"),
         (MOTION.replace("*.csv", "poses"), "neither from poses"),

@@ -1,0 +1,239 @@
+"""Calls from Python as tables of a configuration, so that one code path serves both.
+
+What TOML has no word for stays an object in the table: recordings, methods, parameters, metrics,
+tables of what is true.
+"""
+
+import os
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxevent import methods
+from jaxevent.errors import InputError
+from jaxevent.estimator import Estimator
+from jaxevent.io.output import values_of
+from jaxevent.parameters import Parameters, read_toml
+from jaxevent.recording import Recording
+from jaxevent.runs.config import Named, Tables
+from jaxevent.runs.own import Metric, find_method, import_path, named_metric
+from jaxevent.shown import a_kind
+
+PathLike = str | os.PathLike
+CALLED = "# As called from Python; of objects only the names are told.\n"
+
+
+class Forms(NamedTuple):
+    """The two forms of a call: of a configuration, and of objects."""
+
+    example: str  # of objects
+    of_file: Collection[str]  # names of arguments that a configuration may have beside it
+    of_objects: Collection[str]  # of those that tell objects from a configuration
+
+    def is_config(self, arguments: Sequence[Any], settings: Mapping[str, Any]) -> bool:
+        """Tell whether a call names a configuration rather than recordings.
+
+        Args:
+            arguments: By position.
+            settings: By name.
+
+        Raises:
+            InputError: There are arguments beside the path of a TOML file that go with recordings
+                alone, or a single path is that of something else.
+        """
+        first = arguments[0] if arguments else settings.get("config")
+        if first is None or not is_path(first):
+            return False
+        beside = [name for name in settings if name not in self.of_file]
+        if Path(first).suffix != ".toml":
+            method = len(arguments) > 1 and names_method(arguments[1])
+            if method or any(name in self.of_objects for name in settings):
+                return False
+            try:
+                read_toml(first)
+            except InputError as error:
+                raise InputError(
+                    f"{error}; or if it is a recording, give a method too: {self.example}"
+                ) from None
+        if beside:
+            raise InputError(
+                f"{first}: {beside[0]} is no argument beside a configuration; set it in the file"
+            )
+        return True
+
+
+def is_path(value: Any) -> bool:
+    return isinstance(value, str | os.PathLike)
+
+
+def names_method(value: Any) -> bool:
+    """Tell whether an argument can only mean a method, or several."""
+    if is_path(value):
+        return isinstance(value, str) and (value in methods.names() or ":" in value)
+    return value is not None
+
+
+def recordings_of(given: Any) -> list[Any]:
+    """Recordings as a configuration lists them.
+
+    Args:
+        given: A recording or a path, a list of them, or a mapping from names.
+    """
+    if isinstance(given, Mapping):
+        return [Named(_text(name, "a recording"), _recording(one)) for name, one in given.items()]
+    if is_path(given) or isinstance(given, Recording):
+        given = [given]
+    return [_recording(one) for one in _listed(given, "recordings", "recordings or paths")]
+
+
+def _recording(given: Any) -> str | Recording:
+    if isinstance(given, Recording):
+        return given
+    if is_path(given):
+        return os.fspath(given)
+    raise InputError(f"recordings hold {a_kind(given)}; give jaxevent.Recording objects or paths")
+
+
+def methods_of(given: Any) -> list[dict[str, Any]]:
+    """Methods as the tables [[method]] of a configuration.
+
+    Args:
+        given: A method, a list of methods, or a mapping from labels. A method is a name, an
+            Estimator, a function, a pair (method, params), or a table as in a configuration.
+    """
+    if isinstance(given, Mapping) and "name" not in given:
+        return [{**_method(one), "label": _text(label, "a method")} for label, one in given.items()]
+    one = isinstance(given, str | Estimator | Mapping) or callable(given) or _is_pair(given)
+    tables = [_method(each) for each in ([given] if one else _listed(given, "methods", "methods"))]
+    return _labelled(tables)
+
+
+def _is_pair(given: Any) -> bool:
+    """Tell a pair (method, params) from a tuple of two methods."""
+    return (
+        isinstance(given, tuple)
+        and len(given) == 2
+        and (isinstance(given[1], Parameters | Mapping | os.PathLike))
+        and not (isinstance(given[1], Mapping) and "name" in given[1])
+    )
+
+
+def _method(given: Any) -> dict[str, Any]:
+    if isinstance(given, Mapping):
+        return {name: plain(value) for name, value in given.items()}
+    if isinstance(given, tuple):
+        if not _is_pair(given):
+            raise InputError(
+                f"a method is {str(given)[:60]!r}; give a pair (method, params), of Params or a "
+                "mapping"
+            )
+        method, params = given
+        return {"name": method, "params": plain(params)}
+    return {"name": given}
+
+
+def _labelled(tables: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The tables, those of one method told apart by what differs from its defaults."""
+    names = [method_name(table.get("name")) for table in tables]
+    for table, name in zip(tables, names, strict=True):
+        params = table.get("params")
+        if names.count(name) > 1 and "label" not in table and params is not None:
+            values: Mapping[str, Any] = params.values() if isinstance(params, Parameters) else {}
+            usual = type(params)().values() if isinstance(params, Parameters) else {}
+            if isinstance(params, Mapping):
+                values = params
+            changed = {k: v for k, v in values.items() if k not in usual or v != usual[k]}
+            table["label"] = ", ".join([name, *(point(k, v) for k, v in changed.items())])
+    return tables
+
+
+def point(name: str, value: Any) -> str:
+    """A setting in a label."""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return f"{name} {value:g}" if number else f"{name} {value}"
+
+
+def method_name(given: Any) -> str:
+    """Return the name of a method that has no label."""
+    return given if isinstance(given, str) else find_method(given).name
+
+
+def metrics_of(given: Any) -> list[str | Metric]:
+    """Metrics as a configuration lists them.
+
+    Args:
+        given: A metric, a list of metrics, or a mapping from names. A metric is a name, a function,
+            or a pair (name, function).
+    """
+    if isinstance(given, Mapping):
+        given = list(given.items())
+    elif isinstance(given, str | Metric) or callable(given):
+        given = [given]
+    return [_metric(one) for one in _listed(given, "metrics", "names or functions")]
+
+
+def _metric(given: Any) -> str | Metric:
+    if isinstance(given, str | Metric):
+        return given
+    if isinstance(given, tuple) and len(given) == 2 and isinstance(given[0], str):
+        return named_metric(given[1], given[1], given[0])
+    metric = named_metric(given, given)
+    path = import_path(given)
+    return metric if path is None or path.rpartition(":")[2] != metric.name else path
+
+
+def settings_of(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a protocol or a fit, their values as TOML has them."""
+    return {name: plain(value) for name, value in given.items() if value is not None}
+
+
+def plain(value: Any) -> Any:
+    """A value as TOML has it: lists, numbers, text; what TOML has no word for as it is."""
+    if isinstance(value, Parameters | Recording | Estimator | Tables):
+        return value
+    if isinstance(value, Mapping):
+        return {name: plain(one) for name, one in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(one) for one in value]
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    return value
+
+
+def described(value: Any) -> Any:
+    """A table as TOML can hold it: objects by their names."""
+    if isinstance(value, Named):
+        return described(value.recording) if is_path(value.recording) else value.name
+    if isinstance(value, Recording | Metric):
+        return value.name
+    if isinstance(value, Tables):
+        return "given in Python"
+    if isinstance(value, Parameters):
+        return described(values_of(value))
+    if isinstance(value, Mapping):
+        return {name: described(one) for name, one in value.items() if one is not None}
+    if isinstance(value, list):
+        return [described(one) for one in value]
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, str | bool | int | float):
+        return value
+    if isinstance(value, Estimator) or callable(value):
+        return method_name(value)
+    return a_kind(value)
+
+
+def _listed(given: Any, what: str, of: str) -> Sequence[Any]:
+    if not isinstance(given, Iterable):
+        raise InputError(f"{what} are {a_kind(given)}; give a list of {of}")
+    return list(given)
+
+
+def _text(name: Any, what: str) -> str:
+    if not isinstance(name, str) or not name:
+        raise InputError(f"the name of {what} is {name!r}; give text")
+    return name

@@ -1,0 +1,249 @@
+"""Methods and metrics of a user's own: "package.module:object" in TOML, objects in Python.
+
+A metric is a function `metric(estimate, truth)` of two arrays that returns a number:
+
+| family | arrays | called for |
+|---|---|---|
+| reconstruction | intensity (H, W), 0 black and 1 white | every image |
+| blob | positions (T, targets, 2) in px, NaN where unknown | every recording |
+| egomotion | components (T, d) of the model, at times that are not lost | every recording |
+
+A method is an `Estimator`, or a function `method(recording, times)` that returns an estimate at
+`times` (T,), int64 us: the mean, or a tuple (mean, covariance) with the shapes of
+`jaxevent.estimator.Estimate`. Of blobs the mean may be positions (T, targets, 2) alone; NaN where
+a target is not tracked, or where the motion is lost.
+"""
+
+import dataclasses
+import hashlib
+import importlib
+import sys
+from collections.abc import Callable, Collection, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent import methods
+from jaxevent.errors import InputError
+from jaxevent.estimator import Estimate, Estimator, imported
+from jaxevent.parameters import nearest
+from jaxevent.recording import Recording
+from jaxevent.shown import a_kind
+
+# Keys of rows that are no measures: no metric may have their names.
+RESERVED = (
+    "recording", "method", "params", "error", "skipped", "split", "warning", "per_frame",
+    "per_time", "own_metrics", "regions", "moving", "clip", "normalise", "gap", "model", "frames",
+    "missing", "events", "times", "windows", "seconds", "t", "sample",
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Metric:
+    """A metric of a user's own, by the name that results give it."""
+
+    name: str
+    function: Callable[[Any, Any], Any]
+
+    def __call__(self, estimate: NDArray, truth: NDArray, recording: str) -> float:
+        """The metric's number; raises `InputError` naming metric and recording where it has none.
+
+        The function gets copies, so that it cannot change what other metrics see.
+        """
+        where = f"{recording}: the metric {self.name!r}"
+        try:
+            value = self.function(np.array(estimate), np.array(truth))
+        except Exception as error:  # whatever the user's code raises
+            raise InputError(f"{where} raised {said(error)}; correct it") from error
+        try:
+            number = float(value) if np.size(value) == 1 else None
+        except (TypeError, ValueError):
+            number = None
+        if number is None:
+            raise InputError(f"{where} returned {_shown(value)}; return one number")
+        if not np.isfinite(number):
+            raise InputError(
+                f"{where} returned {number}, which has no mean; return a finite number"
+            )
+        return number
+
+
+def find_metrics(given: Iterable[Any], known: Collection[str]) -> list[Metric]:
+    """The metrics of the user's own among those given; `known` are the protocol's by name.
+
+    Raises `InputError` for unknown names, for what is not callable and for a name given twice.
+    """
+    found: dict[str, Metric] = {}
+    for one in given:
+        if isinstance(one, str) and ":" not in one:
+            if one not in known:
+                raise InputError(f"there is no metric {one!r}; {nearest(one, known)}")
+            continue
+        metric = one if isinstance(one, Metric) else _metric(one)
+        if metric.name in known or metric.name in RESERVED:
+            raise InputError(
+                f"a metric of your own is called {metric.name!r}, as results call something else; "
+                "rename it"
+            )
+        if metric.name in found:
+            raise InputError(f"two metrics are called {metric.name!r}; rename one")
+        found[metric.name] = metric
+    return list(found.values())
+
+
+def _metric(given: Any) -> Metric:
+    function = imported(given, object, "metric") if isinstance(given, str) else given
+    return named_metric(given, function)
+
+
+def named_metric(given: Any, function: Any, name: str | None = None) -> Metric:
+    """A metric by its own name or another; raises `InputError` for what is none, naming `given`."""
+    if not callable(function) or isinstance(function, type):
+        raise InputError(
+            f"the metric {given!r} is {a_kind(function)}, which cannot be called; give a function "
+            "of an estimate and the truth"
+        )
+    name = name or getattr(function, "__name__", None) or getattr(function, "name", None)
+    if not isinstance(name, str) or name == "<lambda>":
+        raise InputError(
+            f"the metric {_shown(given)} has no name; give metrics as a mapping from names, as "
+            '{"my_metric": function}'
+        )
+    return Metric(name, function)
+
+
+def own_names(metrics: Iterable[Metric]) -> dict[str, list[str]]:
+    """The entry of a row that names its own metrics; empty where there are none."""
+    names = [metric.name for metric in metrics]
+    return {"own_metrics": names} if names else {}
+
+
+class Function(NamedTuple):
+    """A method that is a function: `estimate = function(recording, times)`."""
+
+    name: str
+    function: Callable[[Recording, NDArray[np.int64]], Any]
+
+    def estimate(
+        self, recording: Recording, times: NDArray[np.int64], shapes: Sequence[tuple[int, ...]]
+    ) -> Estimate:
+        """The estimate at `times` (T,), us, as NumPy arrays.
+
+        Args:
+            recording: What the method is given.
+            times: int64 us.
+            shapes: Of the mean, those possible without the axis of times; -1 is any number.
+
+        Returns:
+            Mean and covariance; the latter is None where the function returns none.
+
+        Raises:
+            InputError: The function raised something, or returned no array of such a shape.
+        """
+        where = f"{recording.name}: the method {self.name!r}"
+        try:
+            found = self.function(recording, times)
+        except Exception as error:  # whatever the user's code raises
+            raise InputError(f"{where} raised {said(error)}; correct it") from error
+        parts = [*found] if isinstance(found, tuple | Estimate) else [found]
+        try:
+            arrays = [None if part is None else np.asarray(part) for part in parts[:2]]
+        except (TypeError, ValueError):
+            arrays = []
+        mean = arrays[0] if arrays else None
+        wanted = " or ".join(_axes(shape) for shape in shapes)
+        if mean is None or mean.dtype.kind not in "iufb" or not _fits(mean.shape, times, shapes):
+            raise InputError(f"{where} returned {_shown(parts[0])}; return an array {wanted}")
+        covariance = arrays[1] if len(arrays) > 1 else None
+        mean = mean.astype(np.float64) if mean.dtype.kind != "f" else mean
+        return Estimate(mean, covariance, np.isfinite(mean))
+
+
+def _fits(
+    shape: tuple[int, ...], times: NDArray[np.int64], shapes: Sequence[tuple[int, ...]]
+) -> bool:
+    return any(
+        len(shape) == len(one) + 1
+        and shape[0] == len(times)
+        and all(b in (-1, a) for a, b in zip(shape[1:], one, strict=True))
+        for one in shapes
+    )
+
+
+def _axes(shape: tuple[int, ...]) -> str:
+    return f"({', '.join(['times', *('targets' if n < 0 else str(n) for n in shape)])})"
+
+
+def find_method(given: Any, family: str | None = None) -> Estimator | Function:
+    """A method by name, "package.module:object" or itself.
+
+    Raises `InputError` for an unknown name, for one of another family and for what is no method.
+    """
+    if isinstance(given, str):
+        if ":" not in given:
+            return methods.find(given, family)
+        found = imported(given, object, "method")
+    else:
+        found = given
+    if isinstance(found, Function):
+        return found
+    if isinstance(found, Estimator):
+        if family is not None and found.family != family:
+            raise InputError(
+                f"the method {found.name!r} is of {found.family}, not of {family}; "
+                f"{nearest(found.name, methods.names(family))}"
+            )
+        return found
+    what = repr(given) if isinstance(given, str) else _shown(given)
+    if isinstance(found, type):
+        raise InputError(f"the method {what} is a class; give an object of it")
+    if not callable(found):
+        raise InputError(
+            f"the method {what} is {a_kind(found)}, not an Estimator; give a name, an Estimator or "
+            "a function of a recording and times"
+        )
+    return Function(getattr(found, "__name__", type(found).__name__), found)
+
+
+def import_path(thing: Any) -> str | None:
+    """Return the text by which other processes find an object: a method's name, "module:object".
+
+    None where they cannot: it was made in a notebook or inside a function, or is in no module.
+    """
+    if isinstance(thing, Estimator):
+        if thing.name in methods.names() and methods.find(thing.name) is thing:
+            return thing.name
+        places = {type(thing).__module__, thing.Params.__module__}
+    else:
+        places = {getattr(thing, "__module__", None)}
+    for place in sorted(filter(None, places)):
+        module = sys.modules.get(place)
+        if module is None or place == "__main__" or not getattr(module, "__file__", None):
+            continue
+        for name, value in vars(module).items():
+            if value is thing:
+                return f"{place}:{name}"
+    return None
+
+
+def code_of(path: str) -> str | None:
+    """A hash of the file of the module in "module:object"; None where there is no file."""
+    file = getattr(importlib.import_module(path.partition(":")[0]), "__file__", None)
+    if file is None or not Path(file).is_file():
+        return None
+    return hashlib.blake2b(Path(file).read_bytes(), digest_size=16).hexdigest()
+
+
+def said(error: BaseException) -> str:
+    """An exception in words: its type, and its message in one line."""
+    reason = " ".join(str(error).split())
+    return f"{type(error).__name__}{f' ({reason})' if reason else ''}"
+
+
+def _shown(thing: Any) -> str:
+    shape = getattr(thing, "shape", None)
+    if shape is not None and shape != ():
+        return f"{getattr(thing, 'dtype', type(thing).__name__)} of shape {tuple(shape)}"
+    return " ".join(repr(thing).split())[:60]
