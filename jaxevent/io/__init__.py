@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
 from jaxevent.io.options import ReadOptions
+from jaxevent.lenses import LENSES, find_model
 from jaxevent.recording import Events, Frames, Recording
 
 __all__ = ["load", "save"]
@@ -33,6 +34,8 @@ _SMALL = 1 << 27  # bytes of arrays that every file may unfold to
 _MOST_COMPRESSED = 100  # times that a larger one may unfold to of its own bytes
 _MOST_PIXELS = 1 << 16  # of a side: coordinates are uint16
 _MOST_TIME = 1 << 62  # us, 146,000 years: sums and differences of two times stay in int64
+
+_COUNTS = {8: "eight", 9: "nine", 12: "twelve"}  # of the numbers of a camera
 
 READABLE = (
     "readable are a folder or zip with events.txt (Event-Camera Dataset), AEDAT 2 and 4, "
@@ -411,15 +414,49 @@ def _polarity(p: NDArray, source: str, first_row: int) -> NDArray[np.bool_]:
     return on
 
 
-def pinhole(values: NDArray, source: str) -> PinholeCamera:
-    """The camera of nine numbers: fx fy cx cy k1 k2 p1 p2 k3."""
-    values = np.ravel(values)
-    if values.shape != (9,) or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+def pinhole(values: NDArray, source: str, model: str = "radtan") -> PinholeCamera:
+    """The camera of a list of numbers: fx fy cx cy, and those of its lens, as k1 k2 p1 p2 k3.
+
+    Raises `InputError` for another count, for numbers that are not finite, and for a model that
+    `jaxevent.lenses` does not list.
+    """
+    found = find_model(model)
+    if found is None:
+        raise InputError(f"{source}: {unsupported_lens(model)}")
+    values, names = np.ravel(values), LENSES[found].coefficients
+    count = 4 + len(names)
+    if values.shape != (count,) or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
         raise InputError(
-            f"{source}: the calibration must be nine finite numbers, fx fy cx cy k1 k2 p1 p2 k3"
+            f"{source}: the calibration must be {_COUNTS[count]} finite numbers, fx fy cx cy "
+            f"{' '.join(names)}"
         )
-    fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(value) for value in values)
-    return PinholeCamera(fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+    fx, fy, cx, cy, *distortion = (float(value) for value in values)
+    return PinholeCamera(fx, fy, cx, cy, tuple(distortion), found)
+
+
+def unsupported_lens(model: str) -> str:
+    """The sentence of a calibration of another lens model, as of `Recording.left_out`."""
+    return (
+        f"the calibration has the lens model {model[:40]!r}, which is not supported; supported are "
+        f"{', '.join(LENSES)}"
+    )
+
+
+def calibrated(
+    intrinsics: NDArray, model: str, coefficients: NDArray, source: str
+) -> tuple[PinholeCamera | None, dict[str, str]]:
+    """The camera of a calibration, and `Recording.left_out` where its lens is not supported.
+
+    `intrinsics` are fx, fy, cx and cy in px; missing `coefficients` are 0. "plumb_bob" of eight
+    coefficients, as drivers write it, is rational. Raises `InputError` for bad numbers.
+    """
+    found, k = find_model(model), np.ravel(coefficients)
+    if found == "radtan" and len(k) == len(LENSES["rational"].coefficients):
+        found = "rational"
+    if found is None:
+        return None, {"camera": f"{source}: {unsupported_lens(model)}"}
+    padding = np.zeros(max(0, len(LENSES[found].coefficients) - len(k)))
+    return pinhole(np.concatenate([np.ravel(intrinsics), k, padding]), source, found), {}
 
 
 def whole_number(value: Any, source: str, what: str) -> int:

@@ -37,10 +37,19 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.io import check_unfolded, pinhole, reading, sensor_size, times, vectors, whole_number
+from jaxevent.io import (
+    calibrated,
+    check_unfolded,
+    reading,
+    sensor_size,
+    times,
+    vectors,
+    whole_number,
+)
 from jaxevent.io.decoded import BLOCK, Columns, DecodedImages, decoded
 from jaxevent.io.images import LUMA
 from jaxevent.io.options import ReadOptions
+from jaxevent.lenses import LENSES, find_model
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
 
@@ -73,7 +82,7 @@ def read(
     if "arrays_left_out" in extra and meta:
         del extra["arrays_left_out"]
     with reading(f"{source}: meta"):
-        camera, told = _camera(meta, source) if "meta" in meta else (None, None)
+        camera, told, left_out = _camera(meta, source) if "meta" in meta else (None, None, {})
         poses = _poses(meta["full_trajectory"], source) if "full_trajectory" in meta else None
         samples = _imu(meta["imu"][imu], source) if imu is not None else None
         frames = None
@@ -89,7 +98,9 @@ def read(
     otherwise = f"{path}: no image tells the sensor's size;"
     size = sensor_size(options.size, told, frames=frames, otherwise=otherwise)
     events = decoded(_decoder(path), size, source, options)
-    return Recording(path.name, *size, events, frames, camera, poses, samples, extra)
+    return Recording(
+        path.name, *size, events, frames, camera, poses, samples, extra, left_out=left_out
+    )
 
 
 def _decoder(path: Path) -> Any:
@@ -220,15 +231,16 @@ class _Images:
 
 def _camera(
     meta: Mapping[str, Any], source: str
-) -> tuple[PinholeCamera | None, tuple[int, int] | None]:
-    """The calibration, None of another model than radtan, and (width, height)."""
+) -> tuple[PinholeCamera | None, tuple[int, int], dict[str, str]]:
+    """The calibration, (width, height), and what is left out."""
     about = meta["meta"]
     width, height = (whole_number(about[name], source, name) for name in ("res_x", "res_y"))
-    if about.get("dist_model") != "radtan":
-        return None, (width, height)
-    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    model = str(about.get("dist_model"))
+    lens = LENSES.get(find_model(model) or "")
+    names = ("fx", "fy", "cx", "cy", *(lens.coefficients if lens else ()))
     values = np.array([float(about.get(name, 0.0)) for name in names])
-    return pinhole(values, f"{source}: meta"), (width, height)
+    camera, left_out = calibrated(values[:4], model, values[4:], f"{source}: meta")
+    return camera, (width, height), left_out
 
 
 def _poses(trajectory: Sequence[Mapping[str, Any]], source: str) -> Poses | None:

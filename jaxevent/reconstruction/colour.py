@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Events, Frames, Recording, Times, microseconds
@@ -192,12 +191,12 @@ def _channel(recording: Recording, events: Events, name: str, row: int, column: 
         frames = Frames(frames.t, sampled(np.asarray(frames.images)), frames.exposure)
     if pinhole is not None:
         # Pixel i of the channel is pixel 2 i + column of the sensor, both counted at their centres.
-        pinhole = PinholeCamera(
-            pinhole.fx / 2,
-            pinhole.fy / 2,
-            (pinhole.cx - column) / 2,
-            (pinhole.cy - row) / 2,
-            pinhole.distortion,
+        pinhole = dataclasses.replace(
+            pinhole,
+            fx=pinhole.fx / 2,
+            fy=pinhole.fy / 2,
+            cx=(pinhole.cx - column) / 2,
+            cy=(pinhole.cy - row) / 2,
         )
     size = (recording.height, recording.width)
     extra = {
