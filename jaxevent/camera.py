@@ -20,7 +20,7 @@ class PinholeCamera:
 
     `model` names the distortion of the lens, see `jaxevent.lenses`: "radtan" (Brown-Conrady: k1,
     k2, p1, p2, k3), "rational" (k1, k2, p1, p2, k3, k4, k5, k6) or "equidistant" (fisheye: k1, k2,
-    k3, k4). `distortion` holds its coefficients; missing ones are 0. Raises `InputError` for
+    k3, k4). `distortion` holds its coefficients, floats; missing ones are 0. Raises `InputError` for
     another model and for more coefficients than it has.
     """
 
@@ -28,7 +28,7 @@ class PinholeCamera:
     fy: float
     cx: float
     cy: float
-    distortion: tuple[float, ...] = ()
+    distortion: tuple = ()
     model: str = "radtan"
 
     def __post_init__(self) -> None:
