@@ -20,8 +20,8 @@ class PinholeCamera:
 
     `model` names the distortion of the lens, see `jaxevent.lenses`: "radtan" (Brown-Conrady: k1,
     k2, p1, p2, k3), "rational" (k1, k2, p1, p2, k3, k4, k5, k6) or "equidistant" (fisheye: k1, k2,
-    k3, k4). `distortion` holds its coefficients, floats; missing ones are 0. Raises `InputError` for
-    another model and for more coefficients than it has.
+    k3, k4). `distortion` holds its coefficients, floats; missing ones are 0. Raises `InputError`
+    for another model and for more coefficients than it has.
     """
 
     fx: float

@@ -38,15 +38,30 @@ def add_size(one: argparse.ArgumentParser) -> None:
     )
 
 
-def add_reading(one: argparse.ArgumentParser) -> None:
-    """Add the options of `jaxevent.load`; `run` takes them as `reading`, for `open_recording`."""
+def add_reading(one: argparse.ArgumentParser, frames: bool = True) -> None:
+    """Add the options of `jaxevent.load`; `run` takes them as `reading`, for `open_recording`.
+
+    Without `frames` there is no option that chooses the frames.
+    """
     add_size(one)
     one.add_argument(
         "--stream",
         metavar="NAME",
         help="which camera, of a file that holds several: a topic, left, right or a number",
     )
-    one.set_defaults(reading=("size", "stream"))
+    if frames:
+        add_frames(one, "--frames", "a file")
+    one.set_defaults(reading=("size", "stream", *(("frames",) if frames else ())))
+
+
+def add_frames(one: argparse.ArgumentParser, name: str, source: str) -> None:
+    """Add the option that chooses the frames of a recording, named in its help as `source`."""
+    one.add_argument(
+        name,
+        metavar="NAME",
+        help=f"which images become the frames, of {source} that holds several kinds: a topic or a "
+        "number; none leaves frames out",
+    )
 
 
 def open_recording(path: Path, reading: dict[str, Any], **more: Any) -> Any:

@@ -70,7 +70,8 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--crop", action="store_true", help="cut to a rectangle of pixels that both cameras see"
     )
-    arguments.add_reading(one)
+    arguments.add_frames(one, "--images", "OTHER")
+    arguments.add_reading(one, frames=False)
     arguments.add_output(one, "--out", metavar="FILE", required=True, help="the HDF5 file to write")
 
 
@@ -131,6 +132,7 @@ def run(
     exposure: float | int | None,
     white: float | int | None,
     crop: bool,
+    images: str | None,
     reading: dict[str, Any],
     out: Path,
 ) -> None:
@@ -152,6 +154,7 @@ def run(
         reference=reference is not None,
         exposure=exposure,
         white=white,
+        frames=images,
         progress=show_progress(),
     )
     recording = arguments.open_recording(path, reading)

@@ -22,7 +22,7 @@ from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
 from jaxevent.io.options import ReadOptions
 from jaxevent.lenses import LENSES, find_model
-from jaxevent.recording import Events, Frames, Recording
+from jaxevent.recording import PER_FRAME, Events, Frames, Recording
 
 __all__ = ["load", "save"]
 
@@ -30,6 +30,7 @@ Reader = Callable[[Path, ReadOptions], Recording]
 
 _BAGS = (b"#ROSBAG", b"\x89MCAP0\r\n", b"SQLite format 3\0")
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+NO_FRAMES = "none"
 _SMALL = 1 << 27  # bytes of arrays that every file may unfold to
 _MOST_COMPRESSED = 100  # times that a larger one may unfold to of its own bytes
 _MOST_PIXELS = 1 << 16  # of a side: coordinates are uint16
@@ -73,7 +74,8 @@ def load(
             "left" or "right" of MVSEC and M3ED, the number of a stream of AEDAT 4.
         trust: Whether HDF5 may be made of other files, by links, external storage or virtual
             datasets. Such a file can have any file read that you may read, or never end.
-        frames: Which images become the frames, of a file that holds several kinds.
+        frames: Which images become the frames, of a file that holds several kinds: a topic of a
+            bag, the number of a stream of AEDAT 4. "none" leaves frames out, in any format.
         time_unit: The unit of the event times, "s", "ms", "us" or "ns"; None infers it.
         repair: How to mend event times that go back: "sort" late events, "drop" outliers, "unwrap"
             a counter, keep a "part" between resets, or several of them, as in "unwrap,sort"; see
@@ -89,7 +91,11 @@ def load(
             f"size = {size} must be two positive numbers of pixels, (width, height), of at most "
             f"{_MOST_PIXELS}"
         )
-    options = ReadOptions(size, in_memory, progress, stream, frames, time_unit, repair)
+    without_frames = frames == NO_FRAMES
+    name = None if without_frames else frames
+    options = ReadOptions(
+        size, in_memory, progress, stream, name, time_unit, repair, without_frames
+    )
     with contextlib.ExitStack() as stack:
         if trust:
             from jaxevent.io.hdf5_files import trusting
@@ -99,8 +105,18 @@ def load(
             from jaxevent.io.disorder import parse_repair
 
             parse_repair(repair)
-        recording = _reader(path, options)(path, options).check(str(path))
+        recording = _reader(path, options)(path, options)
+    if without_frames:
+        recording = _drop_frames(recording)
+    recording.check(str(path))
     return dataclasses.replace(recording, notes=(*recording.notes, *options.notes))
+
+
+def _drop_frames(recording: Recording) -> Recording:
+    """The recording without frames and what there is one of for each frame."""
+    extra = {name: part for name, part in recording.extra.items() if name not in PER_FRAME}
+    left_out = {**recording.left_out, "frames": "frames='none' or --frames none leaves them out"}
+    return dataclasses.replace(recording, frames=None, extra=extra, left_out=left_out)
 
 
 def save(
@@ -139,6 +155,11 @@ def _reader(path: Path, options: ReadOptions) -> Reader:
         head = b"" if is_folder else _head(path)
     if read := _reader_of_streams(path, head):
         return read
+    if options.frames is not None:
+        raise InputError(
+            f"{path}: the format has one kind of frames, and none named {options.frames!r}; leave "
+            "out frames= or --frames, or give none to read no frames"
+        )
     if not is_folder and head.startswith(HDF5_MAGIC) or _later_hdf5(path, is_folder):
         return _hdf5_reader(path, options)
     refuse_stream(path, options)
@@ -455,8 +476,14 @@ def calibrated(
         found = "rational"
     if found is None:
         return None, {"camera": f"{source}: {unsupported_lens(model)}"}
-    padding = np.zeros(max(0, len(LENSES[found].coefficients) - len(k)))
-    return pinhole(np.concatenate([np.ravel(intrinsics), k, padding]), source, found), {}
+    count = len(LENSES[found].coefficients)
+    if np.any(k[count:]):
+        return None, {
+            "camera": f"{source}: the calibration has {len(k)} coefficients of the lens model "
+            f"{model[:40]!r}, of which {count} are supported"
+        }
+    k = np.concatenate([k[:count], np.zeros(max(0, count - len(k)))])
+    return pinhole(np.concatenate([np.ravel(intrinsics), k]), source, found), {}
 
 
 def whole_number(value: Any, source: str, what: str) -> int:
