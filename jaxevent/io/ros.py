@@ -84,9 +84,10 @@ def read(path: Path, options: ReadOptions) -> Recording:
         found = bag.beside(topic, held := bag.topics(kind))
         chosen[kind] = found[0] if len(found) == 1 else None
         if held and chosen[kind] is None:
+            number = "several are" if found else "none is"
             left_out[field] = (
-                f"the topics {', '.join(held)} hold some, of which {'none' if not found else 'more'}"
-                f"{' than one' if found else ''} is under the name of {topic or 'the frames'}"
+                f"the topics {', '.join(held)} hold some, of which {number} under the name of "
+                f"{topic or 'the frames'}"
             )
     with reading(source):
         frames, colours = _frames(path, bag, image, options.in_memory)
