@@ -154,6 +154,13 @@ def pair(text: str) -> tuple[int, ...]:
     return _numbers(text, (2,), int, "ID,ID, for example 0,1")
 
 
+def names(text: str) -> tuple[str, ...]:
+    found = tuple(name.strip() for name in text.split(","))
+    if len(found) != 2 or not all(found):
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME,NAME, for example cam1,cam0")
+    return found
+
+
 def plane(text: str) -> tuple[float, ...]:
     return _numbers(text, (4,), float, "A,B,C,D, for example 0,0,1,2.5")
 
