@@ -49,9 +49,15 @@ def add_reading(one: argparse.ArgumentParser, frames: bool = True) -> None:
         metavar="NAME",
         help="which camera, of a file that holds several: a topic, left, right or a number",
     )
+    one.add_argument(
+        "--camera",
+        metavar="FILE",
+        help="calibration of the camera instead of the recording's: camchain.yaml of Kalibr or "
+        "camera_info of ROS; FILE:NAME takes one of several",
+    )
     if frames:
         add_frames(one, "--frames", "a file")
-    one.set_defaults(reading=("size", "stream", *(("frames",) if frames else ())))
+    one.set_defaults(reading=("size", "stream", "camera", *(("frames",) if frames else ())))
 
 
 def add_frames(one: argparse.ArgumentParser, name: str, source: str) -> None:
@@ -106,6 +112,7 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
     if any(outputs.values()):
         yield {**taken, "force": force}
     elif outputs:
+        from jaxevent.io.calibration import split_name
         from jaxevent.io.companions import companions
         from jaxevent.io.description import Command, running
         from jaxevent.io.output import into_folders
@@ -119,6 +126,8 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
             for one in (value if isinstance(value, list) else [value])
             if isinstance(one, Path)
         ]
+        if camera := taken.get("reading", {}).get("camera"):
+            inputs.append(split_name(camera)[0])
         check(named, inputs, force=force)
         read = [file for path in inputs for file in (path, *companions(path))]
         with into_folders(force), running(Command(words, read)):

@@ -57,6 +57,7 @@ def load(
     frames: str | None = None,
     time_unit: str | None = None,
     repair: str | None = None,
+    camera: str | os.PathLike[str] | None = None,
 ) -> Recording:
     """Read and check a recording; its format is told by its content, not by its name.
 
@@ -80,6 +81,8 @@ def load(
         repair: How to mend event times that go back: "sort" late events, "drop" outliers, "unwrap"
             a counter, keep a "part" between resets, or several of them, as in "unwrap,sort"; see
             `jaxevent.io.disorder`. None refuses such times, and the message says what would help.
+        camera: A calibration instead of the recording's: camchain.yaml of Kalibr or camera_info of
+            ROS in YAML, or FILE:NAME, a camera of several; see `jaxevent.io.calibration`.
 
     Raises:
         InputError: The file is missing, damaged or of another format, or what it holds is not a
@@ -109,6 +112,12 @@ def load(
     if without_frames:
         recording = _drop_frames(recording)
     recording.check(str(path))
+    if camera is not None:
+        from jaxevent.io.calibration import read_camera
+
+        lens = read_camera(camera, (recording.width, recording.height))
+        left_out = {name: why for name, why in recording.left_out.items() if name != "camera"}
+        recording = dataclasses.replace(recording, camera=lens, left_out=left_out)
     return dataclasses.replace(recording, notes=(*recording.notes, *options.notes))
 
 

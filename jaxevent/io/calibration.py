@@ -15,6 +15,7 @@ distortion_coefficients; its name is camera_name.
 """
 
 import dataclasses
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,8 @@ def read_cameras(path: Path) -> dict[str, CalibratedCamera]:
     from ruamel.yaml import YAML
 
     source = str(path)
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; correct the path")
     with reading(source):
         if path.stat().st_size > _MOST_BYTES:
             raise InputError(f"{path}: is too large for a calibration; give the YAML of cameras")
@@ -73,33 +76,41 @@ def read_cameras(path: Path) -> dict[str, CalibratedCamera]:
     )
 
 
-def read_camera(path: Path, size: tuple[int, int], name: str | None = None) -> PinholeCamera:
+def split_name(source: str | os.PathLike[str]) -> tuple[Path, str | None]:
+    """Split FILE:NAME, a camera of a file, into both; the name is None where there is none."""
+    text = os.fspath(source)
+    path, separator, name = text.rpartition(":")
+    return (Path(path), name) if separator and not Path(text).exists() else (Path(text), None)
+
+
+def read_camera(source: str | os.PathLike[str], size: tuple[int, int]) -> PinholeCamera:
     """Read one camera of a YAML file.
 
     Args:
-        path: The file.
-        size: (width, height) in px of the images that it is for; of several cameras the one of
-            this size is taken.
-        name: Which camera of several, as cam0.
+        source: The file, or FILE:NAME, as camchain.yaml:cam0.
+        size: (width, height) in px of the images that it is for. Without a name the camera of this
+            size is taken.
 
     Raises:
         InputError: The file holds no such camera, several, one of another size, or one whose lens
             is not supported.
     """
+    path, name = split_name(source)
     cameras = read_cameras(path)
     if name is not None and name not in cameras:
         raise InputError(f"{path}: has no camera {name!r}; give one of {', '.join(cameras)}")
     names = [name] if name is not None else list(cameras)
     fitting = [one for one in names if cameras[one].size in (None, size)]
     if not fitting:
-        held = ", ".join(f"{one} ({_shown(cameras[one].size)})" for one in names)
+        held = ", ".join("{} of {}x{}".format(one, *(cameras[one].size or ())) for one in names)
         raise InputError(
-            f"{path}: holds {held}, and none of {_shown(size)}; give the calibration of this camera"
+            f"{path}: holds {held} pixels, but the recording has {size[0]}x{size[1]}; give the "
+            "calibration of its camera"
         )
     if len(fitting) > 1:
         raise InputError(
-            f"{path}: {', '.join(fitting)} have {_shown(size)}; name one of them, as in "
-            f"{path.name}:{fitting[0]}"
+            f"{path}: holds {', '.join(fitting)} of {size[0]}x{size[1]} pixels; name one of them, "
+            f"as in {path.name}:{fitting[0]}"
         )
     return lens_of(cameras, fitting[0], path)
 
@@ -110,10 +121,6 @@ def lens_of(cameras: Mapping[str, CalibratedCamera], name: str, path: Path) -> P
     if lens is None:
         raise InputError(f"{cameras[name].left_out}; calibrate {name} of {path.name} with another")
     return lens
-
-
-def _shown(size: tuple[int, int] | None) -> str:
-    return "of unknown size" if size is None else f"{size[0]}x{size[1]}"
 
 
 def _chain(table: Mapping[str, Any], path: str) -> dict[str, CalibratedCamera]:
