@@ -24,10 +24,10 @@ class PinholeCamera:
     for another model and for more coefficients than it has.
     """
 
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    fx: float | int
+    fy: float | int
+    cx: float | int
+    cy: float | int
     distortion: tuple = ()
     model: str = "radtan"
 
