@@ -2,9 +2,10 @@
 
 The layouts are described in the reader modules, and what each was checked against: `aedat2`,
 `aedat4`, `columns` (tables of text and NumPy records), `event_stream`, `evimo`, `hdf5`,
-`hdf5_layouts`, `mat`, `n_caltech`, `npz`, `prophesee`, `ros` (with `bags` and `ros_events`) and
-`text`. They are imported when first needed. This module also turns the raw numbers of a file into
-checked fields, so that every reader accepts the same values and words its errors alike.
+`hdf5_layouts`, `mat`, `n_caltech`, `npz`, `prophesee`, `ros` (with `bags`, `ros_messages` and
+`ros_events`) and `text`; `calibration` reads files of cameras. They are imported when first needed.
+This module also turns the raw numbers of a file into checked fields, so that every reader accepts
+the same values and words its errors alike.
 """
 
 import contextlib
