@@ -43,6 +43,7 @@ bool polarity
 """
 _EVENT_PACKAGES = ("dvs_msgs", "prophesee_event_msgs", "dv_ros_msgs")
 
+_LONGEST = 1 << 16  # characters of a definition that is parsed
 _CHUNK = 6  # records of MCAP
 
 Fields = list[tuple[str, Any]]  # of a type of message: names, and types as rosbags parses them
@@ -163,6 +164,8 @@ def _parse(kind: str, definition: Any) -> dict[str, Fields]:
         is_array = package in _EVENT_PACKAGES and kind.endswith("/EventArray")
         text = _EVENTS.format(package) if is_array else ""
     parsed: dict[str, Any] = {}
+    if len(text) > _LONGEST:
+        return parsed
     with contextlib.suppress(Exception):  # of any kind: the parser follows the text of the file
         parsed = get_types_from_idl(text) if is_idl else get_types_from_msg(text, kind)
     return {name: fields for name, (_, fields) in parsed.items()}

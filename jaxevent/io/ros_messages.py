@@ -25,6 +25,7 @@ _BASES = {
     "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
 _MOST_FIELDS = 64  # of an element of an array
+_DEEPEST = 8  # parts within parts
 
 
 class Layout:
@@ -72,7 +73,7 @@ def _members(
         inner, count = detail
         parts = [(f"{name}[{i}]", inner) for i in range(count if count <= _MOST_FIELDS else 0)]
     else:
-        fields = types.get(detail, ()) if node.name == "NAME" and depth < 8 else ()
+        fields = types.get(detail, ()) if node.name == "NAME" and depth < _DEEPEST else ()
         parts = [(f"{name}.{field}".lstrip("."), inner) for field, inner in fields]
     found: list[tuple[str, str]] = []
     for part, inner in parts:
@@ -89,14 +90,19 @@ class _Reader:
     def __init__(self, types: Mapping[str, Fields], data: bytes, order: str, is_ros1: bool):
         self.types, self.data, self.order, self.is_ros1 = types, data, order, is_ros1
         self.at = 0 if is_ros1 else 4
+        # Parts without fields take no bytes, so that these alone would not bound the work.
+        self.parts_left = len(data) + _MOST_FIELDS
 
-    def part(self, kind: str) -> dict[str, Any]:
-        return {name: self.value(type_) for name, type_ in self.types[kind]}
+    def part(self, kind: str, depth: int = 0) -> dict[str, Any]:
+        self.parts_left -= 1
+        if kind not in self.types or depth > _DEEPEST or self.parts_left < 0:
+            raise ValueError(f"a part {kind[:60]!r} without a usable definition")
+        return {name: self.value(type_, depth) for name, type_ in self.types[kind]}
 
-    def value(self, type_: Any) -> Any:
+    def value(self, type_: Any, depth: int) -> Any:
         node, detail = type_
         if node.name == "NAME":
-            return self.part(detail)
+            return self.part(detail, depth + 1)
         if node.name == "BASE":
             return self.text() if "string" in detail[0] else self.number(_BASES[detail[0]])
         inner, count = detail
@@ -106,7 +112,7 @@ class _Reader:
         if members is None:
             if count > len(self.data):
                 raise ValueError(f"an array claims {count} elements")
-            return [self.value(inner) for _ in range(count)]
+            return [self.value(inner, depth) for _ in range(count)]
         return self.elements(members, count)
 
     def number(self, kind: str) -> Any:

@@ -13,6 +13,7 @@ import jaxevent
 from jaxevent import cli
 from jaxevent.errors import InputError
 from jaxevent.events import undistort
+from jaxevent.io import ros_messages
 from jaxevent.recording import Events, Frames, Recording
 
 pytest.importorskip("rosbags")
@@ -182,6 +183,22 @@ def test_messages_of_another_length_are_refused(tmp_path):
             writer.write(link, 1, part)
         with pytest.raises(InputError, match=f"{number}.bag: a message of /spikes has .* fetch"):
             jaxevent.load(tmp_path / f"{number}.bag")
+
+
+@pytest.mark.parametrize("parts", ["own_msgs/Burst again", "own_msgs/Part0 part"])
+def test_definitions_may_not_take_any_time(parts):
+    """Parts within themselves, and 2^16 parts of which none takes a byte."""
+    from rosbags.typesys import get_types_from_msg
+
+    texts = {f"Part{k}": f"own_msgs/Part{k + 1} a\nown_msgs/Part{k + 1} b" for k in range(16)}
+    texts |= {"Part16": "", "Burst": f"{parts}\n{TYPES['own_msgs/msg/Burst']}"}
+    fields = {name: held for name, (_, held) in store(True).fielddefs.items()}
+    for name, text in texts.items():
+        kind = f"own_msgs/msg/{name}"
+        fields |= {one: held for one, (_, held) in get_types_from_msg(text, kind).items()}
+    layout = ros_messages.Layout(fields, "own_msgs/msg/Burst", True)
+    with pytest.raises(ValueError, match="without a usable definition"):
+        layout.read(bytes(1000))
 
 
 SEVERAL = {
