@@ -165,8 +165,9 @@ def _columns(bag: Bag, topic: str, names: _Names, pieces: list[NDArray]) -> Colu
             f"{bag.path}: an event of {topic} has more than 10^9 nanoseconds; the bag is damaged, "
             "so fetch it again"
         )
-    # Seconds are unsigned in ROS 1, and in ROS 2 not below 0.
-    return (s.astype(np.int64) & 0xFFFFFFFF) * 1_000_000 + ns // 1000, x, y, p
+    # Seconds are unsigned in ROS 1, and in ROS 2 not below 0; rosbags declares both as int32.
+    s = s.view(np.uint32) if s.dtype == np.int32 else s
+    return s * np.int64(1_000_000) + ns // 1000, x, y, p
 
 
 def _packets(

@@ -11,6 +11,7 @@ number of the largest alignment in the first one decides where its end lies.
 """
 
 import functools
+import struct
 from collections.abc import Mapping
 from typing import Any
 
@@ -24,6 +25,10 @@ _BASES = {
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
+_FORMATS = {
+    "u1": "B", "i1": "b", "u2": "H", "i2": "h", "u4": "I", "i4": "i", "u8": "Q", "i8": "q",
+    "f4": "f", "f8": "d",
+}  # fmt: skip
 _MOST_FIELDS = 64  # of an element of an array
 _DEEPEST = 8  # parts within parts
 
@@ -33,6 +38,7 @@ class Layout:
 
     def __init__(self, types: Mapping[str, Fields], kind: str, is_ros1: bool):
         self._types, self._kind, self._is_ros1 = types, kind, is_ros1
+        self._known: dict[Any, tuple[tuple[str, str], ...] | None] = {}
 
     @property
     def fields(self) -> dict[str, Any]:
@@ -55,7 +61,7 @@ class Layout:
         numbers the field is `value`. Raises `ValueError` where the bytes do not fit the definition.
         """
         order = "<" if self._is_ros1 or data[1] & 1 else ">"
-        reader = _Reader(self._types, data, order, self._is_ros1)
+        reader = _Reader(self._types, data, order, self._is_ros1, self._known)
         values = reader.part(self._kind)
         # A writer of CDR may fill up to a multiple of 4 bytes.
         if not 0 <= len(data) - reader.at <= (0 if self._is_ros1 else 3):
@@ -85,10 +91,16 @@ def _members(
 
 
 class _Reader:
-    """A place in the bytes of a message, and what is read there."""
+    """A place in the bytes of a message, and what is read there.
 
-    def __init__(self, types: Mapping[str, Fields], data: bytes, order: str, is_ros1: bool):
+    `known` keeps the members of the arrays' elements from message to message.
+    """
+
+    def __init__(
+        self, types: Mapping[str, Fields], data: bytes, order: str, is_ros1: bool, known: dict
+    ):
         self.types, self.data, self.order, self.is_ros1 = types, data, order, is_ros1
+        self.known = known
         self.at = 0 if is_ros1 else 4
         # Parts without fields take no bytes, so that these alone would not bound the work.
         self.parts_left = len(data) + _MOST_FIELDS
@@ -108,7 +120,10 @@ class _Reader:
         inner, count = detail
         if node.name == "SEQUENCE":
             count = self.number("u4")
-        members = _members(self.types, inner, "")
+        if inner not in self.known:
+            found = _members(self.types, inner, "")
+            self.known[inner] = None if found is None else tuple(found)
+        members = self.known[inner]
         if members is None:
             if count > len(self.data):
                 raise ValueError(f"an array claims {count} elements")
@@ -116,11 +131,13 @@ class _Reader:
         return self.elements(members, count)
 
     def number(self, kind: str) -> Any:
-        dtype = np.dtype(self.order + kind)
+        size = int(kind[1])
         if not self.is_ros1:
-            self.at += -(self.at - 4) % dtype.itemsize
-        value = np.frombuffer(self.data, dtype, 1, self.at)[0].item()
-        self.at += dtype.itemsize
+            self.at += -(self.at - 4) % size
+        if size > len(self.data) - self.at:
+            raise ValueError(f"{len(self.data)} bytes, too few for its fields")
+        (value,) = struct.unpack_from(self.order + _FORMATS[kind], self.data, self.at)
+        self.at += size
         return value
 
     def text(self) -> str:
@@ -129,11 +146,11 @@ class _Reader:
         self.at += length
         return text.rstrip(b"\0").decode(errors="replace")
 
-    def elements(self, members: list[tuple[str, str]], count: int) -> list[NDArray]:
+    def elements(self, members: tuple[tuple[str, str], ...], count: int) -> list[NDArray]:
         pieces = []
-        for some in (min(count, 1), max(0, count - 1)):
+        for some in (count,) if self.is_ros1 else (min(count, 1), max(0, count - 1)):
             alignment = 0 if self.is_ros1 else (self.at - 4) % 8
-            dtype = _element(tuple(members), self.order, alignment, self.is_ros1)
+            dtype = _element(members, self.order, alignment, self.is_ros1)
             size = some * dtype.itemsize
             if size > len(self.data) - self.at:
                 raise ValueError(
