@@ -35,9 +35,9 @@ import scipy.io
 
 import jaxevent
 from jaxevent import register
+from jaxevent.arrays import LUMA
 from jaxevent.camera import SCurve
 from jaxevent.errors import InputError
-from jaxevent.io.images import LUMA
 from jaxevent.recording import Frames, Recording
 
 BLACK = 14  # grey level of the authors' camera that is no light

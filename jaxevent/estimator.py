@@ -13,17 +13,23 @@ Evaluation, fitting, the command line and pictures know estimators through this 
 
 import abc
 import dataclasses
+import functools
 import importlib
 import inspect
-from collections.abc import Iterator
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 import equinox as eqx
 import jax
+import numpy as np
+from jax.core import Tracer
 
+from jaxevent.arrays import brief
+from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.parameters import Parameters
-from jaxevent.recording import Recording, Times
+from jaxevent.parameters import Parameters, phrase, with_article
+from jaxevent.recording import Events, Recording, Times, microseconds
 
 P = TypeVar("P", bound=Parameters)
 T = TypeVar("T")
@@ -49,9 +55,10 @@ def _kind_of(value: Any) -> str:
 class Estimate(Described):
     """What an estimator tells of some times: `mean, covariance, valid = result(times)`.
 
-    Arrays begin with an axis of times. `valid` says where the mean rests on data: of a pixel at a
-    time inside the recording, of a target that is alive, of a motion that is not lost. Elsewhere
-    the mean is NaN or the last one known.
+    It unpacks, has a length and is indexed as the tuple of its fields: `result(times)[0]` is the
+    mean. Arrays begin with an axis of times. `valid` says where the mean rests on data: of a pixel
+    at a time inside the recording, of a target that is alive, of a motion that is not lost.
+    Elsewhere the mean is NaN or the last one known.
 
     | family | mean | covariance | valid |
     |---|---|---|---|
@@ -69,6 +76,12 @@ class Estimate(Described):
     def __iter__(self) -> Iterator[Any]:
         return iter((self.mean, self.covariance, self.valid))
 
+    def __len__(self) -> int:
+        return len(tuple(iter(self)))
+
+    def __getitem__(self, place: int | slice) -> Any:
+        return tuple(iter(self))[place]
+
 
 class Result(Protocol):
     """What `Estimator.estimate` returns: a function of time; reading it never changes it."""
@@ -76,6 +89,47 @@ class Result(Protocol):
     def __call__(self, times: Times) -> Estimate:
         """The estimate at `times`: integers are microseconds, floats seconds."""
         ...
+
+
+class OptionKind(NamedTuple):
+    """Values that an option takes, and words for them."""
+
+    fits: Callable[[Any], bool]
+    text: str
+
+
+def of_class(kind: type, optional: bool = True) -> OptionKind:
+    """Objects of a class, and None where the option is `optional`."""
+    text = f"{kind.__module__}.{kind.__name__}{' or None' if optional else ''}"
+    return OptionKind(lambda v: isinstance(v, kind) or (optional and v is None), text)
+
+
+def whole(least: int) -> OptionKind:
+    """Whole numbers from `least` to what int64 holds."""
+
+    def fits(value: Any) -> bool:
+        is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        return is_whole and least <= value < 1 << 63
+
+    return OptionKind(fits, f"a whole number from {least} on")
+
+
+def _is_number(value: Any) -> bool:
+    return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
+
+
+FLAG = OptionKind(lambda v: v is None or isinstance(v, bool | np.bool_), "True, False or None")
+TIME = OptionKind(
+    lambda v: v is None or _is_number(v), "one time, integer microseconds or float seconds, or None"
+)
+ROWS = OptionKind(
+    lambda v: v is None or (isinstance(v, Sequence) and not isinstance(v, str)) or np.ndim(v) > 0,
+    "a list with an entry for each, or None",
+)
+DEVICES = OptionKind(
+    lambda v: isinstance(v, Sequence) and all(isinstance(one, jax.Device) for one in v),
+    "a list of devices of JAX",
+)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -98,12 +152,34 @@ class Estimator(abc.ABC, Generic[P]):
     name: str
     Params: type[P]
     family: ClassVar[str]
+    option_kinds: ClassVar[Mapping[str, OptionKind]] = {
+        "camera": of_class(PinholeCamera),
+        "cloud": whole(0),
+        "detect": FLAG,
+        "devices": DEVICES,
+        "model": OptionKind(
+            lambda v: v is None or isinstance(v, str | type), "a name or class of a motion model"
+        ),
+        "progress": FLAG,
+        "refine": FLAG,
+        "seed": whole(0),
+        "seeds": ROWS,
+        "smooth": FLAG,
+        "start": TIME,
+        "stop": TIME,
+        "window_events": whole(1),
+    }
     needs_frames: bool = dataclasses.field(default=False, kw_only=True)
     differentiable: bool = dataclasses.field(default=True, kw_only=True)
     has_covariance: bool = dataclasses.field(default=True, kw_only=True)
     models: tuple[str, ...] = dataclasses.field(default=(), kw_only=True)
     options: frozenset[str] = dataclasses.field(default=frozenset(), kw_only=True)
     about: str = dataclasses.field(default="", kw_only=True)
+
+    def __init_subclass__(cls, **kwargs: Any):
+        super().__init_subclass__(**kwargs)
+        for name in CHECKED & vars(cls).keys():
+            setattr(cls, name, _checked(name, vars(cls)[name]))
 
     def __post_init__(self):
         # `help(akf)` shows an object's own text, if it has one, before its class.
@@ -120,7 +196,11 @@ class Estimator(abc.ABC, Generic[P]):
         return f"<{self.family} method {self.name!r}: {self.about.partition('. ')[0] or 'no text'}>"
 
     def check(self, recording: Recording) -> None:
-        """Raise `InputError` if the recording lacks what the estimator needs."""
+        """Raise `InputError` if the recording lacks what the estimator needs.
+
+        Events that were changed since the recording was made are found here, before kernels run.
+        """
+        recording.check_events()
         if self.needs_frames and recording.frames is None:
             raise InputError(
                 f"{recording.name}: holds no frames, which the method {self.name!r} needs"
@@ -152,6 +232,68 @@ class Estimator(abc.ABC, Generic[P]):
     def estimate(self, recording: Recording, params: P | None = None, **options: Any) -> Any:
         """The `Result` of a recording; see the family's own for its options."""
 
+    @property
+    def spelled(self) -> str:
+        """Its name as Python spells it, for messages."""
+        return self.name.replace("-", "_")
+
+    @property
+    def by_parameters(self) -> str:
+        """How to differentiate it by parameters, for messages."""
+        if not self.differentiable:
+            return "choose another method, this one is no function of parameters to JAX"
+        return (
+            "prepare once outside, features, out = prepare(recording, times), and map or "
+            "differentiate read(params, run(params, features)[0], out)"
+        )
+
+    def check_recording(self, recording: Any, call: str) -> None:
+        """Raise `InputError` unless it is a `Recording`, naming what makes one of it."""
+        if isinstance(recording, Recording):
+            return
+        if isinstance(recording, str | Path):
+            raise InputError(
+                f"{call} takes a recording, not a path; give jaxevent.load({str(recording)!r})"
+            )
+        held = "bare events" if isinstance(recording, Events) else phrase(recording)
+        raise InputError(
+            f"{call} takes a recording, not {held}; give jaxevent.load(path), or of arrays "
+            "jaxevent.Recording.from_arrays(t, x, y, p, width=..., height=...)"
+        )
+
+    def check_params(self, params: Any, call: str) -> None:
+        """Raise `InputError` unless they are parameters of this method, naming what makes them."""
+        if params is None:
+            return
+        if not isinstance(params, self.Params) or params.is_gradient:
+            remedy = "Params(name=value)"
+            if isinstance(params, str | Path):
+                remedy = f"Params.load({str(params)!r})"
+            elif isinstance(params, dict):
+                remedy = "Params(**params)"
+            held = phrase(params)
+            if isinstance(params, Parameters) and not params.is_gradient:
+                held = f"those of {type(params).__module__}"
+            raise InputError(
+                f"{call} takes parameters of its method, not {held}; give {self.spelled}.{remedy}"
+            )
+
+    def refuse_traced(self, params: Any, call: str) -> None:
+        """Raise `InputError` for parameters that JAX traces or maps, naming what takes these."""
+        if params is None:
+            return
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(params)):
+            raise InputError(
+                f"{call} works on the host, where jax.grad, jit and vmap cannot follow; "
+                f"{self.by_parameters}"
+            )
+        for name, number in params.numbers.items():
+            if np.ndim(params.raw[name]) > isinstance(number.default, tuple):
+                raise InputError(
+                    f"{call} takes one value of {name}, not {len(params.raw[name])}; for jax.vmap "
+                    f"over params {self.by_parameters}"
+                )
+
     def refuse_unknown(self, options: dict[str, Any]) -> None:
         """Raise `InputError` for options that `estimate` does not take."""
         for name in options:
@@ -161,6 +303,47 @@ class Estimator(abc.ABC, Generic[P]):
                     f"the method {self.name!r} has no option {name!r}; leave it out (known: "
                     f"{known})"
                 )
+
+    def check_options(self, **options: Any) -> None:
+        """Raise `InputError` for an option of another kind than `option_kinds` says."""
+        for name, value in options.items():
+            kind = self.option_kinds.get(name)
+            if kind is not None and not kind.fits(value):
+                raise InputError(
+                    f"the method {self.name!r} takes {name} as {kind.text}, not {brief(value)}"
+                )
+
+
+CHECKED = frozenset({"prepare", "prepare_images", "estimate", "live", "run"})
+
+
+def _checked(step: str, method: Callable[..., Any]) -> Callable[..., Any]:
+    """A step of an estimator that refuses other kinds of arguments in a sentence."""
+    signature = inspect.signature(method)
+    kinds = signature.parameters.items()
+    rest = next((name for name, one in kinds if one.kind is one.VAR_KEYWORD), "")
+
+    @functools.wraps(method)
+    def checked(self: Any, *args: Any, **kwargs: Any) -> Any:
+        call = f"{self.spelled}.{step}"
+        try:
+            given = signature.bind(self, *args, **kwargs).arguments
+        except TypeError as error:
+            raise InputError(f"{call}: {error}; see help({self.spelled})") from None
+        if "recording" in given:
+            self.check_recording(given["recording"], call)
+        if "params" in given:
+            self.check_params(given["params"], call)
+            if step != "run" or not self.differentiable:
+                self.refuse_traced(given["params"], call)
+        if step == "estimate":
+            others = given.get(rest, {})
+            self.refuse_unknown({name: v for name, v in others.items() if name != "progress"})
+        if "times" in given and np.ndim(us := microseconds(given["times"])) > 1:
+            raise InputError(f"{call}: times have the shape {us.shape}; give a list of times")
+        return method(self, *args, **kwargs)
+
+    return checked
 
 
 def imported(path: str, kind: type[T], what: str) -> T:
@@ -176,6 +359,5 @@ def imported(path: str, kind: type[T], what: str) -> T:
             "package that Python finds (PYTHONPATH)"
         ) from None
     if not isinstance(found, kind):
-        wanted = f"a{'n' * (kind.__name__[0] in 'AEIOU')} {kind.__name__}"
-        raise InputError(f"{path!r} is a {type(found).__name__}, not {wanted}")
+        raise InputError(f"{path!r} is {phrase(found)}, not {with_article(kind.__name__)}")
     return found

@@ -41,6 +41,12 @@ HOMES = {
 }
 
 
+class UnknownMethod(InputError, KeyError):
+    """A name that no method has."""
+
+    __str__ = Exception.__str__  # that of KeyError is the message's repr
+
+
 @functools.cache
 def _load(path: str) -> Estimator:
     return imported(path, Estimator, "method")
@@ -61,7 +67,7 @@ def find(name: str, family: str | None = None) -> Estimator:
     else:
         known = {one: path for homes in HOMES.values() for one, path in homes.items()}
         if name not in known:
-            raise InputError(f"there is no method {name!r}; {nearest(name, names(family))}")
+            raise UnknownMethod(f"there is no method {name!r}; {nearest(name, names(family))}")
         found = _load(known[name])
     if family is not None and found.family != family:
         raise InputError(
@@ -72,11 +78,14 @@ def find(name: str, family: str | None = None) -> Estimator:
 
 
 class _Methods(Mapping[str, Estimator]):
-    """All estimators by name, each loaded when it is first asked for."""
+    """All estimators by name, each loaded when it is first asked for.
+
+    A name that does not exist raises `UnknownMethod`, a `KeyError` that names the nearest.
+    """
 
     def __getitem__(self, name: str) -> Estimator:
         if name not in names():
-            raise KeyError(name)
+            raise UnknownMethod(f"there is no method {name!r}; {nearest(str(name), names())}")
         return find(name)
 
     def __iter__(self) -> Iterator[str]:
@@ -84,6 +93,10 @@ class _Methods(Mapping[str, Estimator]):
 
     def __len__(self) -> int:
         return len(names())
+
+    def __repr__(self) -> str:
+        lines = [f"{family}: {', '.join(names(family))}" for family in HOMES]
+        return "\n".join([f"<{len(self)} methods, each METHODS[name]>", *lines])
 
 
 METHODS: Mapping[str, Estimator] = _Methods()

@@ -83,6 +83,11 @@ class Number(Setting):
     def __get__(self, instance: "Parameters | None", owner: type) -> Any:
         if instance is None:
             return self
+        if instance.is_gradient:
+            raise InputError(
+                f"{self.name} of a gradient is no parameter; read gradient.raw[{self.name!r}], the "
+                "derivative by the stored number, or gradient.per_unit(params), by the parameter"
+            )
         raw = instance.raw[self.name]
         follows = self.gradient or self.name in instance.followed
         return self.physical(raw if follows else jax.lax.stop_gradient(raw))
@@ -97,11 +102,16 @@ class Number(Setting):
 
     def check(self, value: Any) -> None:
         if not isinstance(self.default, tuple):
+            if isinstance(value, list | tuple):
+                raise InputError(
+                    f"the parameter {self.name} is {str(value)[:40]}; give one number, and use "
+                    "jax.vmap over params for several"
+                )
             self.check_one(value)
             return
         if not (isinstance(value, list | tuple) and value):
             raise InputError(
-                f"the parameter {self.name} is {str(value)[:40]}; give a list of numbers, as "
+                f"the parameter {self.name} is {repr(value)[:40]}; give a list of numbers, as "
                 f"{list(self.default)}"
             )
         if len(value) != len(self.default) > 1:
@@ -116,8 +126,8 @@ class Number(Setting):
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not number or not abs(value) < LARGEST:
             raise InputError(
-                f"the parameter {self.name} is {str(value)[:40]}; give a finite number below "
-                f"{LARGEST:g} in size"
+                f"the parameter {self.name} is {repr(value)[:40]}; give a finite number below "
+                f"{LARGEST:g} in size{', without quotes' * isinstance(value, str)}"
             )
         if not self.least <= value <= self.most:
             raise InputError(f"the parameter {self.name} is {value}; it must {self._bounds()}")
@@ -191,7 +201,7 @@ class Choice(Setting):
             options = " or ".join(
                 str(o).lower() if isinstance(o, bool) else repr(o) for o in self.options
             )
-            raise InputError(f"the parameter {self.name} is {str(value)[:40]!r}; give {options}")
+            raise InputError(f"the parameter {self.name} is {repr(value)[:40]}; give {options}")
 
 
 class Count(Setting):
@@ -209,7 +219,7 @@ class Count(Setting):
     def check(self, value: Any) -> None:
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
             raise InputError(
-                f"the parameter {self.name} is {str(value)[:40]!r}; give a whole number above 0"
+                f"the parameter {self.name} is {repr(value)[:40]}; give a whole number above 0"
             )
 
 
@@ -236,13 +246,21 @@ class Parameters(_Module):
     """Base of every estimator's `Params`: `Params(sigma_iso=0.1)`, `params.sigma_iso`.
 
     `raw` holds one differentiable leaf per number, `chosen` the choices and counts. A named set of
-    values is a preset: `Params(preset="paper", sigma_iso=0.1)`. Raises `InputError` for a name that
-    does not exist and for a value outside its domain.
+    values is a preset: `Params(preset="paper", sigma_iso=0.1)`. Numbers may be those of Python,
+    NumPy or JAX, traced ones too. Raises `InputError` for a name that does not exist and for a
+    value outside its domain.
+
+    `jax.grad(loss)(params)` has this type, too. It holds derivatives by the stored numbers, of
+    positive ones by their logarithm: `gradient.raw`, which its repr shows. `gradient.per_unit(
+    params)` has those by the parameters themselves.
     """
 
     raw: dict[str, Array]
     chosen: tuple[tuple[str, str | bool | int], ...] = eqx.field(static=True)
     followed: frozenset[str] = eqx.field(static=True)  # see `with_derivatives`
+    # The homogeneous coordinate of `raw`: 1 of parameters, 0 of what is derived by them, and of
+    # differences of two. Nothing depends on it, so JAX makes it 0 in every gradient and tangent.
+    point: Array
 
     numbers: ClassVar[Mapping[str, Number]] = {}
     choices: ClassVar[Mapping[str, Choice | Count]] = {}
@@ -282,18 +300,73 @@ class Parameters(_Module):
             name: _stored(number, values.get(name, number.default))
             for name, number in self.numbers.items()
         }
-        chosen = {name: values.get(name, choice.default) for name, choice in self.choices.items()}
-        for name, value in chosen.items():
-            self.choices[name].check(value)
-        self.chosen = tuple(chosen.items())
+        self.chosen = tuple(
+            (name, _chosen(choice, values.get(name, choice.default)))
+            for name, choice in self.choices.items()
+        )
         self.followed = frozenset()
+        self.point = jnp.asarray(np.ones((), jnp.result_type(float)))
 
     @classmethod
     def settings(cls) -> dict[str, Setting]:
         """All that it is made of, by name."""
         return {**cls.numbers, **cls.choices}
 
+    @property
+    def is_gradient(self) -> bool:
+        """Whether it holds derivatives by parameters, or a step; false where it is traced."""
+        return isinstance(self.point, Array | np.ndarray) and not (
+            isinstance(self.point, Tracer) or np.any(np.asarray(self.point))
+        )
+
+    def per_unit(self, params: "Parameters") -> dict[str, Array]:
+        """Convert a gradient to derivatives by the parameters themselves, in 1 / their units.
+
+            gradient = jax.grad(loss)(params)
+            gradient.per_unit(params)["c_on"]  # d loss / d c_on
+
+        A gradient holds derivatives by the stored numbers, of positive ones by their logarithm. It
+        does not hold their values, which the chain rule needs.
+
+        Args:
+            params: The parameters at which the gradient was taken.
+
+        Returns:
+            By name, an array of the gradient's shape. NaN of a number whose stored number does not
+            move it, as of one that is 0 and is stored as -inf.
+
+        Raises:
+            InputError: This is no gradient, or `params` is none of parameters of the same class.
+        """
+        if type(params) is not type(self) or params.is_gradient:
+            raise InputError(
+                f"per_unit needs the {type(self).__qualname__} at which the gradient was taken, "
+                f"not {phrase(params)}; give gradient.per_unit(params)"
+            )
+        if not (self.is_gradient or isinstance(self.point, Tracer)):
+            raise InputError(
+                "per_unit converts a gradient and these are parameters; call it as "
+                "jax.grad(loss)(params).per_unit(params)"
+            )
+        found = {}
+        for name, number in self.numbers.items():
+            raw = jnp.asarray(params.raw[name])
+            _, slope = jax.jvp(number.physical, (raw,), (jnp.ones_like(raw),))
+            found[name] = jnp.where(slope == 0, jnp.nan, self.raw[name] / slope)
+        return found
+
     def __repr__(self) -> str:
+        if not all(isinstance(leaf, Array | np.ndarray) for leaf in self.raw.values()):
+            return eqx.tree_pformat(self)
+        if self.is_gradient:
+            parts = {name: _leaf_shown(self.raw[name], self.numbers[name]) for name in self.numbers}
+            zeros = [name for name, text in parts.items() if text == "0"]
+            some = ", ".join(f"{name}={text}" for name, text in parts.items() if text != "0")
+            rest = f"0: {', '.join(zeros)}" if zeros else ""
+            return (
+                f"<gradient by {type(self).__qualname__}.raw, where positive numbers are logarithms"
+                f": {'; '.join(filter(None, [some, rest]))}>"
+            )
         defaults = type(self)()
         changed, same = [], []
         for name in self.settings():
@@ -311,6 +384,8 @@ class Parameters(_Module):
     def replace(self: T, **values: Any) -> T:
         """The same with some other values; raises `InputError` as the class does."""
         _refuse_unknown(values, self.settings())
+        if self.is_gradient:
+            raise InputError("a gradient has no values to replace; replace those of its parameters")
         raw = {
             name: _stored(self.numbers[name], value, self.raw[name].dtype)
             for name, value in values.items()
@@ -318,8 +393,7 @@ class Parameters(_Module):
         }
         chosen = dict(self.chosen)
         for name in values.keys() - raw.keys():
-            self.choices[name].check(values[name])
-            chosen[name] = values[name]
+            chosen[name] = _chosen(self.choices[name], values[name])
         return self._with({**self.raw, **raw}, tuple(chosen.items()), self.followed)
 
     def with_raw(self: T, raw: Mapping[str, Array]) -> T:
@@ -342,7 +416,8 @@ class Parameters(_Module):
         followed: frozenset[str],
     ) -> T:
         new = object.__new__(type(self))
-        for name, value in (("raw", raw), ("chosen", chosen), ("followed", followed)):
+        fields = {"raw": raw, "chosen": chosen, "followed": followed, "point": self.point}
+        for name, value in fields.items():
             object.__setattr__(new, name, value)
         return new
 
@@ -398,25 +473,76 @@ def _elementwise(name: str, values: Array) -> Array:
     return jnp.asarray(known, jax.dtypes.canonicalize_dtype(known.dtype))
 
 
+def _plain(value: Any) -> Any:
+    """Arrays of NumPy, JAX and others as Python's numbers and lists; other values as they are."""
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, Tracer):
+        return value
+    if isinstance(value, np.ndarray | np.generic | Array):
+        return value.tolist()  # None where masked
+    if hasattr(value, "__array__") and not isinstance(value, type):
+        return np.asarray(value).tolist()
+    return value
+
+
 def _stored(number: Number, value: Any, dtype: Any = None) -> Array:
-    """What is stored of a value, which is checked unless it is an array."""
-    if not isinstance(value, Array):
-        number.check(value)
+    """What is stored of a value, which is checked unless it is traced."""
+    dtype = jnp.result_type(float) if dtype is None else dtype
+    if isinstance(value, Tracer):
+        if not (
+            jnp.issubdtype(value.dtype, np.floating) or jnp.issubdtype(value.dtype, np.integer)
+        ):
+            raise InputError(
+                f"the parameter {number.name} is traced as {value.dtype}; give a real number"
+            )
+    elif any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value)):
+        value = jnp.stack([jnp.asarray(one, dtype) for one in value])
+    else:
+        plain = _plain(value)
+        number.check(plain)
         # By NumPy, as JAX compiles a conversion.
-        value = np.asarray(value, jnp.result_type(float) if dtype is None else dtype)
-    value = jnp.asarray(value, jnp.result_type(float) if dtype is None else dtype)
-    return number.unconstrained(value)
+        value = np.asarray(plain, dtype)
+    return number.unconstrained(jnp.asarray(value, dtype))
+
+
+def _chosen(setting: Choice | Count, value: Any) -> Any:
+    """A choice or count as it is kept, checked."""
+    value = _plain(value)
+    setting.check(value)
+    return value
+
+
+def with_article(name: str) -> str:
+    """A name with its article: "a dict", "an Estimate"."""
+    return f"a{'n' * (name[0] in 'AEIOUaeiou')} {name}"
+
+
+def phrase(value: Any) -> str:
+    """A value's type in words, for messages: "a dict", "the class Params", "a gradient"."""
+    if value is None:
+        return "None"
+    if isinstance(value, Parameters) and value.is_gradient:
+        return "a gradient"
+    if isinstance(value, type):
+        return f"the class {value.__qualname__}"
+    if isinstance(value, np.ndarray | Array):
+        return "an array"
+    return with_article(type(value).__qualname__)
+
+
+def _leaf_shown(value: Array | np.ndarray, number: Number) -> str:
+    """A number or its stored one, of traced and mapped ones the type or shape."""
+    if isinstance(value, Tracer):
+        return value.aval.str_short()
+    ndim = isinstance(number.default, tuple)
+    return shown(np.asarray(value).tolist()) if value.ndim <= ndim else f"array{value.shape}"
 
 
 def _value_shown(params: Parameters, name: str) -> str:
     """One value, of a traced or mapped one the type and shape."""
     value = getattr(params, name)
-    if isinstance(value, Tracer):
-        return value.aval.str_short()
-    if not isinstance(value, Array):
-        return shown(value)
-    ndim = isinstance(params.numbers[name].default, tuple)
-    return shown(np.asarray(value).tolist()) if value.ndim <= ndim else f"array{value.shape}"
+    return _leaf_shown(value, params.numbers[name]) if name in params.numbers else shown(value)
 
 
 def shown(value: Any) -> str:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxevent import arrays
 from jaxevent.camera import PinholeCamera, Response, TableResponse, UnknownResponse
 from jaxevent.errors import InputError, OrderError
 from jaxevent.shown import Shown, plural
@@ -30,7 +31,10 @@ def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
 
     Raises `InputError` for other types and for times that are not finite or too large for int64.
     """
-    time = np.asarray(time)
+    try:
+        time = np.asarray(time)
+    except ValueError:  # lists of different lengths
+        time = np.empty(0, object)
     if time.dtype.kind not in "iuf":
         raise InputError(
             f"{what} are {time.dtype}; give integers (microseconds) or floats (seconds)"
@@ -101,17 +105,52 @@ class ColumnSource(EventSource, Protocol):
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Events:
-    """Events in memory, sorted by time, one array per field, each of shape (events,)."""
+    """Events in memory, sorted by time, one array per field, each of shape (events,).
+
+    Columns are checked when they are given and become plain arrays of these types: t is any
+    integer type, x and y whole numbers from 0 to 65535 of any type, p bool, 0/1 or -1/1 of any
+    type. Arrays that have the type already are kept, not copied; change them no more. Raises
+    `InputError` for other types, values that the types do not hold, columns of different length
+    and times that go back.
+    """
 
     t: NDArray[np.int64]
     x: NDArray[np.uint16]
     y: NDArray[np.uint16]
     p: NDArray[np.bool_]
 
+    def __post_init__(self):
+        source, most = "events", (arrays.MAX_PIXELS, arrays.MAX_PIXELS)
+        if (np.asarray(self.t).dtype if hasattr(self.t, "dtype") else np.dtype(int)).kind == "f":
+            raise InputError(
+                f"{source}: t is {self.t.dtype}; give integer microseconds, or make the recording "
+                "by Recording.from_arrays(..., time_unit='s')"
+            )
+        t, x, y, p = (arrays.as_column(getattr(self, n), f"{source}: {n}") for n in "txyp")
+        arrays.check_lengths(t, x, y, p, source)
+        columns = {
+            "t": arrays.as_times(t, f"{source}: t"),
+            "x": arrays.coordinates("x", x, most, source),
+            "y": arrays.coordinates("y", y, most, source),
+            "p": arrays.polarities(p, source),
+        }
+        for name, values in columns.items():
+            object.__setattr__(self, name, values)
+        self.check_order(source)
+
+    @classmethod
+    def of_checked(cls, t: NDArray, x: NDArray, y: NDArray, p: NDArray) -> "Events":
+        """Events of columns that were checked and are plain, as rows of other events are."""
+        events = object.__new__(cls)
+        for name, values in zip("txyp", (t, x, y, p), strict=True):
+            object.__setattr__(events, name, values)
+        return events
+
     @classmethod
     def empty(cls) -> "Events":
-        none = np.empty(0, np.uint16)
-        return cls(none.astype(np.int64), none, none, none.astype(bool))
+        """No events."""
+        kinds = (np.int64, np.uint16, np.uint16, np.bool_)
+        return cls.of_checked(*(np.empty(0, kind) for kind in kinds))
 
     def __repr__(self) -> str:
         return f"<{_span('event', len(self), self.t)}>"
@@ -120,9 +159,18 @@ class Events:
         return len(self.t)
 
     def __getitem__(self, rows: slice | NDArray) -> "Events":
-        return Events(self.t[rows], self.x[rows], self.y[rows], self.p[rows])
+        """The events of a slice, a mask or row numbers that rise; `InputError` for others."""
+        if isinstance(rows, slice) and rows.step in (None, 1):
+            return Events.of_checked(self.t[rows], self.x[rows], self.y[rows], self.p[rows])
+        _check_rows(rows, "events")
+        columns = (np.ascontiguousarray(getattr(self, name)[rows]) for name in "txyp")
+        part = Events.of_checked(*columns)
+        if isinstance(rows, slice) or np.asarray(rows).dtype.kind != "b":
+            part.check_order("events")
+        return part
 
     def index(self, time: int) -> int:
+        """The number of events earlier than `time` (us)."""
         return int(np.searchsorted(self.t, time))
 
     def to_structured(self) -> NDArray:
@@ -143,19 +191,21 @@ class Events:
 
         `source` and `first_row` say where the events came from in the message.
         """
-        if not len(self.t) == len(self.x) == len(self.y) == len(self.p):
-            raise InputError(
-                f"{source}: t, x, y and p have {len(self.t)}, {len(self.x)}, {len(self.y)} and "
-                f"{len(self.p)} values; they must be equally long"
-            )
-        # Comparing neighbours is three times faster than np.diff, which writes int64 differences.
-        backwards = self.t[1:] < self.t[:-1]
-        if backwards.any():
-            row = int(np.argmax(backwards)) + 1
+        arrays.check_lengths(self.t, self.x, self.y, self.p, source)
+        self.check_order(source, first_row)
+        self.check_places(width, height, source, first_row)
+
+    def check_order(self, source: str, first_row: int = 0) -> None:
+        """Raise `InputError` unless the events are sorted by time."""
+        row = arrays.first_decrease(self.t)
+        if row is not None:
             raise OrderError(
                 f"{source}: event {first_row + row} is at {self.t[row]} us, earlier than the one "
                 f"before it at {self.t[row - 1]} us; sort the events by time (stable)"
             )
+
+    def check_places(self, width: int, height: int, source: str, first_row: int = 0) -> None:
+        """Raise `InputError` unless the events are inside a width x height sensor."""
         for name, values, size in (("x", self.x, width), ("y", self.y, height)):
             if len(values) and int(values.max()) >= size:
                 row = int(np.argmax(values >= size))
@@ -163,6 +213,84 @@ class Events:
                     f"{source}: event {first_row + row} has {name} = {values[row]} outside the "
                     f"{width}x{height} sensor; give the sensor's size or remove the event"
                 )
+
+
+def _check_rows(rows: Any, what: str) -> None:
+    """Raise `InputError` for what chooses one row, or several columns, of `what`."""
+    if not isinstance(rows, slice) and (np.ndim(rows) != 1 or np.asarray(rows).dtype.kind == "O"):
+        raise InputError(
+            f"{what} are chosen by a slice, a mask or a list of rows, not {arrays.brief(rows)}; "
+            f"write {what}[row : row + 1] for one of them"
+        )
+
+
+class CheckedEvents:
+    """An `EventSource` around one that checks nothing: events are checked when they are read.
+
+    Raises `InputError` where events are not of the type `Events`, go back in time, lie outside the
+    sensor of `size` (width, height), or are not as many as the rows asked for.
+    """
+
+    def __init__(self, source: EventSource, size: tuple[int, int], name: str):
+        self._source, self.checked_size, self._name = source, size, f"{name}: events"
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def __getitem__(self, rows: slice) -> Events:
+        start, stop, step = rows.indices(len(self))
+        if step != 1:
+            raise InputError(f"{self._name} are read as a range of rows, events[i:j], step 1")
+        if stop <= start:
+            return Events.empty()
+        # The event before the range is read too, so that pieces are sorted as a whole.
+        lead = min(start, 1)
+        events = self._source[start - lead : stop]
+        if not isinstance(events, Events) or len(events) != stop - start + lead:
+            held = f"{len(events)} events" if isinstance(events, Events) else type(events).__name__
+            raise InputError(
+                f"{self._name}[{start - lead}:{stop}] of {type(self._source).__name__} is {held}; "
+                f"it must be jaxevent.Events of {stop - start + lead} rows"
+            )
+        events.check(*self.checked_size, self._name, start - lead)
+        return events[lead:]
+
+    def index(self, time: int) -> int:
+        """The number of events earlier than `time` (us); raises `InputError` for a wrong one."""
+        row = self._source.index(time)
+        if isinstance(row, int | np.integer) and 0 <= row <= len(self):
+            row = int(row)
+            near = self[max(row - 1, 0) : row + 1].t
+            if (
+                near[: min(row, 1)].max(initial=time - 1)
+                < time
+                <= near[min(row, 1) :].min(initial=np.iinfo(np.int64).max)
+            ):
+                return row
+        raise InputError(
+            f"{self._name}: index({time}) of {type(self._source).__name__} is {arrays.brief(row)}; "
+            "it must be the number of events earlier than that time (us)"
+        )
+
+
+def _checked_source(events: Any, size: tuple[int, int], name: str) -> EventSource:
+    """The events of a recording, checked or checking themselves when they are read."""
+    if isinstance(events, Events):
+        events.check_places(*size, name)
+        return events
+    built_in = isinstance(
+        events, type | str | bytes | list | tuple | range
+    )  # these have `index` too
+    if built_in or not (isinstance(events, EventSource) and callable(events.index)):
+        raise InputError(
+            f"{name}: events is a {type(events).__name__}, not jaxevent.Events; make the recording "
+            "by jaxevent.Recording.from_arrays(t, x, y, p, width=..., height=...), or of a file by "
+            "jaxevent.load"
+        )
+    known = getattr(events, "checked_size", None)
+    if isinstance(known, tuple) and known[0] <= size[0] and known[1] <= size[1]:
+        return events
+    return CheckedEvents(events, size, name)
 
 
 @runtime_checkable
@@ -184,13 +312,46 @@ class ImageSource(Protocol):
 class Frames:
     """Grey frames: images (frames, height, width), mid-exposure times and exposure lengths (us).
 
-    Images are uint8 or uint16 grey levels, or floats already in [0, 1]. An exposure of 0 means
-    that its length is not known.
+    Images are uint8 or uint16 grey levels, or floats in [0, 1]; times rise. An exposure of 0 means
+    that its length is not known. All is checked when it is given, of images that stay in a file
+    their type and shape. Raises `InputError` for other types, shapes and values.
     """
 
     t: NDArray[np.int64]
     images: NDArray | ImageSource
     exposure: NDArray[np.int64]
+
+    def __post_init__(self):
+        images, source = self.images, "frames"
+        lazy = isinstance(images, ImageSource) and not isinstance(images, np.ndarray | np.generic)
+        lazy = lazy and isinstance(images.dtype, np.dtype) and not hasattr(images, "__dlpack__")
+        if not lazy:
+            images = arrays.as_array(images, f"{source}: images")
+        arrays.check_image_kind(np.dtype(images.dtype), source)
+        t = _integer_times(self.t, f"{source}: t")
+        exposure = _integer_times(self.exposure, f"{source}: exposure")
+        shape = tuple(images.shape)
+        if len(shape) != 3 or not len(t) == len(exposure) == shape[0]:
+            raise InputError(
+                f"{source} have shape {shape}, and there are {len(t)} times and {len(exposure)} "
+                "exposures; give images (n, height, width), and n of both"
+            )
+        if not lazy:
+            arrays.check_image_values(images, source)
+            images = arrays.plain_images(np.asarray(images))
+        for name, values in (("t", t), ("images", images), ("exposure", exposure)):
+            object.__setattr__(self, name, values)
+        self._check_times(source)
+
+    @classmethod
+    def of_checked(
+        cls, t: NDArray[np.int64], images: NDArray | ImageSource, exposure: NDArray[np.int64]
+    ) -> "Frames":
+        """Frames that were checked, as rows of others are, or references of linear intensity."""
+        frames = object.__new__(cls)
+        for name, values in (("t", t), ("images", images), ("exposure", exposure)):
+            object.__setattr__(frames, name, values)
+        return frames
 
     def __repr__(self) -> str:
         height, width = self.images.shape[1:]
@@ -200,7 +361,12 @@ class Frames:
         return len(self.t)
 
     def __getitem__(self, rows: slice | NDArray) -> "Frames":
-        return Frames(self.t[rows], self.images[rows], self.exposure[rows])
+        """The frames of a slice, a mask or row numbers that rise; `InputError` for others."""
+        _check_rows(rows, "frames")
+        part = Frames.of_checked(self.t[rows], self.images[rows], self.exposure[rows])
+        if not isinstance(rows, slice) or (rows.step or 1) < 1:
+            part._check_times("frames")
+        return part
 
     @property
     def intensity(self) -> NDArray[np.float32]:
@@ -212,19 +378,23 @@ class Frames:
 
     def check(self, width: int, height: int, source: str) -> None:
         """Raise `InputError` unless the frames fit the sensor, are in order and hold numbers."""
-        if self.images.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
-            raise InputError(
-                f"{source}: frames are {self.images.dtype}; store uint8, uint16 or floats in [0, 1]"
-            )
+        arrays.check_image_kind(np.dtype(self.images.dtype), f"{source}: frames")
+        self.check_shape(width, height, source)
+        self._check_times(source)
+        arrays.check_image_values(self.images, source)
+
+    def check_shape(self, width: int, height: int, source: str) -> None:
+        """Raise `InputError` unless the images are those of a width x height sensor."""
         if self.images.shape != (len(self.t), height, width) or len(self.exposure) != len(self.t):
             raise InputError(
                 f"{source}: frames have shape {self.images.shape} and {len(self.exposure)} "
                 f"exposures; {len(self.t)} frame times of a {width}x{height} sensor need "
                 f"({len(self.t)}, {height}, {width}) and {len(self.t)}"
             )
-        late = self.t[1:] <= self.t[:-1]
-        if late.any():
-            row = int(np.argmax(late)) + 1
+
+    def _check_times(self, source: str) -> None:
+        row = arrays.first_decrease(self.t, strict=True)
+        if row is not None:
             raise InputError(
                 f"{source}: frame {row} at {self.t[row]} us is not later than frame {row - 1} at "
                 f"{self.t[row - 1]} us; sort the frames by time and remove repeated ones"
@@ -235,14 +405,38 @@ class Frames:
                 f"{source}: frame {row} has the exposure {self.exposure[row]} us; it must be "
                 "positive, or 0 where unknown"
             )
-        if self.images.dtype.kind == "f":
-            for row in range(len(self)):
-                image = np.asarray(self.images[row : row + 1])
-                if not ((image >= 0) & (image <= 1)).all():
-                    raise InputError(
-                        f"{source}: frame {row} holds NaN or values outside [0, 1]; scale float "
-                        "frames to [0, 1] and remove broken ones"
-                    )
+
+
+def _integer_times(values: Any, what: str) -> NDArray[np.int64]:
+    """Times (n,) of any integer type as plain int64 us, or `InputError`."""
+    t = arrays.as_column(values, what)
+    if t.dtype.kind == "f" and len(t):
+        raise InputError(
+            f"{what} is {t.dtype}; give integer microseconds, as np.rint(1e6 * {what.split()[-1]})"
+            ".astype('int64') of seconds"
+        )
+    return arrays.as_times(t, what)
+
+
+def _set_rows(part: Any, what: str, **columns: tuple[tuple[int, ...], Any]) -> None:
+    """Set checked times and, by name, columns of a shape per row and a type; or `InputError`."""
+    t = _integer_times(part.t, f"{what}: t")
+    row = arrays.first_decrease(t)
+    if row is not None:
+        raise InputError(
+            f"{what} times are not sorted: row {row} is earlier than the one above it; sort them"
+        )
+    object.__setattr__(part, "t", t)
+    for name, (shape, kind) in columns.items():
+        values = arrays.as_array(getattr(part, name), f"{what}: {name}")
+        wanted = (len(t), *shape)
+        kept = values.astype(kind) if np.isfinite(values).all() else values
+        if values.shape != wanted or not (kept == values).all():
+            raise InputError(
+                f"{what}: {name} is {values.dtype} of shape {values.shape}; it must be finite "
+                f"{np.dtype(kind)} of shape {wanted}, one row for each of {len(t)} times"
+            )
+        object.__setattr__(part, name, arrays.as_plain(values, kind))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -252,6 +446,9 @@ class Poses:
     t: NDArray[np.int64]
     position: NDArray[np.float64]
     quaternion: NDArray[np.float64]
+
+    def __post_init__(self):
+        _set_rows(self, "pose", position=((3,), np.float64), quaternion=((4,), np.float64))
 
     def __len__(self) -> int:
         return len(self.t)
@@ -268,6 +465,9 @@ class Imu:
     gyro: NDArray[np.float64]
     acc: NDArray[np.float64]
 
+    def __post_init__(self):
+        _set_rows(self, "IMU", gyro=((3,), np.float64), acc=((3,), np.float64))
+
     def __len__(self) -> int:
         return len(self.t)
 
@@ -282,6 +482,9 @@ class Triggers:
     t: NDArray[np.int64]
     edge: NDArray[np.int8]
     channel: NDArray[np.uint8]
+
+    def __post_init__(self):
+        _set_rows(self, "trigger", edge=((), np.int8), channel=((), np.uint8))
 
     def __len__(self) -> int:
         return len(self.t)
@@ -317,6 +520,150 @@ class Recording(Shown):
     triggers: Triggers | None = None
     notes: tuple[str, ...] = ()
     left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        if not isinstance(self.name, str):
+            raise InputError(
+                f"name is {arrays.brief(self.name)}, a {type(self.name).__name__}; give a text, "
+                "the recording's name"
+            )
+        size = arrays.as_size(self.width, self.height, self.name)
+        for side, pixels in zip(("width", "height"), size, strict=True):
+            object.__setattr__(self, side, pixels)
+        events = _checked_source(self.events, size, self.name)
+        object.__setattr__(self, "events", events)
+        parts = {
+            "frames": Frames, "camera": PinholeCamera, "poses": Poses, "imu": Imu,
+            "triggers": Triggers,
+        }  # fmt: skip
+        for field, kind in parts.items():
+            part = getattr(self, field)
+            if part is not None and not isinstance(part, kind):
+                raise InputError(
+                    f"{self.name}: {field} is a {type(part).__name__}; give "
+                    f"{kind.__module__}.{kind.__name__} or None"
+                )
+        if self.frames is not None:
+            self.frames.check_shape(self.width, self.height, self.name)
+        for field in ("extra", "left_out"):
+            if not isinstance(getattr(self, field), Mapping):
+                raise InputError(
+                    f"{self.name}: {field} is a {type(getattr(self, field)).__name__}; give a "
+                    "dictionary by name"
+                )
+        if not isinstance(self.notes, tuple | list):
+            raise InputError(
+                f"{self.name}: notes is a {type(self.notes).__name__}; give a tuple of sentences"
+            )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        t: Any,
+        x: Any = None,
+        y: Any = None,
+        p: Any = None,
+        *,
+        width: int | None = None,
+        height: int | None = None,
+        frames: Any = None,
+        frame_times: Any = None,
+        exposure: Any = None,
+        time_unit: arrays.TimeUnit | None = None,
+        name: str = "arrays",
+        camera: PinholeCamera | None = None,
+        poses: Poses | None = None,
+        imu: Imu | None = None,
+        triggers: Triggers | None = None,
+        extra: Mapping[str, Any] | None = None,
+    ) -> "Recording":
+        """Make a recording of arrays in memory.
+
+        Arrays are lists or arrays of any library that NumPy can read: NumPy of any byte order and
+        stride, JAX, PyTorch on the CPU, columns of pandas, polars and Arrow. Those that have the
+        recording's own types are kept, not copied; change them no more.
+
+        Args:
+            t: Times of the events (n,), sorted. Integers are us unless `time_unit` says otherwise;
+                floats need `time_unit`. Given alone: a structured array, a DataFrame, a table or a
+                dictionary that holds all four columns by names such as t, x, y, p or timestamp,
+                x, y, polarity.
+            x: Columns of the events (n,), whole numbers from 0 to width - 1.
+            y: Rows of the events (n,), whole numbers from 0 to height - 1.
+            p: Polarity (n,): bool, 0 and 1 or -1 and 1 of any type. 1 is ON.
+            width: Pixels of a row of the sensor; by default those of the frames.
+            height: Pixels of a column of the sensor; by default those of the frames.
+            frames: Images (m, height, width), or in colour (m, height, width, 3), red first: uint8,
+                uint16 or floats in [0, 1]. Colours become grey (ITU-R 601 luma) and are kept in
+                `extra["rgb"]`, uint8.
+            frame_times: Times (m,) of the middle of each exposure, which rise; units are as of `t`.
+            exposure: Length of the exposures, one number or (m,), of the same unit; by default
+                unknown.
+            time_unit: Unit of `t`, `frame_times` and `exposure`: "s", "ms", "us" or "ns". Times
+                are rounded to us.
+            name: The recording's name, in messages and on pages.
+            camera: Lens of the event camera.
+            poses: Ground truth of the camera's motion.
+            imu: Inertial measurements.
+            triggers: Signals from outside.
+            extra: Further arrays by name; see `Recording`.
+
+        Returns:
+            The recording, checked.
+
+        Raises:
+            InputError: An argument has another type, shape or length, a value is not finite, not
+                on the sensor or not in order, or more than one meaning is possible. The message
+                names the argument and the remedy.
+        """
+        arrays.check_unit(time_unit)
+        if x is None and y is None and p is None:
+            given = arrays.columns_of(t)
+            t, x, y, p = (given[field] for field in "txyp")
+        missing = [field for field, v in zip("txyp", (t, x, y, p), strict=True) if v is None]
+        if missing:
+            raise InputError(
+                f"{missing[0]} is missing; give t, x, y and p, or one array with these fields"
+            )
+        grey = colours = None
+        if frames is not None:
+            grey, colours = arrays.as_images(frames)
+            height = grey.shape[1] if height is None else height
+            width = grey.shape[2] if width is None else width
+        elif frame_times is not None or exposure is not None:
+            what = "exposure" if frame_times is None else "frame_times"
+            raise InputError(f"{what} is given without frames; give frames, (m, height, width)")
+        if width is None or height is None:
+            raise InputError(
+                "width and height are missing, the sensor's size in pixels; give width=346, "
+                "height=260 or what your camera has"
+            )
+        size = arrays.as_size(width, height, name)
+        columns = (arrays.as_column(v, field) for field, v in zip("xyp", (x, y, p), strict=True))
+        us, (x, y, p) = arrays.as_times(t, "t", time_unit), columns
+        arrays.check_lengths(us, x, y, p, name)
+        events = Events.of_checked(
+            us,
+            arrays.coordinates("x", x, size, name),
+            arrays.coordinates("y", y, size, name),
+            arrays.polarities(p, name),
+        )
+        events.check(*size, name)
+        made = None
+        if grey is not None:
+            if frame_times is None:
+                raise InputError("frame_times is missing; give the time of each of the frames")
+            middle = arrays.as_times(frame_times, "frame_times", time_unit)
+            lengths = arrays.as_array(0 if exposure is None else exposure, "exposure")
+            if lengths.ndim == 0:
+                lengths = np.broadcast_to(lengths, middle.shape)
+            made = Frames(middle, grey, arrays.as_times(lengths, "exposure", time_unit))
+        further = {} if extra is None else extra
+        if colours is not None and isinstance(further, Mapping):
+            further = {"rgb": colours, **further}
+        recording = cls(name, *size, events, made, camera, poses, imu, further, triggers)
+        recording.refuse_empty()
+        return recording
 
     def __repr__(self) -> str:
         count = len(self.events)
@@ -428,18 +775,25 @@ class Recording(Shown):
         return {**self.extra, **cut}
 
     def check(self, source: str | None = None) -> "Recording":
-        """Return self, or raise `InputError` naming what is wrong and where."""
+        """Return self, or raise `InputError` naming what is wrong and where.
+
+        Arrays that were changed since the recording was made are found, too.
+        """
         source = source or self.name
-        if self.width < 1 or self.height < 1:
-            raise InputError(f"{source}: the sensor size {self.width}x{self.height} is not valid")
-        if not len(self.events) and not self.frames:
-            raise InputError(f"{source}: holds no event and no frame; nothing can be estimated")
-        if isinstance(self.events, Events):
-            self.events.check(self.width, self.height, source)
+        self.refuse_empty(source)
+        self.check_events(source)
         if self.frames is not None:
             self.frames.check(self.width, self.height, source)
-        named = (("pose", self.poses), ("IMU", self.imu), ("trigger", self.triggers))
-        for name, part in named:
-            if part is not None and (np.diff(part.t) < 0).any():
-                raise InputError(f"{source}: {name} times are not sorted; sort them")
         return self
+
+    def check_events(self, source: str | None = None) -> None:
+        """Raise `InputError` where events in memory were changed since they were checked."""
+        if isinstance(self.events, Events):
+            self.events.check(self.width, self.height, source or self.name)
+
+    def refuse_empty(self, source: str | None = None) -> None:
+        """Raise `InputError` where there is neither an event nor a frame."""
+        if not len(self.events) and not self.frames:
+            raise InputError(
+                f"{source or self.name}: holds no event and no frame; nothing can be estimated"
+            )

@@ -270,7 +270,8 @@ def optimise(
     Args:
         loss: `loss(params, batch)`, the mean over a batch's measurements; pure.
         params: Where to start; what is not named stays as it is.
-        names: Parameters to follow the gradient of.
+        names: Parameters to follow the gradient of. Where a loss jumps as they change, its gradient
+            is not its slope; that of the AKF does with `ratio_width = 0`.
         batches: Pytrees, one compilation for each shape. A batch with an attribute `weight` counts
             that much in means over batches. Or a function `prepare(params)` that gives batches to
             fit to and batches to validate on, for parameters that act when batches are made. Of

@@ -83,8 +83,14 @@ class Pixel:
         # Sums that cancel exactly in counts must not leave a rounding error to divide by.
         if abs(S) < 1e-12 or not self.p.get("calibrate", True):
             return 1.0
-        r = dL / S
-        return r if self.p["ratio_min"] <= r <= self.p["ratio_max"] else 1.0
+        r, width = dL / S, self.p.get("ratio_width", 0)
+        if width == 0:
+            return r if self.p["ratio_min"] <= r <= self.p["ratio_max"] else 1.0
+        weight = 1.0
+        for inside in (r - self.p["ratio_min"], self.p["ratio_max"] - r):
+            t = min(max(inside / width + 0.5, 0), 1)
+            weight *= 3 * t**2 - 2 * t**3
+        return 1 + weight * (r - 1) if weight else 1.0
 
     def forward(self, k, n):
         return self.at_left(k) + self.ratio(k) * (self.moved(n) - self.before(self.left[k]))

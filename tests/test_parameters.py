@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from jaxevent.errors import InputError
@@ -81,3 +82,86 @@ def test_values_made_in_double_precision_are_read_in_single():
         assert params.sigma.dtype == np.float32 and float(params.sigma) == pytest.approx(0.3)
         under_jit = jax.jit(lambda params: params.sigma)(params)
         np.testing.assert_allclose(params.sigma, under_jit, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [np.float16, np.float32, np.int8, np.array, jnp.array, lambda v: jnp.array(v, jnp.bfloat16)],
+)
+def test_numbers_of_numpy_and_jax_are_numbers(kind):
+    value = kind(2)
+    params = Given(sigma=value, offset=value, cells=np.uint16(4))
+    assert float(params.sigma) == pytest.approx(2, rel=1e-12) and float(params.offset) == 2
+    assert Given().replace(sigma=value).values() == Given(sigma=2).values()
+    assert params.cells == 4 and type(params.cells) is int
+
+
+@pytest.mark.parametrize(
+    "value, said",
+    [
+        (np.float32("nan"), "sigma is nan; give a finite number"),
+        (jnp.array(jnp.inf), "sigma is inf; give a finite number"),
+        (jnp.array(-1.0), "sigma is -1.0; it must not be negative"),
+        (np.bool_(True), "sigma is True; give a finite number"),
+        ("0.1", "sigma is '0.1'; give a finite number below 1e.15 in size, without quotes"),
+        (0.1 + 0j, "sigma is .*; give a finite number"),
+        (np.complex64(1), "sigma is .*; give a finite number"),
+        (np.ma.masked, "sigma is None; give a finite number"),
+        ([0.1, 0.2], "sigma is .*; give one number, and use jax.vmap"),
+        (np.array([0.1]), "sigma is .*; give one number, and use jax.vmap"),
+        (jnp.ones((2, 2)), "sigma is .*; give one number, and use jax.vmap"),
+    ],
+)
+def test_what_is_no_number_is_refused_in_a_sentence(value, said):
+    for make in (Given, Given().replace):
+        with pytest.raises(InputError, match=f"^the parameter {said}") as refused:
+            make(sigma=value)
+        assert "\n" not in str(refused.value)
+
+
+def test_traced_values_pass_unless_they_are_complex():
+    given = jax.jit(lambda s: Given(sigma=s).sigma)
+    assert np.isnan(given(jnp.nan))
+    with pytest.raises(InputError, match="sigma is traced as complex.*; give a real number"):
+        given(1j)
+
+
+def loss(params):
+    return (params.offset - 2) ** 2 + jnp.log(params.sigma) * params.outliers + params.sigma**3
+
+
+def test_a_gradient_shows_itself_and_is_converted_to_units():
+    params = Given(sigma=0.25, outliers=0.2)
+    for gradient in (jax.grad(loss)(params), jax.jit(jax.grad(loss))(params)):
+        assert gradient.is_gradient and not params.is_gradient
+        text = repr(gradient)
+        assert text.startswith("<gradient by Given.raw") and text.endswith("; 0: late>")
+        assert "offset=-6, sigma=0.2469, outliers=-0.2218;" in text  # d / d ln, d / d logit
+        found = gradient.per_unit(params)
+        h = 1e-6
+        for name in ("offset", "sigma", "outliers"):
+            ends = [
+                loss(params.replace(**{name: float(getattr(params, name)) + s})) for s in (-h, h)
+            ]
+            assert float(found[name]) == pytest.approx(float(ends[1] - ends[0]) / (2 * h), rel=1e-8)
+    with pytest.raises(InputError, match=r"sigma of a gradient .* gradient.per_unit\(params\)"):
+        getattr(gradient, "sigma")  # noqa: B009
+    for refused in (lambda: params.per_unit(params), lambda: gradient.per_unit(gradient)):
+        with pytest.raises(InputError, match="per_unit"):
+            refused()
+    inside = jax.jit(lambda params: jax.grad(loss)(params).per_unit(params))(params)
+    np.testing.assert_allclose(inside["sigma"], found["sigma"], rtol=1e-12)
+    assert np.isnan(Given(sigma=0.0).raw["sigma"] * 0)  # stored as -inf
+    assert np.isnan(jax.grad(lambda p: p.sigma)(p0 := Given(sigma=0.0)).per_unit(p0)["sigma"])
+
+
+def test_a_step_is_no_parameters_and_its_sum_with_some_is():
+    params = Given()
+    adam = optax.adam(0.1)
+    gradient, memory = jax.grad(loss)(params), adam.init(params)
+    step, memory = adam.update(gradient, memory)
+    assert step.is_gradient and memory[0].mu.is_gradient
+    moved = optax.apply_updates(params, step)
+    assert not moved.is_gradient and float(moved.offset) == pytest.approx(-0.9)
+    assert repr(moved).startswith("Given(offset=-0.9, sigma=0.4524, ")
+    assert repr(jax.tree.map(lambda leaf: None, params)).startswith("Given(")

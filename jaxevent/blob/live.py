@@ -68,7 +68,7 @@ class LiveTracks:
         kernel: Callable[[Packing], FusedRun | None],
     ):
         self.params, self._filter, self._kernel = params, filter, kernel
-        self._tail = Tail()
+        self._tail = Tail(*size)
         self._recording = Recording("live", *size, self._tail)
         self._detect = seeds is None if detect is None else detect
         self._packing: Packing | None = None
@@ -99,9 +99,9 @@ class LiveTracks:
 
     def add(self, events: Events) -> None:
         """Add events that are not earlier than those before; raises `InputError` for bad ones."""
-        if self._start is not None:
+        if self._start is not None and isinstance(events, Events):
             events = events[events.index(self._start) :]
-        self._tail.add(events, self._recording.width, self._recording.height)
+        self._tail.add(events)
         if not len(events):
             return
         if self._packing is None:

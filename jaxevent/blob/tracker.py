@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import jax
@@ -24,7 +24,7 @@ from jaxevent.blob.steps import Filter
 from jaxevent.blob.targets import Slots
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
-from jaxevent.estimator import Estimator
+from jaxevent.estimator import Estimator, OptionKind, of_class
 from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.recording import Recording, Times, microseconds
 
@@ -42,6 +42,10 @@ class Tracker(Estimator[P]):
 
     filter: Filter
     family: ClassVar[str] = "blob"
+    option_kinds: ClassVar[Mapping[str, OptionKind]] = {
+        **Estimator.option_kinds,
+        "found": of_class(Found),
+    }
     options: frozenset[str] = dataclasses.field(
         default=frozenset({"seeds", "start", "stop", "detect", "found", "smooth", "compiler"}),
         kw_only=True,
@@ -67,6 +71,7 @@ class Tracker(Estimator[P]):
         recording, unless told to `extrapolate`: then the estimate is not valid there.
         """
         self.check(recording)
+        self.check_options(seeds=seeds, start=start, stop=stop, detect=detect, found=found)
         params = self.Params() if params is None else params
         packing = Packing(recording, params, seeds, start, stop, detect, found=found)
         us = np.atleast_1d(microseconds(times))
@@ -186,6 +191,9 @@ class Tracker(Estimator[P]):
                 filter's states cannot be smoothed, or numba is asked for and has no kernel.
         """
         self.check(recording)
+        self.check_options(
+            seeds=seeds, start=start, stop=stop, detect=detect, found=found, smooth=smooth
+        )
         self._check_compiler(compiler)
         if smooth:
             self._check_smoothing()
@@ -228,6 +236,7 @@ class Tracker(Estimator[P]):
             InputError: A seed is outside the sensor, or numba is asked for and has no kernel.
         """
         self._check_compiler(compiler)
+        self.check_options(seeds=seeds, start=start, detect=detect)
         params = self.Params() if params is None else params
         kernel = functools.partial(self._fused, params, compiler)
         return LiveTracks(

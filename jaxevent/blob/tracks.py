@@ -4,7 +4,7 @@ import copy
 import dataclasses
 import functools
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +18,14 @@ from jaxevent.blob.prepare import Mark, Packing, Stretch
 from jaxevent.blob.scan import ScanRun, numbers_in
 from jaxevent.blob.states import TrackStates
 from jaxevent.blob.steps import Filter
+from jaxevent.blob.tables import TABLE_RATE, TABLE_UNITS, evenly, table_columns
 from jaxevent.errors import InputError
 from jaxevent.progress import bar
 from jaxevent.recording import Times, microseconds
 from jaxevent.shown import Shown
+
+if TYPE_CHECKING:
+    import pandas
 
 BEGINS = 32  # stretches from which tracking can be taken up again
 TOGETHER = 2**12  # states that are told of at once
@@ -160,6 +164,44 @@ class Tracks(Shown):
                 held = []
         if held:
             yield np.concatenate([t for t, _ in held]), _joined([now for _, now in held])
+
+    def to_dataframe(
+        self,
+        times: Times | None = None,
+        ids: Sequence[int] | NDArray[np.integer] | None = None,
+    ) -> "pandas.DataFrame":
+        """Make a pandas table of the tracks, the one that `jaxevent track` writes as CSV.
+
+        Args:
+            times: Integers (us) or floats (s), in any order; by default 1000 per second.
+            ids: Which tracks; by default all.
+
+        Returns:
+            A row for each time and track that is alive then, by time and then by track. The columns
+            are t (s), id, the state x, y, vx, vy, lambda1, lambda2, theta, q and its standard
+            deviations sigma_x ... sigma_q. `attrs["units"]` has the unit of each column.
+
+        Raises:
+            InputError: A time is outside the recording, or there is no such track.
+        """
+        import pandas
+
+        if times is None:
+            times = evenly(self.start, self.stop, TABLE_RATE)
+        times = np.sort(np.atleast_1d(microseconds(times)))
+        parts: list[list[NDArray]] = []
+        for t, states in self.batches(times, ids):
+            row, place = np.nonzero(states.valid)
+            own = states.mean[row, place], states.covariance[row, place]
+            parts.append([t[row], states.id[place], *own])
+        if not parts:
+            states = self._nothing(np.zeros(0, np.int64), self._chosen(ids))
+            flat = states.mean.reshape(0, 8), states.covariance.reshape(0, 8, 8)
+            parts.append([np.zeros(0, np.int64), np.zeros(0, np.int64), *flat])
+        joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
+        table = pandas.DataFrame(table_columns(*joined))
+        table.attrs["units"] = dict(TABLE_UNITS)
+        return table
 
     def _pieces(
         self, times: Times, ids: Sequence[int] | NDArray[np.integer] | None, extrapolate: bool

@@ -55,9 +55,16 @@ def add_reading(one: argparse.ArgumentParser, frames: bool = True) -> None:
         help="calibration of the camera instead of the recording's: camchain.yaml of Kalibr or "
         "camera_info of ROS; FILE:NAME takes one of several",
     )
+    one.add_argument(
+        "--time-unit",
+        choices=("s", "ms", "us", "ns"),
+        help="unit of the event times, for a table that does not state it; default: inferred",
+    )
     if frames:
         add_frames(one, "--frames", "a file")
-    one.set_defaults(reading=("size", "stream", "camera", *(("frames",) if frames else ())))
+    one.set_defaults(
+        reading=("size", "stream", "camera", "time_unit", *(("frames",) if frames else ()))
+    )
 
 
 def add_frames(one: argparse.ArgumentParser, name: str, source: str) -> None:

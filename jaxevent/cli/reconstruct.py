@@ -120,8 +120,8 @@ def run(
         raise InputError(f"{params}: parameters are of one method; name it with --method")
     estimator = find(method or "mc", "reconstruction")
     values = estimator.Params() if params is None else estimator.Params.load(params, method)
-    asked = None if times is None else read_times(times)
     recording = arguments.open_recording(path, reading)
+    asked = None if times is None else read_times(times, (recording.start, recording.stop))
     name = recording.name
     recording = dataclasses.replace(recording, name=str(path))  # for messages
     if at == "frames" and recording.frames is None:

@@ -124,6 +124,7 @@ class MotionEstimator(Estimator[P]):
         Raises `InputError` as `find_model` does, and where the model needs a camera and there is
         none.
         """
+        self.check_options(model=model, camera=camera)
         if model is None:
             model = next(one for one in MODELS.values() if self.knows(one))
         found, camera = self.find_model(model), camera or recording.camera
@@ -274,6 +275,7 @@ class OnHost(MotionEstimator[P]):
     ) -> tuple[Given, NDArray[np.int64]]:
         """What `run` needs; raises `InputError` as `estimate` does and for times outside."""
         self.refuse_unknown(more)
+        self.check_options(seed=seed, progress=progress, **more)
         found, camera = self.place(recording, model, camera)
         if not extrapolate and len(recording.events):
             check_times(times, recording.start, recording.stop, recording.name)

@@ -1,7 +1,7 @@
 """What every estimator of the camera's motion gives: a `Motion`, which answers at any time."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,9 @@ from jaxevent.egomotion.models import Model, find_model
 from jaxevent.estimator import Estimate
 from jaxevent.recording import Recording, Times, check_times, microseconds
 from jaxevent.shown import Shown
+
+if TYPE_CHECKING:
+    import pandas
 
 ACROSS = 0.1  # of the spread of speeds at several depths, that of the velocity across them
 # Of a motion, what a lens that was calibrated leaves: of a rotation, that f is off by 0.5 %, the
@@ -32,6 +35,30 @@ def decided(model: str | type[Model], covariance: NDArray[np.floating]) -> NDArr
 def left_by_lens(camera: PinholeCamera | None) -> float:
     """The share of a motion that a camera's calibration leaves: `LENS` if its lens distorts."""
     return LENS if camera is not None and camera.is_distorted else 0.0
+
+
+def table_columns(
+    model: str | type[Model], times: NDArray[np.int64], told: Estimate
+) -> dict[str, NDArray]:
+    """Arrange a motion as the columns of a table.
+
+    Args:
+        model: Its model, of d components.
+        times: (T,), us.
+        told: The motion at these times: mean (T, d), covariance (T, d, d), valid (T,).
+
+    Returns:
+        Arrays (T,) by name: t (s), each component, its standard deviation sigma_<component>, and
+        lost, 0 or 1. Where it is lost the components and their sigmas are NaN.
+    """
+    names = find_model(model).components
+    lost = ~told.valid[:, None]
+    variance = np.diagonal(told.covariance, axis1=1, axis2=2)
+    columns: dict[str, NDArray] = {"t": times / 1e6}
+    columns |= dict(zip(names, np.where(lost, np.nan, told.mean).T, strict=True))
+    sigma = np.where(lost, np.nan, np.sqrt(np.maximum(variance, 0)))
+    columns |= {f"sigma_{name}": s for name, s in zip(names, sigma.T, strict=True)}
+    return columns | {"lost": (~told.valid).astype(int)}
 
 
 class Calibration(NamedTuple):
@@ -235,6 +262,35 @@ class Motion(Shown):
         dt = np.diff(self.t[found]).astype(float)
         rates = np.diff(self.mean[found], axis=0)[dt > 0] / dt[dt > 0, None]
         return rates.T @ rates / max(len(rates), 1)
+
+    def to_dataframe(
+        self, times: Times | None = None, *, centred: bool = False
+    ) -> "pandas.DataFrame":
+        """Make a pandas table of the motion, with the columns that `jaxevent motion` writes as CSV.
+
+        Args:
+            times: Integers (us) or floats (s); by default the table holds the estimates themselves.
+            centred: Whether an estimate counts for the time that what it saw shows, see the call.
+
+        Returns:
+            A row for each time. The columns are t (s), the model's components, their standard
+            deviations sigma_<component>, and lost (0 or 1): where it is 1 the numbers are NaN.
+            `attrs["units"]` has the unit of each column.
+
+        Raises:
+            InputError: A time is not finite or outside the recording.
+        """
+        import pandas
+
+        if times is None:
+            us, told = self.t, Estimate(self.mean, self.covariance, self.valid)
+        else:
+            us, told = np.atleast_1d(microseconds(times)), self(times, centred=centred)
+        table = pandas.DataFrame(table_columns(self.model, us, told))
+        units = dict(zip(self.model.components, self.model.units, strict=True))
+        sigmas = {f"sigma_{name}": unit for name, unit in units.items()}
+        table.attrs["units"] = {"t": "s", **units, **sigmas, "lost": "1"}
+        return table
 
     def __len__(self) -> int:
         return len(self.t)

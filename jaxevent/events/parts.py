@@ -24,6 +24,7 @@ def source_of(part: Events | Recording) -> EventSource:
 def size_of(part: Events | Recording, size: Size | None) -> Size:
     """(width, height) of the sensor: the recording's, else what was given."""
     if isinstance(part, Recording):
+        part.check_events()
         return part.width, part.height
     if size is None:
         raise InputError("events alone do not tell the sensor; give size=(width, height)")
@@ -53,14 +54,15 @@ def blocks(source: EventSource, start: int = 0, stop: int | None = None) -> Iter
 
 def pick(events: Events, rows: NDArray) -> Events:
     """Some of the events, by a mask or by rows."""
-    return Events(events.t[rows], events.x[rows], events.y[rows], events.p[rows])
+    return events[rows]
 
 
 def rewrite(part: Part, step: Callable[[Events], Events]) -> Part:
     """The same with `step` of its events, which are passed block by block, in order."""
     done = [step(block) for block in blocks(source_of(part))]
     done = done or [Events.empty()]
-    events = Events(*(np.concatenate([getattr(e, name) for e in done]) for name in "txyp"))
+    columns = (np.concatenate([getattr(e, name) for e in done]) for name in "txyp")
+    events = Events.of_checked(*columns)
     if isinstance(part, Recording):
         return dataclasses.replace(part, events=events)
     return events  # ty: ignore[invalid-explicit-return]

@@ -2,15 +2,17 @@
 
 The layouts are described in the reader modules, and what each was checked against: `aedat2`,
 `aedat4`, `columns` (tables of text and NumPy records), `event_stream`, `evimo`, `hdf5`,
-`hdf5_layouts`, `mat`, `n_caltech`, `npz`, `prophesee`, `ros` (with `bags`, `ros_messages` and
-`ros_events`) and `text`; `calibration` reads files of cameras. They are imported when first needed.
-This module also turns the raw numbers of a file into checked fields, so that every reader accepts
-the same values and words its errors alike.
+`hdf5_layouts`, `mat`, `n_caltech`, `npz`, `parquet`, `prophesee`, `ros` (with `bags`,
+`ros_messages` and `ros_events`) and `text`; `time_units` finds the unit of times in tables,
+`calibration` reads files of cameras. They are imported when first needed. This module also turns
+the raw numbers of a file into checked fields, so that every reader accepts the same values and
+words its errors alike.
 """
 
 import contextlib
 import dataclasses
 import os
+import re
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,23 +21,45 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent import arrays
+from jaxevent.arrays import times
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
 from jaxevent.io.options import ReadOptions
 from jaxevent.lenses import LENSES, find_model
 from jaxevent.recording import PER_FRAME, Events, Frames, Recording
 
-__all__ = ["load", "save"]
+__all__ = ["load", "save", "times"]
 
 Reader = Callable[[Path, ReadOptions], Recording]
 
 _BAGS = (b"#ROSBAG", b"\x89MCAP0\r\n", b"SQLite format 3\0")
+_UNPACK = "unpack it and load the file inside"
+_UNREADABLE = {
+    b"\x1f\x8b": ("compressed by gzip", _UNPACK),
+    b"BZh": ("compressed by bzip2", _UNPACK),
+    b"\xfd7zXZ\0": ("compressed by xz", _UNPACK),
+    b"\x28\xb5\x2f\xfd": ("compressed by zstd", _UNPACK),
+    b"7z\xbc\xaf\x27\x1c": ("an archive of 7-Zip", _UNPACK),
+    b"Rar!": ("an archive of RAR", _UNPACK),
+    b"FEA1": ("Feather version 1", "write it anew as Parquet"),
+    b"SIMPLE  =": ("FITS", "store events as a table of text or .npz"),
+    **{
+        b"\x80" + bytes([protocol]): (
+            "a pickle, which can run any program when it is read",
+            "if you trust it, load it with pickle and write it as .npz with t, x, y and p",
+        )
+        for protocol in range(2, 6)
+    },
+}
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 NO_FRAMES = "none"
+_PROPHESEE = re.compile(
+    rb"^% *(evt|format|version|data file|end)\b", re.I | re.M
+)  # lines of its headers
 _SMALL = 1 << 27  # bytes of arrays that every file may unfold to
 _MOST_COMPRESSED = 100  # times that a larger one may unfold to of its own bytes
-_MOST_PIXELS = 1 << 16  # of a side: coordinates are uint16
-_MOST_TIME = 1 << 62  # us, 146,000 years: sums and differences of two times stay in int64
+TIME_UNITS = ("s", "ms", "us", "ns")
 
 _COUNTS = {8: "eight", 9: "nine", 12: "twelve"}  # of the numbers of a camera
 
@@ -43,7 +67,7 @@ READABLE = (
     "readable are a folder or zip with events.txt (Event-Camera Dataset), AEDAT 2 and 4, "
     "Prophesee RAW and DAT, Event Stream, bags of ROS 1 and ROS 2, HDF5 (jaxevent's own, DSEC, "
     "MVSEC, M3ED and others), MATLAB .mat (v5 and v7.3), N-Caltech101 .bin, folders of EVIMO2, "
-    ".npz, .npy and tables of text"
+    ".npz, .npy, Parquet, Feather and tables of text"
 )
 
 
@@ -78,7 +102,8 @@ def load(
             datasets. Such a file can have any file read that you may read, or never end.
         frames: Which images become the frames, of a file that holds several kinds: a topic of a
             bag, the number of a stream of AEDAT 4. "none" leaves frames out, in any format.
-        time_unit: The unit of the event times, "s", "ms", "us" or "ns"; None infers it.
+        time_unit: The unit of the event times, "s", "ms", "us" or "ns", of formats that do not
+            state it; None infers it (`jaxevent.io.time_units`), with an `InputWarning` in doubt.
         repair: How to mend event times that go back: "sort" late events, "drop" outliers, "unwrap"
             a counter, keep a "part" between resets, or several of them, as in "unwrap,sort"; see
             `jaxevent.io.disorder`. None refuses such times, and the message says what would help.
@@ -90,10 +115,14 @@ def load(
             valid recording; the message names the place and the remedy.
     """
     path = Path(path)
-    if size is not None and not 1 <= min(size) <= max(size) <= _MOST_PIXELS:
+    if size is not None and not 1 <= min(size) <= max(size) <= arrays.MAX_PIXELS:
         raise InputError(
             f"size = {size} must be two positive numbers of pixels, (width, height), of at most "
-            f"{_MOST_PIXELS}"
+            f"{arrays.MAX_PIXELS}"
+        )
+    if time_unit not in (None, *TIME_UNITS):
+        raise InputError(
+            f"time_unit = {time_unit!r} is not a unit of time; give 's', 'ms', 'us' or 'ns'"
         )
     without_frames = frames == NO_FRAMES
     name = None if without_frames else frames
@@ -109,10 +138,11 @@ def load(
             from jaxevent.io.disorder import parse_repair
 
             parse_repair(repair)
-        recording = _reader(path, options)(path, options)
+        with naming(path):
+            recording = _reader(path, options)(path, options)
     if without_frames:
         recording = _drop_frames(recording)
-    recording.check(str(path))
+    recording.refuse_empty(str(path))
     if camera is not None:
         from jaxevent.io.calibration import read_camera
 
@@ -164,6 +194,7 @@ def _reader(path: Path, options: ReadOptions) -> Reader:
     with reading(str(path)):
         head = b"" if is_folder else _head(path)
     if read := _reader_of_streams(path, head):
+        refuse_time_unit(path, options)
         return read
     if options.frames is not None:
         raise InputError(
@@ -177,6 +208,7 @@ def _reader(path: Path, options: ReadOptions) -> Reader:
         from jaxevent.io import evimo
 
         if evimo.knows(path):
+            refuse_time_unit(path, options)
             return evimo.read
         if not (path / "events.txt").is_file():
             raise InputError(f"{path}: the folder holds no events.txt; {READABLE}")
@@ -191,13 +223,25 @@ def _reader(path: Path, options: ReadOptions) -> Reader:
         from jaxevent.io import mat
 
         return mat.read_v5
-    return _streamed_reader(path, head)
+    if read := _table_reader(path, head):
+        return read
+    read = _streamed_reader(path, head)
+    refuse_time_unit(path, options)
+    return read
 
 
 def refuse_stream(path: Path, options: ReadOptions) -> None:
     """Raise `InputError` where a camera of a file is named that holds only one."""
     if options.stream is not None:
         raise InputError(f"{path}: holds one camera only; leave out stream= or --stream")
+
+
+def refuse_time_unit(path: Path, options: ReadOptions) -> None:
+    """Raise `InputError` where a unit of time is given for a format that states it."""
+    if options.time_unit is not None:
+        raise InputError(
+            f"{path}: this format states the unit of its times; leave out time_unit= or --time-unit"
+        )
 
 
 def _head(path: Path) -> bytes:
@@ -241,17 +285,35 @@ def _streamed_reader(path: Path, head: bytes) -> Reader:
         from jaxevent.io import prophesee
 
         return prophesee.read
-    from jaxevent.io import columns
-
-    if head.startswith(columns.NUMPY_MAGIC):
-        return columns.read_npy
-    if columns.is_text(head):
-        return columns.read_text
     from jaxevent.io import n_caltech
 
     if n_caltech.is_plausible(path):
         return n_caltech.read
+    for magic, (what, remedy) in _UNREADABLE.items():
+        if head.startswith(magic):
+            raise InputError(f"{path}: is {what}; {remedy}")
     raise InputError(f"{path}: the format is not recognised; {READABLE}")
+
+
+def _table_reader(path: Path, head: bytes) -> Reader | None:
+    """The reader of a file of columns, told by its first bytes."""
+    if head.startswith((b"#!AER-DAT", b"Event Stream")):
+        return None
+    from jaxevent.io import columns
+
+    if head.startswith(b"% "):
+        with path.open("rb") as file:
+            first = file.read(1 << 13)
+        is_table = columns.is_text(first) and not _PROPHESEE.search(first)
+        return columns.read_text if is_table else None
+
+    if head.startswith(columns.NUMPY_MAGIC):
+        return columns.read_npy
+    if head.startswith((b"PAR1", b"ARROW1\0\0")):
+        from jaxevent.io import parquet
+
+        return parquet.read
+    return columns.read_text if columns.is_text(head) else None
 
 
 def _zip_reader(path: Path) -> Reader:
@@ -294,20 +356,31 @@ def _hdf5_reader(path: Path, options: ReadOptions) -> Reader:
         ours = isinstance(events, h5py.Group) and {"t", "x", "y", "p"} <= set(events)
         ours |= str(hdf5_files.attribute(file, "format")) == "jaxevent"
         others = not ours and hdf5_layouts.knows(file)
-        matlab = hdf5.is_matlab(path, file)
-    if others:
+        matlab = hdf5.is_matlab(path)
+    if others and not matlab:
         return hdf5_layouts.read
     refuse_stream(path, options)
-    if ours:
-        return hdf5.read
     if matlab:
         from jaxevent.io import mat
 
         return mat.read_v73
+    if ours:
+        return hdf5.read
     raise InputError(
         f"{path}: the HDF5 file has neither events/t, x, y and p nor events under other known "
         f"names; {READABLE}"
     )
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Put the path before the message of an `InputError` that does not name it."""
+    try:
+        yield
+    except InputError as error:
+        if type(error) is not InputError or str(path) in str(error):
+            raise
+        raise InputError(f"{path}: {error}") from error
 
 
 @contextlib.contextmanager
@@ -347,31 +420,6 @@ def check_unfolded(size: int, stored: int, source: str) -> None:
         )
 
 
-def times(
-    values: NDArray, source: str, what: str, scale: float = 1e6, first_row: int = 0
-) -> NDArray[np.int64]:
-    """Times (n,) as int64 us: integers are us already, floats are multiplied by `scale`.
-
-    `first_row` is the row of the first one in `source`.
-    """
-    values = _numbers(values, source, f"{what} times")
-    is_float = values.dtype.kind == "f"
-    values = values.astype(np.float64, copy=False) if is_float else values
-    # NaN and infinity fail this comparison too.
-    most = _MOST_TIME / scale if is_float else _MOST_TIME
-    if len(values) and not -most < values.min() <= values.max() < most:
-        row = int(np.argmin((values > -most) & (values < most)))
-        unit = "seconds" if is_float and scale == 1e6 else "microseconds"
-        shown = f"{values[row]:.16g}" if is_float else str(values[row])
-        raise InputError(
-            f"{source}: {what} {first_row + row} has the time {shown}, not finite "
-            f"or too large for {unit}; correct the unit or remove it"
-        )
-    if not is_float:
-        return values.astype(np.int64, copy=False)
-    return np.rint(values * scale).astype(np.int64)
-
-
 def checked_events(
     t: NDArray,
     x: NDArray,
@@ -388,61 +436,16 @@ def checked_events(
     `t` is int64 us. Coordinates count from `origin`. Polarity is bool, 0/1 or -1/1. `first_row` is
     the row of the first event in `source`. Raises `InputError` for the first bad event.
     """
-    if min(size) < 1 or max(size) > _MOST_PIXELS:
-        raise InputError(
-            f"{source}: the sensor has {size[0]}x{size[1]} pixels, but at most {_MOST_PIXELS} of a "
-            "side, and at least one, can be read; correct its size with size=(width, height) or "
-            "--size"
-        )
-    if not len(t) == len(x) == len(y) == len(p):
-        raise InputError(
-            f"{source}: t, x, y and p have {len(t)}, {len(x)}, {len(y)} and {len(p)} values; "
-            "they must be equally long"
-        )
-
-    def pixels(name: str, values: NDArray, count: int) -> NDArray[np.uint16]:
-        values = _numbers(values, source, name)
-        last = origin + count - 1
-        if values.dtype.kind == "f":
-            good = (values >= origin) & (values <= last) & (values == np.rint(values))
-            bad_row = None if good.all() else int(np.argmin(good))
-        elif len(values) and not origin <= values.min() <= values.max() <= last:
-            bad_row = int(np.argmax((values < origin) | (values > last)))
-        else:
-            bad_row = None
-        if bad_row is not None:
-            raise InputError(
-                f"{source}: event {first_row + bad_row} has {name} = {values[bad_row]:.12g}; on "
-                f"the {size[0]}x{size[1]} sensor {name} is a whole number from {origin} to {last}, "
-                "so give the sensor's size or remove the event"
-            )
-        return (values - origin if origin else values).astype(np.uint16, copy=False)
-
-    x, y = pixels("x", x, size[0]), pixels("y", y, size[1])
-    events = Events(t, x, y, _polarity(p, source, first_row))
-    events.check(*size, source, first_row)
+    arrays.as_size(*size, source)
+    arrays.check_lengths(t, x, y, p, source)
+    events = Events.of_checked(
+        arrays.as_plain(t, np.int64),
+        arrays.coordinates("x", x, size, source, first_row=first_row, origin=origin),
+        arrays.coordinates("y", y, size, source, first_row=first_row, origin=origin),
+        arrays.polarities(p, source, first_row),
+    )
+    events.check_order(source, first_row)
     return events
-
-
-def _polarity(p: NDArray, source: str, first_row: int) -> NDArray[np.bool_]:
-    if p.dtype.kind == "b" and p.ndim == 1:
-        return p
-    p = _numbers(p, source, "p")
-    if p.dtype == np.uint8 and (not len(p) or p.max() <= 1):
-        return p.view(np.bool_)
-    on, off, negative = p == 1, p == 0, p == -1
-    good = on | off | negative
-    if not good.all():
-        row = int(np.argmin(good))
-        raise InputError(
-            f"{source}: event {first_row + row} has the polarity {p[row]:.12g}; it must be 1 for "
-            "ON and 0 or -1 for OFF"
-        )
-    if off.any() and negative.any():
-        raise InputError(
-            f"{source}: polarities 0 and -1 both occur; use 0/1 or -1/1 throughout, 1 being ON"
-        )
-    return on
 
 
 def pinhole(values: NDArray, source: str, model: str = "radtan") -> PinholeCamera:
@@ -500,7 +503,11 @@ def whole_number(value: Any, source: str, what: str) -> int:
     """One number of a file as an int, or `InputError` unless it is a whole one below 2^62."""
     value = np.asarray(value)
     number = value.item() if value.size == 1 and value.dtype.kind in "iuf" else None
-    if number is None or not -_MOST_TIME < number < _MOST_TIME or number != int(number):
+    if (
+        number is None
+        or not -arrays.MAX_TIME_US < number < arrays.MAX_TIME_US
+        or number != int(number)
+    ):
         raise InputError(
             f"{source}: {what} must be one whole number, not {np.ravel(value)[:3]}; correct it"
         )
@@ -531,11 +538,3 @@ def vectors(values: NDArray, shape: tuple[int, int], source: str, what: str) -> 
             "numbers, one row per time"
         )
     return values.astype(np.float64, copy=False)
-
-
-def _numbers(values: NDArray, source: str, what: str) -> NDArray:
-    if values.ndim != 1 or values.dtype.kind not in "iuf":
-        raise InputError(
-            f"{source}: {what} is {values.dtype} of shape {values.shape}; store a list of numbers"
-        )
-    return values

@@ -99,7 +99,7 @@ def _joined(pieces: list[Events]) -> Events:
     columns = []
     for name in ("t", "x", "y", "p"):
         columns.append(np.concatenate([getattr(piece, name) for piece in pieces]))
-    return Events(*columns)
+    return Events.of_checked(*columns)
 
 
 def from_columns(
@@ -175,7 +175,7 @@ class DecodedEvents:
         self._recent: dict[int, Events] = {}
         self._stream: Iterator[tuple[Any, Columns]] = iter(())
         self._next = -1
-        self._size, self._source, self._origin = size, source, origin
+        self.checked_size, self._source, self._origin = size, source, origin
 
     def __len__(self) -> int:
         return int(self._rows[-1])
@@ -220,7 +220,7 @@ class DecodedEvents:
             )
         events = checked_events(
             *columns,
-            self._size,
+            self.checked_size,
             self._source,
             first_row=int(self._rows[number]),
             origin=self._origin,

@@ -35,6 +35,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import LUMA
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
 from jaxevent.io import (
@@ -47,7 +48,6 @@ from jaxevent.io import (
     whole_number,
 )
 from jaxevent.io.decoded import BLOCK, Columns, DecodedImages, decoded
-from jaxevent.io.images import LUMA
 from jaxevent.io.options import ReadOptions
 from jaxevent.lenses import LENSES, find_model
 from jaxevent.recording import Frames, Imu, Poses, Recording

@@ -45,17 +45,26 @@ from jaxevent.io import (
     companions,
     pinhole,
     reading,
+    refuse_time_unit,
     times,
     vectors,
     whole_number,
 )
-from jaxevent.io.columns import time_scale
+from jaxevent.io.columns import first_and_last, signed, stated_unit, unsigned_off
 from jaxevent.io.decoded import decoded
 from jaxevent.io.description import CLOCK
 from jaxevent.io.disorder import Columns, examine
 from jaxevent.io.hdf5_files import array, attribute, dataset, open_file
 from jaxevent.io.options import ReadOptions
 from jaxevent.io.output import complete_hdf5
+from jaxevent.io.time_units import (
+    NAMES,
+    Clock,
+    InferredUnit,
+    infer_unit,
+    to_microseconds,
+    unit_of_words,
+)
 from jaxevent.progress import bar
 from jaxevent.recording import (
     EventColumns,
@@ -128,21 +137,105 @@ Column = Any  # one field of the events: a dataset, or what is sliced like one
 
 
 class Microseconds:
-    """Times in floating-point seconds, or in us where all are whole, read as int64 us."""
+    """Times in another unit or of another type, read as int64 us."""
 
-    def __init__(self, seconds: Column, source: str):
-        self._seconds, self._source = seconds, source
-        self.shape, self.dtype = seconds.shape, np.dtype(np.int64)
-        count = seconds.shape[0] if len(seconds.shape) == 1 else 0
-        ends = [seconds[:_CHUNK], seconds[max(count - 1, 0) :]] if count else [np.empty(0)]
-        self._scale = time_scale(np.concatenate(ends), source)
-        self.in_seconds = self._scale != 1
+    def __init__(self, stored: Column, unit: str, source: str):
+        self._stored, self._unit, self._source = stored, unit, source
+        self.shape, self.dtype = stored.shape, np.dtype(np.int64)
+        self.is_float = stored.dtype.kind == "f"
 
     def __getitem__(self, rows: Any) -> Any:
-        values = np.asarray(self._seconds[rows], np.float64)
+        values = np.asarray(self._stored[rows])
         first = rows.start or 0 if isinstance(rows, slice) else int(rows)
-        t = times(values.reshape(-1), self._source, "event", self._scale, first)
+        t = to_microseconds(values.reshape(-1), self._unit, self._source, "event", first)
         return t if values.ndim else t[0]
+
+
+class SignedPolarities:
+    """Polarities of which a large number stands for -1, see `columns.unsigned_off`."""
+
+    def __init__(self, stored: Column, off: float):
+        self._stored, self._off = stored, off
+        self.shape, self.dtype = stored.shape, np.dtype(np.float64)
+
+    def __getitem__(self, rows: Any) -> Any:
+        return signed(np.asarray(self._stored[rows]), self._off)
+
+
+def convert_columns(
+    columns: Mapping[str, Column],
+    size: tuple[int, int],
+    source: str,
+    options: ReadOptions,
+    *,
+    name: str = "t",
+    usual: str | None = None,
+) -> tuple[dict[str, Column], InferredUnit]:
+    """Convert stored columns to those of `StoredEvents`, without reading more than their ends.
+
+    Args:
+        columns: Columns t, x, y and p, in any unit of time.
+        size: (width, height) of the sensor.
+        source: Name of the file for messages.
+        options: Choices of the caller.
+        name: Name of the column of times.
+        usual: Usual unit of the layout, see `infer_unit`.
+
+    Returns:
+        The columns with t in us and p with signs, and the unit.
+
+    Raises:
+        InputError: The type of the times cannot resolve them.
+    """
+    t = columns["t"]
+    shapes = {column.shape for column in columns.values()}
+    if len(shapes) > 1 or len(t.shape) != 1 or not t.shape[0]:
+        return dict(columns), InferredUnit("us")  # `StoredEvents` names the fault
+    with reading(f"{source}: events"):
+        sample = first_and_last(
+            lambda rows: {key: np.asarray(columns[key][rows]) for key in "txyp"}, t.shape[0]
+        )
+    stated = _unit_attribute(t) or stated_unit(name, sample["t"])
+    unit = infer_unit(sample, t.shape[0], size, source, options, stated=stated, usual=usual)
+    converted = dict(columns)
+    if unit.name != "us" or t.dtype.kind not in "iu":
+        converted["t"] = Microseconds(t, unit.name, f"{source}: events/t")
+    off = unsigned_off(sample["p"])
+    if off is not None:
+        converted["p"] = SignedPolarities(columns["p"], off)
+    return converted, unit
+
+
+def _unit_attribute(t: Column) -> tuple[str, str] | None:
+    """Return the unit in an attribute of a column of times, and the words for it."""
+    if isinstance(t, h5py.Dataset):
+        for name in ("unit", "units"):
+            if (unit := unit_of_words(attribute(t, name))) is not None:
+                return unit, f"its attribute {name!r}"
+    return None
+
+
+def clock_of_columns(
+    columns: Mapping[str, Column],
+    unit: InferredUnit,
+    source: str,
+    offset: int = 0,
+) -> Clock:
+    """Return the clock of events for the times of images, poses and samples beside them.
+
+    Args:
+        columns: Columns of `convert_columns`.
+        unit: Unit of the event times, as stored.
+        source: Name of the file for messages.
+        offset: Time that is added to the events' in us.
+    """
+    t = columns["t"]
+    if len(t.shape) != 1 or not t.shape[0] or t.dtype.kind not in "iu":
+        return Clock(unit.name, 0, 0, False)
+    with reading(f"{source}: events"):
+        first, last = t[:1][0], t[t.shape[0] - 1 :][0]
+    is_float = isinstance(t, Microseconds) and t.is_float
+    return Clock(unit.name, int(first) + offset, int(last) + offset, is_float)
 
 
 class StoredEvents:
@@ -163,7 +256,7 @@ class StoredEvents:
 
         `size` is (width, height). Raises `InputError` unless the fields fit each other.
         """
-        self._size = size
+        self.checked_size = size
         self._source = source
         self._t, self._x, self._y, self._p = (columns[name] for name in "txyp")
         shapes = [field.shape for field in (self._t, self._x, self._y, self._p)]
@@ -198,7 +291,9 @@ class StoredEvents:
             t = times(self._t[part], self._source, "event", first_row=part.start) + self._offset
             x, y, p = self._x[part], self._y[part], self._p[part]
         try:
-            events = checked_events(t, x, y, p, self._size, self._source, first_row=start - lead)
+            events = checked_events(
+                t, x, y, p, self.checked_size, self._source, first_row=start - lead
+            )
         except OrderError:
             times_of_blocks = (columns[0] for _, columns in self.decode(None))
             raise examine(times_of_blocks, source=self._source).explain(self._source) from None
@@ -216,7 +311,7 @@ class StoredEvents:
         """These events, with their times repaired as the options say."""
         if options.repair is None:
             return self
-        return decoded(self.decode, self._size, self._source, options)
+        return decoded(self.decode, self.checked_size, self._source, options)
 
     def columns(self, rows: slice, room: EventColumns | None = None) -> EventColumns | None:
         """See `recording.ColumnSource`."""
@@ -339,10 +434,10 @@ def _in_memory(recording: Recording) -> Recording:
     return dataclasses.replace(recording, events=recording.events[:], frames=frames)
 
 
-def is_matlab(path: Path, file: Any) -> bool:
-    """Whether MATLAB wrote a file with `events`: it puts 512 bytes of its own before HDF5."""
+def is_matlab(path: Path) -> bool:
+    """Return whether MATLAB wrote a file: it puts 512 bytes of its own before HDF5."""
     with path.open("rb") as stored:
-        return stored.read(6) == b"MATLAB" and isinstance(file.get("events"), h5py.Dataset)
+        return stored.read(6) == b"MATLAB"
 
 
 def _recording(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
@@ -357,15 +452,12 @@ def _recording(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
             f"{path}: has version {version} of the layout but this jaxevent reads version "
             f"{VERSION}; update jaxevent"
         )
-    frames = poses = imu = camera = None
+    images = None
     if isinstance(file.get("frames"), h5py.Group):
-        t, exposure = (_times(file, f"frames/{name}", source) for name in ("t", "exposure"))
         name = f"{source}: frames/images"
         images = StoredImages(dataset(file, "frames/images", source), name)
         if len(images.shape) != 3:
             raise InputError(f"{name} has shape {images.shape}; store (frames, height, width)")
-        if len(t):
-            frames = Frames(t, images, exposure)
     extra = _extra(file, source)
     if size is None and "width" in attributes and "height" in attributes:
         with reading(f"{source}: attributes width and height"):
@@ -386,21 +478,48 @@ def _recording(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
         raise InputError(
             f"{path}: has no attributes width and height; give size=(width, height) or --size"
         )
+    columns: dict[str, Column] = {n: dataset(file, f"events/{n}", source) for n in "txyp"}
+    offset = 0
+    if "t_offset" in file:
+        offset = whole_number(array(file, "t_offset", source), source, "t_offset")
+    table = dataset(file, "ms_to_idx", source) if "ms_to_idx" in file else None
+    unit = InferredUnit("us")
+    states_unit = attributes.get("format") == "jaxevent" or table is not None
+    if states_unit:
+        refuse_time_unit(path, options)
+    if not states_unit or columns["t"].dtype.kind == "f":
+        columns, unit = convert_columns(columns, size, source, options)
+    if unit.name != "us" and offset:
+        raise InputError(
+            f"{source}: events/t is in {NAMES[unit.name]} and t_offset in microseconds; store all "
+            "times in integer microseconds"
+        )
+    notes = list(unit.notes)
+    clock = Clock("us", 0, 0, False)
+    if not states_unit:
+        clock = clock_of_columns(columns, unit, source, offset)
+
+    def stamps(name: str, what: str) -> NDArray[np.int64]:
+        return clock.read(array(file, name, source), f"{source}: {name}", what, notes)
+
+    frames = poses = imu = camera = triggers = None
+    if images is not None:
+        t, exposure = stamps("frames/t", "frame"), _times(file, "frames/exposure", source)
+        frames = Frames(t, images, exposure) if len(t) else None
     if isinstance(file.get("camera"), h5py.Dataset):
         with reading(f"{source}: camera"):
             model = file["camera"].attrs.get("model", "radtan")
         camera = pinhole(array(file, "camera", source), f"{path}: camera", str(model))
     if isinstance(file.get("poses"), h5py.Group):
-        t = _times(file, "poses/t", source)
+        t = stamps("poses/t", "pose")
         position = _vectors(file, "poses/position", (len(t), 3), source)
         poses = Poses(t, position, _vectors(file, "poses/quaternion", (len(t), 4), source))
     if isinstance(file.get("imu"), h5py.Group):
-        t = _times(file, "imu/t", source)
+        t = stamps("imu/t", "IMU sample")
         gyro, acc = (_vectors(file, f"imu/{name}", (len(t), 3), source) for name in ("gyro", "acc"))
         imu = Imu(t, gyro, acc)
-    triggers = None
     if isinstance(file.get("triggers"), h5py.Group):
-        t = _times(file, "triggers/t", source)
+        t = stamps("triggers/t", "trigger")
         edge, channel = (array(file, f"triggers/{n}", source) for n in ("edge", "channel"))
         fit = edge.shape == channel.shape == t.shape
         if not fit or not np.isin(edge, (-1, 0, 1)).all() or not np.isin(channel, range(256)).all():
@@ -409,20 +528,10 @@ def _recording(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
             )
         triggers = Triggers(t, edge.astype(np.int8), channel.astype(np.uint8))
     name = str(attributes.get("name", path.stem))
-    columns: dict[str, Column] = {n: dataset(file, f"events/{n}", source) for n in "txyp"}
-    offset = 0
-    if "t_offset" in file:
-        offset = whole_number(array(file, "t_offset", source), source, "t_offset")
-    if columns["t"].dtype.kind == "f":
-        columns["t"] = Microseconds(columns["t"], f"{source}: events/t")
-        if columns["t"].in_seconds and offset:
-            raise InputError(
-                f"{source}: events/t is in seconds and t_offset in microseconds; store all times "
-                "in integer microseconds"
-            )
-    table = dataset(file, "ms_to_idx", source) if "ms_to_idx" in file else None
     events = StoredEvents(columns, size, source, offset, table).repaired(options)
-    return Recording(name, *size, events, frames, camera, poses, imu, extra, triggers)
+    return Recording(
+        name, *size, events, frames, camera, poses, imu, extra, triggers, notes=tuple(notes)
+    )
 
 
 def _is_dsec(file: Any) -> bool:

@@ -9,13 +9,14 @@
                                 calib/{intrinsics (fx fy cx cy), distortion_coeffs, resolution}
     Metavision                  /CD/events, records with fields t, x, y, p, also compressed by ECF
                                 (`ecf`); attribute geometry; /EXT_TRIGGER/events, records t, p, id
-    v2e                         /events (N, 4): t in us, x, y, p; the order is told by the content
+    v2e                         /events, or the only dataset, (N, 4) or (4, N): t in us, x, y, p;
+                                the order is told by the content; 4294967295 is a polarity of -1
     others                      /events or the file itself with t, x, y and p, whole lists or
-                                records, under the names that `columns.NAMES` lists
+                                records, under the names that `jaxevent.arrays.NAMES` lists
 
-Integers are us, floats seconds. Exposures are unknown: 0. Where a file holds two cameras, left or
-right must be chosen. M3ED's frames come from cameras beside the event camera, with pixels of their
-own, and are not read. Poses come from further files beside these, see `truth`.
+Integers are usually us, floats seconds (`time_units`). Exposures are unknown: 0. Where a file holds
+two cameras, left or right must be chosen. M3ED's frames come from cameras beside the event camera,
+with pixels of their own, and are not read. Poses come from further files beside these, see `truth`.
 """
 
 from collections.abc import Mapping
@@ -34,6 +35,7 @@ from jaxevent.io import (
     ecf,
     reading,
     refuse_stream,
+    refuse_time_unit,
     sensor_size,
     times,
     vectors,
@@ -41,9 +43,17 @@ from jaxevent.io import (
 )
 from jaxevent.io.columns import find, order_of
 from jaxevent.io.decoded import DecodedImages
-from jaxevent.io.hdf5 import Column, Microseconds, StoredEvents, StoredImages, read_stored
+from jaxevent.io.hdf5 import (
+    Column,
+    StoredEvents,
+    StoredImages,
+    clock_of_columns,
+    convert_columns,
+    read_stored,
+)
 from jaxevent.io.hdf5_files import array, attribute, dataset, filters_of
 from jaxevent.io.options import ReadOptions
+from jaxevent.io.time_units import SAMPLE, InferredUnit
 from jaxevent.io.truth import read_poses
 from jaxevent.recording import Frames, Imu, Recording, Triggers
 
@@ -53,7 +63,9 @@ _SIDES = {"prophesee": "M3ED", "davis": "MVSEC"}
 
 def knows(file: Any) -> bool:
     """Whether a file holds events in one of these layouts."""
-    if any(isinstance(file.get(name), h5py.Group) for name in _SIDES) or _is_plain(file):
+    if any(isinstance(file.get(name), h5py.Group) for name in _SIDES):
+        return True
+    if _plain_name(file) is not None:
         return True
     return any(_fields(file, name) is not None for name in _GROUPS)
 
@@ -76,19 +88,34 @@ def _recording(file: Any, path: Path, options: ReadOptions) -> Recording:
             read = _m3ed if name == "prophesee" else _mvsec
             return read(file, path, options, f"{name}/{side}")
     refuse_stream(path, options)
-    if not _is_plain(file):
+    columns: dict[str, Column] = {}
+    name, name_of_t = "", "t"
+    plain = _plain_name(file)
+    if plain is None:
         with reading(source):
             name = next(name for name in _GROUPS if _fields(file, name) is not None)
+        name_of_t = (_fields(file, name) or {})["t"]
         columns = _columns(file, name, source)
-    else:
-        columns = {}
-    frames = _images(file, source) if isinstance(file.get("images"), h5py.Group) else None
-    told = _told_size(file, source)
+    images = _images(file, source) if isinstance(file.get("images"), h5py.Group) else None
+    told = _told_size(file, source) if size is None else None
+    if told is None and images is not None:
+        told = (images[1].shape[2], images[1].shape[1])
     otherwise = f"{path}: neither an attribute nor an image tells the sensor's size;"
-    size = sensor_size(size, told, frames=frames, otherwise=otherwise)
-    columns = columns or _plain_columns(file, size, source)
+    size = sensor_size(size, told, frames=None, otherwise=otherwise)
+    columns = columns if plain is None else _plain_columns(file, plain, size, source)
+    unit = InferredUnit("us")
+    if name == "CD/events":
+        refuse_time_unit(path, options)
+    else:
+        columns, unit = convert_columns(columns, size, source, options, name=name_of_t)
+    notes, frames = list(unit.notes), None
+    if images is not None:
+        clock = clock_of_columns(columns, unit, source)
+        t = clock.read(images[0], source, "image", notes)
+        frames = Frames(t, images[1], np.zeros_like(t))
     stored = StoredEvents(columns, size, source).repaired(options)
-    return Recording(path.stem, *size, stored, frames, triggers=_triggers(file, source))
+    triggers = _triggers(file, source)
+    return Recording(path.stem, *size, stored, frames, triggers=triggers, notes=tuple(notes))
 
 
 def _triggers(file: Any, source: str) -> Triggers | None:
@@ -104,23 +131,27 @@ def _triggers(file: Any, source: str) -> Triggers | None:
     return Triggers(t, whole["p"].astype(np.int8), whole["id"].astype(np.uint8))
 
 
-def _is_plain(file: Any) -> bool:
-    """Whether `events` are four columns without names. (MATLAB's have a header before HDF5.)"""
-    events = file.get("events")
-    if not isinstance(events, h5py.Dataset) or file.userblock_size:
-        return False
+def _plain_name(file: Any) -> str | None:
+    """The name of four columns without names: `events`, or whatever stands alone in a file.
+
+    None where there are none. (MATLAB's files have a header before HDF5.)
+    """
+    names = ["events"] if "events" in file else list(file)[:2]
+    found = file.get(names[0]) if len(names) == 1 else None
+    if not isinstance(found, h5py.Dataset) or file.userblock_size or found.dtype.kind not in "iuf":
+        return None
     # Of a virtual dataset the shape cannot be asked for without following it.
-    is_virtual = events.id.get_create_plist().get_layout() == h5py.h5d.VIRTUAL
-    return events.dtype.kind in "iuf" and (is_virtual or events.ndim == 2 and events.shape[1] == 4)
+    is_virtual = found.id.get_create_plist().get_layout() == h5py.h5d.VIRTUAL
+    return names[0] if is_virtual or found.ndim == 2 and 4 in found.shape else None
 
 
-def _plain_columns(file: Any, size: tuple[int, int], source: str) -> dict[str, Column]:
-    whole = dataset(file, "events", source)
-    order = order_of(np.asarray(whole[: 1 << 16]), size, source)
-    columns: dict[str, Column] = {name: _Part(whole, order.index(name)) for name in "txyp"}
-    if columns["t"].dtype.kind == "f":
-        columns["t"] = Microseconds(columns["t"], source)
-    return columns
+def _plain_columns(file: Any, name: str, size: tuple[int, int], source: str) -> dict[str, Column]:
+    whole = dataset(file, name, source)
+    is_wide = whole.shape[1] != 4  # (4, events)
+    first = np.asarray(whole[:, :SAMPLE].T if is_wide else whole[:SAMPLE])
+    order = order_of(first, size, source)
+    part = _Row if is_wide else _Part
+    return {name: part(whole, order.index(name)) for name in "txyp"}
 
 
 def _side(path: Path, group: Any, stream: str | None) -> str:
@@ -142,6 +173,7 @@ def _side(path: Path, group: Any, stream: str | None) -> str:
 
 def _m3ed(file: Any, path: Path, options: ReadOptions, group: str) -> Recording:
     source, size = str(path), options.size
+    refuse_time_unit(path, options)
     columns = _columns(file, group, source)
     camera, left_out = None, {}
     if f"{group}/calib/intrinsics" in file:
@@ -186,6 +218,18 @@ class _Part:
         return self._whole.fields(self._key)[rows]
 
 
+class _Row:
+    """A row of (4, N) as a list of its own."""
+
+    def __init__(self, whole: Any, row: int):
+        self._whole, self._row = whole, row
+        self.shape: tuple[int, ...] = whole.shape[1:]
+        self.dtype: np.dtype = whole.dtype
+
+    def __getitem__(self, columns: Any) -> Any:
+        return self._whole[self._row, columns]
+
+
 def _mvsec(file: Any, path: Path, options: ReadOptions, group: str) -> Recording:
     source, size = str(path), options.size
     whole = dataset(file, f"{group}/events", source)
@@ -194,25 +238,31 @@ def _mvsec(file: Any, path: Path, options: ReadOptions, group: str) -> Recording
             f"{source}: {group}/events has shape {whole.shape}; store (events, 4): x, y, t, p"
         )
     x, y, t, p = (_Part(whole, column) for column in range(4))
-    columns: dict[str, Column] = {"t": Microseconds(t, source), "x": x, "y": y, "p": p}
-    frames = imu = None
+    columns: dict[str, Column] = {"t": t, "x": x, "y": y, "p": p}
+    frames = imu = images = told = None
     if f"{group}/image_raw" in file:
         images = dataset(file, f"{group}/image_raw", source)
-        stamps = _times(file, f"{group}/image_raw_ts", source)
         if images.ndim != 3:
             raise InputError(f"{source}: {group}/image_raw has shape {images.shape}; store 3 axes")
+        told = (images.shape[2], images.shape[1]) if len(images) else None
+    otherwise = f"{path}: has no {group}/image_raw to tell the sensor's size;"
+    size = sensor_size(size, told, frames=None, otherwise=otherwise)
+    columns, unit = convert_columns(columns, size, source, options, usual="s")
+    notes, clock = list(unit.notes), clock_of_columns(columns, unit, source)
+    if images is not None:
+        stamps = array(file, f"{group}/image_raw_ts", source)
+        stamps = clock.read(stamps, f"{source}: {group}/image_raw_ts", "image", notes)
         if len(stamps):
             frames = Frames(stamps, StoredImages(images, source), np.zeros_like(stamps))
     if f"{group}/imu" in file:
-        stamps = _times(file, f"{group}/imu_ts", source)
+        stamps = array(file, f"{group}/imu_ts", source)
+        stamps = clock.read(stamps, f"{source}: {group}/imu_ts", "IMU sample", notes)
         name = f"{group}/imu"
         values = vectors(array(file, name, source), (len(stamps), 6), source, name)
         imu = Imu(stamps, values[:, 3:], values[:, :3])
-    otherwise = f"{path}: has no {group}/image_raw to tell the sensor's size;"
-    size = sensor_size(size, frames=frames, otherwise=otherwise)
     events = StoredEvents(columns, size, source).repaired(options)
     poses = read_poses(path, group)
-    return Recording(path.stem, *size, events, frames, poses=poses, imu=imu)
+    return Recording(path.stem, *size, events, frames, poses=poses, imu=imu, notes=tuple(notes))
 
 
 def _fields(file: Any, name: str) -> Mapping[str, str] | None:
@@ -238,14 +288,14 @@ def _columns(file: Any, name: str, source: str) -> dict[str, Column]:
         columns = {key: _Part(whole, fields[key]) for key in "txyp"}
     else:
         columns = {key: dataset(file, f"{name}/{fields[key]}", source) for key in "txyp"}
-    if columns["t"].dtype.kind == "f":
-        columns["t"] = Microseconds(columns["t"], source)
     return columns
 
 
 def _told_size(file: Any, source: str) -> tuple[int, int] | None:
     with reading(f"{source}: attributes"):
         if (size := attribute(file, "sensor_resolution")) is not None:
+            if np.size(size) == 3:  # height, width, channels
+                size = np.ravel(size)[:2]
             height, width = _pair(size, source)
             return width, height
         if (text := attribute(file, "geometry")) is not None:
@@ -258,12 +308,17 @@ def _told_size(file: Any, source: str) -> tuple[int, int] | None:
 
 
 def _pair(values: Any, source: str) -> tuple[int, int]:
+    if np.size(values) != 2:
+        raise InputError(
+            f"{source}: the sensor's size is {np.size(values)} numbers; store two, or give "
+            "size=(width, height) or --size"
+        )
     first, second = (whole_number(n, source, "a side of the size") for n in np.ravel(values))
     return first, second
 
 
-def _images(file: Any, source: str) -> Frames | None:
-    """The images of event_utils, one dataset each, in the order of their names."""
+def _images(file: Any, source: str) -> tuple[NDArray, DecodedImages] | None:
+    """The times and images of event_utils, one dataset each, in the order of their names."""
     with reading(f"{source}: images"):
         names = sorted(file["images"])
         if not names:
@@ -274,7 +329,6 @@ def _images(file: Any, source: str) -> Frames | None:
         raise InputError(f"{source}: images/{names[0]} has shape {first.shape}; store grey images")
     held = len(names) * (first.size or 0) * first.dtype.itemsize
     check_unfolded(held, file.id.get_filesize(), f"{source}: images")
-    t = times(stamps, source, "image")
 
     def image(name: str) -> NDArray:
         pixels = array(file, f"images/{name}", source)
@@ -290,8 +344,4 @@ def _images(file: Any, source: str) -> Frames | None:
         first.dtype,
         f"{source}: images",
     )
-    return Frames(t, images, np.zeros_like(t))
-
-
-def _times(file: Any, name: str, source: str) -> NDArray[np.int64]:
-    return times(array(file, name, source), f"{source}: {name}", "row")
+    return stamps, images

@@ -11,22 +11,25 @@ import contextlib
 import dataclasses
 import math
 import re
+import warnings
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.errors import InputError
+from jaxevent.arrays import LUMA
+from jaxevent.errors import InputError, InputWarning
 from jaxevent.io import reading
 from jaxevent.io.output import complete
+from jaxevent.io.time_units import NAMES, SCALES, unit_of_name
 from jaxevent.recording import microseconds
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
 TIMES = ("timestamps.txt", "images.txt")
 _DEEP_COLOUR = re.compile(r"\b(L|LA|RGB\w*|CMYK);16")  # Pillow's name of how pixels are stored
-LUMA = np.array([0.299, 0.587, 0.114])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -291,27 +294,72 @@ def _times(path: Path) -> tuple[NDArray[np.int64], list[str] | None]:
     return times, names
 
 
-def read_times(path: Path) -> NDArray[np.int64]:
-    """The times (us) of a text file, sorted: a time in each line, or a table with a column t.
+def read_times(path: Path, span: tuple[int, int] | None = None) -> NDArray[np.int64]:
+    """Read the times of a text file, sorted: a time in each line, or a table with a column t.
 
-    Columns are separated by commas, semicolons or spaces, and the first line names them; without
-    names the times are the first column. Where all are whole numbers they are microseconds,
-    otherwise seconds. Lines that begin with # do not count. Raises `InputError` for other files.
+    Columns are separated by commas, semicolons or spaces, and the first line names them, t with a
+    unit or without (t_ns); without names the times are the first column. Without a unit whole
+    numbers are microseconds, others seconds, unless few of them then lie in the recording and all
+    of them in another unit. Lines that begin with # do not count.
+
+    Args:
+        path: The file.
+        span: First and last time of the recording in us.
+
+    Returns:
+        (n,) int64 us.
+
+    Raises:
+        InputError: The file holds something else.
     """
-    rows = [re.split(r"\s*[,;]\s*|\s+", line.strip()) for line in _lines(path)]
-    column = 0
+    lines = [re.sub(r"\s+(?=[\[(])", "", line.strip()) for line in _lines(path)]
+    rows = [re.split(r"\s*[,;]\s*|\s+", line) for line in lines]
+    column, unit = 0, None
     if rows and not re.match(r"[+-]?\.?\d", rows[0][0]):
-        if "t" not in rows[0]:
-            raise InputError(f"{path}: has no column t but {', '.join(rows[0])[:80]}; add it")
-        column = rows.pop(0).index("t")
+        names = rows.pop(0)
+        named = [name for name in names if name == "t"] or [n for n in names if unit_of_name(n)]
+        if not named:
+            raise InputError(f"{path}: has no column t but {', '.join(names)[:80]}; add it")
+        column, unit = names.index(named[0]), unit_of_name(named[0])
     if not rows:
         raise InputError(f"{path}: holds no times; give one in each line")
     words = [row[column] if column < len(row) else "" for row in rows]
-    times = _parsed(path, words, "give a time in each line, or a table with a column t")
+    remedy = "give a time in each line, or a table with a column t"
+    times = _parsed(path, words, remedy, unit)
+    if span is not None and unit is None:
+        times = _inside(path, words, remedy, times, span)
     if (times[1:] < times[:-1]).any():
         row = int(np.argmax(times[1:] < times[:-1])) + 1
         raise InputError(f"{path}: time {row}, {words[row]}, is before the one above it; sort them")
     return times
+
+
+def _inside(
+    path: Path, words: Sequence[str], remedy: str, times: NDArray[np.int64], span: tuple[int, int]
+) -> NDArray[np.int64]:
+    """The times in their usual unit, or in another one that alone puts them in the recording."""
+
+    def share(t: NDArray[np.int64]) -> float:
+        return float(np.mean((t >= span[0]) & (t <= span[1])))
+
+    if share(times) >= 0.5:
+        return times
+    fitting = {}
+    for unit in SCALES:
+        with contextlib.suppress(InputError):
+            t = _parsed(path, words, remedy, unit)
+            if share(t) == 1 and 10 * (t.max() - t.min()) >= span[1] - span[0]:
+                fitting[unit] = t
+    if len(fitting) != 1:
+        return times
+    unit, t = next(iter(fitting.items()))
+    warnings.warn(
+        f"{path}: the times are taken as {NAMES[unit]}, since they lie in the recording then; name "
+        f"the column t_{unit} to be sure",
+        InputWarning,
+        stacklevel=3,
+    )
+    return t
 
 
 def _lines(path: Path) -> list[str]:
@@ -321,14 +369,17 @@ def _lines(path: Path) -> list[str]:
     return [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
 
 
-def _parsed(path: Path, words: Sequence[str], remedy: str) -> NDArray[np.int64]:
-    """Times in us: of whole numbers, if all are, as they are, else of seconds."""
+def _parsed(
+    path: Path, words: Sequence[str], remedy: str, unit: str | None = None
+) -> NDArray[np.int64]:
+    """Times in us; without a unit whole numbers, if all are, are us, others seconds."""
     whole = all(re.fullmatch(r"[+-]?\d+", word) for word in words)
+    scale = Fraction(SCALES[unit or ("us" if whole else "s")]).limit_denominator(1000)
     times: list[int] = []
     for number, word in enumerate(words):
-        value = math.nan
+        value: Any = math.nan
         with contextlib.suppress(ValueError):
-            value = int(word) if whole else float(word) * 1e6
+            value = int(word) * scale if whole else float(word) * float(scale)
         if not abs(value) < 9e18:
             raise InputError(
                 f"{path}: line {number} of numbers starts with {word[:20]!r}, not a time; {remedy}"

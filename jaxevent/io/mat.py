@@ -1,4 +1,4 @@
-"""The MATLAB layout of the asynchronous Kalman filter and HDR recordings, v5 and v7.3:
+"""MATLAB files, v5 and v7.3: the layout of the asynchronous Kalman filter and HDR recordings:
 
     events      (N, 4)     t (us), x, y, p; x and y count from 1, p is 0/1 or -1/1; or (4, N)
     image       (H, W, K)  uint8, uint16 or floats in [0, 1]
@@ -12,26 +12,53 @@ Only `events` is required, and the size where there is no `image`. f_Q, ct, HDR_
 numeric variable are kept in `Recording.extra`, HDR_mat as [y, x] or [frames, y, x]. HDR_mat in
 colour becomes the mean of its three channels, as in the authors' programs; (H, W, 3) is colour
 unless there are three frames. MATLAB's rows and columns (1 x N) become vectors.
+
+In place of `events` there may be four vectors with the names of `columns` (ASL-DVS: ts, x, y, pol),
+as variables or as fields of a struct, or one other array (N, 4) or (4, N), in an order that
+`columns.order_of` tells. Their x and y count from 0 where a 0 occurs, otherwise from 1. The fields
+of other structs are kept as "struct.field".
 """
 
+import contextlib
 import struct
 import zlib
+from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.io import check_unfolded, reading, sensor_size, times
+from jaxevent.io.columns import (
+    as_rows,
+    find,
+    first_and_last,
+    order_of,
+    signed,
+    stated_unit,
+    unsigned_off,
+)
 from jaxevent.io.decoded import from_columns
 from jaxevent.io.options import ReadOptions
+from jaxevent.io.time_units import (
+    SAMPLE,
+    Clock,
+    InferredUnit,
+    clock_of,
+    infer_unit,
+    to_microseconds,
+)
 from jaxevent.recording import Events, Frames, Recording
 
 _MATRIX, _COMPRESSED = 14, 15  # types of elements
 _FLAGS, _SIZES, _NAME = 6, 5, 1
 _NUMBERS = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13}
 _CLASSES = range(6, 16)  # of arrays: double, single and the integers
+_VARIABLES = ("image", "time_image", "exposure", "f_Q", "ct", "HDR_mat")  # but events
+_STRUCT = 2  # class of a struct
 
 
 def read_v5(path: Path, options: ReadOptions) -> Recording:
@@ -70,24 +97,25 @@ def _unpacked(path: Path) -> BytesIO:
             body = unpacking.decompress(unpacking.unconsumed_tail, size + 1)
         if kind != _MATRIX or len(body) != size:
             raise InputError(f"{path}: the variable at byte {at} is damaged; fetch it again")
-        if _is_numeric(memoryview(body), order, f"{path}: the variable at byte {at}"):
-            out.write(struct.pack(order + "2I", kind, size))
-            out.write(body)
+        source = f"{path}: the variable at byte {at}"
+        for part in _numeric_parts(memoryview(body), order, source):
+            out.write(struct.pack(order + "2I", kind, len(part)))
+            out.write(part)
         at += 8 + int(struct.unpack_from(order + "2I", data, at)[1])
     out.seek(0)
     return out
 
 
-def _is_numeric(body: memoryview, order: str, source: str) -> bool:
-    """Whether a variable is an array of numbers; `InputError` where its elements do not fill it.
+class _Element(NamedTuple):
+    """One element of a variable: its type and bytes, and the offset of the next element."""
 
-    They are the flags, whose lowest byte is the class and whose bit 11 says complex, the sizes, the
-    name, the real and for complex the imaginary numbers.
-    """
-    damaged = InputError(f"{source} is damaged; fetch the file again")
-    kinds = []
+    kind: int
+    data: memoryview
+    stop: int
+
+
+def _elements(body: memoryview, order: str, damaged: InputError) -> Iterator[_Element]:
     at = 0
-    numeric = is_complex = False
     while at < len(body):
         if len(body) - at < 8:
             raise damaged
@@ -97,22 +125,62 @@ def _is_numeric(body: memoryview, order: str, source: str) -> bool:
             kind, size, start, stop = kind & 0xFFFF, kind >> 16, at + 4, at + 8
         if start + size > len(body) or (stop == at + 8 and start == at + 4 and size > 4):
             raise damaged
-        if not kinds:
-            if kind != _FLAGS or size != 8:
-                raise damaged
-            (flags,) = struct.unpack_from(order + "I", body, start)
-            numeric, is_complex = flags & 0xFF in _CLASSES, bool(flags & 0x800)
-            if not numeric:
-                return False
-        kinds.append(kind)
+        yield _Element(kind, body[start : start + size], stop)
         at = stop
-    if (
-        kinds[1:3] != [_SIZES, _NAME]
-        or len(kinds) != 4 + is_complex
-        or not set(kinds[3:]) <= _NUMBERS
-    ):
+
+
+def _numeric_parts(
+    body: memoryview, order: str, source: str, *, is_field: bool = False
+) -> list[bytes]:
+    """The arrays of numbers that a variable is or, as a struct of one element, has as its fields.
+
+    They are the flags, whose lowest byte is the class and whose bit 11 says complex, the sizes, the
+    name, the real and for complex the imaginary numbers; of a struct, in place of numbers, the
+    length of its fields' names, these, and the fields. Fields become variables of their own, named
+    "struct.field"; structs that are fields themselves are left out. Raises `InputError` where the
+    elements do not fill the variable.
+    """
+    damaged = InputError(f"{source} is damaged; fetch the file again")
+    elements = _elements(body, order, damaged)
+    flags = next(elements, None)
+    if flags is None or flags.kind != _FLAGS or len(flags.data) != 8:
         raise damaged
-    return True
+    (bits,) = struct.unpack_from(order + "I", flags.data)
+    is_struct = bits & 0xFF == _STRUCT
+    if bits & 0xFF not in _CLASSES and (is_field or not is_struct):
+        return []
+    kept = [flags, *elements]
+    if [element.kind for element in kept[1:3]] != [_SIZES, _NAME]:
+        raise damaged
+    numbers = kept[3:]
+    if not is_struct:
+        is_right = {element.kind for element in numbers} <= _NUMBERS
+        if len(numbers) != 1 + bool(bits & 0x800) or not is_right:
+            raise damaged
+        return [bytes(body)]
+    if len(numbers) < 2 or len(numbers[0].data) != 4:
+        raise damaged
+    (length,) = struct.unpack(order + "I", numbers[0].data)
+    joined, fields = bytes(numbers[1].data), numbers[2:]
+    if not length or len(joined) % length or any(field.kind != _MATRIX for field in fields):
+        raise damaged
+    names = [joined[at : at + length].split(b"\0")[0] for at in range(0, len(joined), length)]
+    if len(fields) != len(names):  # an array of structs
+        return []
+    parts = []
+    for name, field in zip(names, fields, strict=True):
+        whole = bytes(kept[2].data) + b"." + name
+        if len(field.data):
+            held = _numeric_parts(field.data, order, source, is_field=True)
+            parts += [_renamed(part, whole, order) for part in held]
+    return parts
+
+
+def _renamed(body: bytes, name: bytes, order: str) -> bytes:
+    """An array of numbers with a name: its third element."""
+    elements = [*_elements(memoryview(body), order, InputError("damaged"))]
+    held = struct.pack(order + "2I", 1, len(name)) + name + bytes(-len(name) % 8)
+    return body[: elements[1].stop] + held + body[elements[2].stop :]
 
 
 def read_v73(path: Path, options: ReadOptions) -> Recording:
@@ -123,7 +191,13 @@ def read_v73(path: Path, options: ReadOptions) -> Recording:
 
     variables: dict[str, NDArray] = {}
     with reading(str(path)), hdf5_files.open_file(path) as file:
-        for name, dataset in file.items():
+        items: list[tuple[str, Any]] = []
+        for name, item in file.items():
+            if isinstance(item, h5py.Group) and not name.startswith("#"):
+                items += [(f"{name}/{field}", part) for field, part in item.items()]
+            else:
+                items.append((name, item))
+        for name, dataset in items:
             if isinstance(dataset, h5py.Dataset) and dataset.dtype.kind in "biuf":
                 with reading(f"{path}: {name}"):
                     # MATLAB stores the shape of an empty array as its data, and all axes reversed.
@@ -131,7 +205,8 @@ def read_v73(path: Path, options: ReadOptions) -> Recording:
                     stored = hdf5_files.array(file, name, str(path))
                     if empty and stored.all():
                         raise InputError(f"{path}: {name} is said to be empty but has a size")
-                    variables[name] = np.zeros(stored.astype(int)) if empty else stored.T
+                    value = np.zeros(stored.astype(int)) if empty else stored.T
+                    variables[name.replace("/", ".")] = value
                     held = sum(value.nbytes for value in variables.values())
                     check_unfolded(held, path.stat().st_size, str(path))
     return _recording(path, options, variables)
@@ -143,37 +218,110 @@ def _recording(path: Path, options: ReadOptions, variables: dict) -> Recording:
         for name, value in variables.items()
         if isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
     }
-    if "events" not in arrays:
+    found = _find_events(arrays)
+    if found is None:
         raise InputError(
-            f"{path}: has no numeric variable events; store it as N x 4 (t in us, x, y, p)"
+            f"{path}: has no numeric variable events; store it as N x 4 (t in us, x, y, p), or "
+            "vectors t, x, y and p"
         )
-    columns = arrays.pop("events")
-    frames = _frames(path, arrays) if "image" in arrays else None
+    images = arrays.pop("image") if "image" in arrays else None
+    if images is not None:
+        images = _checked_images(path, images)
     otherwise = f"{path}: has no image to tell the sensor's size;"
-    size = sensor_size(options.size, frames=frames, otherwise=otherwise)
-    events = _events(path, columns, size, options)
+    told = None if images is None else (images.shape[2], images.shape[1])
+    size = sensor_size(options.size, told, frames=None, otherwise=otherwise)
+    events, unit, clock = _events(path, found, size, options)
+    notes, frames = list(unit.notes), None
+    if images is not None:
+        frames = _frames(path, images, arrays, clock, notes)
     extra = {name: _squeeze(value) for name, value in arrays.items() if name != "HDR_mat"}
     if "HDR_mat" in arrays:
         number = 0 if frames is None else len(frames)
         extra["HDR_mat"] = _reference(arrays["HDR_mat"], number, f"{path}: HDR_mat")
-    return Recording(path.stem, *size, events, frames, extra=extra)
+    return Recording(path.stem, *size, events, frames, extra=extra, notes=tuple(notes))
 
 
-def _events(path: Path, columns: NDArray, size: tuple[int, int], options: ReadOptions) -> Events:
+class _StoredEvents(NamedTuple):
+    """Events as stored: columns by name, or in one array whose order may be known.
+
+    `is_layout` says that it is the array of the layout: t x y p, where times are sorted so.
+    """
+
+    columns: dict[str, NDArray]
+    array: NDArray | None
+    name_of_t: str = ""
+    is_layout: bool = False
+
+
+def _find_events(arrays: dict[str, NDArray]) -> _StoredEvents | None:
+    """Take the events out of the variables; None where there are none."""
+    if "events" in arrays:
+        return _StoredEvents({}, arrays.pop("events"), is_layout=True)
+    structs = sorted({name.partition(".")[0] for name in arrays if "." in name})
+    for prefix in ("", *(f"{name}." for name in structs)):
+        inside = [name.removeprefix(prefix) for name in arrays if name.startswith(prefix)]
+        if (fields := find(inside)) is not None:
+            columns = {key: arrays.pop(prefix + name) for key, name in fields.items()}
+            return _StoredEvents(columns, None, fields["t"])
+    plain = [
+        name
+        for name, value in arrays.items()
+        if name not in _VARIABLES and as_rows(value) is not None
+    ]
+    return _StoredEvents({}, arrays.pop(plain[0])) if len(plain) == 1 else None
+
+
+def _events(
+    path: Path, found: _StoredEvents, size: tuple[int, int], options: ReadOptions
+) -> tuple[Events, InferredUnit, Clock]:
     source = f"{path}: events"
-    if columns.size == 0:
-        return Events.empty()
-    if columns.ndim != 2 or 4 not in columns.shape:
-        raise InputError(
-            f"{source} has shape {columns.shape}; store it as N x 4 (t in us, x, y, p)"
-        )
-    t, x, y, p = columns.T if columns.shape[1] == 4 else columns
-    timed = times(t, source, "event", scale=1.0), x, y, p
-    return from_columns(timed, size, source, options, origin=1)
+    if found.array is None:
+        columns = {name: _vector(value) for name, value in found.columns.items()}
+    elif found.array.size == 0:
+        unit = InferredUnit("us")
+        return Events.empty(), unit, clock_of(unit, found.array, ())
+    else:
+        rows = as_rows(found.array)
+        if rows is None:
+            raise InputError(
+                f"{source} has shape {found.array.shape}; store it as N x 4 (t in us, x, y, p)"
+            )
+        order = "txyp"
+        if not found.is_layout:
+            order = order_of(rows[:SAMPLE], (size[0] + 1, size[1] + 1), source)
+        elif not _has_order_of_layout(rows[:SAMPLE]):
+            with contextlib.suppress(InputError):  # the first bad value is named
+                order = order_of(rows[:SAMPLE], (size[0] + 1, size[1] + 1), source)
+        columns = {name: rows[:, order.index(name)] for name in "txyp"}
+    t, x, y, p = (columns[name] for name in "txyp")
+    # MATLAB counts from 1, and programs that write its files from 0.
+    is_from_0 = not found.is_layout and any((c == 0).any() for c in (x, y))
+    unit = InferredUnit("us")
+    if len({column.shape for column in columns.values()}) == 1 and t.ndim == 1 and len(t):
+        sample = first_and_last(lambda part: {n: columns[n][part] for n in "txyp"}, len(t))
+        stated = stated_unit(found.name_of_t, t)
+        unit = infer_unit(sample, len(t), size, source, options, stated=stated, usual="us")
+    us = to_microseconds(t, unit.name, source, "event")
+    p = signed(p, unsigned_off(p))
+    origin = 0 if is_from_0 else 1
+    events = from_columns((us, x, y, p), size, source, options, origin)
+    if is_from_0:
+        unit = unit._replace(notes=(*unit.notes, "x and y count from 0, as a 0 occurs"))
+    return events, unit, clock_of(unit, t, us)
 
 
-def _frames(path: Path, arrays: dict[str, NDArray]) -> Frames | None:
-    images = arrays.pop("image")
+def _has_order_of_layout(rows: NDArray) -> bool:
+    """Return whether the first of four columns can be times and the last polarities."""
+    return bool((rows[1:, 0] >= rows[:-1, 0]).all() or np.isin(rows[:, 3], (-1, 0, 1)).all())
+
+
+def _vector(value: NDArray) -> NDArray:
+    """MATLAB's row or column (1 x N) as a vector."""
+    return value.reshape(-1) if value.size == max(value.shape, default=0) else value
+
+
+def _checked_images(path: Path, images: NDArray) -> NDArray | None:
+    """Images as [frame, y, x]; None of none."""
     if images.size == 0:
         return None
     if images.dtype.kind == "f" and images.max() > 1:
@@ -183,11 +331,16 @@ def _frames(path: Path, arrays: dict[str, NDArray]) -> Frames | None:
         )
     if images.ndim == 2:
         images = images[:, :, None]
-    images = _frames_first(images, f"{path}: image")
+    return _frames_first(images, f"{path}: image")
+
+
+def _frames(
+    path: Path, images: NDArray, arrays: dict[str, NDArray], clock: Clock, notes: list[str]
+) -> Frames:
     if "time_image" not in arrays:
         raise InputError(f"{path}: image has no times; add time_image, mid-exposure times in us")
     source = f"{path}: time_image"
-    t = times(np.ravel(arrays.pop("time_image")), source, "image", scale=1.0)
+    t = clock.read(np.ravel(arrays.pop("time_image")), source, "image", notes, usual="us")
     if "exposure" in arrays:
         source = f"{path}: exposure"
         exposure = times(np.ravel(arrays.pop("exposure")), source, "image", scale=1.0)

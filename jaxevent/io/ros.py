@@ -32,13 +32,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import LUMA
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
 from jaxevent.io import calibrated, check_unfolded, reading, sensor_size
 from jaxevent.io.bags import Bag
 from jaxevent.io.bayer import PATTERNS, demosaic
 from jaxevent.io.decoded import DecodedImages, decoded
-from jaxevent.io.images import LUMA, read_image
+from jaxevent.io.images import read_image
 from jaxevent.io.options import ReadOptions
 from jaxevent.io.ros_events import event_topic, event_topics
 from jaxevent.recording import Events, Frames, Imu, Poses, Recording

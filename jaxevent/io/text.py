@@ -1,15 +1,17 @@
 """The text layout of the Event-Camera Dataset (Mueggler et al., IJRR 2017), in a folder or zip.
 
-    events.txt       t x y p                  p is 0/1 or -1/1; a first line may be: width height
+    events.txt       t x y p                  p is 0/1 or -1/1; first lines may be: width height,
+                                              and names of the columns, in any order
     images.txt       t path                   path relative to the folder
     groundtruth.txt  t px py pz qx qy qz qw   m, unit quaternion
     imu.txt          t ax ay az gx gy gz      m/s^2, rad/s
     calib.txt        fx fy cx cy k1 k2 p1 p2 k3
 
-All t are seconds; events.txt with whole numbers only, which would be microseconds or worse, is
-refused. Only events.txt is required, and it may be empty where there are images. In a
-zip the files may lie in one top folder. The exposure of the images is unknown: 0. Colour images
-become grey (ITU-R 601 luma); where all are, `extra["rgb"]` keeps their colours.
+All t are seconds. Where those of events.txt are whole numbers only, their unit is another, which is
+inferred (`time_units`) or given, and the other files are read on the clock of the events. Only
+events.txt is required, and it may be empty where there are images. In a zip the files may lie in
+one top folder. The exposure of the images is unknown: 0. Colour images become grey (ITU-R 601
+luma); where all are, `extra["rgb"]` keeps their colours.
 """
 
 import re
@@ -24,10 +26,12 @@ from numpy.typing import NDArray
 from tqdm.utils import CallbackIOWrapper
 
 from jaxevent.errors import InputError
-from jaxevent.io import check_unfolded, pinhole, reading, sensor_size, times
+from jaxevent.io import check_unfolded, pinhole, reading, sensor_size
+from jaxevent.io.columns import find, is_time, signed, stated_unit, unsigned_off
 from jaxevent.io.decoded import from_columns
 from jaxevent.io.images import kept_colours, read_grey_and_colour
 from jaxevent.io.options import ReadOptions
+from jaxevent.io.time_units import SAMPLE, clock_of, infer_unit, to_microseconds, unit_of_name
 from jaxevent.progress import bar
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
@@ -53,39 +57,61 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
 def _read(path: Path, root: Path | zipfile.Path, options: ReadOptions) -> Recording:
     source = f"{path}: events.txt"
-    frames, colours = _frames(path, root)
-    columns, header = _table(
+    stamps, unit_of_stamps, images, colours = _images(path, root)
+    columns, header, names = _table(
         root / "events.txt", source, "t x y p", header="width height", progress=options.progress
     )
     otherwise = (
         f"{source}: neither a first line 'width height' nor an image tells the sensor's size;"
     )
-    size = sensor_size(options.size, header, frames=frames, otherwise=otherwise)
-    t, x, y, p = columns
-    if len(t) > 1 and (t == np.rint(t)).all() and t[0] != t[-1]:
+    told = header or (None if images is None else (images.shape[2], images.shape[1]))
+    size = sensor_size(options.size, told, frames=None, otherwise=otherwise)
+    fields = find(names) or {name: name for name in "txyp"}
+    t, x, y, p = (columns[names.index(fields[name])] for name in "txyp")
+    stated = stated_unit(fields["t"], t)
+    sample = {"t": t[:SAMPLE], "x": x[:SAMPLE], "y": y[:SAMPLE]}
+    if len(t) > SAMPLE:
+        sample = {n: np.append(sample[n], v[-1]) for n, v in (("t", t), ("x", x), ("y", y))}
+    unit = infer_unit(sample, len(t), size, source, options, stated=stated, usual="s")
+    is_known = stated is not None or options.time_unit is not None
+    if unit.name == "s" and not is_known and _are_whole(t):
         raise InputError(
             f"{source}: all times are whole numbers, but those of this layout are seconds; write "
-            "seconds with decimals, or load a table with the line 't x y p' before events in us"
+            "seconds with decimals, or give the unit, time_unit= or --time-unit"
         )
-    columns = times(t, source, "event"), x, y, p
-    events = from_columns(columns, size, source, options)
+    notes = list(unit.notes)
+    us = to_microseconds(t, unit.name, source, "event")
+    events = from_columns((us, x, y, signed(p, unsigned_off(p))), size, source, options)
+    clock = clock_of(unit, t, us)
 
-    poses = imu = camera = None
+    frames = poses = imu = camera = None
+    if images is not None:
+        source = f"{path}: images.txt"
+        at = clock.read(stamps, source, "image", notes, usual="s", stated=unit_of_stamps)
+        frames = Frames(at, images, np.zeros_like(at))
     if (root / "groundtruth.txt").is_file():
         source = f"{path}: groundtruth.txt"
-        (t, *pose), _ = _table(root / "groundtruth.txt", source, "t px py pz qx qy qz qw")
+        (t, *pose), _, _ = _table(root / "groundtruth.txt", source, "t px py pz qx qy qz qw")
         pose = np.stack(pose, axis=1)
-        poses = Poses(times(t, source, "pose"), pose[:, :3], pose[:, 3:])
+        at = clock.read(t, source, "pose", notes, usual="s")
+        poses = Poses(at, pose[:, :3], pose[:, 3:])
     if (root / "imu.txt").is_file():
         source = f"{path}: imu.txt"
-        (t, *sample), _ = _table(root / "imu.txt", source, "t ax ay az gx gy gz")
+        (t, *sample), _, _ = _table(root / "imu.txt", source, "t ax ay az gx gy gz")
         sample = np.stack(sample, axis=1)
-        imu = Imu(times(t, source, "IMU sample"), gyro=sample[:, 3:], acc=sample[:, :3])
+        at = clock.read(t, source, "IMU sample", notes, usual="s")
+        imu = Imu(at, gyro=sample[:, 3:], acc=sample[:, :3])
     if (root / "calib.txt").is_file():
         source = f"{path}: calib.txt"
-        values, _ = _table(root / "calib.txt", source, "fx fy cx cy k1 k2 p1 p2 k3")
+        values, _, _ = _table(root / "calib.txt", source, "fx fy cx cy k1 k2 p1 p2 k3")
         camera = pinhole(np.concatenate(values), source)
-    return Recording(path.stem, *size, events, frames, camera, poses, imu, colours)
+    return Recording(
+        path.stem, *size, events, frames, camera, poses, imu, colours, notes=tuple(notes)
+    )
+
+
+def _are_whole(t: NDArray) -> bool:
+    return len(t) > 1 and bool((t == np.rint(t)).all()) and t[0] != t[-1]
 
 
 def _table(
@@ -94,30 +120,33 @@ def _table(
     layout: str,
     header: str | None = None,
     progress: bool | None = None,
-) -> tuple[list[NDArray[np.float64]], tuple[int, int] | None]:
-    """The columns of a file of numbers, finite float64, and its first line if that is a header.
+) -> tuple[list[NDArray[np.float64]], tuple[int, int] | None, list[str]]:
+    """Read a file of numbers: its columns, finite float64, their names, and its header.
 
-    Lines before the numbers that are blank or start with # are passed over.
+    Lines before the numbers that are blank, start with # or hold letters are passed over. One with
+    the names of events names the columns, which otherwise are those of the layout.
     """
     names = layout.split()
     found = None
     skip = 0
     with reading(source), file.open("rb") as lines:
-        while (line := lines.readline().removeprefix(BOM_UTF8)) and (
-            not line.strip() or line.startswith(b"#")
-        ):
+        while line := lines.readline().removeprefix(BOM_UTF8):
+            words = _words(line)
+            if header is not None and len(words) == len(names) and find(words):
+                names = words
+            elif header is not None and len(fields := line.split()) == len(header.split()):
+                if not all(field.isdigit() and int(field) for field in fields):
+                    raise InputError(
+                        f"{source}: line {skip + 1} has {len(fields)} fields but is not "
+                        f"'{header}'; each line must be '{layout}'"
+                    )
+                found = (int(fields[0]), int(fields[1]))
+            elif line.strip() and not line.startswith(b"#"):
+                if len(words) != len(names) or not _are_names(words):
+                    break
             skip += 1
-        if header is not None and len(fields := line.split()) == len(header.split()):
-            if not all(field.isdigit() and int(field) for field in fields):
-                raise InputError(
-                    f"{source}: line {skip + 1} has {len(fields)} fields but is not '{header}'; "
-                    f"each line must be '{layout}'"
-                )
-            found = (int(fields[0]), int(fields[1]))
-            skip += 1
-            line = lines.readline()
         if not line.strip() and not lines.read().strip():
-            return [np.empty(0) for _ in names], found
+            return [np.empty(0) for _ in names], found, names
     # 4 to 5 million events/s with sep=r"\s+" on one core, 40 times numpy.loadtxt.
     total = file.stat().st_size if isinstance(file, Path) else None
     with (
@@ -151,24 +180,39 @@ def _table(
                 f"finite numbers '{layout}'"
             )
         columns.append(values)
-    return columns, found
+    return columns, found, names
 
 
-def _frames(
+def _words(line: bytes) -> list[str]:
+    """The words of a line that may be a comment; a unit belongs to its name: "t [s] x y p"."""
+    text = line.decode("utf-8", "replace").lstrip("#% ")
+    return re.sub(r"\s+(?=[\[(])", "", text).split()
+
+
+def _are_names(words: list[str]) -> bool:
+    """Return whether a line names columns: none of its words begins as a number does."""
+    return bool(words) and not any(re.match(r"[+-]?\.?\d|nan|inf", w, re.I) for w in words)
+
+
+def _images(
     path: Path, root: Path | zipfile.Path
-) -> tuple[Frames | None, dict[str, NDArray[np.uint8]]]:
-    """The frames, and the colours of coloured ones as `extra` keeps them."""
+) -> tuple[NDArray, str | None, NDArray | None, dict[str, NDArray[np.uint8]]]:
+    """The times of the frames, as stored, the unit in their name, the frames, and the colours."""
+    none = np.empty(0), None, None, dict[str, NDArray[np.uint8]]()
     if not (root / "images.txt").is_file():
-        return None, {}
+        return none
     source = f"{path}: images.txt"
     with reading(source):
         lines = (root / "images.txt").read_text(encoding="utf-8-sig").splitlines()
-    stamps, images, colours, unfolded = [], [], [], 0
+    stamps, unit, images, colours, unfolded = [], None, [], [], 0
     seen, stored = set(), 0 if path.is_dir() else path.stat().st_size
     for number, line in enumerate(lines, 1):
         if not line.strip() or line.startswith("#"):
             continue
         fields = line.split(maxsplit=1)
+        if not stamps and _are_names(fields) and is_time(fields[0]):
+            unit = unit_of_name(fields[0])
+            continue
         try:
             stamps.append(float(fields[0]))
             name = fields[1].strip()
@@ -190,9 +234,8 @@ def _frames(
                 f"{_kind(images[0])}; all images must have the sensor's size and one depth"
             )
     if not images:
-        return None, {}
-    t = times(np.array(stamps), source, "image")
-    return Frames(t, np.stack(images), np.zeros_like(t)), kept_colours(colours)
+        return none
+    return np.array(stamps), unit, np.stack(images), kept_colours(colours)
 
 
 def _image(

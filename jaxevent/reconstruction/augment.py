@@ -65,6 +65,9 @@ class AugmentParams(CertaintyParams):
     ratio_max = Positive(
         1 / 0.6, "1", "largest calibrated over nominal threshold believed", gradient=False
     )
+    ratio_width = Positive(
+        0.4, "1", "width about both bounds in which belief fades; 0: hard bounds", gradient=False
+    )
     weighting = Choice(
         ("linear", "certainty"), "of two frames between them: by time alone, or by certainty too"
     )
@@ -227,6 +230,30 @@ class Level(eqx.Module):
         raise NotImplementedError
 
 
+def bounded_ratio(params: AugmentParams, ratio: Array, known: Array) -> Array:
+    """Replace calibrated over nominal thresholds by 1 where out of bounds or not known (10).
+
+    Within `ratio_width` / 2 of a bound a ratio r becomes 1 + w (r - 1), with the weight
+    w = t^2 (3 - 2 t) for t that rises from 0 to 1 across the bound. So images do not jump as the
+    parameters change. Elsewhere the bounds are hard.
+
+    Args:
+        params: Bounds and width, as ratios.
+        ratio: (frames, pixels).
+        known: Where there is a ratio, (frames, pixels).
+
+    Returns:
+        (frames, pixels).
+    """
+    above, below = ratio - params.ratio_min, params.ratio_max - ratio
+    width = params.ratio_width
+    weight = jnp.where((above >= 0) & (below >= 0), 1.0, 0.0)
+    inside = jnp.minimum(above, below)  # of the nearer bound: the other one's weight is 1 or 0
+    t = jnp.clip(inside / jnp.where(width > 0, width, 1) + 0.5, 0, 1)
+    weight = jnp.where(width > 0, t * t * (3 - 2 * t), weight)
+    return jnp.where(known & (weight > 0), 1 + weight * (ratio - 1), 1)
+
+
 class Augmented(Level):
     """L^A(t), (8)-(11): between two deblurred frames, integrated from both with c calibrated.
 
@@ -257,9 +284,7 @@ class Augmented(Level):
         span = brightness(params, frames.span[0], frames.span[1])  # row f: from frame f to f + 1
         following = jnp.roll(right, -1, axis=0)
         ratio = (following - left) / jnp.where(span == 0, 1, span)
-        believed = (span != 0) & (ratio >= params.ratio_min) & (ratio <= params.ratio_max)
-        believed &= params.calibrate
-        ratio = jnp.where(believed, ratio, 1)
+        ratio = bounded_ratio(params, ratio, (span != 0) & params.calibrate)
 
         # Before the first exposure: backwards from its right edge with the nominal threshold.
         first = right[0] - brightness(params, frames.before[0], frames.before[1])

@@ -99,4 +99,5 @@ high_pass = _filter(
     Nothing,
     Params,
     "The high-pass filter of events alone, whose images have no absolute brightness",
+    fuses=False,
 )

@@ -37,7 +37,7 @@ def advance(params: FrameParams, state: State, dt: Array, frame: Observation) ->
     return State(frame.level, jnp.broadcast_to(state.P, frame.level.shape))
 
 
-def _direct(name: str, model: type[Level], about: str) -> Filter:
+def _direct(name: str, model: type[Level], about: str, **more: Any) -> Filter:
     def observe(values: Any, frames: FrameFeatures) -> Direct:
         return Direct(model(values, frames))
 
@@ -50,6 +50,7 @@ def _direct(name: str, model: type[Level], about: str) -> Filter:
         needs_frames=True,
         has_covariance=False,
         about=about,
+        **more,
     )
 
 
@@ -65,5 +66,7 @@ augmented = _direct(
     "The augmented frame of the AKF, read directly: two deblurred frames, and the events between "
     "them with a threshold calibrated for each pixel.",
 )
-blend = _direct("blend", Blended, "The frames before and after, blended by time; no events.")
-last_frame = _direct("last-frame", Held, "The last frame, held; no events.")
+blend = _direct(
+    "blend", Blended, "The frames before and after, blended by time; no events.", fuses=False
+)
+last_frame = _direct("last-frame", Held, "The last frame, held; no events.", fuses=False)

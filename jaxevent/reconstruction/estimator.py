@@ -22,14 +22,32 @@ class ImageEstimator(Estimator[P]):
     Images are `Estimate`s: `mean` is intensity, 0 the frames' black and 1 their white, and goes
     beyond; `covariance` is the variance of log intensity ln(I + I0), NaN of methods that estimate
     none; `valid` is false where the intensity is not a finite number.
+
+    Attributes:
+        fuses: Whether images rest on events and frames together, so that thresholds must suit both.
     """
 
     family: ClassVar[str] = "reconstruction"
+    fuses: bool = dataclasses.field(default=True, kw_only=True)
     has_likelihood: ClassVar[bool] = False  # whether it has `log_likelihood` of the frames given
+
+    @property
+    def by_parameters(self) -> str:
+        if not self.differentiable:
+            return super().by_parameters
+        return (
+            f"prepare once outside, images = {self.spelled}.prepare_images(recording, times), and "
+            "map or differentiate images(params)"
+        )
 
     def check_span(self, recording: Recording, times: Times, params: P) -> None:
         """Raise `InputError` for times outside the recording, its frames on either clock."""
         check_times(times, *time_span(recording, params.clock_offset), recording.name)
+
+    def check(self, recording: Recording) -> None:
+        """Raise `InputError` for a recording without data, or without what the method needs."""
+        super().check(recording)
+        recording.refuse_empty()
 
     @abc.abstractmethod
     def estimate(
@@ -126,6 +144,7 @@ class PixelEstimator(ImageEstimator[P]):
         `options` are those of `Video`. Raises `InputError` if the recording lacks what the method
         needs.
         """
+        self.check_options(**options)
         return Video(self, recording, self.Params() if params is None else params, **options)
 
     def live(
@@ -139,5 +158,6 @@ class PixelEstimator(ImageEstimator[P]):
         """
         if self.looks_ahead:
             raise InputError(f"the method {self.name!r} needs what comes later; use akf")
+        self.check_options(**options)
         params = self.Params() if params is None else params
         return LiveVideo(self, size, params, frames=frames, **options)

@@ -156,6 +156,7 @@ class Filter(PixelEstimator[P]):
         "xla". Further options are those of `Video`. Raises `InputError` if the recording lacks what
         the method needs, and where numba is asked for what it cannot do.
         """
+        self.check_options(**options)
         params = self.Params() if params is None else params
         fused = video_by_kernel(FusedVideo, self, recording, params, compiler, options)
         return Video(self, recording, params, **options) if fused is None else fused

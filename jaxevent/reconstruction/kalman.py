@@ -46,7 +46,7 @@ class Params(AugmentParams):
     clip_rate = Positive(100.0, "1 / ((ln I)^2 s)", "1/R of clipped frames, if one-sided")
 
     presets = {
-        "paper": {},
+        "paper": {"ratio_width": 0.0},
         "hdr": {
             "c_on": 0.2,
             "c_off": 0.2,

@@ -68,7 +68,7 @@ class LiveVideo:
     ):
         self.estimator, self.params, self.window_events = estimator, params, window_events
         self._expects_frames = frames
-        self._recording = Recording("live", *size, Tail(), extra=extra or {})
+        self._recording = Recording("live", *size, Tail(*size), extra=extra or {})
         self._video: Video | None = None
         self._grown = False
 
@@ -96,7 +96,7 @@ class LiveVideo:
 
     def add(self, events: Events) -> None:
         """Add events that are not earlier than those before; raises `InputError` for bad ones."""
-        self._events.add(events, self._recording.width, self._recording.height)
+        self._events.add(events)
         self._grown = True
         self._settle()
 

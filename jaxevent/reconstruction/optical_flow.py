@@ -277,6 +277,7 @@ flow = Flow(
     Params,
     needs_frames=True,
     differentiable=False,
+    fuses=False,
     has_covariance=False,
     about="The frames before and after, each moved along the optical flow between them (dense "
     "inverse search), blended by time; no events. Needs the extra `vision`.",

@@ -430,7 +430,7 @@ class Smoother(PixelEstimator[Params]):
 
     has_likelihood: ClassVar[bool] = True
     options: frozenset[str] = dataclasses.field(
-        default=frozenset({"window_events", "devices", "compiler"}), kw_only=True
+        default=frozenset({"window_events", "devices", "compiler", "factors"}), kw_only=True
     )
 
     @property
@@ -592,6 +592,7 @@ class Smoother(PixelEstimator[Params]):
         `run` and `read` serve in double precision, on other devices and on several. `factors` (2,
         pixels) are those of ON and OFF thresholds of single pixels. Raises `InputError`.
         """
+        self.check_options(**options)
         params = self.Params() if params is None else params
         fused = video_by_kernel(SmoothedVideo, self, recording, params, compiler, options)
         return Video(self, recording, params, **options) if fused is None else fused

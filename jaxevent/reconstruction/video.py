@@ -4,6 +4,7 @@ import abc
 import functools
 import itertools
 import math
+import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
@@ -17,6 +18,7 @@ from jaxevent.estimator import Estimate
 from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.clock import Timing
+from jaxevent.reconstruction.consistency import events_contradict_frames
 from jaxevent.reconstruction.features import Features, ReadOut, over_pixels, pixel_mesh
 from jaxevent.reconstruction.reading import ImageReader
 from jaxevent.reconstruction.stream import StreamState
@@ -37,6 +39,9 @@ class ImageMethod(Protocol):
 
     @property
     def name(self) -> str: ...
+
+    @property
+    def fuses(self) -> bool: ...
 
     def check(self, recording: Recording) -> None: ...
 
@@ -106,7 +111,8 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
     """Images of a reconstruction: `image, variance, valid = sequence(times)`.
 
     A subclass reads images in `_read`. Images do not depend on which others were asked for. Raises
-    `InputError` if the recording lacks what the estimator needs.
+    `InputError` if the recording lacks what the estimator needs. The first reading warns where
+    events contradict frames at the given thresholds, see `consistency`.
     """
 
     def __init__(
@@ -120,6 +126,7 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
         estimator.check(recording)
         self.estimator, self.recording, self.params = estimator, recording, params
         self.progress = progress
+        self._compared = not estimator.fuses
 
     @property
     @abc.abstractmethod
@@ -200,6 +207,11 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
             raise InputError("times must be sorted to be read in batches; sort them")
         if not extrapolate:
             self.estimator.check_span(self.recording, times, self.params)
+        if not self._compared:
+            self._compared = True
+            contradiction = events_contradict_frames(self.recording, self.params)
+            if contradiction is not None:
+                warnings.warn(contradiction, stacklevel=2)
         start, stop = self.recording.start, self.recording.stop
         with bar(total=len(times), desc="images", unit="image", progress=self.progress) as shown:
             for batch, images in self._read(times):

@@ -58,7 +58,7 @@ def read_frames(
                     "for each image"
                 )
             recording = dataclasses.replace(
-                recording, frames=Frames(t, images, np.zeros(len(t), np.int64))
+                recording, frames=Frames.of_checked(t, images, np.zeros(len(t), np.int64))
             )
     if recording.frames is None:
         raise InputError(f"{path}: holds no frames; give the other camera's recording or images")
@@ -85,7 +85,7 @@ def _read_series(
             )
         images.append(image)
     length = np.full(len(series.t), round((exposure or 0) * 1e6), np.int64)
-    frames = Frames(series.t, np.stack(images), length)
+    frames = Frames.of_checked(series.t, np.stack(images), length)
     height, width = images[0].shape
     if not reference:
         frames.check(width, height, str(path))

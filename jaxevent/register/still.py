@@ -47,7 +47,8 @@ def register_still(
             f"an HDR image of shape {image.shape} cannot be used; give linear intensities "
             "(height, width), none negative, NaN where they are not known"
         )
-    shown = Frames(np.zeros(1, np.int64), image[None], np.zeros(1, np.int64))
+    # Linear intensity, which goes beyond 1 and is NaN where it is not known.
+    shown = Frames.of_checked(np.zeros(1, np.int64), image[None], np.zeros(1, np.int64))
     still = Recording("image", image.shape[1], image.shape[0], Events.empty(), shown)
     sift = cv2.SIFT_create(4000, contrastThreshold=0.02)
 

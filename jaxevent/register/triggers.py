@@ -121,7 +121,7 @@ def by_triggers(
     kept = other.with_frames(rows)
     assert kept.frames is not None
     own = kept.frames.exposure
-    stamped = Frames(
+    stamped = Frames.of_checked(
         t[place[rows]], kept.frames.images, np.where(own > 0, own, exposure[place[rows]])
     )
     kept = dataclasses.replace(kept, frames=stamped)

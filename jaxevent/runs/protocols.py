@@ -86,6 +86,9 @@ class Reference(Frames):
     clip: tuple[float, float]
     white: float | None = None
 
+    def __post_init__(self):
+        """Take the images as they are: `reference` checks them, with limits of their own."""
+
     def truth(self, row: int) -> NDArray[np.float64]:
         """One image (height, width) of intensity, NaN where there is no reference."""
         image = np.asarray(self.images[row], np.float64)

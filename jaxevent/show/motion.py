@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from jaxevent.egomotion import flow as event_flow
 from jaxevent.egomotion.comparison import Comparison, compare
 from jaxevent.egomotion.models import Model, find_model
-from jaxevent.egomotion.motion import Motion, decided
+from jaxevent.egomotion.motion import Motion, decided, table_columns
 from jaxevent.egomotion.truth import Known, known
 from jaxevent.egomotion.twists import constant_between, from_poses, nearest_axes
 from jaxevent.errors import InputError, MissingExtra, require
@@ -44,14 +44,7 @@ def write_motion_table(
 
     A sigma is the square root of its component's variance. Where the motion is lost both are empty.
     """
-    names = find_model(model).components
-    lost = ~told.valid[:, None]
-    variance = np.diagonal(told.covariance, axis1=1, axis2=2)
-    columns: dict[str, Any] = {"t": times / 1e6}
-    columns |= dict(zip(names, np.where(lost, np.nan, told.mean).T, strict=True))
-    sigma = np.where(lost, np.nan, np.sqrt(np.maximum(variance, 0)))
-    columns |= {f"sigma_{name}": s for name, s in zip(names, sigma.T, strict=True)}
-    _write_csv(path, columns | {"lost": (~told.valid).astype(int)})
+    _write_csv(path, table_columns(model, times, told))
 
 
 def write_known(

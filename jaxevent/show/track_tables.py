@@ -15,17 +15,16 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
+from jaxevent.blob.tables import COLUMNS, TABLE_UNITS, UNITS, table_columns
 from jaxevent.errors import InputError
 from jaxevent.io.description import CLOCK
 from jaxevent.io.output import complete, complete_hdf5
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Times, microseconds
 
-COLUMNS = ("x", "y", "vx", "vy", "lambda1", "lambda2", "theta", "q")
 QUANTITIES = (
     "t", "id", "other", "inverse_ttc", "sigma_inverse_ttc", "range", "sigma_range"
 )  # fmt: skip
-UNITS = ("px", "px", "px/s", "px/s", "px", "px", "rad", "rad/s")
 
 
 def write_tracks(
@@ -86,13 +85,10 @@ def track_writer(
 @contextlib.contextmanager
 def _csv_writer(path: Path) -> Iterator[Callable[..., None]]:
     with complete(path) as partial, partial.open("w", newline="") as file:
-        names = ("t", "id", *COLUMNS, *(f"sigma_{name}" for name in COLUMNS))
-        file.write(",".join(names) + "\n")
+        file.write(",".join(TABLE_UNITS) + "\n")
 
         def append(t: NDArray, number: NDArray, mean: NDArray, covariance: NDArray) -> None:
-            deviation = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0))
-            columns = [t / 1e6, number, *mean.T, *deviation.T]
-            table = pd.DataFrame(dict(enumerate(columns)))
+            table = pd.DataFrame(table_columns(t, number, mean, covariance))
             table.to_csv(file, index=False, header=False)
 
         yield append

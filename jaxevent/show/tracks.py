@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_range
 from jaxevent.blob.states import TrackStates
+from jaxevent.blob.tables import TABLE_RATE, evenly
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.io.output import complete
@@ -60,7 +61,7 @@ class Output:
     """
 
     path: Path
-    rate: float | int | None = 1000.0
+    rate: float | int | None = TABLE_RATE
     background: str = "events"
     pairs: Sequence[tuple[int, int]] = ()
     extent: float | int | None = None
@@ -154,12 +155,16 @@ class Output:
         method: str | None,
     ) -> "Written":
         duration = (tracks.stop - tracks.start) * 1e-6
-        rate = 1000.0 if self.rate is None else float(self.rate)
-        coarse = _evenly(tracks, min(rate, _COARSE / duration))
+        rate = TABLE_RATE if self.rate is None else float(self.rate)
+        coarse = evenly(tracks.start, tracks.stop, min(rate, _COARSE / duration))
         often = min(max(_FPS, _PICTURES / duration), max(rate, _FPS))
-        pictures = _evenly(tracks, often) if ".mp4" in places else coarse[:0]
+        pictures = evenly(tracks.start, tracks.stop, often) if ".mp4" in places else coarse[:0]
         tables = [path for kind, path in places.items() if kind in (".csv", ".h5", ".hdf5")]
-        times = _evenly(tracks, rate) if tables and self.rate is not None else coarse[:0]
+        times = (
+            evenly(tracks.start, tracks.stop, rate)
+            if tables and self.rate is not None
+            else coarse[:0]
+        )
         rows = _Rows(coarse, tracks.id)
         with contextlib.ExitStack() as stack:
             writers = [
@@ -415,13 +420,6 @@ class _Rows:
                 True,
             )
         return mean, covariance, valid
-
-
-def _evenly(tracks: Tracks, rate: float) -> NDArray[np.int64]:
-    """Times (us) at a rate (1/s) from the start of the tracking to before its end."""
-    count = math.ceil((tracks.stop - tracks.start) * rate / 1e6)
-    times = tracks.start + np.rint(np.arange(count) * (1e6 / rate)).astype(np.int64)
-    return np.unique(times[times < tracks.stop])
 
 
 def _within(t: NDArray[np.int64], some: NDArray[np.int64]) -> NDArray[np.intp]:

@@ -391,7 +391,8 @@ def test_a_track_that_hops_from_a_lamp_is_the_lamp_s_if_it_is_mostly_there(leave
     order = np.argsort(t)
     x, y = np.rint(xi[order]).T.astype(np.uint16)
     us = np.rint(1e6 * t[order]).astype(np.int64)
-    recording = Recording("lamps", *SMALL, Events(us, x, y, on[order]))
+    seen = x < SMALL[0]
+    recording = Recording("lamps", *SMALL, Events(us, x, y, on[order])[seen])
     at = np.arange(10_000, 2_000_000, 20_000)
     path = _path(at, 40 + 60 * np.maximum(at * 1e-6 - leaves, 0), 40, 3.5, 30)
     kept, number = without_lamps([path], recording, np.zeros(SMALL[::-1], bool))

@@ -9,6 +9,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pandas as pd
 import pytest
 from commands import described, fails
 from PIL import Image
@@ -129,6 +130,26 @@ def test_another_method_is_tried_where_the_usual_one_finds_nothing_soon(
     late = " before the recording's middle" if first else ""
     said = f"voting found no motion{late}, so planes is tried"
     assert (said in capsys.readouterr().out) == (first != 0.4)
+
+
+def test_a_dataframe_has_the_columns_that_the_command_writes(tmp_path):
+    t = np.array([1000, 3000, 6000])
+    mean, covariance = np.arange(6.0).reshape(3, 2), np.tile(np.diag([4.0, 9.0]), (3, 1, 1))
+    motion = Motion.of("planar", t, mean, covariance, np.array([True, True, False]))
+    motion = dataclasses.replace(motion, span=(0, 7000))
+    table = motion.to_dataframe()
+    times = np.arange(0, 7001, 500)
+    pictures.write_motion_table(tmp_path / "motion.csv", "planar", times, motion(times))
+    rows = pd.read_csv(tmp_path / "motion.csv")
+    pd.testing.assert_frame_equal(motion.to_dataframe(times), rows)
+    assert list(table) == ["t", "vx", "vy", "sigma_vx", "sigma_vy", "lost"]
+    np.testing.assert_array_equal(table["t"], t / 1e6)
+    np.testing.assert_array_equal(table["vy"], [1, 3, np.nan])
+    np.testing.assert_array_equal(table["sigma_vy"], [3, 3, np.nan])
+    assert table["lost"].tolist() == [0, 0, 1] and table.attrs["units"]["sigma_vx"] == "px/s"
+    assert motion.to_dataframe(0.002)["vx"].tolist() == [1.0]
+    with pytest.raises(InputError, match="times from 8000"):
+        motion.to_dataframe(8000)
 
 
 def test_a_folder_of_everything(folder, capsys):

@@ -10,6 +10,7 @@ from pathlib import Path
 import h5py
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 from commands import decoded, described, fails
 from PIL import Image
@@ -18,7 +19,7 @@ import jaxevent
 from jaxevent import blob, cli
 from jaxevent.blob import constant_velocity
 from jaxevent.blob.quantities import inverse_ttc, size_range
-from jaxevent.errors import install_command
+from jaxevent.errors import InputError, install_command
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.show import tracks as written
 from jaxevent.show.track_pictures import track_colour
@@ -68,6 +69,26 @@ def read_table(path: Path) -> tuple[list[str], np.ndarray]:
 
 def test_header_is_exact():
     assert HEADER == ["t", "id", "x", "y", "vx", "vy", "lambda1", "lambda2", "theta", "q"]
+
+
+def test_a_dataframe_is_the_table_that_the_command_writes(folder):
+    argv = ["track", folder / "two.h5", *METHOD, "--params", folder / "mine.toml"]
+    out = folder / "tracks.csv"
+    assert cli.main([*map(str, [*argv, "--out", out]), *seeded()]) == 0
+    tracks, rows = followed(), pd.read_csv(out)
+    table = tracks.to_dataframe()
+    pd.testing.assert_frame_equal(table.astype(rows.dtypes), rows, rtol=1e-12)
+    assert table.attrs["units"]["sigma_vx"] == "px/s" and table["id"].dtype == np.int64
+
+    times = [tracks.start + 5000, tracks.start + 1000]  # sorted by time
+    part, states = tracks.to_dataframe(times, [1]), tracks(np.sort(times), [1])
+    assert part["t"].tolist() == [t / 1e6 for t in sorted(times)] and set(part["id"]) == {1}
+    np.testing.assert_array_equal(part["x"], states.mean[:, 0, 0])
+    np.testing.assert_array_equal(part["sigma_x"], np.sqrt(states.covariance[:, 0, 0, 0]))
+    none = tracks.to_dataframe(np.zeros(0, int))
+    assert len(none) == 0 and list(none) == list(table)
+    with pytest.raises(InputError, match="times from"):
+        tracks.to_dataframe(tracks.stop + 10**6)
 
 
 @pytest.mark.slow

@@ -28,6 +28,7 @@ def _script():
 fuzz = _script()
 
 
+@pytest.mark.filterwarnings("ignore::jaxevent.InputWarning")  # of damaged times
 @pytest.mark.parametrize("name", fuzz.FORMATS)
 @given(seed=st.integers(0, 2**31 - 1))
 @settings(max_examples=50)

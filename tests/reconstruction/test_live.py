@@ -93,9 +93,9 @@ def test_what_cannot_be_added_is_said():
 
 
 def test_the_tail_keeps_its_numbers():
-    events, tail = small().events, Tail()
+    events, tail = small().events, Tail(WIDTH, HEIGHT)
     for row in range(0, 400, 50):
-        tail.add(events[row : row + 50], WIDTH, HEIGHT)
+        tail.add(events[row : row + 50])
     tail.drop(120)
     assert (len(tail), tail.dropped, len(tail.held())) == (400, 120, 280)
     assert tail[:1].t[0] == events.t[0] and tail.index(int(events.t[200])) <= 200

@@ -26,7 +26,7 @@ def test_it_is_found_by_its_path():
         find(PATH, "blob")
     with pytest.raises(jaxevent.InputError, match="'own_filter:trends' cannot be imported"):
         find("own_filter:trends")
-    with pytest.raises(jaxevent.InputError, match="is a .*, not an Estimator"):
+    with pytest.raises(jaxevent.InputError, match="is the class Params, not an Estimator"):
         find("own_filter:Params")
 
 

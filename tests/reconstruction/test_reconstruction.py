@@ -26,6 +26,7 @@ PARAMS = {
     "c_off": 0.09,
     "I0": 0.4,
     "ratio_min": 0.05,
+    "ratio_width": 0.5,
     "kappa": 3e4,
     "sigma_proc": 0.3,
     "sigma_iso": 0.4,
@@ -670,9 +671,30 @@ def test_frames_of_an_automatic_exposure_share_a_scale():
         jaxevent.last_frame.estimate(wrong)
 
 
+@pytest.mark.parametrize("width", [0.0, 0.4])
+def test_gradients_by_thresholds_integrate_to_the_change_of_a_loss(width):
+    """With soft bounds on calibrated thresholds; hard ones make jumps that no gradient sees."""
+    recording = random_recording(5, 500, 5)
+    times = np.linspace(recording.start, recording.stop, 9).astype(np.int64)
+    images = chain(jaxevent.augmented, recording, times)
+    params = jaxevent.augmented.Params(ratio_width=width)
+
+    @jax.jit
+    @jax.vmap
+    @jax.value_and_grad
+    def loss(log_c):
+        return (images(params.with_raw({"c_on": log_c})).mean ** 2).mean()
+
+    log_c = np.linspace(np.log(0.08), np.log(0.12), 401)
+    value, slope = (np.asarray(v) for v in loss(log_c))
+    gained = np.trapezoid(slope, log_c)
+    agree = abs(gained - (value[-1] - value[0])) < 0.01 * np.abs(slope).mean() * np.ptp(log_c)
+    assert agree == (width > 0)
+
+
 def test_presets():
     paper, hdr = (jaxevent.akf.Params(preset=name) for name in ("paper", "hdr"))
-    assert paper.values() == jaxevent.akf.Params().values()
+    assert paper.values() == jaxevent.akf.Params(ratio_width=0.0).values()
     assert hdr.weighting == "certainty" and not hdr.calibrate
     assert float(jaxevent.akf.Params(preset="hdr", I0=0.5).I0) == 0.5
     with pytest.raises(jaxevent.InputError, match="no preset 'hdri'; did you mean 'hdr'"):

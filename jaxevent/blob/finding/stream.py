@@ -105,7 +105,7 @@ class Stream:
                 number += len(left[-1])
         if number <= HELD:
             columns = zip(*((one.t, one.x, one.y, one.p) for one in left), strict=True)
-            stream._held, stream._kept = Events(*map(np.concatenate, columns)), None
+            stream._held, stream._kept = Events.of_checked(*map(np.concatenate, columns)), None
         else:
             stream._kept = kept
         return stream

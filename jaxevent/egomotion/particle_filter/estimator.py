@@ -120,6 +120,7 @@ class Voting(MotionEstimator[Params]):
         Raises `InputError` as `estimate` does, for a recording without events and, unless told to
         `extrapolate`, for times outside the recording.
         """
+        self.check_options(seed=seed)
         kind, gatherer = self.gatherer(recording, params, model, camera)
         if not len(recording.events):
             raise InputError(f"{recording.name}: holds no events; choose another recording")
@@ -196,6 +197,7 @@ class Voting(MotionEstimator[Params]):
             InputError: The model is unknown, or it needs a camera and there is none, or numba is
                 asked for and has no kernel.
         """
+        self.check_options(seed=seed, progress=progress, smooth=smooth, cloud=cloud)
         if params is None:
             found, _ = self.place(recording, model, camera)
             params = self.suit(recording, self.start(found), camera=camera).params

@@ -85,7 +85,7 @@ CLEARLY = 0.97  # of the misfit by time, where the course tells more than noise
 FASTEST = 2.0  # times as fast as what moves on the whole: what exposures are sampled for
 INFLATE = 3.0  # of the variance of an image that motion is refined with
 
-evidence = Evidence("evidence", Params)  # reads images at single instants
+evidence = Evidence("evidence", Params, fuses=False)  # reads images at single instants
 
 
 class Targets(Described):
@@ -686,6 +686,7 @@ class MotionCompensated(ImageEstimator[Params]):
         `options` are those of `CompensatedVideo`.
         """
         self.refuse_unknown({name: v for name, v in options.items() if name != "progress"})
+        self.check_options(**options)
         chosen = self.Params() if params is None else params
         return CompensatedVideo(self, recording, chosen, **options)
 

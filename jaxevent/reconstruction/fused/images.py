@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from jaxevent import dispatch
 from jaxevent.devices import accelerated, full_precision
+from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.reconstruction.clock import Timing
@@ -58,7 +59,7 @@ class Divided(abc.ABC):
         numbers = [
             (leaf, k)
             for leaf, (path, value) in enumerate(jax.tree_util.tree_flatten_with_path(params)[0])
-            if getattr(path[-1], "key", None) not in dead
+            if getattr(path[-1], "key", "point") not in {"point", *dead}
             for k in range(np.size(value))
         ]
         self.check(params, Directions(tuple(numbers), ("mean", "variance")))
@@ -134,6 +135,8 @@ class FusedImages(eqx.Module):
 
     def __call__(self, params: Any, *, variance: bool = True) -> Estimate:
         outputs = ("mean", "variance") if variance else ("mean",)
+        # No image depends on `point`: without a tangent of it the kernel carries none.
+        params = eqx.tree_at(lambda p: p.point, params, jax.lax.stop_gradient(params.point))
         mean, P, valid = _images((self.held, outputs), self.number, self.rows, params)
         return Estimate(mean, P, valid)
 
@@ -216,13 +219,30 @@ def _images_jvp(about: Any, primals: Any, tangents: Any) -> Any:
     if not numbers:
         images = _images(about, number, rows, params)
         return images, tuple(jnp.zeros(image.shape, _tangent(image)) for image in images)
-    mean, variance, valid, slopes = _called(about, number, rows, params, numbers)
+    mean, variance, valid, slopes = _with_derivatives((*about, numbers), number, rows, params)
     change = jnp.concatenate([jnp.ravel(changes[k]) for k in moving]).astype(slopes.dtype)
     change = jnp.pad(change, (0, slopes.shape[-1] - change.size))
     moved = jnp.einsum("tpil,l->tpi", slopes, change)
     d_variance = moved[..., 1] if moved.shape[-1] > 1 else jnp.zeros_like(variance)
     d_valid = np.zeros(valid.shape, jax.dtypes.float0)
     return (mean, variance, valid), (moved[..., 0], d_variance, d_valid)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _with_derivatives(about: Any, number: Any, rows: Any, params: Any) -> Any:
+    held, outputs, numbers = about
+    return _called((held, outputs), number, rows, params, numbers)
+
+
+def _with_derivatives_jvp(about: Any, primals: Any, tangents: Any) -> Any:
+    """Refuse second derivatives, which no kernel carries; a change of nothing changes nothing."""
+    if not all(map(_is_zero, jax.tree.leaves(tangents, is_leaf=_is_zero))):
+        raise InputError(
+            f"the kernel of the method {about[0].method.name!r} has first derivatives only; for "
+            'second ones, as of jax.hessian, give prepare_images(..., compiler="xla")'
+        )
+    made = _with_derivatives(about, *primals)
+    return made, tuple(jnp.zeros(one.shape, _tangent(one)) for one in made)
 
 
 def _is_zero(tangent: Any) -> bool:
@@ -234,3 +254,4 @@ def _tangent(image: Any) -> Any:
 
 
 _images.defjvp(_images_jvp, symbolic_zeros=True)
+_with_derivatives.defjvp(_with_derivatives_jvp, symbolic_zeros=True)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.errors import InputError
 from jaxevent.kernels import over_rows
 from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.reconstruction.clock import Timing
@@ -167,7 +168,10 @@ class DividedRecording:
         least = np.iinfo(np.int64).min
         checked = EventColumns(around.t, around.x, around.y, around.p.view(np.uint8), 0, least)
         bands = self._bands_of(checked, weight)
-        assert bands is not None
+        if bands is None:  # somebody changed arrays after they were checked
+            name = self.recording.name
+            around.check(self.recording.width, self.recording.height, name, context)
+            raise InputError(f"{name}: events changed while they were read; make a new recording")
         return bands, state
 
     def _bands_of(self, stored: EventColumns, weight: NDArray) -> Bands | None:

@@ -1,0 +1,425 @@
+"""Columns and images of other libraries as plain NumPy arrays, and checks of the values in them.
+
+An array-like is a list, or anything that answers NumPy's array protocol (`__array__`) or DLPack
+(`__dlpack__`): arrays of NumPy and JAX, tensors of PyTorch, columns of pandas, polars and Arrow.
+None of these libraries is imported. Plain arrays are of the machine's byte order, contiguous and
+writable, as compiled functions take them; an array that is plain already is not copied.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError
+
+TimeUnit = Literal["s", "ms", "us", "ns"]
+
+NAMES = {
+    "t": ("t", "ts", "time", "times", "timestamp", "timestamps", "time_stamp"),
+    "x": ("x", "xs"),
+    "y": ("y", "ys"),
+    "p": ("p", "ps", "pol", "pols", "polarity", "polarities", "on"),
+}
+LUMA = np.array([0.299, 0.587, 0.114])  # of red, green and blue, ITU-R 601
+MAX_PIXELS = 1 << 16  # of a side: coordinates are uint16
+MAX_TIME_US = 1 << 62  # 146,000 years: sums and differences of two times stay in int64
+_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
+_LUMA_16 = (19595, 38470, 7471)  # LUMA in units of 2^-16, as Pillow computes grey
+_BLOCK = 1 << 20  # values compared together, so that a check needs no memory to speak of
+_HELD_NOT_NUMBERS = {
+    "O": "convert it to numbers",
+    "U": "convert the text to numbers",
+    "S": "convert the text to numbers",
+    "c": "give its real part",
+    "M": "give .astype('datetime64[us]').astype('int64'), microseconds",
+    "m": "give .astype('timedelta64[us]').astype('int64'), microseconds",
+    "V": "give one field of it, or the whole array as the only argument of from_arrays",
+}
+
+
+def find(names: Sequence[str]) -> dict[str, str] | None:
+    """Which of some names are t, x, y and p; None unless each is there, once."""
+    found = {}
+    for field, aliases in NAMES.items():
+        fitting = [name for name in names if str(name).strip().lower() in aliases]
+        if len(fitting) != 1:
+            return None
+        found[field] = fitting[0]
+    return found
+
+
+def as_array(values: Any, what: str) -> NDArray:
+    """The numbers of an array-like, bool, integer or float, as a NumPy array of any shape.
+
+    `what` names the argument in messages. Raises `InputError` for what holds no numbers and where
+    some are masked.
+    """
+    if isinstance(values, np.ma.MaskedArray):
+        if np.ma.getmaskarray(values).any():
+            raise InputError(
+                f"{what} has masked values; remove these rows from all columns, or fill them in"
+            )
+        values = values.data
+    if isinstance(values, str | bytes | Mapping | set | frozenset) or (
+        not hasattr(values, "__array__") and isinstance(values, Iterable) and _is_spent(values)
+    ):
+        raise InputError(f"{what} is a {type(values).__name__}; give an array or a list of numbers")
+    try:
+        if isinstance(values, np.ndarray) or not hasattr(values, "__dlpack__"):
+            array = np.asarray(values)
+        elif hasattr(values, "__array__"):
+            array = np.asarray(values)
+        else:
+            array = np.from_dlpack(values)
+    except Exception as error:  # whatever the library of the array raises
+        reason = " ".join(str(error).split())[:150] or type(error).__name__
+        raise InputError(
+            f"{what}, a {type(values).__name__}, cannot be read as a NumPy array ({reason}); give "
+            "one on the CPU, without a gradient, whose rows are equally long"
+        ) from None
+    if array.dtype.kind not in "biuf":
+        remedy = _HELD_NOT_NUMBERS.get(array.dtype.kind, "convert it to numbers")
+        raise InputError(f"{what} is of type {array.dtype}, not numbers; {remedy}")
+    return array
+
+
+def _is_spent(values: Iterable[Any]) -> bool:
+    """Whether these can be passed over only once, or have no order, as generators and files."""
+    return not (hasattr(values, "__len__") and hasattr(values, "__getitem__"))
+
+
+def as_column(values: Any, what: str) -> NDArray:
+    """The numbers of an array-like (n,), bool, integer or float.
+
+    Raises `InputError` for other shapes and types, naming the argument `what`.
+    """
+    array = as_array(values, what)
+    if array.ndim != 1:
+        remedy = (
+            "give np.ravel of it" if array.size == max((*array.shape, 1)) else "give one column"
+        )
+        raise InputError(f"{what} has the shape {array.shape}, not (n,); {remedy}")
+    return array
+
+
+def as_plain(values: NDArray, dtype: Any = None) -> NDArray:
+    """An array of the machine's byte order, contiguous and writable; itself if it is that."""
+    dtype = values.dtype.newbyteorder("=") if dtype is None else np.dtype(dtype)
+    return np.require(values, dtype, "CAWE")
+
+
+def columns_of(events: Any) -> dict[str, Any]:
+    """The columns t, x, y and p of a structured array, a DataFrame, a table or a dictionary.
+
+    Raises `InputError` where these are not found by their names (`NAMES`).
+    """
+    names: Any = getattr(getattr(events, "dtype", None), "names", None)
+    if names is None and isinstance(events, Mapping):
+        names = list(events)
+    for attribute in ("column_names", "columns"):  # of Arrow; of pandas and polars
+        if names is None and not isinstance(events, np.ndarray):
+            names = getattr(events, attribute, None)
+    if names is None and all(hasattr(events, name) for name in "txyp"):
+        return {name: getattr(events, name) for name in "txyp"}
+    try:
+        fields = None if names is None else find(list(names))
+    except TypeError:
+        names = fields = None
+    if fields is None:
+        shape = getattr(events, "shape", None)
+        held = f"of shape {shape}" if shape is not None else ""
+        if names is not None:
+            held = f"with {', '.join(map(str, names))[:80] or 'no columns'}"
+        raise InputError(
+            f"events, a {type(events).__name__} {held}".rstrip()
+            + ", has no columns named t, x, y and p; give each on its own: "
+            "from_arrays(t, x, y, p, width=..., height=...)"
+        )
+    return {field: events[name] for field, name in fields.items()}
+
+
+def check_unit(time_unit: Any) -> None:
+    """Raise `InputError` unless a unit of time is "s", "ms", "us" or "ns", or None."""
+    if time_unit is not None and time_unit not in get_args(TimeUnit):
+        raise InputError(
+            f"time_unit = {brief(time_unit)} is no unit of time; give 's', 'ms', 'us' or 'ns'"
+        )
+
+
+def as_times(values: Any, what: str, time_unit: TimeUnit | None = None) -> NDArray[np.int64]:
+    """Times (n,) as plain int64 us.
+
+    Integers are in `time_unit`, without one in us. Raises `InputError` for floats without a unit,
+    and for floats whose type cannot tell neighbouring times apart.
+    """
+    t = as_column(values, what)
+    if t.dtype.kind == "b" and len(t):
+        raise InputError(f"{what} is of type bool, not times; give integers or floats")
+    if t.dtype.kind == "f" and time_unit is None and len(t):
+        raise InputError(
+            f"{what} is {t.dtype}, which tells no unit; give time_unit='s' (or 'ms', 'us', 'ns'), "
+            "or integer microseconds"
+        )
+    scale = 1.0 if time_unit is None else _US[time_unit]
+    if t.dtype.kind == "f":
+        refuse_coarse_times(t, scale, what)
+        t = times(t, what, "row", scale) if len(t) else t
+    elif scale >= 1 and len(t):
+        check_span(t, what, "row", round(scale))
+        t = t.astype(np.int64, copy=False)
+        t = t * round(scale) if scale > 1 else t
+    elif len(t):
+        check_span(t, what, "row")
+        t = (t.astype(np.int64, copy=False) + 500) // 1000
+    return as_plain(t, np.int64)
+
+
+def refuse_coarse_times(t: NDArray, scale: float, what: str) -> None:
+    """Raise `InputError` for float times whose type cannot tell neighbours apart.
+
+    That is where two values of the type next to each other, at the largest time, are over 1 us
+    apart and further than two events on average. `scale` is the us of one unit.
+    """
+    if len(t) < 2:
+        return
+    first, last = float(t.min()), float(t.max())
+    largest = max(abs(first), abs(last))
+    if not np.isfinite(largest):
+        return
+    step = float(np.spacing(t.dtype.type(largest))) * scale
+    if step > 1 and step > (last - first) * scale / (len(t) - 1):
+        raise InputError(
+            f"{what}: {t.dtype} holds times near {largest:g} in steps of {step:.3g} us, coarser "
+            "than neighbouring events; keep them as float64 or integer microseconds from the start"
+        )
+
+
+def times(
+    values: NDArray, source: str, what: str, scale: float = 1e6, first_row: int = 0
+) -> NDArray[np.int64]:
+    """Times (n,) as int64 us: integers are us already, floats are multiplied by `scale`.
+
+    `first_row` is the row of the first one in `source`; both are for messages.
+    """
+    values = numbers(values, source, f"{what} times")
+    is_float = values.dtype.kind == "f"
+    values = values.astype(np.float64, copy=False) if is_float else values
+    check_span(values, source, what, scale if is_float else 1, first_row)
+    if not is_float:
+        return values.astype(np.int64, copy=False)
+    return np.rint(values * scale).astype(np.int64)
+
+
+def check_span(
+    values: NDArray, source: str, what: str, scale: float = 1, first_row: int = 0
+) -> None:
+    """Raise `InputError` for times, of `scale` us each, that are not finite or beyond int64."""
+    is_float = values.dtype.kind == "f"
+    # NaN and infinity fail this comparison too.
+    most = MAX_TIME_US / scale if is_float else MAX_TIME_US // scale
+    if len(values) and not -most < values.min() <= values.max() < most:
+        row = int(np.argmin((values > -most) & (values < most)))
+        unit = {1e6: "seconds", 1e3: "milliseconds", 1e-3: "nanoseconds"}.get(scale, "microseconds")
+        shown = f"{values[row]:.16g}" if is_float else str(values[row])
+        raise InputError(
+            f"{_place(source)}{what} {first_row + row} has the time {shown}, not finite "
+            f"or too large for {unit}; correct the unit or remove it"
+        )
+
+
+def numbers(values: NDArray, source: str, what: str) -> NDArray:
+    """The array, or `InputError` unless it is a list of integers or floats."""
+    if values.ndim != 1 or values.dtype.kind not in "iuf":
+        raise InputError(
+            f"{_place(source)}{what} is {values.dtype} of shape {values.shape}; store a list of "
+            "numbers"
+        )
+    return values
+
+
+def brief(value: Any) -> str:
+    """A value on one line, cut to 60 characters, for messages."""
+    return " ".join(repr(value).split())[:60]
+
+
+def _place(source: str) -> str:
+    return f"{source}: " if source else ""
+
+
+def as_size(width: Any, height: Any, source: str) -> tuple[int, int]:
+    """The sides of a sensor, whole numbers of pixels from 1 to `MAX_PIXELS`, or `InputError`."""
+    for name, side in (("width", width), ("height", height)):
+        if not isinstance(side, int | np.integer) or isinstance(side, bool):
+            raise InputError(
+                f"{_place(source)}{name} is {brief(side)}; give a whole number of pixels"
+            )
+    if min(width, height) < 1 or max(width, height) > MAX_PIXELS:
+        raise InputError(
+            f"{_place(source)}the sensor has {width}x{height} pixels, but at most {MAX_PIXELS} "
+            "of a side, and at least one, can be read; correct its size with size=(width, height) "
+            "or --size"
+        )
+    return int(width), int(height)
+
+
+def coordinates(
+    name: str,
+    values: NDArray,
+    size: tuple[int, int],
+    source: str,
+    *,
+    first_row: int = 0,
+    origin: int = 0,
+) -> NDArray[np.uint16]:
+    """Columns ("x") or rows ("y") of events on a sensor (width, height), plain.
+
+    They count from `origin`. Raises `InputError` for the first that is no whole number on it.
+    """
+    values = numbers(values, source, name)
+    last = origin + (size[0] if name == "x" else size[1]) - 1
+    if values.dtype.kind == "f":
+        values = values.astype(np.float32) if values.dtype.itemsize < 4 else values
+        good = (values >= origin) & (values <= last) & (values == np.rint(values))
+        bad_row = None if good.all() else int(np.argmin(good))
+    else:
+        # What the type cannot hold is not looked for.
+        kind, bad_row = np.iinfo(values.dtype), None
+        low = kind.min < origin and len(values) and values.min() < origin
+        if low or (kind.max > last and len(values) and values.max() > last):
+            bad_row = int(np.argmax((values < origin) | (values > last)))
+    if bad_row is not None:
+        known = max(size) < MAX_PIXELS
+        on = f"on the {size[0]}x{size[1]} sensor " if known else ""
+        remedy = "give the sensor's size or remove the event" if known else "remove the event"
+        raise InputError(
+            f"{_place(source)}event {first_row + bad_row} has {name} = {values[bad_row]:.12g}; "
+            f"{on}{name} is a whole number from {origin} to {last}, so {remedy}"
+        )
+    return as_plain(values - origin if origin else values, np.uint16)
+
+
+def polarities(p: NDArray, source: str, first_row: int = 0) -> NDArray[np.bool_]:
+    """Polarity, bool, 0/1 or -1/1 of any type, as plain bool; True is ON.
+
+    Raises `InputError` for the first other value.
+    """
+    if p.dtype.kind == "b" and p.ndim == 1:
+        p = as_plain(p)
+        # A view of other bytes as bool may hold some that are neither.
+        return p if not len(p) or p.view(np.uint8).max() <= 1 else p.view(np.uint8) != 0
+    p = numbers(p, source, "p")
+    if p.dtype == np.uint8 and (not len(p) or p.max() <= 1):
+        return as_plain(p).view(np.bool_)
+    on, off, negative = p == 1, p == 0, p == -1
+    good = on | off | negative
+    if not good.all():
+        row = int(np.argmin(good))
+        raise InputError(
+            f"{_place(source)}event {first_row + row} has the polarity {p[row]:.12g}; it must be 1 "
+            "for ON and 0 or -1 for OFF; p > 0 makes it so where other positive numbers are ON"
+        )
+    if off.any() and negative.any():
+        raise InputError(
+            f"{_place(source)}polarities 0 and -1 both occur; use 0/1 or -1/1 throughout, 1 being "
+            "ON"
+        )
+    return on
+
+
+def check_lengths(t: Any, x: Any, y: Any, p: Any, source: str) -> None:
+    """Raise `InputError` unless the four columns of events are equally long."""
+    if not len(t) == len(x) == len(y) == len(p):
+        raise InputError(
+            f"{_place(source)}t, x, y and p have {len(t)}, {len(x)}, {len(y)} and {len(p)} values; "
+            "they must be equally long"
+        )
+
+
+def first_decrease(t: NDArray, strict: bool = False) -> int | None:
+    """The first row whose time is before the one above it, or with `strict` not after it."""
+    for begin in range(0, max(len(t) - 1, 0), _BLOCK):
+        # Comparing neighbours is three times faster than np.diff, which writes differences.
+        part = t[begin : begin + _BLOCK + 1]
+        bad = part[1:] <= part[:-1] if strict else part[1:] < part[:-1]
+        if bad.any():
+            return begin + int(np.argmax(bad)) + 1
+    return None
+
+
+def as_images(frames: Any, what: str = "frames") -> tuple[NDArray, NDArray[np.uint8] | None]:
+    """Grey images (n, H, W), and the colours (n, H, W, 3) of those given in colour, else None.
+
+    Images are uint8, uint16 or floats in [0, 1]; colours are red, green, blue. None stands for
+    colours that are grey too. Raises `InputError` for other types, shapes and values.
+    """
+    images = as_array(frames, what)
+    shape = images.shape
+    if images.ndim == 4 and shape[3] == 1:
+        images = images[..., 0]
+    check_image_kind(images.dtype, what)
+    if images.ndim not in (3, 4) or (images.ndim == 4 and shape[3] != 3):
+        remedy = "give (n, H, W) or (n, H, W, 3)"
+        if images.ndim == 2:
+            remedy += f": {what}[None] for a single image"
+        elif images.ndim == 4 and shape[1] == 3:
+            remedy += f": {what}.transpose(0, 2, 3, 1) if channels come first"
+        elif images.ndim == 4 and shape[1] == 1:
+            remedy += f": {what}[:, 0] if channels come first"
+        elif images.ndim == 4 and shape[3] == 4:
+            remedy += f": {what}[..., :3] leaves out transparency"
+        raise InputError(f"{what} have the shape {shape}; {remedy}")
+    check_image_values(images, what)
+    if images.ndim == 3:
+        return plain_images(images), None
+    differ = any((one != one[..., :1]).any() for one in images)
+    grey = np.stack([grey_of(one) for one in images]) if len(images) else images[..., 0]
+    return plain_images(grey), np.stack([_in_8_bits(one) for one in images]) if differ else None
+
+
+def grey_of(image: NDArray) -> NDArray:
+    """The luma (H, W) of an image (H, W, 3) in its own type, rounded as Pillow does."""
+    if image.dtype.kind == "f":
+        return image @ LUMA.astype(image.dtype)
+    parts = (image[..., k].astype(np.uint32) * np.uint32(_LUMA_16[k]) for k in range(3))
+    return ((sum(parts) + np.uint32(1 << 15)) >> np.uint32(16)).astype(
+        image.dtype.newbyteorder("=")
+    )
+
+
+def _in_8_bits(image: NDArray) -> NDArray[np.uint8]:
+    if image.dtype.kind == "f":
+        return np.rint(image * 255).astype(np.uint8)
+    if image.dtype.itemsize == 1:
+        return image
+    return ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+
+
+def plain_images(images: NDArray) -> NDArray:
+    """Images of the machine's byte order, contiguous and writable; of floats, float32 or 64."""
+    if images.dtype.kind == "f" and images.dtype.itemsize not in (4, 8):
+        return as_plain(images, np.float32 if images.dtype.itemsize < 4 else np.float64)
+    return as_plain(images)
+
+
+def check_image_kind(dtype: np.dtype, what: str) -> None:
+    """Raise `InputError` unless images of a type are uint8, uint16 or floats."""
+    if dtype.kind != "f" and (dtype.kind != "u" or dtype.itemsize > 2):
+        raise InputError(
+            f"{what} are {dtype}; store uint8, uint16 or floats in [0, 1], such as "
+            f"{what}.astype('uint8') of levels from 0 to 255"
+        )
+
+
+def check_image_values(images: Any, what: str) -> None:
+    """Raise `InputError` for float images (n, ...) that hold NaN or values outside [0, 1]."""
+    if images.dtype.kind != "f":
+        return
+    for row in range(len(images)):
+        image = np.asarray(images[row : row + 1])
+        if image.size and not (image.min() >= 0 and image.max() <= 1):  # NaN fails it too
+            raise InputError(
+                f"{what}: frame {row} holds NaN or values outside [0, 1]; scale float frames to "
+                "[0, 1], dividing by 255 if these are levels of 8 bits, and remove broken ones"
+            )

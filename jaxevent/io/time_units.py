@@ -1,0 +1,545 @@
+"""The unit of the times in a file of columns: seconds, milliseconds, microseconds or nanoseconds.
+
+A unit is taken, in this order, from the caller (`time_unit=`, `--time-unit`), from what the file
+states (the name of the column, as in `timestamp_us` or `t [ns]`, a type with a unit, an attribute),
+and from the numbers. Whole numbers are usually microseconds, numbers with decimals seconds; a
+layout may have a usual unit of its own. The numbers are compared with what recordings are like
+under each unit, as a sum of log-likelihoods:
+
+    span         log10 of seconds: mean 0.7, standard deviation 1.3 above and 1.8 below
+    rate         log10 of events per pixel and second: mean 0, deviation 1.2 above and 1.5 below
+    bursts       log10 of seconds between events of a pixel, 5 % quantile: mean -3, deviation 0.9,
+                 where it is far below that of independent events
+    magnitude    up to 12 days after zero, or a date between 2000 and 2050
+    resolution   the largest power of ten of which all times are multiples
+
+The numbers decide only where there are at least `FEWEST_EVENTS`. A unit other than the usual one,
+or one that is hardly better than the next, is reported as an `InputWarning`; any unit that the
+layout does not state is a note of the recording. The constants were chosen on simulated recordings
+(`experiments/time_units.py`).
+
+Times of images, poses and IMU samples of the same file are on the clock of the events: they keep
+their usual unit unless, in it, they miss the events or their intervals cannot be, and another unit
+mends both. Of numbers of the same kind as the event times, the unit of these comes first.
+"""
+
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError, InputWarning
+from jaxevent.io import times
+from jaxevent.io.options import ReadOptions
+
+SCALES = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}  # us in one unit
+NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+FEWEST_EVENTS = 300
+SAMPLE = 1 << 16  # events from which order, unit and signs are inferred
+_FEWEST_REPETITIONS = 100  # intervals between events of one pixel
+_BURST = 0.01  # of the mean interval, or of the sample; of independent events it is 0.025 or more
+_DOUBT = 2.7  # nats by which an undoubted unit exceeds the next
+_SUPERIORITY = 1.0  # nats by which a unit must exceed the usual one
+_CONTRADICTION = 8.0  # nats by which another unit must exceed a stated one for a warning
+_COARSEST_US = 1000.0  # rounding of a type that is refused
+_FEWEST_STEPS = 64  # of a rounded type within the span of the events
+_LONGEST_US = 1e12  # of a recording with times that have decimals: 11.6 days
+_GAP = 1000.0  # times the sum of all other steps that a gap lasts
+_LARGEST_US = 2.0**62  # beyond which times are refused in any case
+_INTERVALS_US = (150.0, 5e6)  # between images, poses and samples
+_LITTLE, _MUCH = 0.02, 0.5  # intersection over union of the spans of two clocks
+
+_SPELLED = {
+    "s": r"s|secs?|seconds?",
+    "ms": r"ms|msecs?|millis|milliseconds?",
+    "us": r"us|[µμ]s|usecs?|micros|microseconds?",
+    "ns": r"ns|nsecs?|nanos|nanoseconds?",
+}
+_TIME = r"(t|ts|time|times|timestamp|timestamps|time_stamp)"
+_NAMED = {
+    unit: re.compile(
+        # A lone "s" without a separator is a plural.
+        rf"{_TIME}(?:\s*[\[(]\s*(?:in )?(?:{words})\s*[\])]|[\s_./:-]+(?:in[\s_])?(?:{words})"
+        + (r")" if unit == "s" else rf"|(?:{words}))"),
+        re.IGNORECASE,
+    )
+    for unit, words in _SPELLED.items()
+}
+# Log-probabilities of a unit before any number but the kind is known.
+_WHOLE = {"us": 0.0, "ns": -3.0, "ms": -3.5, "s": -10.0}
+_DECIMAL = {"s": 0.0, "ms": -3.5, "us": -4.0, "ns": -8.0}
+_ROUNDED = {"s": 0.0, "us": -0.5, "ms": -3.0, "ns": -3.0}  # whole, since their type is coarse
+_UNUSUAL = -4.0  # of units other than the usual one of a layout
+
+
+class InferredUnit(NamedTuple):
+    """The unit of a column of event times.
+
+    Attributes:
+        name: "s", "ms", "us" or "ns".
+        notes: What `Recording.notes` says of it.
+    """
+
+    name: str
+    notes: tuple[str, ...] = ()
+
+
+def to_microseconds(
+    values: NDArray, unit: str, source: str, what: str, first_row: int = 0
+) -> NDArray[np.int64]:
+    """Convert times of a unit to int64 us.
+
+    Args:
+        values: (n,) times.
+        unit: "s", "ms", "us" or "ns"; nanoseconds are rounded.
+        source: Name of the file for messages.
+        what: "event", "image" or the like.
+        first_row: Row of the first time in the file.
+
+    Raises:
+        InputError: A time is not finite or too large for us.
+    """
+    if values.dtype.kind not in "iu" or unit == "us":
+        return times(values, source, what, SCALES[unit], first_row)
+    wide = values if values.dtype == np.uint64 else values.astype(np.int64)
+    if unit == "ns":
+        whole, rest = np.divmod(wide, wide.dtype.type(1000))
+        return times(whole, source, what, first_row=first_row) + (rest >= 500)
+    times(wide * np.float64(SCALES[unit]), source, what, 1.0, first_row)  # that they fit
+    return wide.astype(np.int64) * round(SCALES[unit])
+
+
+def unit_of_name(name: str) -> str | None:
+    """Return the unit that the name of a column of times states, as in "t_ns"; else None."""
+    for unit, pattern in _NAMED.items():
+        if pattern.fullmatch(name.strip()):
+            return unit
+    return None
+
+
+def split_unit(name: str) -> tuple[str, str | None]:
+    """Return a name without the unit at its end, and the unit, as of "frame_t_ns"."""
+    for unit, words in _SPELLED.items():
+        end = rf"\s*[\[(]\s*(?:{words})\s*[\])]|[\s_./:-]+(?:{words})"
+        if found := re.fullmatch(rf"(.+?)(?:{end})", name.strip(), re.IGNORECASE):
+            return found.group(1), unit
+    return name, None
+
+
+def unit_of_words(words: Any) -> str | None:
+    """Return the unit that an attribute such as "us" or "[microseconds]" states; else None."""
+    if not isinstance(words, str):
+        return None
+    bare = words.strip().strip("[]()").lower()
+    return next((u for u, known in _SPELLED.items() if re.fullmatch(known, bare)), None)
+
+
+def numbers_of_dates(values: NDArray) -> tuple[NDArray, str | None]:
+    """Return NumPy's dates and durations as whole numbers, and their unit; other values as given.
+
+    Args:
+        values: (n,) times of any type.
+
+    Returns:
+        (n,) int64 and "s", "ms", "us" or "ns" for datetime64 and timedelta64, else `values`, None.
+    """
+    if values.dtype.kind not in "mM":
+        return values, None
+    unit = np.datetime_data(values.dtype)
+    if unit[0] not in SCALES or unit[1] != 1:
+        values, unit = values.astype(f"{values.dtype.kind}8[us]"), ("us", 1)
+    return values.view(np.int64), unit[0]
+
+
+def infer_unit(
+    sample: Mapping[str, NDArray],
+    count: int,
+    size: tuple[int, int],
+    source: str,
+    options: ReadOptions,
+    *,
+    stated: tuple[str, str] | None = None,
+    usual: str | None = None,
+) -> InferredUnit:
+    """Infer the unit of event times, warn where it is doubtful, and check their resolution.
+
+    Args:
+        sample: Columns t, x and y, (n,) each: the first events, and then the last one.
+        count: Number of events in all.
+        size: (width, height) of the sensor in pixels.
+        source: Name of the file for messages.
+        options: Their `time_unit`, where given, is taken.
+        stated: Unit that the file states, and the words for how ("the name 't_ns'").
+        usual: Unit of the layout; None has microseconds for whole numbers, seconds for others.
+
+    Returns:
+        The unit, with notes on how it was found and on a coarse resolution.
+
+    Raises:
+        InputError: The type of the times cannot resolve neighbouring ones, or the times span more
+            than 11.6 days.
+    """
+    t = sample["t"]
+    if t.ndim != 1 or t.dtype.kind not in "iuf" or not len(t):
+        return InferredUnit(options.time_unit or (stated[0] if stated else usual or "us"))
+    numbers = _Numbers.of(sample, count, size)
+    expected = usual or _convention(numbers)
+    scores = {unit: numbers.score(unit, usual) for unit in SCALES}
+    best = max(scores, key=lambda unit: scores[unit])
+    known = count >= FEWEST_EVENTS and numbers.span > 0
+    notes: list[str] = []
+    doubt = ""
+    if options.time_unit is not None:
+        unit = options.time_unit
+    elif stated is not None:
+        unit = stated[0]
+        notes.append(f"event times are {NAMES[unit]}, by {stated[1]}")
+        if known and scores[best] > scores[unit] + _CONTRADICTION:
+            doubt = (
+                f"{source}: event times are {NAMES[unit]} by {stated[1]}, but "
+                f"{numbers.describe(unit)}; as {NAMES[best]} {numbers.describe(best)}: if the "
+                f"name is wrong, give time_unit={best!r} or --time-unit {best}"
+            )
+    elif not known:
+        unit = expected
+        if (
+            numbers.span
+            and _is_impossible(numbers.median, unit)
+            and not _is_impossible(numbers.median, best)
+        ):
+            unit = best
+            notes.append(f"event times are taken as {NAMES[unit]}, by their magnitude")
+            doubt = _doubt(source, numbers, unit, expected)
+    else:
+        unit = best if scores[best] > scores[expected] + _SUPERIORITY else expected
+        after = max((u for u in scores if u != unit), key=lambda u: scores[u])
+        is_doubtful = scores[unit] < scores[after] + _DOUBT
+        if unit != expected or is_doubtful:
+            notes.append(f"event times are taken as {NAMES[unit]}, since {numbers.describe(unit)}")
+            doubt = _doubt(source, numbers, unit, expected if unit != expected else after)
+    scale = SCALES[unit]
+    if options.time_unit is None and numbers.has_decimals and numbers.span * scale > _LONGEST_US:
+        raise InputError(
+            f"{source}: the times are numbers with decimals, so {NAMES[unit]}, but span "
+            f"{numbers.span * scale / 86400e6:.0f} days; store them as integer microseconds, or "
+            "give their unit, time_unit= or --time-unit"
+        )
+    notes += _resolution(numbers, unit, source)
+    if doubt:
+        _warn(doubt)
+    return InferredUnit(unit, tuple(notes))
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, InputWarning, stacklevel=4)
+
+
+def _doubt(source: str, numbers: "_Numbers", unit: str, other: str) -> str:
+    return (
+        f"{source}: no unit of the event times is stated; {NAMES[unit]} are taken, since "
+        f"{numbers.describe(unit)}, while as {NAMES[other]} {numbers.describe(other)}; give "
+        f"time_unit={unit!r} or --time-unit {unit} to confirm, or the right unit"
+    )
+
+
+class _Numbers(NamedTuple):
+    """Properties of a column of event times, in its own unit."""
+
+    count: int
+    pixels: int
+    span: float
+    largest: float
+    median: float  # without sign
+    repetition: float | None
+    digits: int | None  # decimal places, negative for multiples of ten; None for any number
+    is_float: bool
+    rounding: float  # distance between neighbouring numbers of the type
+
+    @classmethod
+    def of(cls, sample: Mapping[str, NDArray], count: int, size: tuple[int, int]) -> "_Numbers":
+        pixels = max(size[0] * size[1], 1)
+        kept = np.isfinite(sample["t"])
+        stored = sample["t"][kept]
+        t = stored.astype(np.float64)
+        if not len(t):
+            return cls(count, pixels, 0.0, 0.0, 0.0, None, None, True, 0.0)
+        # Differences of integers are exact, those of large ones as floats are not.
+        whole = stored.dtype.kind != "f"
+        steps = np.diff(stored.astype(np.int64) if whole else t).astype(np.float64)
+        # The sum of steps forwards is the span also where a counter wraps or one time goes back. A
+        # step that exceeds all others by far is a gap or a damaged time.
+        span = float(steps[steps > 0].sum())
+        longest = float(steps[: count - 1 if count <= len(t) else -1].max(initial=0.0))
+        span -= longest if longest > _GAP * (span - longest) else 0.0
+        if len(steps) and steps[-1] < 0 and count > len(t):
+            span *= count / len(t)
+        largest = float(np.abs(t).max())
+        repetition = _repetition(stored, sample["x"][kept], sample["y"][kept])
+        if repetition is not None:
+            held = float(steps[: SAMPLE - 1][steps[: SAMPLE - 1] > 0].sum())
+            if repetition > _BURST * min(span * pixels / count, held):
+                repetition = None
+        return cls(
+            count,
+            pixels,
+            span,
+            largest,
+            float(np.median(np.abs(t))),
+            repetition,
+            _digits(stored),
+            not whole,
+            _rounding(stored, largest),
+        )
+
+    @property
+    def has_decimals(self) -> bool:
+        return self.is_float and (self.digits is None or self.digits > 0)
+
+    def rate(self, unit: str) -> float:
+        """Events per pixel and second."""
+        return self.count / (self.pixels * self.span * SCALES[unit] * 1e-6)
+
+    def describe(self, unit: str) -> str:
+        seconds = self.span * SCALES[unit] * 1e-6
+        rate = f", {self.rate(unit):.2g} events per pixel and second" if seconds else ""
+        return f"they last {seconds:.3g} s{rate}"
+
+    def score(self, unit: str, usual: str | None) -> float:
+        """Return the log-likelihood of a unit, up to a constant, in nats."""
+        score = self._prior(unit, usual)
+        seconds = SCALES[unit] * 1e-6
+        if not self.span:
+            return score + _of_magnitude(self.median * seconds)
+        span = np.log10(self.span * seconds)
+        score += _normal(span, 0.7, 1.3 if span > 0.7 else 1.8)
+        rate = np.log10(self.rate(unit))
+        score += _normal(rate, 0.0, 1.2 if rate > 0 else 1.5)
+        if self.repetition is not None:
+            score += max(_normal(np.log10(self.repetition * seconds), -3.0, 0.9), -6.0)
+        return score + _of_magnitude(self.median * seconds) + self._of_resolution(unit)
+
+    def _prior(self, unit: str, usual: str | None) -> float:
+        if self.rounding >= 1:
+            return _ROUNDED[unit] + (_UNUSUAL if usual not in (None, unit) else 0.0)
+        if usual is None:
+            return _DECIMAL[unit] if self.has_decimals else _WHOLE[unit]
+        if unit == "s" and not self.has_decimals:
+            return _WHOLE["s"]  # no recording has its events at whole seconds
+        return 0.0 if unit == usual else _UNUSUAL
+
+    def _of_resolution(self, unit: str) -> float:
+        """Return the log-likelihood of the decimal places."""
+        if self.rounding >= 1:
+            return 0.0
+        if self.digits is None:
+            return -1.2
+        if not self.has_decimals:
+            typical = {"us": 0, "ms": 0, "ns": -3, "s": 0}[unit]
+            return -0.3 if self.digits == typical else -4.0
+        typical = {"s": 6, "ms": 3, "us": 3, "ns": 3}[unit]
+        if self.digits == typical:
+            return -0.3
+        if unit == "s":
+            return {1: -6.0, 2: -6.0, 3: -3.5, 4: -3.5, 5: -3.0}.get(self.digits, -1.5)
+        return -3.5 if self.digits > typical else -1.5
+
+
+def _normal(value: float, mean: float, deviation: float) -> float:
+    return max(-0.5 * ((value - mean) / deviation) ** 2, -30.0)
+
+
+def _is_impossible(largest: float, unit: str) -> bool:
+    return _of_magnitude(largest * SCALES[unit] * 1e-6) < -10
+
+
+def _of_magnitude(seconds: float) -> float:
+    if seconds <= 1e6:
+        return 0.0
+    if seconds < 9.4e8:
+        return -4.0
+    return -1.0 if seconds < 2.6e9 else -20.0
+
+
+def _convention(numbers: _Numbers) -> str:
+    """Return the usual unit of a table: us for whole numbers that differ, s for decimals.
+
+    Large numbers of a coarse type are whole in any case; dates are then seconds.
+    """
+    if numbers.rounding >= 1 and 9.4e8 <= numbers.median < 2.6e9:
+        return "s"
+    if numbers.is_float and (numbers.has_decimals or not numbers.span):
+        return "s"
+    return "us"
+
+
+def _repetition(t: NDArray, x: NDArray, y: NDArray) -> float | None:
+    """Return the 5 % quantile of intervals between events of one pixel, None of too few."""
+    order = np.lexsort((x[:-1], y[:-1]))  # the last event is not next to the others
+    x, y, t = x[order], y[order], t[order]
+    same = (x[1:] == x[:-1]) & (y[1:] == y[:-1]) & (t[1:] > t[:-1])
+    if np.count_nonzero(same) < _FEWEST_REPETITIONS:
+        return None
+    return float(np.quantile((t[1:][same] - t[:-1][same]).astype(np.float64), 0.05))
+
+
+def _digits(values: NDArray) -> int | None:
+    """Return the least n with all values multiples of 10^-n, -9 to 9; None where there is none."""
+    if values.dtype.kind != "f":
+        whole = values
+    else:
+        t = values.astype(np.float64)
+        error = 2 * np.spacing(np.abs(values).max()).astype(np.float64)
+        for n in range(10):
+            # Numbers that are whole only within an error of half a step say nothing.
+            if n and error * 10.0**n > 0.05:
+                return None
+            scaled = t * 10.0**n
+            if (np.abs(scaled - np.rint(scaled)) <= error * 10.0**n * (n > 0)).all():
+                if n:
+                    return n
+                break
+        else:
+            return None
+        if np.abs(t).max() >= 2.0**63:
+            return 0
+        whole = t.astype(np.int64)
+    if not whole.any():
+        return 0
+    return -next((n for n in range(9, 0, -1) if not (whole % 10**n).any()), 0)
+
+
+def _rounding(values: NDArray, largest: float) -> float:
+    """Return the distance between neighbouring numbers near the largest value of a type.
+
+    Numbers of a wider type that all are numbers of 32 bits were rounded to these before.
+    """
+    if values.dtype.kind != "f":
+        return 0.0
+    spacing = float(np.spacing(values.dtype.type(largest)))
+    if values.dtype.itemsize > 4 and len(values) > 16 and largest < 3e38:
+        decimals = values[values != np.rint(values)]
+        if len(decimals) > 16 and (decimals.astype(np.float32) == decimals).all():
+            coarse = float(np.spacing(np.float32(largest)))
+            # Multiples of a large binary fraction, such as halves, are numbers of any type.
+            if (decimals * 1024 != np.rint(decimals * 1024)).any():
+                return coarse
+    return spacing
+
+
+def _resolution(numbers: _Numbers, unit: str, source: str) -> list[str]:
+    """Return a note on times rounded by their type; `InputError` where that loses them."""
+    rounding, largest = (value * SCALES[unit] for value in (numbers.rounding, numbers.largest))
+    if rounding <= 1 or numbers.count < 2 or largest >= _LARGEST_US:
+        return []
+    steps = numbers.span / numbers.rounding
+    few = numbers.count >= FEWEST_EVENTS and steps < _FEWEST_STEPS
+    if rounding >= _COARSEST_US or few:
+        raise InputError(
+            f"{source}: the type of the event times cannot resolve them: as {NAMES[unit]} its "
+            f"numbers near {_short(largest)} are {_short(rounding)} apart; store integer "
+            "microseconds or 64-bit floats, counted from the start of the recording"
+        )
+    return [f"event times are rounded by their type to {_short(rounding)}"]
+
+
+def _short(us: float) -> str:
+    if us < 1e3:
+        return f"{us:.3g} us"
+    return f"{us / 1e3:.3g} ms" if us < 1e6 else f"{us / 1e6:.10g} s"
+
+
+class Clock(NamedTuple):
+    """The events' clock, for the times of images, poses and samples beside them.
+
+    Attributes:
+        unit: Unit of the event times, as stored.
+        first: Time of the first event in us.
+        last: Time of the last event in us; that of the first where there are none.
+        is_float: Whether the times are stored as floats.
+    """
+
+    unit: str
+    first: int
+    last: int
+    is_float: bool
+
+    def read(
+        self,
+        values: NDArray,
+        source: str,
+        what: str,
+        notes: list[str],
+        *,
+        usual: str | None = None,
+        stated: str | None = None,
+    ) -> NDArray[np.int64]:
+        """Convert times of images, poses or samples to us; see the text of this module.
+
+        Args:
+            values: (n,) times as stored.
+            source: Name of the file for messages.
+            what: "image", "pose" or the like.
+            notes: A note is appended where the unit is not the usual one.
+            usual: Unit of the layout; None has us for integers, s for floats.
+            stated: Unit that the file states.
+
+        Returns:
+            (n,) int64 us.
+        """
+        unit = stated or usual or ("s" if values.dtype.kind == "f" else "us")
+        as_usual = to_microseconds(values, unit, source, what)
+        if stated is not None or self.last <= self.first or len(as_usual) < 2:
+            return as_usual
+        is_alike = self.unit != unit and self.is_float == (values.dtype.kind == "f")
+        if is_alike and self._fits(values, self.unit):
+            return to_microseconds(values, self.unit, source, what)
+        if self._fits(values, unit):
+            return as_usual
+        others = {other: self._overlap(values, other) for other in SCALES if other != unit}
+        # The unit of the events first, where several would do.
+        best = max(others, key=lambda u: (others[u] > _MUCH / 2, u == self.unit, others[u]))
+        if others[best] <= _MUCH / 2 or not self._has_plausible_intervals(values, best):
+            return as_usual
+        note = f"{what} times are taken as {NAMES[best]}, on the clock of the events"
+        is_new = note not in notes
+        notes += [note] * is_new
+        if best != self.unit and is_new:
+            _warn(
+                f"{source}: {note}; as {NAMES[unit]}, the usual unit, they would not fit the "
+                f"events: write whole microseconds, or {NAMES[unit]}, to be sure"
+            )
+        return to_microseconds(values, best, source, what)
+
+    def _fits(self, values: NDArray, unit: str) -> bool:
+        if not self._has_plausible_intervals(values, unit):
+            return False
+        first, last = _ends(values, unit)
+        if last < self.first or first > self.last:
+            return False
+        inside = first >= self.first and last <= self.last
+        return not inside or self._overlap(values, unit) > _LITTLE
+
+    def _overlap(self, values: NDArray, unit: str) -> float:
+        """Return the intersection of the spans over their union."""
+        first, last = _ends(values, unit)
+        common = min(last, self.last) - max(first, self.first)
+        return max(common, 0.0) / max(max(last, self.last) - min(first, self.first), 1.0)
+
+    @staticmethod
+    def _has_plausible_intervals(values: NDArray, unit: str) -> bool:
+        first, last = _ends(values, unit)
+        least, most = _INTERVALS_US
+        return least <= (last - first) / (len(values) - 1) <= most
+
+
+def _ends(values: NDArray, unit: str) -> tuple[float, float]:
+    return float(values.min()) * SCALES[unit], float(values.max()) * SCALES[unit]
+
+
+def clock_of(unit: InferredUnit, stored: NDArray, t: Sequence[int] | NDArray) -> Clock:
+    """Return the clock of events with the times `t` (us), which are `stored` in a unit."""
+    first, last = (int(t[0]), int(t[-1])) if len(t) else (0, 0)
+    return Clock(unit.name, first, last, stored.dtype.kind == "f")

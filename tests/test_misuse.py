@@ -1,0 +1,38 @@
+"""Samples of the table of misuse; `python tests/misuse.py` tries all of it."""
+
+import pytest
+from misuse import EQUAL, REFUSED, Case, constructions, estimates, is_right, outcome, run
+
+
+def wrong_of(told: dict[str, str], tried: list[Case]) -> dict[str, str]:
+    return {one.name: told[one.name] for one in tried if not is_right(one, told[one.name])}
+
+
+def test_recordings_of_unusual_arrays():
+    tried = constructions()[::9]
+    told = {one.name: outcome(one) for one in tried}
+    assert len(told) > 150 and not wrong_of(told, tried)
+
+
+@pytest.mark.slow
+def test_estimates_in_a_child_of_limited_memory():
+    kinds = ("stride 2", "read-only", "own source/place", "own source/short", "x 600")
+    tried = [
+        one
+        for one in estimates()
+        if one.name.startswith("akf.estimate") and any(kind in one.name for kind in kinds)
+    ]
+    assert len(tried) == len(kinds) and not wrong_of(run(tried), tried)
+
+
+def test_the_table_notices_what_is_wrong():
+    def raises(error: Exception) -> Case:
+        def call() -> None:
+            raise error
+
+        return Case("a", call, lambda: [1], REFUSED)
+
+    assert not is_right(raises(TypeError()), outcome(raises(TypeError("x"))))
+    assert not is_right(raises(TypeError()), outcome(raises(ValueError("x is wrong; correct it"))))
+    other = Case("b", lambda: [1, 2], lambda: [1, 3], EQUAL)
+    assert outcome(other) == "DIFFERS" and not is_right(other, "DIFFERS")
