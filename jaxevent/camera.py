@@ -1,8 +1,7 @@
-"""Cameras: how intensity becomes grey levels and with what certainty; pinhole geometry."""
+"""Cameras: how intensity becomes grey levels and with what certainty; what a lens shows where."""
 
 import abc
 import dataclasses
-from collections.abc import Sequence
 
 import equinox as eqx
 import jax.core
@@ -12,29 +11,68 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.errors import InputError
+from jaxevent.lenses import LENSES, find_model
 
 
 @dataclasses.dataclass(frozen=True)
 class PinholeCamera:
-    """Focal lengths and centre in pixels; distortion k1, k2, p1, p2, k3 (Brown-Conrady)."""
+    """A camera of one centre of projection: focal lengths and centre in px, and its lens.
 
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    `model` names the distortion of the lens, see `jaxevent.lenses`: "radtan" (Brown-Conrady: k1,
+    k2, p1, p2, k3), "rational" (k1, k2, p1, p2, k3, k4, k5, k6) or "equidistant" (fisheye: k1, k2,
+    k3, k4). `distortion` holds its coefficients, floats; missing ones are 0. Raises `InputError`
+    for another model and for more coefficients than it has.
+    """
+
+    fx: float | int
+    fy: float | int
+    cx: float | int
+    cy: float | int
+    distortion: tuple = ()
+    model: str = "radtan"
+
+    def __post_init__(self) -> None:
+        model = find_model(str(self.model))
+        if model is None:
+            raise InputError(
+                f"the lens model {self.model!r} of a camera is not supported; give one of "
+                f"{', '.join(LENSES)}"
+            )
+        names, given = LENSES[model].coefficients, tuple(self.distortion)
+        if len(given) > len(names):
+            raise InputError(
+                f"a camera of the lens model {model} has {len(given)} coefficients; give at most "
+                f"{len(names)}, {', '.join(names)}"
+            )
+        object.__setattr__(self, "distortion", (*given, *(0.0,) * (len(names) - len(given))))
+        object.__setattr__(self, "model", model)
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether straight lines may be seen bent."""
+        return self.model == "equidistant" or any(self.distortion)
+
+    @property
+    def undistorted(self) -> "PinholeCamera":
+        """The camera of the same focal lengths and centre without distortion."""
+        return PinholeCamera(self.fx, self.fy, self.cx, self.cy)
 
     def distort(self, at: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Where the camera sees normalised coordinates X / Z, Y / Z (n, 2), in px (n, 2)."""
-        bent, _ = _distorted(np.asarray(at, np.float64), self.distortion)
-        scale, centre = np.array([self.fx, self.fy]), np.array([self.cx, self.cy])
-        return bent * scale + centre
+        """Places in px (n, 2) at which normalised coordinates X / Z, Y / Z (n, 2) are seen.
+
+        NaN beyond the radius at which the distortion turns back, where no light passes the lens.
+        """
+        at, lens = np.asarray(at, np.float64), LENSES[self.model]
+        bent, _ = lens.distort(at, self.distortion)
+        bent = np.where((np.hypot(*at.T) < lens.turn(self.distortion))[:, None], bent, np.nan)
+        return bent * (self.fx, self.fy) + (self.cx, self.cy)
 
     def normalise(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
         """Normalised coordinates X / Z, Y / Z (n, 2) of what is seen at places x, y (n,) in px.
 
-        Distortion is undone. NaN where it has no inverse, which is far from the centre. Raises
-        `InputError` for a camera without positive focal lengths.
+        Distortion is undone. NaN where it has no inverse, which is far from the centre, and more
+        than 87 degrees from the axis. Raises `InputError` for a camera without positive focal
+        lengths.
         """
         x, y = np.asarray(x), np.asarray(y)
         if not (0 < self.fx < np.inf and 0 < self.fy < np.inf):
@@ -44,43 +82,8 @@ class PinholeCamera:
             )
         places, which = np.unique(np.stack([x, y], -1).astype(float), axis=0, return_inverse=True)
         seen = (places - (self.cx, self.cy)) / (self.fx, self.fy)
-        straight = seen.copy()
-        if any(self.distortion):
-            # Newton's method; the Jacobian is positive definite as far as an inverse exists.
-            for _ in range(20):
-                bent, jacobian = _distorted(straight, self.distortion)
-                straight = straight + _solved(jacobian, seen - bent)
-            bent, jacobian = _distorted(straight, self.distortion)
-            good = np.abs(bent - seen).max(-1) < 1e-9
-            good &= (np.linalg.det(jacobian) > 0) & (np.hypot(*straight.T) < 20)
-            straight[~good] = np.nan
+        straight = LENSES[self.model].undistort(seen, self.distortion)
         return np.asarray(straight[which.reshape(-1)], np.float64)
-
-
-def _solved(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0], np.float64)
-
-
-def _distorted(
-    xy: NDArray[np.float64], distortion: Sequence[float]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Brown-Conrady distortion of normalised coordinates (n, 2) and its Jacobian (n, 2, 2)."""
-    k1, k2, p1, p2, k3 = distortion
-    x, y = xy.T
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # of radial, times x or y
-    bent = np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        -1,
-    )
-    across = x * y * slope + 2 * p1 * x + 2 * p2 * y
-    xx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
-    yy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
-    return bent, np.stack([np.stack([xx, across], -1), np.stack([across, yy], -1)], -2)
 
 
 # Grey values or intensities of any shape, in JAX or NumPy.

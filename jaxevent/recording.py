@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 Times = ArrayLike | int | float
 
+PER_FRAME = ("gain", "rgb")  # names of `Recording.extra` that hold one entry per frame
+
 
 def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
     """Times as int64 microseconds: integers are taken as microseconds, floats as seconds.
@@ -778,10 +780,10 @@ class Recording(Shown):
         )
 
     def _extra_of(self, rows: slice | NDArray | None) -> Mapping[str, Any]:
-        """The further arrays; those with one entry per frame ("gain", "rgb") cut like frames."""
+        """The further arrays; those with one entry per frame cut like frames."""
         if rows is None:
             return self.extra
-        cut = {name: self.extra[name][rows] for name in ("gain", "rgb") if name in self.extra}
+        cut = {name: self.extra[name][rows] for name in PER_FRAME if name in self.extra}
         return {**self.extra, **cut}
 
     def check(self, source: str | None = None) -> "Recording":

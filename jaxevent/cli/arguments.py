@@ -38,8 +38,11 @@ def add_size(one: argparse.ArgumentParser) -> None:
     )
 
 
-def add_reading(one: argparse.ArgumentParser) -> None:
-    """Add the options of `jaxevent.load`; `run` takes them as `reading`, for `open_recording`."""
+def add_reading(one: argparse.ArgumentParser, frames: bool = True) -> None:
+    """Add the options of `jaxevent.load`; `run` takes them as `reading`, for `open_recording`.
+
+    Without `frames` there is no option that chooses the frames.
+    """
     add_size(one)
     one.add_argument(
         "--stream",
@@ -47,11 +50,31 @@ def add_reading(one: argparse.ArgumentParser) -> None:
         help="which camera, of a file that holds several: a topic, left, right or a number",
     )
     one.add_argument(
+        "--camera",
+        metavar="FILE",
+        help="calibration of the camera instead of the recording's: camchain.yaml of Kalibr or "
+        "camera_info of ROS; FILE:NAME takes one of several",
+    )
+    one.add_argument(
         "--time-unit",
         choices=("s", "ms", "us", "ns"),
         help="unit of the event times, for a table that does not state it; default: inferred",
     )
-    one.set_defaults(reading=("size", "stream", "time_unit"))
+    if frames:
+        add_frames(one, "--frames", "a file")
+    one.set_defaults(
+        reading=("size", "stream", "camera", "time_unit", *(("frames",) if frames else ()))
+    )
+
+
+def add_frames(one: argparse.ArgumentParser, name: str, source: str) -> None:
+    """Add the option that chooses the frames of a recording, named in its help as `source`."""
+    one.add_argument(
+        name,
+        metavar="NAME",
+        help=f"which images become the frames, of {source} that holds several kinds: a topic or a "
+        "number; none leaves frames out",
+    )
 
 
 def open_recording(path: Path, reading: dict[str, Any], **more: Any) -> Any:
@@ -96,6 +119,7 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
     if any(outputs.values()):
         yield {**taken, "force": force}
     elif outputs:
+        from jaxevent.io.calibration import split_name
         from jaxevent.io.companions import companions
         from jaxevent.io.description import Command, running
         from jaxevent.io.output import into_folders
@@ -109,6 +133,8 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
             for one in (value if isinstance(value, list) else [value])
             if isinstance(one, Path)
         ]
+        if camera := taken.get("reading", {}).get("camera"):
+            inputs.append(split_name(camera)[0])
         check(named, inputs, force=force)
         read = [file for path in inputs for file in (path, *companions(path))]
         with into_folders(force), running(Command(words, read)):
@@ -142,6 +168,13 @@ def seed(text: str) -> tuple[float, ...]:
 
 def pair(text: str) -> tuple[int, ...]:
     return _numbers(text, (2,), int, "ID,ID, for example 0,1")
+
+
+def names(text: str) -> tuple[str, ...]:
+    found = tuple(name.strip() for name in text.split(","))
+    if len(found) != 2 or not all(found):
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME,NAME, for example cam1,cam0")
+    return found
 
 
 def plane(text: str) -> tuple[float, ...]:

@@ -44,9 +44,17 @@ def add(commands: Any) -> None:
     )
     one.add_argument(
         "--calibration",
-        metavar="TOML",
+        metavar="FILE",
         type=Path,
-        help="both cameras and the transform between them, see jaxevent.register.Rig.read",
+        help="both cameras and the transform between them: camchain.yaml of Kalibr, or TOML, see "
+        "jaxevent.register.Rig.read",
+    )
+    one.add_argument(
+        "--cameras",
+        metavar="NAME,NAME",
+        type=arguments.names,
+        help="the event camera and the other one in a camchain, for example cam1,cam0; default: by "
+        "their sizes, else the first two",
     )
     one.add_argument(
         "--depth",
@@ -73,7 +81,8 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--crop", action="store_true", help="cut to a rectangle of pixels that both cameras see"
     )
-    arguments.add_reading(one)
+    arguments.add_frames(one, "--images", "OTHER")
+    arguments.add_reading(one, frames=False)
     arguments.add_output(one, "--out", metavar="FILE", required=True, help="the HDF5 file to write")
 
 
@@ -107,7 +116,7 @@ def _check(given: set[str]) -> None:
     for one, other in (("homography", "calibration"), ("depth", "plane")):
         if {one, other} <= given:
             raise InputError(f"--{one} and --{other} say the same; leave one of them out")
-    for name in ("depth", "plane"):
+    for name in ("depth", "plane", "cameras"):
         if name in given and "calibration" not in given:
             raise InputError(f"--{name} needs --calibration; add it or leave --{name} out")
     if "channel" in given and "triggers" not in given:
@@ -134,6 +143,8 @@ def run(
     exposure: float | int | None,
     white: float | int | None,
     crop: bool,
+    images: str | None,
+    cameras: tuple[str, str] | None,
     reading: dict[str, Any],
     out: Path,
 ) -> None:
@@ -144,7 +155,7 @@ def run(
     given = {
         "homography": homography, "calibration": calibration, "depth": depth, "plane": plane,
         "offset": offset, "search": search, "channel": channel, "triggers": triggers,
-        "reference": reference, "crop": crop or None,
+        "reference": reference, "crop": crop or None, "cameras": cameras,
     }  # fmt: skip
     _check({name for name, value in given.items() if value is not None})
     lag, offset = (offset, None) if triggers is not None else (None, offset)
@@ -155,6 +166,7 @@ def run(
         reference=reference is not None,
         exposure=exposure,
         white=white,
+        frames=images,
         progress=show_progress(),
     )
     recording = arguments.open_recording(path, reading)
@@ -162,7 +174,8 @@ def run(
     recording = dataclasses.replace(recording, name=str(path))  # for messages
     seen, grid = (recording.width, recording.height), None
     if calibration is not None:
-        known = rig.Rig.read(calibration, recording.camera)
+        sizes = (seen, (other.width, other.height))
+        known = rig.Rig.read(calibration, recording.camera, cameras=cameras, sizes=sizes)
         recording = dataclasses.replace(recording, camera=known.events)
         far = {} if depth is None else {"depth": rig.read_depth(depth, seen)}
         grid = known.grid(seen, (other.width, other.height), plane=plane, **far)

@@ -217,15 +217,16 @@ def undistorted(
 
     Distortion is undone, the principal point is (0, 0), and both axes have the focal length
     f = sqrt(fx fy). On the host, in float64. Raises `InputError` for a camera without positive
-    focal lengths and for pixels at which its distortion has no inverse.
+    focal lengths and for pixels at which its distortion has no inverse, or that look more than 87
+    degrees from the axis.
     """
     straight = camera.normalise(x, y)
     if np.isnan(straight).any():
         row = int(np.argmax(np.isnan(straight).any(-1)))
         raise InputError(
-            f"the distortion {camera.distortion} has no inverse at pixel ({np.ravel(x)[row]:g}, "
-            f"{np.ravel(y)[row]:g}); mend the calibration or leave out events that far from the "
-            "centre"
+            f"the {camera.model} distortion {camera.distortion} has no inverse at pixel "
+            f"({np.ravel(x)[row]:g}, {np.ravel(y)[row]:g}) within 87 degrees of the axis; mend the "
+            "calibration or leave out events that far from the centre"
         )
     f = float(np.sqrt(camera.fx * camera.fy))
     return f * straight, f

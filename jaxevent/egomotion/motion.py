@@ -34,7 +34,7 @@ def decided(model: str | type[Model], covariance: NDArray[np.floating]) -> NDArr
 
 def left_by_lens(camera: PinholeCamera | None) -> float:
     """The share of a motion that a camera's calibration leaves: `LENS` if its lens distorts."""
-    return LENS if camera is not None and any(camera.distortion) else 0.0
+    return LENS if camera is not None and camera.is_distorted else 0.0
 
 
 def table_columns(

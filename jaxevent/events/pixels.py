@@ -165,10 +165,11 @@ def undistort(recording: Recording) -> Recording:
     camera, width, height = recording.camera, recording.width, recording.height
     if camera is None:
         raise InputError(
-            f"{recording.name}: holds no calibration, which undistorting needs; set its camera"
+            f"{recording.name}: holds no calibration, which undistorting needs; give its camera"
+            f"{recording.describe_left_out('camera')}"
         )
     y, x = (axis.ravel() for axis in np.mgrid[:height, :width])
-    ideal = dataclasses.replace(camera, distortion=(0.0,) * 5)
+    ideal = camera.undistorted
     to = np.rint(ideal.distort(camera.normalise(x, y)))
     seen = np.all((to >= 0) & (to < (width, height)), axis=-1)  # not of NaN
     column, row = np.where(seen[:, None], to, 0).astype(np.uint16).T

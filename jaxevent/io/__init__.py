@@ -2,10 +2,11 @@
 
 The layouts are described in the reader modules, and what each was checked against: `aedat2`,
 `aedat4`, `columns` (tables of text and NumPy records), `event_stream`, `evimo`, `evreal`, `hdf5`,
-`hdf5_layouts`, `mat`, `n_caltech`, `npz`, `parquet`, `prophesee`, `ros` (with `bags` and
-`ros_events`), `text` and `timelens`; the unit of times in tables in `time_units`. They are imported
-when first needed. This module also turns the raw numbers of a file into checked fields, so that
-every reader accepts the same values and words its errors alike.
+`hdf5_layouts`, `mat`, `n_caltech`, `npz`, `parquet`, `prophesee`, `ros` (with `bags`,
+`ros_messages` and `ros_events`), `text` and `timelens`; `time_units` finds the unit of times in
+tables, `calibration` reads files of cameras. They are imported when first needed. This module also
+turns the raw numbers of a file into checked fields, so that every reader accepts the same values
+and words its errors alike.
 """
 
 import codecs
@@ -26,7 +27,8 @@ from jaxevent.arrays import times
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
 from jaxevent.io.options import ReadOptions
-from jaxevent.recording import Events, Frames, Recording
+from jaxevent.lenses import LENSES, find_model
+from jaxevent.recording import PER_FRAME, Events, Frames, Recording
 
 __all__ = ["load", "save", "times"]
 
@@ -52,6 +54,7 @@ _UNREADABLE = {
     },
 }
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+NO_FRAMES = "none"
 _PROPHESEE = re.compile(
     rb"^% *(evt|format|version|data file|end)\b", re.I | re.M
 )  # lines of its headers
@@ -59,6 +62,8 @@ _LINE = 1 << 12  # bytes of a line that are looked at
 _SMALL = 1 << 27  # bytes of arrays that every file may unfold to
 _MOST_COMPRESSED = 100  # times that a larger one may unfold to of its own bytes
 TIME_UNITS = ("s", "ms", "us", "ns")
+
+_COUNTS = {8: "eight", 9: "nine", 12: "twelve"}  # of the numbers of a camera
 
 READABLE = (
     "readable are a folder or zip with events.txt (Event-Camera Dataset), AEDAT 2 and 4, "
@@ -79,6 +84,7 @@ def load(
     frames: str | None = None,
     time_unit: str | None = None,
     repair: str | None = None,
+    camera: str | os.PathLike[str] | None = None,
 ) -> Recording:
     """Read and check a recording; its format is told by its content, not by its name.
 
@@ -96,12 +102,15 @@ def load(
             "left" or "right" of MVSEC and M3ED, the number of a stream of AEDAT 4.
         trust: Whether HDF5 may be made of other files, by links, external storage or virtual
             datasets. Such a file can have any file read that you may read, or never end.
-        frames: Which images become the frames, of a file that holds several kinds.
+        frames: Which images become the frames, of a file that holds several kinds: a topic of a
+            bag, the number of a stream of AEDAT 4. "none" leaves frames out, in any format.
         time_unit: The unit of the event times, "s", "ms", "us" or "ns", of formats that do not
             state it; None infers it (`jaxevent.io.time_units`), with an `InputWarning` in doubt.
         repair: How to mend event times that go back: "sort" late events, "drop" outliers, "unwrap"
             a counter, keep a "part" between resets, or several of them, as in "unwrap,sort"; see
             `jaxevent.io.disorder`. None refuses such times, and the message says what would help.
+        camera: A calibration instead of the recording's: camchain.yaml of Kalibr or camera_info of
+            ROS in YAML, or FILE:NAME, a camera of several; see `jaxevent.io.calibration`.
 
     Raises:
         InputError: The file is missing, damaged or of another format, or what it holds is not a
@@ -117,7 +126,11 @@ def load(
         raise InputError(
             f"time_unit = {time_unit!r} is not a unit of time; give 's', 'ms', 'us' or 'ns'"
         )
-    options = ReadOptions(size, in_memory, progress, stream, frames, time_unit, repair)
+    without_frames = frames == NO_FRAMES
+    name = None if without_frames else frames
+    options = ReadOptions(
+        size, in_memory, progress, stream, name, time_unit, repair, without_frames
+    )
     with contextlib.ExitStack() as stack:
         if trust:
             from jaxevent.io.hdf5_files import trusting
@@ -129,8 +142,23 @@ def load(
             parse_repair(repair)
         with naming(path):
             recording = _reader(path, options)(path, options)
+    if without_frames:
+        recording = _drop_frames(recording)
     recording.refuse_empty(str(path))
+    if camera is not None:
+        from jaxevent.io.calibration import read_camera
+
+        lens = read_camera(camera, (recording.width, recording.height))
+        left_out = {name: why for name, why in recording.left_out.items() if name != "camera"}
+        recording = dataclasses.replace(recording, camera=lens, left_out=left_out)
     return dataclasses.replace(recording, notes=(*recording.notes, *options.notes))
+
+
+def _drop_frames(recording: Recording) -> Recording:
+    """The recording without frames and what there is one of for each frame."""
+    extra = {name: part for name, part in recording.extra.items() if name not in PER_FRAME}
+    left_out = {**recording.left_out, "frames": "frames='none' or --frames none leaves them out"}
+    return dataclasses.replace(recording, frames=None, extra=extra, left_out=left_out)
 
 
 def save(
@@ -170,6 +198,11 @@ def _reader(path: Path, options: ReadOptions) -> Reader:
     if read := _reader_of_streams(path, head):
         refuse_time_unit(path, options)
         return read
+    if options.frames is not None:
+        raise InputError(
+            f"{path}: the format has one kind of frames, and none named {options.frames!r}; leave "
+            "out frames= or --frames, or give none to read no frames"
+        )
     if not is_folder and head.startswith(HDF5_MAGIC) or _later_hdf5(path, is_folder):
         return _hdf5_reader(path, options)
     refuse_stream(path, options)
@@ -440,15 +473,55 @@ def checked_events(
     return events
 
 
-def pinhole(values: NDArray, source: str) -> PinholeCamera:
-    """The camera of nine numbers: fx fy cx cy k1 k2 p1 p2 k3."""
-    values = np.ravel(values)
-    if values.shape != (9,) or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+def pinhole(values: NDArray, source: str, model: str = "radtan") -> PinholeCamera:
+    """The camera of a list of numbers: fx fy cx cy, and those of its lens, as k1 k2 p1 p2 k3.
+
+    Raises `InputError` for another count, for numbers that are not finite, and for a model that
+    `jaxevent.lenses` does not list.
+    """
+    found = find_model(model)
+    if found is None:
+        raise InputError(f"{source}: {unsupported_lens(model)}")
+    values, names = np.ravel(values), LENSES[found].coefficients
+    count = 4 + len(names)
+    if values.shape != (count,) or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
         raise InputError(
-            f"{source}: the calibration must be nine finite numbers, fx fy cx cy k1 k2 p1 p2 k3"
+            f"{source}: the calibration must be {_COUNTS[count]} finite numbers, fx fy cx cy "
+            f"{' '.join(names)}"
         )
-    fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(value) for value in values)
-    return PinholeCamera(fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+    fx, fy, cx, cy, *distortion = (float(value) for value in values)
+    return PinholeCamera(fx, fy, cx, cy, tuple(distortion), found)
+
+
+def unsupported_lens(model: str) -> str:
+    """The sentence of a calibration of another lens model, as of `Recording.left_out`."""
+    return (
+        f"the calibration has the lens model {model[:40]!r}, which is not supported; supported are "
+        f"{', '.join(LENSES)}"
+    )
+
+
+def calibrated(
+    intrinsics: NDArray, model: str, coefficients: NDArray, source: str
+) -> tuple[PinholeCamera | None, dict[str, str]]:
+    """The camera of a calibration, and `Recording.left_out` where its lens is not supported.
+
+    `intrinsics` are fx, fy, cx and cy in px; missing `coefficients` are 0. "plumb_bob" of eight
+    coefficients, as drivers write it, is rational. Raises `InputError` for bad numbers.
+    """
+    found, k = find_model(model), np.ravel(coefficients)
+    if found == "radtan" and len(k) == len(LENSES["rational"].coefficients):
+        found = "rational"
+    if found is None:
+        return None, {"camera": f"{source}: {unsupported_lens(model)}"}
+    count = len(LENSES[found].coefficients)
+    if np.any(k[count:]):
+        return None, {
+            "camera": f"{source}: the calibration has {len(k)} coefficients of the lens model "
+            f"{model[:40]!r}, of which {count} are supported"
+        }
+    k = np.concatenate([k[:count], np.zeros(max(0, count - len(k)))])
+    return pinhole(np.concatenate([np.ravel(intrinsics), k]), source, found), {}
 
 
 def whole_number(value: Any, source: str, what: str) -> int:

@@ -62,6 +62,8 @@ def read(path: Path, options: ReadOptions) -> Recording:
     for kind, field in (("frame", "frames"), ("imus", "imu"), ("triggers", "triggers")):
         several = of_kind[kind]
         listed = ", ".join(map(str, several))
+        if kind == "frame" and options.without_frames:
+            continue
         if kind == "frame" and options.frames is not None:
             if options.frames not in map(str, several):
                 raise InputError(

@@ -29,8 +29,24 @@ bool is_bigendian
 uint8[] events
 """
 
+# Definitions for bags that hold none, as rosbag2 wrote before 2023.
+_EVENTS = """std_msgs/Header header
+uint32 height
+uint32 width
+{0}/Event[] events
+================================================================================
+MSG: {0}/Event
+uint16 x
+uint16 y
+builtin_interfaces/Time ts
+bool polarity
+"""
+_EVENT_PACKAGES = ("dvs_msgs", "prophesee_event_msgs", "dv_ros_msgs")
+
+_LONGEST = 1 << 16  # characters of a definition that is parsed
 _CHUNK = 6  # records of MCAP
 
+Fields = list[tuple[str, Any]]  # of a type of message: names, and types as rosbags parses them
 Place = tuple[int, int]  # a time of recording (ns), and how many messages of it come before
 
 
@@ -53,6 +69,7 @@ class Bag:
                     _check_chunks(file)
         with self._open() as reader:
             self._types = [(c.topic, c.msgtype, c.msgcount) for c in reader.connections]
+            self._definitions = {c.msgtype: c.msgdef for c in reader.connections}
 
     def _open(self) -> Any:
         if self.is_ros1:
@@ -83,13 +100,27 @@ class Bag:
         """The type of a topic's messages."""
         return next(kind for name, kind, count in self._types if name == topic and count)
 
-    def beside(self, events: str, kind: str) -> str | None:
-        """The topic of a type that belongs to the same camera as the events, if one does."""
-        several = self.topics(kind)
-        if len(several) > 1:
+    def kinds(self) -> dict[str, str]:
+        """The types of all topics that hold messages, by topic."""
+        return {topic: kind for topic, kind, count in self._types if count}
+
+    @functools.cached_property
+    def fields(self) -> dict[str, Fields]:
+        """The fields of every type of message, by the definitions that the bag holds, or else
+        that are known; of a type without a definition there are none."""
+        found = {name: fields for name, (_, fields) in _types(self.is_ros1).fielddefs.items()}
+        for kind, definition in self._definitions.items():
+            if kind not in found:
+                found = _parse(kind, definition) | found
+        return found
+
+    def beside(self, events: str | None, several: list[str]) -> list[str]:
+        """The topics that belong to the same camera as the events: the only one, or those of the
+        events' own name."""
+        if len(several) > 1 and events is not None:
             parent = events.rpartition("/")[0] + "/"
             several = [topic for topic in several if topic.startswith(parent)]
-        return several[0] if len(several) == 1 else None
+        return several
 
     def messages(self, topic: str, place: Place | None = None) -> Iterator[tuple[Place, bytes]]:
         """Contents of a topic's messages, each with its place, from a place on."""
@@ -120,6 +151,24 @@ def _types(is_ros1: bool) -> Any:
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(_PACKET, "event_camera_msgs/msg/EventPacket"))
     return store
+
+
+def _parse(kind: str, definition: Any) -> dict[str, Fields]:
+    """The fields of a type and of those that it holds; none where its definition is damaged."""
+    from rosbags.interfaces import MessageDefinitionFormat
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg
+
+    package = kind.partition("/")[0]
+    text, is_idl = definition.data, definition.format == MessageDefinitionFormat.IDL
+    if definition.format == MessageDefinitionFormat.NONE:
+        is_array = package in _EVENT_PACKAGES and kind.endswith("/EventArray")
+        text = _EVENTS.format(package) if is_array else ""
+    parsed: dict[str, Any] = {}
+    if len(text) > _LONGEST:
+        return parsed
+    with contextlib.suppress(Exception):  # of any kind: the parser follows the text of the file
+        parsed = get_types_from_idl(text) if is_idl else get_types_from_msg(text, kind)
+    return {name: fields for name, (_, fields) in parsed.items()}
 
 
 def _open_ros1(path: Path) -> Any:

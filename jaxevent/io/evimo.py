@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.io import pinhole, reading, sensor_size, times, vectors, whole_number
+from jaxevent.io import calibrated, reading, sensor_size, times, vectors, whole_number
 from jaxevent.io.decoded import DecodedImages, decoded
 from jaxevent.io.images import grey_of_bgr
 from jaxevent.io.numpy_files import (
@@ -46,6 +46,7 @@ from jaxevent.io.numpy_files import (
     read_member,
 )
 from jaxevent.io.options import ReadOptions
+from jaxevent.lenses import LENSES, find_model
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
 
@@ -78,7 +79,7 @@ def read(
     if "arrays_left_out" in extra and meta:
         del extra["arrays_left_out"]
     with reading(f"{source}: meta"):
-        camera, told = _camera(meta, source) if "meta" in meta else (None, None)
+        camera, told, left_out = _camera(meta, source) if "meta" in meta else (None, None, {})
         poses = _poses(meta["full_trajectory"], source) if "full_trajectory" in meta else None
         samples = _imu(meta["imu"][imu], source) if imu is not None else None
         frames = None
@@ -96,7 +97,6 @@ def read(
     columns = open_events(*(path / f"dataset_events_{name}.npy" for name in ("t", "xy", "p")))
     unit = "s" if columns["t"].dtype.kind == "f" else "us"
     events = decoded(events_decoder(columns, unit, source), size, source, options)
-    left_out = {}
     if frames is None and parts["classical"].names:
         left_out["frames"] = (
             f"the times of the {len(parts['classical'].names):,} images in dataset_classical.npz "
@@ -174,15 +174,16 @@ class _Images:
 
 def _camera(
     meta: Mapping[str, Any], source: str
-) -> tuple[PinholeCamera | None, tuple[int, int] | None]:
-    """The calibration, None of another model than radtan, and (width, height)."""
+) -> tuple[PinholeCamera | None, tuple[int, int], dict[str, str]]:
+    """The calibration, (width, height), and what is left out."""
     about = meta["meta"]
     width, height = (whole_number(about[name], source, name) for name in ("res_x", "res_y"))
-    if about.get("dist_model") != "radtan":
-        return None, (width, height)
-    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    model = str(about.get("dist_model"))
+    lens = LENSES.get(find_model(model) or "")
+    names = ("fx", "fy", "cx", "cy", *(lens.coefficients if lens else ()))
     values = np.array([float(about.get(name, 0.0)) for name in names])
-    return pinhole(values, f"{source}: meta"), (width, height)
+    camera, left_out = calibrated(values[:4], model, values[4:], f"{source}: meta")
+    return camera, (width, height), left_out
 
 
 def _poses(trajectory: Sequence[Mapping[str, Any]], source: str) -> Poses | None:

@@ -10,7 +10,8 @@
     /frames/t             (frames,) int64 us, mid-exposure
     /frames/exposure      (frames,) int64 us, 0 where unknown
     /frames/images        (frames, height, width) uint8, uint16 or floats in [0, 1]
-    /camera               (9,) float64: fx fy cx cy k1 k2 p1 p2 k3
+    /camera               (9,) float64: fx fy cx cy k1 k2 p1 p2 k3; of another lens model
+                          (`jaxevent.lenses`), which the attribute model names, its numbers
     /poses/t, position, quaternion   (poses,) int64 us, (poses, 3) m, (poses, 4) x y z w
     /imu/t, gyro, acc     (samples,) int64 us, (samples, 3) rad/s, (samples, 3) m/s^2
     /triggers/t, edge, channel   (triggers,) int64 us, 1 rising 0 falling -1 unknown, number
@@ -88,7 +89,7 @@ _UNITS = {
     "ms_to_idx": "rows of events",
     "frames/t": CLOCK,
     "frames/exposure": "us",
-    "camera": "px (fx, fy, cx, cy), 1 (k1, k2, p1, p2, k3)",
+    "camera": "px (fx, fy, cx, cy), 1 (of the lens)",
     "poses/t": CLOCK,
     "poses/position": "m",
     "poses/quaternion": "1",
@@ -506,7 +507,9 @@ def _recording(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
         t, exposure = stamps("frames/t", "frame"), _times(file, "frames/exposure", source)
         frames = Frames(t, images, exposure) if len(t) else None
     if isinstance(file.get("camera"), h5py.Dataset):
-        camera = pinhole(array(file, "camera", source), f"{path}: camera")
+        with reading(f"{source}: camera"):
+            model = file["camera"].attrs.get("model", "radtan")
+        camera = pinhole(array(file, "camera", source), f"{path}: camera", str(model))
     if isinstance(file.get("poses"), h5py.Group):
         t = stamps("poses/t", "pose")
         position = _vectors(file, "poses/position", (len(t), 3), source)
@@ -611,6 +614,8 @@ def write(
                     _write(file, f"{group}/{name}", values, compression, check)
         if (camera := recording.camera) is not None:
             file["camera"] = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
+            if camera.model != "radtan":
+                file["camera"].attrs["model"] = camera.model
         for name, values in recording.extra.items():
             _write(file, f"extra/{name}", values, compression, check)
         _tell_units(file)

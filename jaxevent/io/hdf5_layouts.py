@@ -32,9 +32,9 @@ from numpy.typing import NDArray
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
 from jaxevent.io import (
+    calibrated,
     check_unfolded,
     ecf,
-    pinhole,
     reading,
     refuse_stream,
     refuse_time_unit,
@@ -187,12 +187,12 @@ def _m3ed(file: Any, path: Path, options: ReadOptions, group: str) -> Recording:
     source, size = str(path), options.size
     refuse_time_unit(path, options)
     columns = _columns(file, group, source)
-    camera = None
+    camera, left_out = None, {}
     if f"{group}/calib/intrinsics" in file:
         with reading(f"{source}: {group}/calib"):
             if f"{group}/calib/resolution" in file and size is None:
                 size = _pair(array(file, f"{group}/calib/resolution", source), source)
-            camera = _camera(file, f"{group}/calib", source)
+            camera, left_out = _camera(file, f"{group}/calib", source)
     if size is None:
         raise InputError(
             f"{path}: {group}/calib has no resolution; give size=(width, height) or --size"
@@ -202,21 +202,19 @@ def _m3ed(file: Any, path: Path, options: ReadOptions, group: str) -> Recording:
         table = dataset(file, f"{group}/ms_map_idx", source)
     events = StoredEvents(columns, size, source, 0, table).repaired(options)
     poses = read_poses(path, group)
-    return Recording(
-        path.stem, *size, events, camera=camera, poses=poses, left_out=describe_images(file)
-    )
+    left_out |= describe_images(file)
+    return Recording(path.stem, *size, events, camera=camera, poses=poses, left_out=left_out)
 
 
-def _camera(file: Any, group: str, source: str) -> PinholeCamera | None:
-    fx, fy, cx, cy = array(file, f"{group}/intrinsics", source)
-    k = np.zeros(4)
+def _camera(file: Any, group: str, source: str) -> tuple[PinholeCamera | None, dict[str, str]]:
+    k, model = np.zeros(0), "radtan"
     if f"{group}/distortion_coeffs" in file:
         k = array(file, f"{group}/distortion_coeffs", source)
     if f"{group}/distortion_model" in file:
         text = array(file, f"{group}/distortion_model", source).item()
-        if "equi" in (text.decode() if isinstance(text, bytes) else str(text)):
-            return None
-    return pinhole(np.array([fx, fy, cx, cy, *k, 0.0]), f"{source}: {group}")
+        model = text.decode() if isinstance(text, bytes) else str(text)
+    intrinsics = array(file, f"{group}/intrinsics", source)
+    return calibrated(intrinsics, model, k, f"{source}: {group}")
 
 
 class _Part:

@@ -6,7 +6,9 @@
     frame_t               mid-exposure times
     exp_start, exp_end    start and end of the exposures; where present, frame_t is not used
     imu_t, gyro, acc      (samples,), (samples, 3) rad/s, (samples, 3) m/s^2
-    calib                 fx fy cx cy k1 k2 p1 p2 k3
+    calib                 fx fy cx cy k1 k2 p1 p2 k3; of another lens model of `jaxevent.lenses`
+                          its numbers
+    calib_model           the name of that model
 
 Times are usually integers in microseconds or floats in seconds, those of events in microseconds too
 where all are whole; names may state a unit, as in frame_t_ns (`time_units`). Only the events are
@@ -116,7 +118,10 @@ def read(path: Path, options: ReadOptions) -> Recording:
         gyro, acc = take("gyro", "acc")
         shape = (len(imu_t), 3)
         imu = Imu(imu_t, vectors(gyro, shape, source, "gyro"), vectors(acc, shape, source, "acc"))
-    camera = pinhole(arrays.pop("calib"), f"{path}: calib") if "calib" in arrays else None
+    camera = None
+    if "calib" in arrays:
+        model = str(arrays.pop("calib_model", "radtan"))
+        camera = pinhole(arrays.pop("calib"), f"{path}: calib", model)
     return Recording(
         path.stem, *size, events, frames, camera, imu=imu, extra=arrays, notes=tuple(notes)
     )

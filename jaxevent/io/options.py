@@ -13,6 +13,7 @@ class ReadOptions:
         progress: Whether to show a progress bar; None shows one on a terminal.
         stream: Name of the camera whose events are read; None where the file holds one.
         frames: Name of the images that become the frames; None lets the reader choose.
+        without_frames: Whether frames are left out.
         time_unit: Unit of the event times, "s", "ms", "us" or "ns"; None infers it.
         repair: Repairs of event times that go back; None refuses them.
         notes: Remarks that readers add, for `Recording.notes`.
@@ -25,4 +26,5 @@ class ReadOptions:
     frames: str | None = None
     time_unit: str | None = None
     repair: str | None = None
+    without_frames: bool = False
     notes: list[str] = dataclasses.field(default_factory=list, compare=False)

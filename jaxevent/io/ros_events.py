@@ -1,11 +1,12 @@
-"""Events in the messages of ROS: EventArray of dvs_msgs and prophesee_event_msgs, EventPacket.
+"""Events in the messages of ROS, whatever their type is called: arrays of events, and packets.
 
-    EventArray   header, height, width, events of x and y (uint16), time (2 x 32 bits), polarity
-    EventPacket  header, height, width, number, time base, encoding, byte order, encoded bytes
+    array   header, height, width, events of x and y, a time (seconds, nanoseconds) and a polarity:
+            EventArray of dvs_msgs, prophesee_event_msgs, dv_ros_msgs
+    packet  header, height, width, time base, encoding, encoded bytes: EventPacket of
+            event_camera_msgs, EventArray of event_array_msgs
 
-An event of an EventArray takes 13 bytes in ROS 1. In ROS 2 (CDR) each number is aligned to its
-size: the first event is at 0, the next at 14, then one every 16 bytes. The typed decoding of
-rosbags makes an object of each event; NumPy reads them all at once.
+A topic holds events where its messages have these fields, in any order and beside any others; see
+`ros_messages`. Where a message tells no size, frames or the caller do.
 
 The encodings of event_camera_msgs/EventPacket that are read:
 
@@ -20,9 +21,8 @@ topic are then on the same clock, but for the drift of the camera's.
 
 import dataclasses
 import functools
-import struct
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,26 +31,52 @@ from jaxevent.errors import InputError, require
 from jaxevent.io.bags import Bag, Place
 from jaxevent.io.decoded import BLOCK, Columns, Decoder, Tally, TriggerList
 from jaxevent.io.prophesee import evt3_events
+from jaxevent.io.ros_messages import Layout
 from jaxevent.recording import Triggers
 
-ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
-PACKET = "event_camera_msgs/msg/EventPacket"
-_ROS1_EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")])
+_TIMES = ("ts", "t", "time", "stamp", "timestamp")
+_POLARITIES = ("polarity", "p", "pol", "on")
 
 
-def _aligned_event(offsets: list[int]) -> np.dtype:
-    return np.dtype(
-        {
-            "names": ["x", "y", "s", "ns", "p"],
-            "formats": ["<u2", "<u2", "<u4", "<u4", "u1"],
-            "offsets": offsets,
-            "itemsize": 16,
-        }
-    )
+class _Names(NamedTuple):
+    """The names of the fields of an array: of the array itself, and of an event's numbers."""
+
+    array: str
+    sec: str
+    nanosec: str
+    x: str
+    y: str
+    p: str
 
 
-# From the end of the event before, 13, the next x is at 14; the time after it at 20.
-_FIRST_EVENT, _NEXT_EVENT = _aligned_event([0, 2, 4, 8, 12]), _aligned_event([0, 2, 6, 10, 14])
+def _names(layout: Layout) -> _Names | None:
+    """The names of a message that is an array of events; None of others."""
+    for field, type_ in layout.fields.items():
+        members = [name for name, _ in layout.members(type_) or ()]
+        lower = {name.lower(): name for name in members}
+        t = next((name for name in _TIMES if f"{name}.nanosec" in lower), None)
+        p = next((name for name in _POLARITIES if name in lower), None)
+        if t is not None and p is not None and {"x", "y", f"{t}.sec"} <= set(lower):
+            wanted = (f"{t}.sec", f"{t}.nanosec", "x", "y", p)
+            return _Names(field, *(lower[name] for name in wanted))
+    return None
+
+
+def _is_packet(layout: Layout) -> bool:
+    fields = layout.fields
+    wanted = {"header", "time_base", "encoding", "events"}
+    return wanted <= set(fields) and layout.members(fields["events"]) == [("", "u1")]
+
+
+def _layout(bag: Bag, kind: str) -> Layout:
+    return Layout(bag.fields, kind, bag.is_ros1)
+
+
+def event_topics(bag: Bag) -> list[str]:
+    """The topics whose messages are events by their fields, sorted."""
+    layouts = {kind: _layout(bag, kind) for kind in set(bag.kinds().values())}
+    held = {kind for kind, one in layouts.items() if _is_packet(one) or _names(one) is not None}
+    return sorted(topic for topic, kind in bag.kinds().items() if kind in held)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,110 +95,113 @@ class EventTopic:
 
 def event_topic(bag: Bag, topic: str) -> EventTopic:
     """Read what is needed before the events of a topic. Raises `InputError` for bad messages."""
-    found = Tally()
-    if bag.kind(topic) != PACKET:
-        decode = functools.partial(_arrays, bag, topic)
-        return EventTopic(decode, _size(bag, topic), found, lambda: None)
-    packet = next(packet for _, packet in bag.decoded(topic))
-    size = (packet.width, packet.height) if packet.width and packet.height else None
-    stamp = packet.header.stamp.sec * 10**9 + packet.header.stamp.nanosec
-    if packet.encoding == "mono":
-        shift = stamp - packet.time_base
-        return EventTopic(functools.partial(_mono, bag, topic, shift), size, found, lambda: None)
-    if packet.encoding != "evt3":
+    found, layout = Tally(), _layout(bag, bag.kind(topic))
+    names = _names(layout)
+    messages = (message for _, message in _messages(bag, topic, layout))
+    if names is not None:
+        decode = functools.partial(_arrays, bag, topic, layout, names)
+        return EventTopic(decode, _size(next(messages)), found, lambda: None)
+    packet = next(messages)
+    size, encoding = _size(packet), packet["encoding"]
+    stamp = packet["header"]["stamp"]
+    stamp = stamp["sec"] * 10**9 + stamp["nanosec"]
+    packets = functools.partial(_packets, bag, topic, layout)
+    if encoding == "mono":
+        shift = stamp - packet["time_base"]
+        return EventTopic(functools.partial(_mono, packets, shift), size, found, lambda: None)
+    if encoding != "evt3":
         raise InputError(
-            f"{bag.path}: the packets of {topic} are encoded as {packet.encoding[:20]!r}; only "
+            f"{bag.path}: the packets of {topic} are encoded as {encoding[:20]!r}; only "
             "mono and evt3 can be read, so record the events as one of these"
         )
     require("evt3", "prophesee")
-    packets = _Evt3Packets(bag, topic, stamp // 1000, found)
-    return EventTopic(packets.decode, size, found, packets.triggers)
+    words = _Evt3Packets(f"{bag.path}: {topic}", packets, stamp // 1000, found)
+    return EventTopic(words.decode, size, found, words.triggers)
 
 
-def _arrays(bag: Bag, topic: str, state: Place | None) -> Iterator[tuple[Place, Columns]]:
+def _messages(
+    bag: Bag, topic: str, layout: Layout, place: Place | None = None
+) -> Iterator[tuple[Place, dict[str, Any]]]:
+    """The messages of a topic, each with its place, from a place on."""
+    for here, data in bag.messages(topic, place):
+        try:
+            yield here, layout.read(data)
+        except ValueError as error:
+            raise InputError(
+                f"{bag.path}: a message of {topic} has {error}; the bag is damaged, so fetch it "
+                "again"
+            ) from None
+
+
+def _size(message: Mapping[str, Any]) -> tuple[int, int] | None:
+    width, height = (message.get(name) for name in ("width", "height"))
+    return (width, height) if width and height else None
+
+
+def _arrays(
+    bag: Bag, topic: str, layout: Layout, names: _Names, state: Place | None
+) -> Iterator[tuple[Place, Columns]]:
     held: list[NDArray] = []
     first, count = None, 0
-    for place, data in bag.messages(topic, state):
+    for place, message in _messages(bag, topic, layout, state):
         first = first or place
-        pieces = _array(bag, topic, data)[1]
+        pieces = message[names.array]
         held += pieces
         count += sum(map(len, pieces))
         if count >= BLOCK:
-            yield first, _columns(bag, topic, held)
+            yield first, _columns(bag, topic, names, held)
             held, first, count = [], None, 0
     if first is not None:
-        yield first, _columns(bag, topic, held)
+        yield first, _columns(bag, topic, names, held)
 
 
-def _array(bag: Bag, topic: str, data: bytes) -> tuple[tuple[int, int], list[NDArray]]:
-    """The size (width, height) that an EventArray tells, and its events in one or two pieces."""
-    # The header's time, and before it its number in ROS 1, 4 bytes of the order of bytes in ROS 2.
-    order = "<" if bag.is_ros1 or data[1] & 1 else ">"
-    at = 16 + struct.unpack_from(f"{order}I", data, 12)[0]
-    at += 0 if bag.is_ros1 else -at % 4
-    height, width, count = struct.unpack_from(f"{order}3I", data, at)
-    at += 12
-    size = _ROS1_EVENT.itemsize * count if bag.is_ros1 else max(0, 16 * count - 3)
-    # A writer of CDR may fill up to a multiple of 4 bytes.
-    if not at + size <= len(data) <= at + size + (0 if bag.is_ros1 else 3):
-        raise InputError(
-            f"{bag.path}: a message of {topic} has {len(data) - at} bytes for {count} events, not "
-            f"{size}; the bag is damaged, so fetch it again"
-        )
-    if bag.is_ros1:
-        return (width, height), [np.frombuffer(data, _ROS1_EVENT, count, at)]
-    padded = data + bytes(16)
-    first = np.frombuffer(padded, _FIRST_EVENT.newbyteorder(order), min(count, 1), at)
-    others = np.frombuffer(padded, _NEXT_EVENT.newbyteorder(order), max(0, count - 1), at + 14)
-    return (width, height), [first, others]
-
-
-def _size(bag: Bag, topic: str) -> tuple[int, int] | None:
-    for _, data in bag.messages(topic):
-        width, height = _array(bag, topic, data)[0]
-        return (width, height) if width and height else None
-    return None
-
-
-def _columns(bag: Bag, topic: str, pieces: list[NDArray]) -> Columns:
+def _columns(bag: Bag, topic: str, names: _Names, pieces: list[NDArray]) -> Columns:
     s, ns, x, y, p = (
-        np.concatenate([piece[name] for piece in pieces]) for name in ("s", "ns", "x", "y", "p")
+        np.concatenate([piece[name] for piece in pieces])
+        for name in (names.sec, names.nanosec, names.x, names.y, names.p)
     )
     if len(ns) and ns.max() >= 10**9:
         raise InputError(
             f"{bag.path}: an event of {topic} has more than 10^9 nanoseconds; the bag is damaged, "
             "so fetch it again"
         )
+    # Seconds are unsigned in ROS 1, and in ROS 2 not below 0; rosbags declares both as int32.
+    s = s.view(np.uint32) if s.dtype == np.int32 else s
     return s * np.int64(1_000_000) + ns // 1000, x, y, p
 
 
 def _packets(
-    bag: Bag, topic: str, encoding: str, width: int, place: Place | None
+    bag: Bag, topic: str, layout: Layout, encoding: str, width: int, place: Place | None
 ) -> Iterator[tuple[Place, Any, NDArray[np.uint8]]]:
     """A topic's packets, each with its place and its whole words of `width` bytes."""
-    for here, packet in bag.decoded(topic, place):
-        if packet.encoding != encoding or (packet.is_bigendian and width == 8):
+    for here, packet in _messages(bag, topic, layout, place):
+        is_bigendian = packet.get("is_bigendian", False)
+        if packet["encoding"] != encoding or (is_bigendian and width == 8):
             raise InputError(
-                f"{bag.path}: {topic} has packets of {packet.encoding[:20]!r} "
-                f"{'in big-endian words ' if packet.is_bigendian else ''}after packets of "
+                f"{bag.path}: {topic} has packets of {packet['encoding'][:20]!r} "
+                f"{'in big-endian words ' if is_bigendian else ''}after packets of "
                 f"{encoding!r}; record them as one encoding, in little-endian words"
             )
-        if len(packet.events) % width:
+        content = np.concatenate([piece["value"] for piece in packet["events"]])
+        if len(content) % width:
             raise InputError(
-                f"{bag.path}: a packet of {topic} has {len(packet.events)} bytes, which are not "
+                f"{bag.path}: a packet of {topic} has {len(content)} bytes, which are not "
                 f"whole words of {width}; the bag is damaged, so fetch it again"
             )
-        yield here, packet, packet.events
+        yield here, packet, content
 
 
-def _mono(bag: Bag, topic: str, shift: int, state: Place | None) -> Iterator[tuple[Place, Columns]]:
+Packets = Callable[[str, int, Any], Iterator[tuple[Place, Any, NDArray[np.uint8]]]]
+
+
+def _mono(packets: Packets, shift: int, state: Place | None) -> Iterator[tuple[Place, Columns]]:
     """Decode packets of words; `shift` (ns) leads from time bases to the clock of headers."""
     held: list[tuple[NDArray, NDArray]] = []
     first = None
-    for place, packet, content in _packets(bag, topic, "mono", 8, state):
+    for place, packet, content in packets("mono", 8, state):
         first = first or place
         words = content.view("<u8")
-        held.append((words, (words & 0xFFFFFFFF).astype(np.int64) + (packet.time_base + shift)))
+        held.append((words, (words & 0xFFFFFFFF).astype(np.int64) + (packet["time_base"] + shift)))
         if sum(len(words) for words, _ in held) >= BLOCK:
             yield first, _mono_columns(held)
             held, first = [], None
@@ -189,14 +218,13 @@ def _mono_columns(held: list[tuple[NDArray, NDArray]]) -> Columns:
 class _Evt3Packets:
     """The words of evt3 packets, one after the other, on the clock of the first header (us)."""
 
-    def __init__(self, bag: Bag, topic: str, stamp: int, found: Tally):
-        self._bag, self._topic, self._stamp, self._found = bag, topic, stamp, found
+    def __init__(self, source: str, packets: Packets, stamp: int, found: Tally):
+        self._source, self._packets, self._stamp, self._found = source, packets, stamp, found
         self._list = TriggerList()
         self._shift: int | None = None
 
     def decode(self, state: Any) -> Iterator[tuple[Any, Columns]]:
-        source = f"{self._bag.path}: {self._topic}"
-        blocks = evt3_events(source, self._words, self._found, self._list, state)
+        blocks = evt3_events(self._source, self._words, self._found, self._list, state)
         for here, (t, x, y, p) in blocks:
             if self._shift is None and len(t):
                 self._shift = self._stamp - int(t[0])
@@ -210,7 +238,7 @@ class _Evt3Packets:
         offset, at = place or (0, None)
         held: list[NDArray] = []
         first, count = None, 0
-        for here, _, content in _packets(self._bag, self._topic, "evt3", 2, at):
+        for here, _, content in self._packets("evt3", 2, at):
             first = first or here
             held.append(content)
             count += len(content)

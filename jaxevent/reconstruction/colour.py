@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
+from jaxevent.io.bayer import PATTERNS as PATTERNS
+from jaxevent.io.bayer import demosaic, sites
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Events, Frames, Recording, Times, microseconds
 
 REC709 = (0.2126, 0.7152, 0.0722)  # luminance of linear red, green and blue; the sum is 1
-PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")  # of a 2 x 2 cell, row by row
 _HIDDEN = 1e-3  # what a frame counts where it does not show a point, so that something does
 _SHOULDER = 0.02  # of white: colours fade to grey over the last 2 % below it
 
@@ -150,19 +150,6 @@ def colour_video(
     return colours
 
 
-def _sites(pattern: str) -> dict[str, tuple[int, int]]:
-    """Row and column in the 2 x 2 cell of R, G1, G2 and B; G1 is the first green, row by row."""
-    if pattern not in PATTERNS:
-        raise InputError(
-            f"the colour pattern {pattern!r} is not one of {', '.join(PATTERNS)}; other patterns "
-            "cannot be split"
-        )
-    greens = iter(("G1", "G2"))
-    names = [next(greens) if letter == "G" else letter for letter in pattern]
-    found = {name: divmod(place, 2) for place, name in enumerate(names)}
-    return {name: found[name] for name in ("R", "G1", "G2", "B")}
-
-
 def split_channels(recording: Recording, pattern: str = "RGGB") -> dict[str, Recording]:
     """The recordings R, G1, G2 and B of the sites of a Bayer pattern, each of half the size.
 
@@ -172,14 +159,14 @@ def split_channels(recording: Recording, pattern: str = "RGGB") -> dict[str, Rec
     `rgb` is left out, others are kept. Raises `InputError` for other patterns and for a sensor of
     odd width or height.
     """
-    sites = _sites(pattern)
+    places = sites(pattern)
     if recording.width % 2 or recording.height % 2:
         raise InputError(
             f"{recording.name}: the {recording.width}x{recording.height} sensor has an odd side, "
             "which a 2x2 colour pattern does not fill; crop the recording to an even size"
         )
     events = recording.events[: len(recording.events)]
-    return {name: _channel(recording, events, name, *site) for name, site in sites.items()}
+    return {name: _channel(recording, events, name, *site) for name, site in places.items()}
 
 
 def _channel(recording: Recording, events: Events, name: str, row: int, column: int) -> Recording:
@@ -194,12 +181,12 @@ def _channel(recording: Recording, events: Events, name: str, row: int, column: 
         frames = Frames(frames.t, sampled(np.asarray(frames.images)), frames.exposure)
     if pinhole is not None:
         # Pixel i of the channel is pixel 2 i + column of the sensor, both counted at their centres.
-        pinhole = PinholeCamera(
-            pinhole.fx / 2,
-            pinhole.fy / 2,
-            (pinhole.cx - column) / 2,
-            (pinhole.cy - row) / 2,
-            pinhole.distortion,
+        pinhole = dataclasses.replace(
+            pinhole,
+            fx=pinhole.fx / 2,
+            fy=pinhole.fy / 2,
+            cx=(pinhole.cx - column) / 2,
+            cy=(pinhole.cy - row) / 2,
         )
     size = (recording.height, recording.width)
     extra = {
@@ -226,31 +213,16 @@ def join_channels(images: Mapping[str, NDArray], pattern: str = "RGGB") -> NDArr
     2 or 4 nearest sites, at the border of those there are. Raises `InputError` for other patterns,
     missing channels and shapes that differ.
     """
-    sites = _sites(pattern)
-    missing = [name for name in sites if name not in images]
+    places = sites(pattern)
+    missing = [name for name in places if name not in images]
     if missing:
         raise InputError(f"the channel {missing[0]} is missing; give R, G1, G2 and B")
-    channels = {name: np.asarray(images[name]) for name in sites}
+    channels = {name: np.asarray(images[name]) for name in places}
     shapes = [channel.shape for channel in channels.values()]
     if len(set(shapes)) > 1 or len(shapes[0]) != 3:
         raise InputError(f"the channels have shapes {shapes}; give all as (times, height, width)")
-    import scipy.ndimage  # slow to import
-
     count, height, width = shapes[0]
-    dtype = np.result_type(np.float32, *channels.values())
-    out = np.empty((count, 2 * height, 2 * width, 3), dtype)
-    cross = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]], dtype)
-    square = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], dtype)
-    for axis, (names, kernel) in enumerate(
-        ((("R",), square), (("G1", "G2"), cross), (("B",), square))
-    ):
-        known = np.zeros((2 * height, 2 * width), dtype)
-        mosaic = np.zeros((count, 2 * height, 2 * width), dtype)
-        for name in names:
-            row, column = sites[name]
-            known[row::2, column::2] = 1
-            mosaic[:, row::2, column::2] = channels[name]
-        weights = scipy.ndimage.convolve(known, kernel, mode="constant")
-        total = scipy.ndimage.convolve(mosaic, kernel[None], mode="constant")
-        out[..., axis] = total / weights
-    return out
+    mosaic = np.empty((count, 2 * height, 2 * width), np.result_type(*channels.values()))
+    for name, (row, column) in places.items():
+        mosaic[:, row::2, column::2] = channels[name]
+    return demosaic(mosaic, pattern)

@@ -110,7 +110,7 @@ def check_camera(camera: PinholeCamera) -> None:
 
 def straighten(camera: PinholeCamera | None, at: NDArray[np.float64]) -> NDArray[np.float64]:
     """Places (n, 2) in px without the distortion."""
-    if camera is None or not any(camera.distortion):
+    if camera is None or not camera.is_distorted:
         return at.astype(np.float64)
     from jaxevent.egomotion.geometry import undistorted
 
@@ -130,23 +130,9 @@ def rays(camera: PinholeCamera, size: tuple[int, int]) -> NDArray[np.float64]:
 
 def bend(camera: PinholeCamera | None, at: NDArray[np.float64]) -> NDArray[np.float64]:
     """Places (n, 2) in px with the distortion; NaN where the radial part has turned back."""
-    if camera is None or not any(camera.distortion):
+    if camera is None or not camera.is_distorted:
         return at
-    k1, k2, p1, p2, k3 = camera.distortion
-    x, y = ((at - (camera.cx, camera.cy)) / (camera.fx, camera.fy)).T
-    r2 = x * x + y * y
-    # r (1 + k1 r^2 + k2 r^4 + k3 r^6) rises with r up to the least root of its slope.
-    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
-    turns = roots.real[(abs(roots.imag) < 1e-9) & (roots.real > 0)]
-    r2 = np.where(r2 < turns.min(initial=math.inf), r2, np.nan)
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack(
-        [
-            camera.fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + camera.cx,
-            camera.fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + camera.cy,
-        ],
-        1,
-    )
+    return camera.distort((at - (camera.cx, camera.cy)) / (camera.fx, camera.fy))
 
 
 def project(camera: PinholeCamera, X: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,7 +1,9 @@
 """The calibration of an event camera and another one."""
 
 import dataclasses
+import itertools
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.io import pinhole
+from jaxevent.io import calibration, pinhole
 from jaxevent.parameters import read_toml
 from jaxevent.register.geometry import Grid, check_camera, keep_inside, project, rays
 
@@ -51,8 +53,15 @@ class Rig:
         object.__setattr__(self, "translation", translation)
 
     @classmethod
-    def read(cls, path: str | Path, events: PinholeCamera | None = None) -> "Rig":
-        """A rig from a TOML file.
+    def read(
+        cls,
+        path: str | Path,
+        events: PinholeCamera | None = None,
+        *,
+        cameras: tuple[str, str] | None = None,
+        sizes: tuple[tuple[int, int], tuple[int, int]] | None = None,
+    ) -> "Rig":
+        """A rig from a camchain of Kalibr (YAML, needs the extra `ros`) or a file of TOML.
 
             [events]                                  # default: the recording's, `events`
             camera = [fx, fy, cx, cy, k1, k2, p1, p2, k3]    # px, Brown-Conrady; or the first four
@@ -61,9 +70,26 @@ class Rig:
             transform = [[...], [...], [...], [0, 0, 0, 1]]  # 4 x 4, or its first three rows
 
         `transform` takes places (m) from the event camera's axes to the other's, as Kalibr's
-        T_cn_cnm1 does if the event camera was its cam0. Raises `InputError` naming what is wrong.
+        T_cn_cnm1 does if the event camera was its cam0.
+
+        Args:
+            path: The file.
+            events: The event camera, for a file of TOML that does not hold it.
+            cameras: The names of the event camera and the other one in a camchain, as
+                ("cam1", "cam0"); omitted, those of the right sizes, and the first two where any
+                would do.
+            sizes: (width, height) in px of the event camera and of the other one.
+
+        Raises:
+            InputError: The file is missing or damaged, or does not tell both cameras.
         """
 
+        if Path(path).suffix.lower() in calibration.SUFFIXES:
+            return cls._of_chain(Path(path), cameras, sizes)
+        if cameras is not None:
+            raise InputError(
+                f"{path}: only a camchain in YAML names its cameras; leave out cameras"
+            )
         table = read_toml(Path(path))
         known = {"events": {"camera"}, "frames": {"camera", "transform"}}
         for name, part in table.items():
@@ -96,6 +122,30 @@ class Rig:
             raise InputError(f"{where} has the shape {transform.shape}; give four rows of four")
         try:
             return cls(own, other, transform[:3, :3], transform[:3, 3])
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+
+    @classmethod
+    def _of_chain(
+        cls,
+        path: Path,
+        cameras: tuple[str, str] | None,
+        sizes: tuple[tuple[int, int], tuple[int, int]] | None,
+    ) -> "Rig":
+        found = calibration.read_cameras(path)
+        own, other = cameras or _pair(path, found, sizes)
+        for name in (own, other):
+            if name not in found:
+                raise InputError(f"{path}: has no camera {name!r}; give two of {', '.join(found)}")
+        lenses = [calibration.lens_of(found, name, path) for name in (own, other)]
+        try:
+            from_events = np.linalg.inv(found[own].transform)
+            transform = found[other].transform @ from_events
+            return cls(*lenses, transform[:3, :3], transform[:3, 3])
+        except np.linalg.LinAlgError:
+            raise InputError(
+                f"{path}: the T_cn_cnm1 of {own} is no transform; correct it"
+            ) from None
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
 
@@ -148,6 +198,34 @@ class Rig:
         # X / Z, so that infinite depth is no special case.
         seen = ray @ self.rotation.T + self.translation / np.where(ahead, Z, np.nan)[:, None]
         return keep_inside(project(self.frames, seen), other).reshape(height, width, 2)
+
+
+def _pair(
+    path: Path,
+    found: Mapping[str, calibration.CalibratedCamera],
+    sizes: tuple[tuple[int, int], tuple[int, int]] | None,
+) -> tuple[str, str]:
+    """The names of the event camera and the other one of a file, by their sizes."""
+    if len(found) < 2:
+        raise InputError(f"{path}: holds one camera, {', '.join(found)}; give two of one camchain")
+    pairs = [
+        pair
+        for pair in itertools.permutations(found, 2)
+        if sizes is None
+        or all(found[one].size in (None, size) for one, size in zip(pair, sizes, strict=True))
+    ]
+    if not pairs:
+        held = ", ".join(f"{name} {one.size}" for name, one in found.items())
+        raise InputError(
+            f"{path}: holds {held}, which are not of the sizes {sizes} of the recording and the "
+            "frames; name two cameras with cameras= or --cameras"
+        )
+    if len(pairs) > 1 and len(found) > 2:
+        raise InputError(
+            f"{path}: holds {', '.join(found)}; name the event camera and the other one with "
+            "cameras= or --cameras"
+        )
+    return pairs[0]
 
 
 def _check_numbers(values: Any, where: str) -> NDArray[np.float64]:

@@ -36,11 +36,12 @@ def describe(recording: Recording, progress: bool | None = None) -> list[tuple[s
         *_about_frames(recording),
     ]
     if (camera := recording.camera) is not None:
+        lens = "" if camera.model == "radtan" else f"{camera.model} "
         lines.append(
             (
                 "calibration",
                 f"fx {camera.fx:.2f}, fy {camera.fy:.2f}, cx {camera.cx:.2f}, cy {camera.cy:.2f}; "
-                f"distortion {', '.join(f'{k:.4g}' for k in camera.distortion)}",
+                f"{lens}distortion {', '.join(f'{k:.4g}' for k in camera.distortion)}",
             )
         )
     for name, part in (("poses", recording.poses), ("IMU", recording.imu)):

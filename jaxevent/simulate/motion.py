@@ -295,9 +295,10 @@ def _smooth(a: NDArray[np.float64]) -> NDArray[np.float64]:
 class MovingCamera:
     """A camera in a world, a `Source` for `simulate`, and the truth of its motion.
 
-    Its principal point is the middle of the image, `focal` is in px, `size` is (width, height),
-    `duration` in s. Times of the truth are integers (us) or floats (s) from 0 to the duration, and
-    `InputError` is raised for others.
+    `size` is (width, height), `duration` in s. The lens is `lens`, or one without distortion, of
+    the focal length `focal` (px), whose principal point is the middle of the image. Times of the
+    truth are integers (us) or floats (s) from 0 to the duration; `InputError` is raised for others,
+    and for a lens whose distortion has no inverse in the image.
     """
 
     world: World
@@ -305,10 +306,13 @@ class MovingCamera:
     size: tuple[int, int] = (240, 180)
     focal: float | int = 200.0
     duration: float | int = 0.5
+    lens: PinholeCamera | None = None
 
     @property
     def camera(self) -> PinholeCamera:
         """The calibration."""
+        if self.lens is not None:
+            return self.lens
         width, height = self.size
         f = float(self.focal)
         return PinholeCamera(f, f, (width - 1) / 2, (height - 1) / 2)
@@ -337,9 +341,9 @@ class MovingCamera:
         depth = np.empty(len(t))
         for k, pose in enumerate(self.motion.pose(t)):
             ray = (pose[:3, :3] @ axis)[None]
-            depth[k] = self.world.seen(pose[:3, 3], ray, 1 / self.focal)[1][0]
+            depth[k] = self.world.seen(pose[:3, 3], ray, 1 / self._f)[1][0]
         turn = np.stack([-twist[:, 4], twist[:, 3]], 1)
-        return float(self.focal) * (turn - twist[:, :2] / depth[:, None])
+        return self._f * (turn - twist[:, :2] / depth[:, None])
 
     def pose(self, times: Times) -> NDArray[np.float64]:
         """True camera-to-world poses (times, 4, 4)."""
@@ -354,18 +358,25 @@ class MovingCamera:
 
     def _seen(self, t: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         pose = self.motion.pose(np.array([t]))[0]
-        level, depth = self.world.seen(
-            pose[:3, 3], self._rays @ pose[:3, :3].T, 1 / float(self.focal)
-        )
+        level, depth = self.world.seen(pose[:3, 3], self._rays @ pose[:3, :3].T, 1 / self._f)
         return level.reshape(self.size[::-1]), depth.reshape(self.size[::-1])
 
     @functools.cached_property
     def _rays(self) -> NDArray[np.float64]:
         width, height = self.size
         y, x = np.mgrid[:height, :width].reshape(2, -1)
-        camera = self.camera
-        across, down = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
-        return np.stack([across, down, np.ones(len(x))], 1)
+        seen = self.camera.normalise(x, y)
+        if np.isnan(seen).any():
+            raise InputError(
+                f"the lens {self.camera} has no inverse in an image of {width}x{height} pixels; "
+                "give a longer focal length or less distortion"
+            )
+        return np.concatenate([seen, np.ones((len(x), 1))], 1)
+
+    @property
+    def _f(self) -> float:
+        """The focal length of both axes (px), their geometric mean."""
+        return math.sqrt(self.camera.fx * self.camera.fy)
 
     def _seconds(self, times: Times) -> NDArray[np.float64]:
         rounded = np.atleast_1d(microseconds(times))
@@ -471,6 +482,7 @@ def motion_scene(
     sensor: Sensor | None = None,
     texture: str | None = None,
     speed: float | int | None = None,
+    lens: PinholeCamera | None = None,
 ) -> tuple[Recording, MovingCamera]:
     """A scene of `MOTION_SCENES` by name, recorded by an ideal event camera, and its truth.
 
@@ -486,7 +498,7 @@ def motion_scene(
     1.8 rad/s, in random directions. "varying" motion adds sinusoids of 1 to 2 Hz to each component
     of T and Omega, with vectors of amplitudes of random direction and 60 % of the mean's length;
     "linear" starts at half the drawn motion and changes in a random direction by twice its length
-    per second. Deterministic in `seed`.
+    per second. `lens` is that of `MovingCamera`. Deterministic in `seed`.
 
     Raises `InputError` for an unknown name or motion, and where the camera leaves the world.
     """
@@ -529,7 +541,7 @@ def motion_scene(
         else:
             pace = rng.uniform(0.6, 1.0) if speed is None else float(speed)
             moved = _drawn(rng, motion, pace, rng.uniform(0.4, 1.8))
-    source = MovingCamera(world, moved, size, focal, duration)
+    source = MovingCamera(world, moved, size, focal, duration, lens)
     return simulate_motion(source, sensor, seed, f"{name} {motion}"), source
 
 

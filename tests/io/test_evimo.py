@@ -86,9 +86,12 @@ def test_it_can_be_stored_and_columns_may_be_arrays_of_one(folder, tmp_path):
     assert len(back.poses) == 3 and len(back.frames) == 2
 
 
-def test_another_model_of_distortion_makes_no_camera(folder):
-    other = {**META, "meta": {**META["meta"], "dist_model": "equidistant"}}
-    assert evimo.read(folder, meta=other).camera is None
+def test_models_of_distortion(folder):
+    fisheye = {**META, "meta": {**META["meta"], "dist_model": "equidistant", "k4": 0.1}}
+    camera = evimo.read(folder, meta=fisheye).camera
+    assert (camera.model, camera.distortion) == ("equidistant", (-0.1, 0.05, 0.0, 0.1))
+    other = evimo.read(folder, meta={**META, "meta": {**META["meta"], "dist_model": "fov"}})
+    assert other.camera is None and "'fov'" in other.describe_left_out("camera")
 
 
 def test_a_folder_of_the_classical_camera(tmp_path):

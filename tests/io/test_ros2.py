@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from jaxevent import io
 from jaxevent.errors import InputError, MissingExtra
-from jaxevent.io import bags, prophesee, ros_events
+from jaxevent.io import bags, prophesee, ros_events, ros_messages
 from jaxevent.recording import Events
 
 pytest.importorskip("rosbags")
@@ -84,15 +84,19 @@ def test_bytes_of_arrays_are_what_rosbags_serialises(little_endian, seed, count,
     data = bytes(store.serialize_cdr(array, kind, little_endian=little_endian))
 
     bag = object.__new__(bags.Bag)
-    bag.is_ros1, bag.path = False, Path("a")
+    bag.path = Path("a")
+    fields = {name: fields for name, (_, fields) in store.fielddefs.items()}
+    layout = ros_messages.Layout(fields, kind, False)
+    names = ros_events._names(layout)
     for filled in (data, data + bytes(3)):
-        size, pieces = ros_events._array(bag, "/events", filled)
-        assert size == SIZE
-        t, x, y, p = ros_events._columns(bag, "/events", pieces)
+        read = layout.read(filled)
+        assert (read["width"], read["height"]) == SIZE
+        assert read["header"]["frame_id"] == "c" * message
+        t, x, y, p = ros_events._columns(bag, "/events", names, read["events"])
         got = Events(t, x.astype("u2"), y.astype("u2"), p.astype(bool))
         assert_events(got, events)
-    with pytest.raises(InputError, match="bytes for .* events, not"):
-        ros_events._array(bag, "/events", data[:-1])
+    with pytest.raises(ValueError, match="bytes for .* elements, not"):
+        layout.read(data[:-1])
 
 
 def test_packets_in_a_bag_of_ros_1(tmp_path, small_blocks):
