@@ -1,4 +1,4 @@
-.PHONY: demo test suite quick lint docs bench gpu clean
+.PHONY: demo test suite quick lint docs bench versions gpu clean
 .DELETE_ON_ERROR:
 
 # Python keeps the bytecode of what is imported, whatever the environment says: nothing else is
@@ -45,6 +45,11 @@ docs: .venv/docs.stamp
 
 bench: .venv/bench.stamp
 	$(bin)/python experiments/bench.py
+
+# Each Python that this machine has, with the oldest and with the newest dependencies; minutes each.
+versions: .venv/made.stamp
+	@$(pip) uv
+	$(bin)/python experiments/versions.py
 
 # All tests, then the table of speed, with an NVIDIA GPU.
 gpu: .venv/gpu.stamp

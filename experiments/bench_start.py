@@ -24,7 +24,7 @@ COMMAND = (sys.executable, "-c", PROGRAM, "reconstruct", str(CROP), "--rate", "2
 
 def seconds(method: str, caches: Path, out: Path) -> float:
     """Of one process."""
-    folders = {"NUMBA_CACHE_DIR": str(caches), "JAXEVENT_CACHE": str(caches)}
+    folders = {"JAXEVENT_CACHE": str(caches)}
     kept = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     words = (*COMMAND, "--method", method, "--out", str(out))

@@ -157,6 +157,13 @@ MUTATIONS = (
         "tests/egomotion/test_egomotion_voting.py -k carries_the_score",
     ),
     Mutation(
+        "a file of compiled code is unpickled whoever wrote it",
+        "jaxevent/kernels/kept.py",
+        "return pickle.loads(payload) if own else None",
+        "return pickle.loads(payload)",
+        "tests/kernels/test_kept.py -k signed",
+    ),
+    Mutation(
         "a layer of the house imports upwards",
         "jaxevent/recording.py",
         "import numpy as np\n",

@@ -2,16 +2,23 @@
 
 Compiling takes seconds, running often less. So `import jaxevent` tells JAX to keep programs that
 took longer than `LEAST` to compile. JAX's own settings win: jax_compilation_cache_dir,
-JAX_COMPILATION_CACHE_DIR, JAX_ENABLE_COMPILATION_CACHE. JAXEVENT_CACHE=0 leaves all as it is, and
-JAXEVENT_CACHE=FOLDER names another folder.
+JAX_COMPILATION_CACHE_DIR, JAX_ENABLE_COMPILATION_CACHE. JAXEVENT_CACHE=0 leaves all as it is and
+keeps nothing, and JAXEVENT_CACHE=FOLDER names another folder.
+
+Machine code that is loaded runs with the user's rights. So the folder is the user's alone: it is
+made with mode 0700, and not used where another user owns it or may write to it. Files of kernels,
+which hold pickles (`jaxevent.kernels.kept`), are read under a key that no other user can read
+(`secret_key`).
 """
 
 import contextlib
+import functools
 import gc
 import hashlib
 import os
 import platform
 import sys
+import tempfile
 import warnings
 from pathlib import Path
 
@@ -20,6 +27,9 @@ LEAST = 0.3  # s; shorter compilations are not worth a file
 # Of Linux's limit of 65,530, at which LLVM aborts the process. The programs that a method needs
 # for a recording of another shape have 500 (smoother) to 900 (mc).
 MAPS = 30_000
+
+KEY_BYTES = 32
+_OPEN = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)  # which not every system has
 
 
 def keep_compiled() -> Path | None:
@@ -49,16 +59,74 @@ def keep_compiled() -> Path | None:
 
 
 def folder_for_compiled() -> Path | None:
-    """The folder in which compiled programs are kept; None where none can be."""
+    """Return the user's own folder of compiled programs, or None where there can be none.
+
+    A folder that other users own or may write to is not used, with a warning.
+    """
     wanted = os.environ.get("JAXEVENT_CACHE", "")
     if wanted == "0":
         return None
-    folder = (Path(wanted) if wanted else _user_folder()) / _processor()
+    base = (Path(wanted) if wanted else _user_folder()).absolute()
+    folder = _own_folder(base)
+    if folder is not None and not folder.is_dir():  # somebody removed it meanwhile
+        _own_folder.cache_clear()
+        secret_key.cache_clear()
+        folder = _own_folder(base)
+    return folder
+
+
+@functools.cache
+def secret_key(folder: Path) -> bytes | None:
+    """Return the key of files in the folder, made at first; None where it cannot be kept.
+
+    It is random, and its file is readable by the user alone. A file that other users own or may
+    read is replaced, so that what was written under it is compiled again.
+    """
+    path = folder / "key"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:  # no home, as in some containers: everything works without
+        for _ in range(3):  # other processes may make one at the same time
+            key = _read_key(path)
+            if key is not None:
+                return key
+            _make_key(path)
+    except OSError:
+        pass
+    return None
+
+
+def _read_key(path: Path) -> bytes | None:
+    """The content of a key's file; None where there is none, or not the user's alone."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | _OPEN)
+    except OSError:
         return None
-    return folder if os.access(folder, os.W_OK) else None
+    try:
+        status = os.fstat(descriptor)
+        private = not _foreign_access(status) and not (_HAS_USERS and status.st_mode & 0o077)
+        content = os.read(descriptor, KEY_BYTES + 1)
+    except OSError:
+        return None
+    finally:
+        os.close(descriptor)
+    return content if private and len(content) == KEY_BYTES else None
+
+
+def _make_key(path: Path) -> None:
+    """Make a key where there is no file, or one of no use; another process's key stays."""
+    descriptor, name = tempfile.mkstemp(dir=path.parent)  # with mode 0600
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(os.urandom(KEY_BYTES))
+        try:
+            os.link(name, path)
+        except FileExistsError:
+            if _read_key(path) is None:
+                path.unlink(missing_ok=True)
+        except OSError:  # a file system without links
+            os.replace(name, path)
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(name)
 
 
 def release_compiled(maps: int = MAPS) -> bool:
@@ -77,6 +145,40 @@ def release_compiled(maps: int = MAPS) -> bool:
     jax.clear_caches()
     gc.collect()
     return True
+
+
+_HAS_USERS = hasattr(os, "geteuid")  # elsewhere the folders of a profile are the user's alone
+
+
+@functools.cache
+def _own_folder(base: Path) -> Path | None:
+    folder = base / _processor()
+    try:
+        for one in [*reversed(base.parents), base, folder]:
+            if not one.is_dir():
+                one.mkdir(mode=0o700, exist_ok=True)
+        for one in (base, folder):
+            reason = _foreign_access(one.stat())
+            if reason:
+                warnings.warn(
+                    f"{one}: compiled programs are neither kept nor looked for there, as {reason}; "
+                    "remove the folder, or name one of your own by JAXEVENT_CACHE=FOLDER, or "
+                    "keep none by JAXEVENT_CACHE=0",
+                    stacklevel=3,
+                )
+                return None
+    except OSError:  # no home, as in some containers: everything works without
+        return None
+    return folder if os.access(folder, os.W_OK) else None
+
+
+def _foreign_access(status: os.stat_result) -> str:
+    """Why a folder or file may hold what another user wrote; empty where it may not."""
+    if not _HAS_USERS:
+        return ""
+    if status.st_uid != os.geteuid():
+        return f"the user {status.st_uid} owns it"
+    return "other users may write to it" if status.st_mode & 0o022 else ""
 
 
 def _user_folder() -> Path:

@@ -39,6 +39,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jaxevent.dispatch import check_platform
 from jaxevent.errors import InputError
 
 AXIS = "devices"
@@ -66,8 +67,18 @@ def full_precision(function: Callable[Q, T]) -> Callable[Q, T]:
     return precise
 
 
+def double_precision(enabled: bool) -> contextlib.AbstractContextManager[Any]:
+    """Compute in double precision within a `with` block, or in single precision."""
+    if hasattr(jax, "enable_x64"):  # since JAX 0.8
+        return jax.enable_x64(enabled)
+    from jax.experimental import enable_x64  # ty: ignore[missing-module-member]
+
+    return enable_x64(enabled)
+
+
 def accelerated() -> bool:
     """Whether JAX computes on a GPU, or another device than the CPU, unless told otherwise."""
+    check_platform()
     return jax.default_backend() != "cpu"
 
 
@@ -81,6 +92,7 @@ def local() -> list[Any]:
 
     `jax.default_device` so confines what runs under it to one.
     """
+    check_platform()
     chosen = jax.config.jax_default_device  # ty: ignore[missing-attribute]
     if chosen is None:
         return list(jax.local_devices())

@@ -14,6 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from jaxevent.dispatch import check_platform
 from jaxevent.errors import InputError
 
 T = TypeVar("T", bound="Parameters")
@@ -291,6 +292,7 @@ class Parameters(_Module):
         cls.__doc__ = "\n".join([about, "", "Arguments:", *_described(cls)])
 
     def __init__(self, *, preset: str | None = None, **values: Any):
+        check_platform()  # the first arrays that JAX makes
         _refuse_unknown(values, {**self.numbers, **self.choices, "preset": None})
         if preset is not None:
             if preset not in self.presets:

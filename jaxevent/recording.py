@@ -740,14 +740,14 @@ class Recording(Shown):
         rows = None
         if self.frames is not None:
             rows = slice(*np.searchsorted(self.frames.t, [t0, t1]))
+        names = ("frames", "poses", "imu", "triggers")
+        cuts = {name: cut(getattr(self, name)) for name in names}
         part = dataclasses.replace(
             self,
             extra=self._extra_of(rows),
             events=self.events[self.events.index(t0) : self.events.index(t1)],
-            frames=cut(self.frames),
-            poses=cut(self.poses),
-            imu=cut(self.imu),
-            triggers=cut(self.triggers),
+            left_out=self._left_out_of(cuts, "outside the times taken"),
+            **cuts,
         )
         if not len(part.events) and part.frames is None:
             raise InputError(
@@ -758,13 +758,25 @@ class Recording(Shown):
 
     def describe_left_out(self, field: str) -> str:
         """The end of a message that misses a field that is None: what the file holds of it."""
-        return f" ({self.left_out[field]})" if field in self.left_out else ""
+        is_missing = getattr(self, field) is None
+        return f" ({self.left_out[field]})" if is_missing and field in self.left_out else ""
+
+    def _left_out_of(self, cuts: Mapping[str, Any], why: str) -> Mapping[str, str]:
+        """Return `left_out` with the fields that a cut leaves without a part, and `why`."""
+        left_out = dict(self.left_out)
+        for name, part in cuts.items():
+            whole = getattr(self, name)
+            if part is None and whole is not None and len(whole):
+                span = f"{whole.t[0] / 1e6:g} to {whole.t[-1] / 1e6:g} s"
+                left_out[name] = f"its {len(whole):,} {name} from {span} are {why}"
+        return left_out
 
     def with_frames(self, rows: slice | NDArray) -> "Recording":
         """The same recording with only some of its frames."""
-        frames = self.frames[rows] if self.frames is not None else None
+        frames = (self.frames[rows] if self.frames is not None else None) or None
+        left_out = self._left_out_of({"frames": frames}, "not among those chosen")
         return dataclasses.replace(
-            self, frames=frames if frames else None, extra=self._extra_of(rows)
+            self, frames=frames, extra=self._extra_of(rows), left_out=left_out
         )
 
     def _extra_of(self, rows: slice | NDArray | None) -> Mapping[str, Any]:

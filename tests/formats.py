@@ -255,10 +255,13 @@ def flatbuffer(name: bytes, fields: dict[int, tuple]) -> bytes:
     return struct.pack("<I", len(out)) + bytes(out)
 
 
-def aedat4(events, size, images=(), image_t=(), exposure=200, packet=100, streams=1):
-    """Events in packets of every `streams`-th; streams 0.. of events, then one of frames."""
+def aedat4(events, size, images=(), image_t=(), exposure=200, packet=100, streams=1, cameras=1):
+    """Events in packets of every `streams`-th; streams 0.. of events, then those of frames.
+
+    The images are those of `cameras` streams in turn.
+    """
     xml = '<dv version="2.0"><node name="outInfo" path="/mainloop/Recorder/outInfo/">'
-    kinds = ["EVTS"] * streams + ["FRME"] * (len(images) > 0)
+    kinds = ["EVTS"] * streams + ["FRME"] * cameras * (len(images) > 0)
     for number, kind in enumerate(kinds):
         xml += f'<node name="{number}" path="/mainloop/Recorder/outInfo/{number}/">'
         xml += '<attr key="compression" type="string">NONE</attr>'
@@ -279,7 +282,7 @@ def aedat4(events, size, images=(), image_t=(), exposure=200, packet=100, stream
                 held[name] = getattr(part, name)
             body = flatbuffer(b"EVTS", {0: (held.tobytes(), len(part))})
             out += struct.pack("<2i", number, len(body)) + body
-    for image, t in zip(images, image_t, strict=True):
+    for number, (image, t) in enumerate(zip(images, image_t, strict=True)):
         start = t - exposure // 2
         fields = {
             **{
@@ -292,7 +295,7 @@ def aedat4(events, size, images=(), image_t=(), exposure=200, packet=100, stream
             10: (image.tobytes(), image.size),
         }
         body = flatbuffer(b"FRME", fields)
-        out += struct.pack("<2i", streams, len(body)) + body
+        out += struct.pack("<2i", streams + number % cameras, len(body)) + body
     return bytes(out)
 
 

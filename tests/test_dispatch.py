@@ -1,9 +1,15 @@
-"""Programs of JAX run in turn, so that kernels called by them may use JAX."""
+"""Programs of JAX run in turn, so that kernels may use JAX, and on a platform that there is."""
 
+import os
 import subprocess
 import sys
 
+import jax
 import pytest
+
+import jaxevent
+from jaxevent import dispatch
+from jaxevent.errors import InputError
 
 AFTER = "import jax.numpy; jax.numpy.ones(3); import jaxevent; jaxevent.akf"
 BEFORE = "import jax, jaxevent; jax.numpy.ones(3); jaxevent.akf"
@@ -18,3 +24,35 @@ LOOK = "; from jaxevent.reconstruction.fused import images; print(images.IN_TURN
 def test_programs_run_in_turn_unless_jax_computed_before(program, said):
     done = subprocess.run([sys.executable, "-c", program + LOOK], capture_output=True, text=True)
     assert done.stdout.strip() == said, done.stderr
+
+
+@pytest.mark.parametrize(
+    "error", [AssertionError(), RuntimeError("Unable to initialize backend 'cuda': none.")]
+)
+def test_a_platform_that_is_not_there_is_refused(error, monkeypatch):
+    def absent():
+        raise error
+
+    monkeypatch.setattr(jax, "default_backend", absent)
+    dispatch.check_platform.cache_clear()
+    with pytest.raises(InputError, match="JAX_PLATFORMS is .*; unset it") as refused:
+        jaxevent.akf.Params()
+    assert str(error).removesuffix(".") in str(refused.value)
+    assert "\n" not in str(refused.value)
+    monkeypatch.undo()
+    jaxevent.akf.Params()
+
+
+@pytest.mark.slow
+def test_a_command_says_so_in_a_line(tmp_path):
+    crop = os.path.join(jaxevent.__path__[0], "data/slider_depth_crop.h5")
+    words = ["reconstruct", crop, "--method", "akf", "--out", str(tmp_path / "a.h5")]
+    done = subprocess.run(
+        [sys.executable, "-m", "jaxevent.cli", *words],
+        env={**os.environ, "JAX_PLATFORMS": "abacus"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.startswith("jaxevent: JAX_PLATFORMS is 'abacus'")
+    assert done.stderr.count("\n") == 1 and not list(tmp_path.iterdir())

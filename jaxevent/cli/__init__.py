@@ -118,13 +118,15 @@ def _shown(words: Sequence[str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _plain_warnings() -> Iterator[None]:
-    """Print each warning about input as one line, without the line of code that raised it."""
+    """Print each warning about input as one line, once, without the line of code that raised it."""
     with warnings.catch_warnings():
-        usual = warnings.showwarning
+        usual, said = warnings.showwarning, set()
 
         def show(message: Any, category: Any, *rest: Any, **more: Any) -> None:
             if issubclass(category, InputWarning):
-                _say(f"warning: {message}")
+                if str(message) not in said:
+                    _say(f"warning: {message}")
+                said.add(str(message))
             else:
                 usual(message, category, *rest, **more)
 

@@ -179,7 +179,11 @@ def attach(path: Path, response: Path, reading: dict[str, Any], out: Path) -> No
     camera = read_response(response)
     recording = arguments.open_recording(path, reading)
     if recording.frames is None:
-        raise InputError(f"{path}: holds no frames, of whose camera a response could be")
+        missing = recording.describe_left_out("frames")
+        raise InputError(
+            f"{path}: holds no frames, of whose camera a response could be{missing}; give a "
+            "recording with frames"
+        )
     told = {"response": np.asarray(camera.levels), "certainty": np.asarray(camera.weights)}
     kept = {name: values for name, values in recording.extra.items() if name != "f_Q"}
     recording = dataclasses.replace(recording, extra={**kept, **told})

@@ -154,8 +154,8 @@ def run(
         raise InputError(f"{path}: holds no events; choose another recording")
     if recording.imu is None and (imu or still is not None):
         raise InputError(
-            f"{path}: holds no IMU; leave out {'--imu' if imu else '--still'} or choose another "
-            "recording"
+            f"{path}: holds no IMU{recording.describe_left_out('imu')}; leave out "
+            f"{'--imu' if imu else '--still'} or choose another recording"
         )
     bias = None
     if recording.imu is not None and still is not None:
@@ -246,8 +246,9 @@ def _need_camera(recording: Any, kind: Any) -> None:
     if kind.needs_camera and recording.camera is None:
         others = [name for name, one in MODELS.items() if not one.needs_camera]
         raise InputError(
-            f"{recording.name}: has no calibration, which {kind.title} needs; give --focal or "
-            f"choose --model {' or '.join(others)}"
+            f"{recording.name}: has no calibration, which {kind.title} needs"
+            f"{recording.describe_left_out('camera')}; give --focal or choose --model "
+            f"{' or '.join(others)}"
         )
 
 

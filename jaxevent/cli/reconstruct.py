@@ -81,11 +81,11 @@ _MC = 5e-6  # s of a core that `mc` takes for a pixel of an image: 0.2 for 240x1
 _PATIENCE = 600.0  # s
 
 
-def _usual(has_frames: bool, pixels: int) -> str:
+def _usual(has_frames: bool, pixels: int, missing: str = "") -> str:
     """The method where none is named, for images of so many pixels in all; says why it is that."""
     seconds = _MC * pixels
     if not has_frames:
-        method, why = "high-pass", "there are no frames, so images show changes alone"
+        method, why = "high-pass", f"there are no frames{missing}, so images show changes alone"
     elif seconds > _PATIENCE:
         method, why = "aks", f"mc, the best, would take {seconds / 60:.0f} minutes of a core"
     else:
@@ -108,6 +108,7 @@ def run(
     colour: bool,
     out: Path,
 ) -> None:
+    from jaxevent.events.clocks import check_clocks, compare_clocks
     from jaxevent.io.images import read_times
     from jaxevent.methods import find
     from jaxevent.runs.protocols import frame_times
@@ -125,15 +126,25 @@ def run(
     name = recording.name
     recording = dataclasses.replace(recording, name=str(path))  # for messages
     if at == "frames" and recording.frames is None:
-        raise InputError(f"{path}: holds no frames; give --rate instead of --at frames")
+        missing = recording.describe_left_out("frames")
+        raise InputError(f"{path}: holds no frames{missing}; give --rate instead of --at frames")
     if asked is None and rate is None and recording.frames is not None:
+        if not estimator.needs_frames:
+            check_clocks(recording, values.clock_offset)
         asked = frame_times(recording.frames, values)
     elif asked is None:
-        asked = evenly(recording, 100.0 if rate is None else rate, start)
+        spanned = recording
+        if getattr(estimator, "fuses", True) or estimator.needs_frames:
+            check_clocks(recording, values.clock_offset)
+        elif compare_clocks(recording, values.clock_offset) is not None:
+            spanned = dataclasses.replace(recording, frames=None)
+        asked = evenly(spanned, 100.0 if rate is None else rate, start)
     asked = within(asked, start, stop, str(path))
     if method is None:
         pixels = len(asked) * recording.width * recording.height
-        estimator = find(_usual(recording.frames is not None, pixels), "reconstruction")
+        missing = recording.describe_left_out("frames")
+        usual = _usual(recording.frames is not None, pixels, missing)
+        estimator = find(usual, "reconstruction")
         values = estimator.Params()
     clock = time.perf_counter()
     video = estimator.estimate(recording, values, progress=show_progress())

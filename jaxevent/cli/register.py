@@ -70,7 +70,10 @@ def add(commands: Any) -> None:
     )
     _add_clock(one)
     one.add_argument(
-        "--exposure", metavar="S", type=float, help="of images in a folder, which do not tell it"
+        "--exposure",
+        metavar="S",
+        type=float,
+        help="of images in a folder, where its timestamps do not tell it",
     )
     one.add_argument(
         "--white", metavar="V", type=float, help="their value of intensity 1; default: the largest"

@@ -74,8 +74,8 @@ def choose(recording: Recording, camera: PinholeCamera | None = None) -> Choice:
         )
     if camera is None:
         line = (
-            "planar motion, since there is no calibration, which the others need; --focal PX "
-            "stands for one"
+            "planar motion, since there is no calibration, which the others need"
+            f"{recording.describe_left_out('camera')}; --focal PX stands for one"
         )
         return Choice(Planar, (line,), {})
     _, f = coordinates(recording.width, recording.height, camera)

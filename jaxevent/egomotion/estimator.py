@@ -130,7 +130,8 @@ class MotionEstimator(Estimator[P]):
         found, camera = self.find_model(model), camera or recording.camera
         if found.needs_camera and camera is None:
             raise InputError(
-                f"{recording.name}: has no calibration, which {found.title} needs; give a camera"
+                f"{recording.name}: has no calibration, which {found.title} needs"
+                f"{recording.describe_left_out('camera')}; give a camera"
             )
         self.check(recording)
         return found, camera

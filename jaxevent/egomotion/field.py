@@ -64,7 +64,8 @@ class RigidFlow:
         if self.motion.model.needs_camera and camera is None:
             raise InputError(
                 f"{self.recording.name}: has no calibration, which the flow of "
-                f"{self.motion.model.title} needs; give a camera"
+                f"{self.motion.model.title} needs{self.recording.describe_left_out('camera')}; "
+                "give a camera"
             )
         size = self.recording.height, self.recording.width
         xi, f = coordinates(size[1], size[0], camera)

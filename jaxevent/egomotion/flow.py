@@ -117,8 +117,8 @@ def iterate(
     camera = camera or recording.camera
     if motion.model.needs_camera and camera is None:
         raise InputError(
-            f"{recording.name}: has no calibration, which the flow of {motion.model.title} needs; "
-            "give a camera"
+            f"{recording.name}: has no calibration, which the flow of {motion.model.title} needs"
+            f"{recording.describe_left_out('camera')}; give a camera"
         )
     gatherer = Gatherer(
         recording,

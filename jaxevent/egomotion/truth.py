@@ -87,7 +87,8 @@ def known(
         if recording.poses is None or recording.camera is None:
             lacking = "poses" if recording.poses is None else "calibration"
             raise InputError(
-                f"{recording.name}: holds no {lacking}, which a depth belongs to; "
+                f"{recording.name}: holds no {lacking}, which a depth belongs to"
+                f"{recording.describe_left_out('poses' if lacking == 'poses' else 'camera')}; "
                 "leave it out and give a table of the true motion"
             )
         twists, f = from_poses(recording.poses, span), recording.camera.fx * recording.camera.fy

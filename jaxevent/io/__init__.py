@@ -1,20 +1,21 @@
 """Reading and writing recordings: `load` any readable file or folder, `save` as HDF5.
 
 The layouts are described in the reader modules, and what each was checked against: `aedat2`,
-`aedat4`, `columns` (tables of text and NumPy records), `event_stream`, `evimo`, `hdf5`,
+`aedat4`, `columns` (tables of text and NumPy records), `event_stream`, `evimo`, `evreal`, `hdf5`,
 `hdf5_layouts`, `mat`, `n_caltech`, `npz`, `parquet`, `prophesee`, `ros` (with `bags`,
-`ros_messages` and `ros_events`) and `text`; `time_units` finds the unit of times in tables,
-`calibration` reads files of cameras. They are imported when first needed. This module also turns
-the raw numbers of a file into checked fields, so that every reader accepts the same values and
-words its errors alike.
+`ros_messages` and `ros_events`), `text` and `timelens`; `time_units` finds the unit of times in
+tables, `calibration` reads files of cameras. They are imported when first needed. This module also
+turns the raw numbers of a file into checked fields, so that every reader accepts the same values
+and words its errors alike.
 """
 
+import codecs
 import contextlib
 import dataclasses
 import os
 import re
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,7 @@ NO_FRAMES = "none"
 _PROPHESEE = re.compile(
     rb"^% *(evt|format|version|data file|end)\b", re.I | re.M
 )  # lines of its headers
+_LINE = 1 << 12  # bytes of a line that are looked at
 _SMALL = 1 << 27  # bytes of arrays that every file may unfold to
 _MOST_COMPRESSED = 100  # times that a larger one may unfold to of its own bytes
 TIME_UNITS = ("s", "ms", "us", "ns")
@@ -67,7 +69,7 @@ READABLE = (
     "readable are a folder or zip with events.txt (Event-Camera Dataset), AEDAT 2 and 4, "
     "Prophesee RAW and DAT, Event Stream, bags of ROS 1 and ROS 2, HDF5 (jaxevent's own, DSEC, "
     "MVSEC, M3ED and others), MATLAB .mat (v5 and v7.3), N-Caltech101 .bin, folders of EVIMO2, "
-    ".npz, .npy, Parquet, Feather and tables of text"
+    "EVREAL and TimeLens, .npz, .npy, Parquet, Feather and tables of text"
 )
 
 
@@ -205,11 +207,14 @@ def _reader(path: Path, options: ReadOptions) -> Reader:
         return _hdf5_reader(path, options)
     refuse_stream(path, options)
     if is_folder:
-        from jaxevent.io import evimo
+        from jaxevent.io import evimo, evreal, timelens
 
         if evimo.knows(path):
             refuse_time_unit(path, options)
             return evimo.read
+        for layout in (evreal, timelens):
+            if layout.knows(path):
+                return layout.read
         if not (path / "events.txt").is_file():
             raise InputError(f"{path}: the folder holds no events.txt; {READABLE}")
         from jaxevent.io import text
@@ -321,7 +326,11 @@ def _zip_reader(path: Path) -> Reader:
         names = archive.namelist()
         unfolded = sum(member.file_size for member in archive.infolist())
         check_unfolded(unfolded, path.stat().st_size, str(path))
-    if any(name.rpartition("/")[2] == "events.txt" for name in names):
+        texts = find_event_texts(names)
+        if texts and texts[0].rpartition("/")[2] != "events.txt":
+            with archive.open(texts[0]) as file:
+                texts = texts if _is_table(file.readline(_LINE)) else []
+    if texts:
         from jaxevent.io import text
 
         return text.read
@@ -330,6 +339,22 @@ def _zip_reader(path: Path) -> Reader:
 
         return npz.read
     raise InputError(f"{path}: the zip holds neither events.txt nor .npy arrays; {READABLE}")
+
+
+def find_event_texts(names: Sequence[str]) -> list[str]:
+    """Return the texts of events among the names in a zip.
+
+    They are all events.txt, or else a text of any name that is the only file, as of rpg_e2vid.
+    """
+    found = [name for name in names if name.rpartition("/")[2] == "events.txt"]
+    files = [name for name in names if not name.endswith("/") and not name.startswith("__MACOSX/")]
+    return found or (files if len(files) == 1 and files[0].endswith(".txt") else [])
+
+
+def _is_table(line: bytes) -> bool:
+    """Whether a text that begins with a line can be events: width and height, or numbers."""
+    words = line.removeprefix(codecs.BOM_UTF8).split()
+    return len(words) in (2, 4) and all(re.fullmatch(rb"[+-]?[\d.eE+-]+", word) for word in words)
 
 
 def _later_hdf5(path: Path, is_folder: bool) -> bool:

@@ -44,7 +44,8 @@ _COMPRESSED = (b"\x04\x22\x4d\x18", b"\x28\xb5\x2f\xfd")  # the first bytes of L
 def read(path: Path, options: ReadOptions) -> Recording:
     """Read a file. Raises `InputError` for bad input.
 
-    `options.stream` is the number of a stream of events, needed where there are several.
+    `options.stream` is the number of a stream of events, needed where there are several, and
+    `options.frames` that of a stream of frames.
     """
     source = str(path)
     with reading(source):
@@ -57,12 +58,31 @@ def read(path: Path, options: ReadOptions) -> Recording:
         for kind in ("events", "frame", "imus", "triggers")
     }
     number, chosen = _choose(path, of_kind["events"], options.stream, streams)
-    for kind in ("frame", "imus", "triggers"):
+    unchosen: dict[str, str] = {}
+    for kind, field in (("frame", "frames"), ("imus", "imu"), ("triggers", "triggers")):
         several = of_kind[kind]
-        if len(several) == 1:
+        listed = ", ".join(map(str, several))
+        if kind == "frame" and options.without_frames:
+            continue
+        if kind == "frame" and options.frames is not None:
+            if options.frames not in map(str, several):
+                raise InputError(
+                    f"{path}: has no stream of frames {options.frames!r}; its streams of frames "
+                    f"are {listed or 'none'}"
+                )
+            chosen[kind] = int(options.frames)
+        elif len(several) == 1:
             chosen[kind] = several[0]
         elif number is not None and len(several) == len(of_kind["events"]):
             chosen[kind] = several[of_kind["events"].index(number)]
+        elif several:
+            remedy = f"; choose one with frames={several[0]}" if kind == "frame" else ""
+            unchosen[field] = f"the streams {listed} hold some, of which none is chosen{remedy}"
+    if number is None and "frame" not in chosen:
+        raise InputError(
+            f"{path}: holds no events, and frames in the streams "
+            f"{', '.join(map(str, of_kind['frame']))}; choose one with frames="
+        )
     frames, rgb, imu, triggers = _others(path, chosen, options.in_memory)
     extra: dict[str, NDArray] = {} if rgb is None else {"rgb": rgb}
     left_out = [
@@ -91,7 +111,16 @@ def read(path: Path, options: ReadOptions) -> Recording:
             yield first, _columns(held)
 
     events = decoded(decode, size, source, options)
-    return Recording(path.stem, *size, events, frames, imu=imu, extra=extra, triggers=triggers)
+    return Recording(
+        path.stem,
+        *size,
+        events,
+        frames,
+        imu=imu,
+        extra=extra,
+        triggers=triggers,
+        left_out=unchosen,
+    )
 
 
 def _choose(

@@ -55,6 +55,14 @@ def rectify_map(path: Path) -> Path | None:
     return _existing(path, "rectify_map.h5") if path.suffix in (".h5", ".hdf5") else None
 
 
+def images(path: Path) -> Path | None:
+    """The folder of the images that DSEC's frame camera took beside the events in `path`."""
+    if path.name != "events.h5" or path.parts[-3:-2] != ("events",):
+        return None
+    folder = path.parents[2] / "images" / path.parent.name
+    return next((one for one in (folder / "rectified", folder) if one.is_dir()), None)
+
+
 def _existing(path: Path, name: str) -> Path | None:
     other = path.with_name(name)
     return other if name != path.name and other.is_file() else None

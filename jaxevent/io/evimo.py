@@ -26,8 +26,6 @@ Polarities are as stored. The layout's description says that those of the Samsun
 Decoder. NumPy's own files, read here; checked against files written by the layout.
 """
 
-import functools
-import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -35,19 +33,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.arrays import LUMA
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.io import (
-    calibrated,
-    check_unfolded,
-    reading,
-    sensor_size,
-    times,
-    vectors,
-    whole_number,
+from jaxevent.io import calibrated, reading, sensor_size, times, vectors, whole_number
+from jaxevent.io.decoded import DecodedImages, decoded
+from jaxevent.io.images import grey_of_bgr
+from jaxevent.io.numpy_files import (
+    events_decoder,
+    open_archive,
+    open_events,
+    read_header,
+    read_member,
 )
-from jaxevent.io.decoded import BLOCK, Columns, DecodedImages, decoded
 from jaxevent.io.options import ReadOptions
 from jaxevent.lenses import LENSES, find_model
 from jaxevent.recording import Frames, Imu, Poses, Recording
@@ -97,40 +94,18 @@ def read(
     told = told or ((shapes[0][1], shapes[0][0]) if shapes else None)
     otherwise = f"{path}: no image tells the sensor's size;"
     size = sensor_size(options.size, told, frames=frames, otherwise=otherwise)
-    events = decoded(_decoder(path), size, source, options)
+    columns = open_events(*(path / f"dataset_events_{name}.npy" for name in ("t", "xy", "p")))
+    unit = "s" if columns["t"].dtype.kind == "f" else "us"
+    events = decoded(events_decoder(columns, unit, source), size, source, options)
+    if frames is None and parts["classical"].names:
+        left_out["frames"] = (
+            f"the times of the {len(parts['classical'].names):,} images in dataset_classical.npz "
+            "are pickled in dataset_info.npz; if you trust it, give its meta to "
+            "jaxevent.io.evimo.read"
+        )
     return Recording(
         path.name, *size, events, frames, camera, poses, samples, extra, left_out=left_out
     )
-
-
-def _decoder(path: Path) -> Any:
-    columns: dict[str, NDArray] = {}
-    for name in ("t", "xy", "p"):
-        file = path / f"dataset_events_{name}.npy"
-        with reading(str(file)):
-            stored = np.load(file, mmap_mode="r", allow_pickle=False)
-        width = 2 if name == "xy" else 1
-        if stored.shape not in ((len(stored), width), (len(stored),)[: 3 - width]):
-            raise InputError(
-                f"{file}: has shape {stored.shape}; it must be (events, {width}), one row per event"
-            )
-        columns[name] = stored.reshape(len(stored), width)
-    lengths = [len(column) for column in columns.values()]
-    if len(set(lengths)) != 1:
-        raise InputError(
-            f"{path}: t, xy and p have {lengths[0]}, {lengths[1]} and {lengths[2]} events; they "
-            "must be equally long"
-        )
-    return functools.partial(_events, str(path), columns)
-
-
-def _events(
-    source: str, columns: Mapping[str, NDArray], state: int | None
-) -> Iterator[tuple[int, Columns]]:
-    for row in range(state or 0, len(columns["t"]), BLOCK):
-        t, xy, p = (np.array(columns[name][row : row + BLOCK]) for name in ("t", "xy", "p"))
-        in_seconds = times(t[:, 0], source, "event", first_row=row)
-        yield row, (in_seconds, xy[:, 0].copy(), xy[:, 1].copy(), p[:, 0])
 
 
 def _info(path: Path) -> Iterator[tuple[str, NDArray]]:
@@ -138,47 +113,15 @@ def _info(path: Path) -> Iterator[tuple[str, NDArray]]:
     file = path / "dataset_info.npz"
     if not file.is_file():
         return
-    with reading(str(file)), _archive(file) as archive:
+    with reading(str(file)), open_archive(file) as archive:
         for name in ("K", "D"):
             if f"{name}.npy" in archive.namelist():
-                values = _member(archive, f"{name}.npy", str(file))
+                values = read_member(archive, f"{name}.npy", str(file))
                 if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
                     raise InputError(f"{file}: {name} must be finite numbers; correct it")
                 yield name, values
         if "meta.npy" in archive.namelist():
             yield "arrays_left_out", np.array(["meta"])
-
-
-def _archive(file: Path) -> zipfile.ZipFile:
-    archive = zipfile.ZipFile(file)
-    unfolded = sum(member.file_size for member in archive.infolist())
-    check_unfolded(unfolded, file.stat().st_size, str(file))
-    return archive
-
-
-def _member(archive: zipfile.ZipFile, name: str, source: str) -> NDArray:
-    """An array of numbers; `InputError` for objects, and for a shape that its bytes cannot fill."""
-    with archive.open(name) as stream:
-        shape, dtype = _header(stream, f"{source}: {name}")
-        if shape is None or dtype is None:
-            raise InputError(f"{source}: {name} is pickled, which is not read; store numbers")
-        if int(np.prod(shape, dtype=object)) * dtype.itemsize > archive.getinfo(name).file_size:
-            raise InputError(f"{source}: {name} is cut off; fetch the file again")
-    with archive.open(name) as stream:
-        return np.lib.format.read_array(stream, allow_pickle=False)
-
-
-def _header(stream: Any, source: str) -> tuple[tuple[int, ...] | None, np.dtype | None]:
-    """The shape and type of an array, both None of one that holds objects."""
-    major, _ = np.lib.format.read_magic(stream)
-    read_header = {
-        1: np.lib.format.read_array_header_1_0,
-        2: np.lib.format.read_array_header_2_0,
-    }
-    if major not in read_header:
-        raise InputError(f"{source}: is an array of an unknown version; store it by numpy.save")
-    shape, _, dtype = read_header[major](stream)
-    return (None, None) if dtype.hasobject else (shape, dtype)
 
 
 class _Images:
@@ -190,12 +133,12 @@ class _Images:
         self.names: set[str] = set()
         if not self.file.is_file():
             return
-        with reading(str(self.file)), _archive(self.file) as archive:
+        with reading(str(self.file)), open_archive(self.file) as archive:
             self.names = {name for name in archive.namelist() if name.startswith(f"{kind}_")}
             if self.names:
                 first = min(self.names)
                 with archive.open(first) as stream:
-                    shape, _ = _header(stream, f"{self.file}: {first}")
+                    shape, _ = read_header(stream, f"{self.file}: {first}")
                 if shape is None or len(shape) not in (2, 3):
                     raise InputError(f"{self.file}: {first} is no image (height, width)")
                 self.shape = (shape[0], shape[1])
@@ -218,13 +161,13 @@ class _Images:
         return f"{self.kind}_{whole_number(frame['id'], str(self.file), 'id'):010d}.npy"
 
     def _images(self, names: Sequence[str]) -> Iterator[NDArray]:
-        with reading(str(self.file)), _archive(self.file) as archive:
+        with reading(str(self.file)), open_archive(self.file) as archive:
             for name in names:
-                image = _member(archive, name, str(self.file))
+                image = read_member(archive, name, str(self.file))
                 if self.kind == "depth":
                     yield (image / 1000).astype(np.float32)
-                elif image.ndim == 3:  # of OpenCV: blue, green, red
-                    yield np.rint(image[..., :3] @ LUMA[::-1]).astype(image.dtype)
+                elif image.ndim == 3:
+                    yield grey_of_bgr(image)
                 else:
                     yield image
 

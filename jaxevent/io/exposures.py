@@ -1,8 +1,8 @@
 """Exposure stacks, and the camera responses that come of them, as files that any program can write.
 
 A stack is a folder of PNG, JPEG or TIFF images of 8 bits of one still scene. Exposure times (s) are
-in its file exposures.txt, lines "s name"; or in the images' own EXIF data. Colours become grey
-(ITU-R 601 luma).
+in its file exposures.txt, lines "s name"; or in DSEC's file of the starts and ends of exposures
+(`images`); or in the images' own EXIF data. Colours become grey (ITU-R 601 luma).
 
 A response is CSV with the columns grey, intensity and certainty: evenly spaced grey values from 0
 to 1, the intensity of each, which never falls, and how certain it is, at most 1.
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from jaxevent.camera import TableResponse
 from jaxevent.errors import InputError
 from jaxevent.io import reading
-from jaxevent.io.images import SUFFIXES, read_image
+from jaxevent.io.images import SUFFIXES, read_exposures, read_image
 from jaxevent.io.output import complete
 
 TIMES = "exposures.txt"
@@ -37,6 +37,8 @@ def read_stack(
     names: list[str] | None = None
     if exposures is None and (folder / TIMES).is_file():
         exposures, names = _listed(folder / TIMES)
+    elif exposures is None and (lengths := read_exposures(folder)) is not None:
+        exposures = (lengths * 1e-6).tolist()
     files = sorted(one for one in folder.iterdir() if one.suffix.lower() in SUFFIXES)
     files = files if names is None else [folder / name for name in names]
     if not files:

@@ -54,7 +54,7 @@ from jaxevent.io.columns import first_and_last, signed, stated_unit, unsigned_of
 from jaxevent.io.decoded import decoded
 from jaxevent.io.description import CLOCK
 from jaxevent.io.disorder import Columns, examine
-from jaxevent.io.hdf5_files import array, attribute, dataset, open_file
+from jaxevent.io.hdf5_files import array, attribute, dataset, describe_images, open_file
 from jaxevent.io.options import ReadOptions
 from jaxevent.io.output import complete_hdf5
 from jaxevent.io.time_units import (
@@ -529,9 +529,33 @@ def _recording(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
         triggers = Triggers(t, edge.astype(np.int8), channel.astype(np.uint8))
     name = str(attributes.get("name", path.stem))
     events = StoredEvents(columns, size, source, offset, table).repaired(options)
+    left_out = {} if frames is not None else _describe_frames(file, path)
     return Recording(
-        name, *size, events, frames, camera, poses, imu, extra, triggers, notes=tuple(notes)
+        name,
+        *size,
+        events,
+        frames,
+        camera,
+        poses,
+        imu,
+        extra,
+        triggers,
+        notes=tuple(notes),
+        left_out=left_out,
     )
+
+
+def _describe_frames(file: h5py.File, path: Path) -> dict[str, str]:
+    """What `Recording.left_out` says of frames in the file, or of DSEC's beside it."""
+    images = companions.images(path)
+    if images is None:
+        return describe_images(file)
+    return {
+        "frames": (
+            f"{images} holds those of another camera; bring them onto the events' pixels by "
+            "jaxevent register"
+        )
+    }
 
 
 def _is_dsec(file: Any) -> bool:

@@ -27,6 +27,7 @@ from jaxevent.io import check_unfolded, most_unfolded, reading
 
 _MOST_COMPRESSED = 4096  # times smaller than in memory that any filter makes real events
 _HEAPS = 1 << 24
+_MOST_OBJECTS, _MOST_NAMES = 1000, 4  # looked at for images, and named
 _COPY = (
     "only what a file itself holds is read, so copy all into one file: if you trust it, by "
     "jaxevent convert --trust"
@@ -210,6 +211,42 @@ def dataset(file: h5py.File, name: str, source: str, undone: Sequence[int] = ())
                 "damaged or incomplete, so fetch it again"
             )
     return found
+
+
+def find_images(file: h5py.File) -> list[str]:
+    """Return the names of datasets that look like images: three or four axes, of 8 or 16 bits.
+
+    Links to other files are not followed, and of large files the first objects are looked at.
+    """
+    found: list[str] = []
+    seen = 0
+
+    def look(name: str, item: h5py.Dataset | h5py.Group) -> bool | None:
+        nonlocal seen
+        seen += 1
+        if isinstance(item, h5py.Dataset) and not name.startswith("extra/"):
+            # Of a virtual dataset the shape cannot be asked for without following it.
+            is_virtual = item.id.get_create_plist().get_layout() == h5py.h5d.VIRTUAL
+            if not is_virtual and item.dtype in (np.uint8, np.uint16) and item.ndim in (3, 4):
+                found.append(name)
+        return True if seen >= _MOST_OBJECTS else None
+
+    file.visititems(look)
+    return found
+
+
+def describe_images(file: h5py.File) -> dict[str, str]:
+    """Return what `Recording.left_out` says of images in a file whose frames are not read."""
+    names = find_images(file)
+    if not names:
+        return {}
+    listed = ", ".join(names[:_MOST_NAMES]) + (", ..." if len(names) > _MOST_NAMES else "")
+    return {
+        "frames": (
+            f"{listed} may be images, of another layout or camera; store them as images with times "
+            "in a folder or as t and image in HDF5, and add them by jaxevent register"
+        )
+    }
 
 
 def _check_deflated(stored: h5py.Dataset, source: str) -> None:

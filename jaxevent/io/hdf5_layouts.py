@@ -10,7 +10,9 @@
     Metavision                  /CD/events, records with fields t, x, y, p, also compressed by ECF
                                 (`ecf`); attribute geometry; /EXT_TRIGGER/events, records t, p, id
     v2e                         /events, or the only dataset, (N, 4) or (4, N): t in us, x, y, p;
-                                the order is told by the content; 4294967295 is a polarity of -1
+                                the order is told by the content; 4294967295 is a polarity of -1;
+                                /frame (frames, H, W) uint8, /frame_ts in us, /frame_idx, the
+                                number of events before each frame, which is not needed
     others                      /events or the file itself with t, x, y and p, whole lists or
                                 records, under the names that `jaxevent.arrays.NAMES` lists
 
@@ -51,7 +53,8 @@ from jaxevent.io.hdf5 import (
     convert_columns,
     read_stored,
 )
-from jaxevent.io.hdf5_files import array, attribute, dataset, filters_of
+from jaxevent.io.hdf5_files import array, attribute, dataset, describe_images, filters_of
+from jaxevent.io.images import grey_of_bgr
 from jaxevent.io.options import ReadOptions
 from jaxevent.io.time_units import SAMPLE, InferredUnit
 from jaxevent.io.truth import read_poses
@@ -97,6 +100,8 @@ def _recording(file: Any, path: Path, options: ReadOptions) -> Recording:
         name_of_t = (_fields(file, name) or {})["t"]
         columns = _columns(file, name, source)
     images = _images(file, source) if isinstance(file.get("images"), h5py.Group) else None
+    if isinstance(file.get("frame"), h5py.Dataset):
+        images = _images_of_v2e(file, source)
     told = _told_size(file, source) if size is None else None
     if told is None and images is not None:
         told = (images[1].shape[2], images[1].shape[1])
@@ -114,8 +119,15 @@ def _recording(file: Any, path: Path, options: ReadOptions) -> Recording:
         t = clock.read(images[0], source, "image", notes)
         frames = Frames(t, images[1], np.zeros_like(t))
     stored = StoredEvents(columns, size, source).repaired(options)
-    triggers = _triggers(file, source)
-    return Recording(path.stem, *size, stored, frames, triggers=triggers, notes=tuple(notes))
+    return Recording(
+        path.stem,
+        *size,
+        stored,
+        frames,
+        triggers=_triggers(file, source),
+        notes=tuple(notes),
+        left_out=describe_images(file) if frames is None else {},
+    )
 
 
 def _triggers(file: Any, source: str) -> Triggers | None:
@@ -190,6 +202,7 @@ def _m3ed(file: Any, path: Path, options: ReadOptions, group: str) -> Recording:
         table = dataset(file, f"{group}/ms_map_idx", source)
     events = StoredEvents(columns, size, source, 0, table).repaired(options)
     poses = read_poses(path, group)
+    left_out |= describe_images(file)
     return Recording(path.stem, *size, events, camera=camera, poses=poses, left_out=left_out)
 
 
@@ -317,6 +330,20 @@ def _pair(values: Any, source: str) -> tuple[int, int]:
     return first, second
 
 
+def _images_of_v2e(file: Any, source: str) -> tuple[NDArray, StoredImages] | None:
+    """The times and images of the frames that v2e keeps beside its events; None without times."""
+    stored = dataset(file, "frame", source)
+    if stored.ndim != 3 or not isinstance(file.get("frame_ts"), h5py.Dataset):
+        return None
+    stamps = array(file, "frame_ts", source)
+    if len(stamps) != len(stored):
+        raise InputError(
+            f"{source}: frame holds {len(stored)} images, frame_ts {len(stamps)} times; there must "
+            "be one time for each image"
+        )
+    return (stamps, StoredImages(stored, f"{source}: frame")) if len(stamps) else None
+
+
 def _images(file: Any, source: str) -> tuple[NDArray, DecodedImages] | None:
     """The times and images of event_utils, one dataset each, in the order of their names."""
     with reading(f"{source}: images"):
@@ -334,9 +361,7 @@ def _images(file: Any, source: str) -> tuple[NDArray, DecodedImages] | None:
         pixels = array(file, f"images/{name}", source)
         if pixels.ndim == 2:
             return pixels
-        # As event_utils stores them with OpenCV: blue, green, red.
-        grey = pixels[..., :3] @ np.array([0.114, 0.587, 0.299])
-        return (grey if pixels.dtype.kind == "f" else np.rint(grey)).astype(pixels.dtype)
+        return grey_of_bgr(pixels)  # as event_utils stores them with OpenCV
 
     images = DecodedImages(
         lambda row: (image(name) for name in names[row:]),

@@ -3,8 +3,10 @@
 A series is a folder of PNG, JPEG, TIFF or .npy files, taken in the order of their names; or one
 .npy file (images, height, width); or one HDF5 file of the datasets t and image, as `jaxevent
 reconstruct` writes. Integers of 8 or 16 bits and floats are linear intensities. Colours become grey
-(ITU-R 601 luma). Timestamps are lines "t", one per image, or "t name"; where all are whole numbers
-they are microseconds, otherwise seconds.
+(ITU-R 601 luma). Timestamps are lines "t", one per image, or "t name", or "start, end" of each
+exposure, as DSEC has them; where all are whole numbers they are microseconds, otherwise seconds.
+The times of DSEC's images are found where DSEC keeps them (https://dsec.ifi.uzh.ch/data-format):
+images/left/exposure_timestamps.txt, or images/timestamps.txt, of images/left/rectified.
 """
 
 import contextlib
@@ -12,7 +14,7 @@ import dataclasses
 import math
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -22,13 +24,16 @@ from numpy.typing import NDArray
 
 from jaxevent.arrays import LUMA
 from jaxevent.errors import InputError, InputWarning
-from jaxevent.io import reading
+from jaxevent.io import check_unfolded, reading
+from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.output import complete
 from jaxevent.io.time_units import NAMES, SCALES, unit_of_name
 from jaxevent.recording import microseconds
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
-TIMES = ("timestamps.txt", "images.txt")
+TIMES = ("timestamps.txt", "images.txt", "timestamp.txt")
+_EXPOSURES = "*exposure_timestamps*.txt"
+_INNER = ("rectified", "distorted")  # folders of images in DSEC's folder of a camera
 _DEEP_COLOUR = re.compile(r"\b(L|LA|RGB\w*|CMYK);16")  # Pillow's name of how pixels are stored
 
 
@@ -36,11 +41,13 @@ _DEEP_COLOUR = re.compile(r"\b(L|LA|RGB\w*|CMYK);16")  # Pillow's name of how pi
 class Series:
     """Images at sorted times (us), each read when asked for: `read(row)` is (height, width).
 
-    `colour(row)` is (height, width, 3) uint8, red first, or None of an image that is stored
-    otherwise.
+    `exposure` is the length of each image's exposure in us, 0 where unknown; `t` is its middle
+    where it is known. `colour(row)` is (height, width, 3) uint8, red first, or None of an image
+    that is stored otherwise.
     """
 
     t: NDArray[np.int64]
+    exposure: NDArray[np.int64]
     read: Callable[[int], NDArray[np.float64]]
     colour: Callable[[int], NDArray[np.uint8] | None]
     files: tuple[Path, ...]  # that hold all this
@@ -110,22 +117,37 @@ def read_series(
         return _of_hdf5(images, scale)
     place = images if images.is_dir() else images.parent
     times = _find_timestamps(place, beside, timestamps)
-    t, names = _times(times)
+    (t, exposure), names = _times(times)
     if images.is_file():
         with reading(str(images)):
             stack = np.load(images, mmap_mode="r", allow_pickle=False)
         _check_count(images, len(stack) if stack.ndim in (3, 4) else 0, times, len(t))
-        return _series(t, lambda row: stack[row], str(images), (images, times), scale)
+        return _series(t, exposure, lambda row: stack[row], str(images), (images, times), scale)
     if names is None:
         files = sorted(p for p in images.iterdir() if p.suffix.lower() in SUFFIXES)
         _check_count(images, len(files), times, len(t))
     else:
         files = [images / name for name in names]
-    return _series(t, lambda row: _image(files[row]), str(images), (*files, times), scale)
+    return _series(t, exposure, lambda row: _image(files[row]), str(images), (*files, times), scale)
+
+
+def find_exposures(place: Path) -> Path | None:
+    """Find the file of the starts and ends of exposures as DSEC names it, of a folder of images."""
+    folders = [place, place.parent] if place.name in _INNER else [place]
+    found = [path for folder in folders for path in sorted(folder.glob(_EXPOSURES))]
+    sides = [side for side in ("left", "right") if side in place.parts]
+    of_side = [path for path in found if any(side in path.stem for side in sides)]
+    chosen = of_side if len(found) > 1 else found
+    return chosen[0] if len(chosen) == 1 else None
 
 
 def _find_timestamps(place: Path, beside: Path | None, names: Sequence[str]) -> Path:
     folders = [place] if beside is None else [place, beside]
+    if names is TIMES:
+        if (exposures := find_exposures(place)) is not None:
+            return exposures
+        if place.name in _INNER:
+            folders.append(place.parents[1])
     for path in (folder / name for name in names for folder in folders):
         if path.is_file():
             return path
@@ -145,6 +167,7 @@ def _check_count(images: Path, found: int, times: Path, expected: int) -> None:
 
 def _series(
     t: NDArray[np.int64],
+    exposure: NDArray[np.int64],
     stored: Callable[[int], NDArray],
     source: str,
     files: tuple[Path, ...],
@@ -171,7 +194,7 @@ def _series(
     def read(row: int) -> NDArray[np.float64]:
         return scale.intensity(image(row), f"{source}: image {row}")
 
-    return Series(t, read, colour, files)
+    return Series(t, exposure, read, colour, files)
 
 
 def _of_hdf5(path: Path, scale: Scale) -> Series:
@@ -190,7 +213,8 @@ def _of_hdf5(path: Path, scale: Scale) -> Series:
             "each image"
         )
     times = microseconds(t[()], f"{path}: t")
-    return _series(times, lambda row: stored[row], str(path), (path,), scale)
+    unknown = np.zeros_like(times)
+    return _series(times, unknown, lambda row: stored[row], str(path), (path,), scale)
 
 
 def _image(path: Path) -> NDArray:
@@ -245,6 +269,67 @@ def read_grey_and_colour(file: Any, source: str) -> tuple[NDArray, NDArray[np.ui
         return grey, np.asarray(image.convert("RGB"))
 
 
+def grey_of_bgr(pixels: NDArray) -> NDArray:
+    """Convert blue, green, red (height, width, 3 or 4), OpenCV's order, to grey of their type."""
+    grey = pixels[..., :3] @ LUMA[::-1]
+    return (grey if pixels.dtype.kind == "f" else np.rint(grey)).astype(pixels.dtype)
+
+
+def read_files(
+    files: Sequence[Path], source: str, in_memory: bool
+) -> tuple[NDArray | DecodedImages, dict[str, Any]]:
+    """Read images in files of their own, each checked once.
+
+    Args:
+        files: At least one file, in the order of the images.
+        source: Name of the folder for messages.
+        in_memory: False leaves the images in their files.
+
+    Returns:
+        Grey images (images, height, width), and the colours of coloured ones as `Recording.extra`
+        keeps them.
+
+    Raises:
+        InputError: An image cannot be read, or has another size or type than the first.
+    """
+    shape, kind = (0, 0), np.dtype(np.uint8)
+    grey: list[NDArray] = []
+    colours: list[NDArray[np.uint8] | None] = []
+    stored = unfolded = 0
+    are_colours, differ = True, False
+    for number, file in enumerate(files):
+        with reading(str(file)):
+            image, colour = read_grey_and_colour(file, str(file))
+            stored += file.stat().st_size
+        if number == 0:
+            shape, kind = (image.shape[0], image.shape[1]), image.dtype
+        if image.shape != shape or image.dtype != kind:
+            raise InputError(
+                f"{file}: is {image.shape[1]}x{image.shape[0]} {image.dtype} but the first image "
+                f"is {shape[1]}x{shape[0]} {kind}; all images must have the sensor's size and one "
+                "depth"
+            )
+        are_colours &= colour is not None
+        differ |= colour is not None and bool((colour != colour[..., :1]).any())
+        unfolded += image.nbytes + (0 if colour is None else colour.nbytes)
+        check_unfolded(unfolded, stored, source)
+        if in_memory:
+            grey.append(image)
+            colours.append(colour)
+    if in_memory:
+        return np.stack(grey), kept_colours(colours)
+
+    def left(which: int, shape: tuple[int, ...], kind: np.dtype) -> DecodedImages:
+        def images(row: int) -> Iterator[NDArray]:
+            for file in files[row:]:
+                yield np.asarray(read_grey_and_colour(file, str(file))[which])
+
+        return DecodedImages(images, (len(files), *shape), kind, source)
+
+    rgb = {"rgb": left(1, (*shape, 3), np.dtype(np.uint8))} if are_colours and differ else {}
+    return left(0, shape, kind), rgb
+
+
 def kept_colours(images: Sequence[NDArray[np.uint8] | None]) -> dict[str, NDArray[np.uint8]]:
     """Colours of all frames as `Recording.extra` keeps them: none if one is grey, or all are."""
     colours = [one for one in images if one is not None]
@@ -282,16 +367,39 @@ def write_intensity(path: Path, image: NDArray[np.float32]) -> None:
             Image.fromarray(image).save(partial, format="TIFF")
 
 
-def _times(path: Path) -> tuple[NDArray[np.int64], list[str] | None]:
-    """The times (us) of a file of lines "t" or "t name", and the names."""
-    lines = [line.split(maxsplit=1) for line in _lines(path)]
+def _times(path: Path) -> tuple[tuple[NDArray[np.int64], NDArray[np.int64]], list[str] | None]:
+    """The times and exposures (us) of lines "t", "t name" or "start, end", and the names."""
+    lines = [re.split(r"\s*[,;]\s*|\s+", line.strip(), maxsplit=1) for line in _lines(path)]
     if len({len(words) for words in lines}) > 1:
         raise InputError(f"{path}: some lines have a name and some have none; give all or none")
-    times = _parsed(path, [words[0] for words in lines], "give lines 't' or 't name'")
+    remedy = "give lines 't', 't name' or 'start, end'"
+    firsts = [words[0] for words in lines]
     names = [words[1].strip() for words in lines] if lines and len(lines[0]) == 2 else None
-    if names and all(re.fullmatch(r"[+-]?[\d.eE+-]+", name) for name in names):
-        raise InputError(f"{path}: has two columns of numbers; keep the times only")
-    return times, names
+    if names is None or not all(re.fullmatch(r"[+-]?[\d.eE+-]+", name) for name in names):
+        times = _parsed(path, firsts, remedy)
+        return (times, np.zeros_like(times)), names
+    both = _parsed(path, firsts + names, remedy)
+    start, end = both[: len(firsts)], both[len(firsts) :]
+    if (end < start).any() or (end[:-1] > start[1:]).any():
+        raise InputError(
+            f"{path}: has two columns of numbers; keep the times only, or the start and the end of "
+            "each exposure, which end before the next one starts"
+        )
+    return (start + (end - start) // 2, end - start), None
+
+
+def read_exposures(place: Path) -> NDArray[np.int64] | None:
+    """Read the exposures (us) of a folder's images, in the order of their names.
+
+    Returns None where no file of times has the starts and ends of exposures.
+    """
+    path = find_exposures(place) or place / TIMES[0]
+    if not path.is_file():
+        return None
+    with contextlib.suppress(InputError):  # of a file that holds something else
+        exposure = _times(path)[0][1]
+        return exposure if exposure.any() else None
+    return None
 
 
 def read_times(path: Path, span: tuple[int, int] | None = None) -> NDArray[np.int64]:

@@ -10,8 +10,9 @@
 All t are seconds. Where those of events.txt are whole numbers only, their unit is another, which is
 inferred (`time_units`) or given, and the other files are read on the clock of the events. Only
 events.txt is required, and it may be empty where there are images. In a zip the files may lie in
-one top folder. The exposure of the images is unknown: 0. Colour images become grey (ITU-R 601
-luma); where all are, `extra["rgb"]` keeps their colours.
+one top folder; a zip of one text alone, as rpg_e2vid reads, may name it otherwise. The exposure of
+the images is unknown: 0. Colour images become grey (ITU-R 601 luma); where all are, `extra["rgb"]`
+keeps their colours.
 """
 
 import re
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 from tqdm.utils import CallbackIOWrapper
 
 from jaxevent.errors import InputError
-from jaxevent.io import check_unfolded, pinhole, reading, sensor_size
+from jaxevent.io import check_unfolded, find_event_texts, pinhole, reading, sensor_size
 from jaxevent.io.columns import find, is_time, signed, stated_unit, unsigned_off
 from jaxevent.io.decoded import from_columns
 from jaxevent.io.images import kept_colours, read_grey_and_colour
@@ -41,25 +42,23 @@ def read(path: Path, options: ReadOptions) -> Recording:
     if path.is_dir():
         return _read(path, path, options)
     with reading(str(path)), zipfile.ZipFile(path) as archive:
-        inside = [
-            name
-            for name in archive.namelist()
-            if name.count("/") <= 1 and name.rpartition("/")[2] == "events.txt"
-        ]
+        inside = [name for name in find_event_texts(archive.namelist()) if name.count("/") <= 1]
         if len(inside) != 1:
             raise InputError(
                 f"{path}: holds {len(inside)} events.txt at its top or in a top folder; "
                 "make a zip of one recording"
             )
-        root = zipfile.Path(archive, inside[0].removesuffix("events.txt"))
-        return _read(path, root, options)
+        folder, _, name = inside[0].rpartition("/")
+        return _read(path, zipfile.Path(archive, folder and f"{folder}/"), options, name)
 
 
-def _read(path: Path, root: Path | zipfile.Path, options: ReadOptions) -> Recording:
-    source = f"{path}: events.txt"
+def _read(
+    path: Path, root: Path | zipfile.Path, options: ReadOptions, name: str = "events.txt"
+) -> Recording:
+    source = f"{path}: {name}"
     stamps, unit_of_stamps, images, colours = _images(path, root)
     columns, header, names = _table(
-        root / "events.txt", source, "t x y p", header="width height", progress=options.progress
+        root / name, source, "t x y p", header="width height", progress=options.progress
     )
     otherwise = (
         f"{source}: neither a first line 'width height' nor an image tells the sensor's size;"

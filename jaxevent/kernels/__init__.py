@@ -8,18 +8,21 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import kept
-from jaxevent.kernels.parts import part_of_others
+from jaxevent.kernels import kept, support
 
 # numba makes two functions more of each. The one for those that call it by its address is left out;
 # without the one for Python a call from there would end the process.
-_USUAL: dict[str, Any] = {"nogil": True, "no_cfunc_wrapper": True}
+_USUAL: dict[str, Any] = {"nogil": True}
 # Counting references to arrays is two thirds of a function that takes many of them.
-_LEAN: dict[str, Any] = {"_nrt": False}
+_LEAN: dict[str, Any] = {}
+if support.HAS_INTERNALS:
+    from jaxevent.kernels.internals import part_of_others
+
+    _USUAL |= {"no_cfunc_wrapper": True}
+    _LEAN |= {"_nrt": False}
 # Sums in any order, so that several are taken at once.
 _LOOSE: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz"}}
 
@@ -31,7 +34,7 @@ def compiled(function: Callable) -> Any:
 
 def part(function: Callable) -> Any:
     """The same for what compiled functions alone call: they are kept, with it inside."""
-    return numba.njit(error_model="numpy", **_USUAL)(inspect.unwrap(function))
+    return _inside(function, error_model="numpy", **_USUAL)
 
 
 def lean(function: Callable) -> Any:
@@ -40,8 +43,8 @@ def lean(function: Callable) -> Any:
 
 
 def lean_part(function: Callable) -> Any:
-    """The same for what such functions alone call; raises `TypeError` where Python does."""
-    return part_of_others(function, error_model="numpy", nogil=True, **_LEAN)
+    """The same for what such functions alone call; not for calls from Python."""
+    return _lean_inside(function, error_model="numpy", nogil=True, **_LEAN)
 
 
 def fast(function: Callable) -> Any:
@@ -50,8 +53,18 @@ def fast(function: Callable) -> Any:
 
 
 def fast_part(function: Callable) -> Any:
-    """The same for what such functions alone call; raises `TypeError` where Python does."""
-    return part_of_others(function, nogil=True, **_LEAN, **_LOOSE)
+    """The same for what such functions alone call; not for calls from Python."""
+    return _lean_inside(function, nogil=True, **_LEAN, **_LOOSE)
+
+
+def _inside(function: Callable, **options: Any) -> Any:
+    """`numba.njit`, not kept; the function itself where there is no numba."""
+    plain = inspect.unwrap(function)
+    return support.numba.njit(**options)(plain) if support.HAS_NUMBA else plain
+
+
+def _lean_inside(function: Callable, **options: Any) -> Any:
+    return (part_of_others if support.HAS_INTERNALS else _inside)(function, **options)
 
 
 class Blank:

@@ -14,10 +14,7 @@ n) of a table that begins at k.
 from collections.abc import Callable
 from typing import Any
 
-from llvmlite import ir
-from numba.core import types
-from numba.core.base import BaseContext
-from numba.extending import intrinsic
+from jaxevent.kernels.support import intrinsic, ir, types
 
 ORDERED = {"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "=="}
 CHOICES = {"max": ">", "min": "<"}
@@ -72,7 +69,7 @@ def block(real: Any, given: str, lines: str, results: str) -> Any:
 class _Machine:
     """Makes instructions of LLVM; its methods return values."""
 
-    def __init__(self, context: BaseContext, builder: Any, real: Any):
+    def __init__(self, context: Any, builder: Any, real: Any):
         self.builder, self.known = builder, dict[str, Any]()
         self.real, self.whole = (context.get_value_type(kind) for kind in (real, types.int64))
         self.truth = context.get_value_type(types.boolean)

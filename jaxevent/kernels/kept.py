@@ -3,75 +3,60 @@
 numba keeps the signatures of a function in an index, and numbers the files that it names. Two
 processes that compile different signatures at the same time read the same index, take the same
 number, and one signature is then answered with the other's machine code. A damaged index or file
-ends the process with a traceback. Here each signature has a file of its own name, which begins with
-a hash of all that it depends on and of what it holds: another file, and a part of one, is nothing
-but compiled again, and so is what cannot be written.
+ends the process with a traceback. Here each signature has a file of its own name, in the user's own
+folder (`jaxevent.cache`). The file begins with a hash of all that it depends on and of what it
+holds: another file, and a part of one, is nothing but compiled again, and so is what cannot be
+written. The hash is made with the user's secret key, so that no other user can make a file that is
+read: its content is a pickle, which could run anything.
 """
 
 import contextlib
 import functools
 import hashlib
+import hmac
 import os
 import pickle
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numba
-from numba.core import sigutils
-from numba.core.caching import FunctionCache, NullCache
-from numba.core.ccallback import CFunc
-from numba.core.runtime.nrt import rtsys
-from numba.core.serialize import dumps
-from numba.cpython import hashing  # noqa: F401  (its symbols: loaded code may refer to them)
-from numba.experimental import function_type  # noqa: F401  (the type of kernels as arguments)
+from jaxevent import cache
+from jaxevent.kernels import support
+from jaxevent.kernels.support import numba
+
+if support.HAS_INTERNALS:
+    from jaxevent.kernels import internals
 
 _HASH = 32  # bytes at the beginning of a file
 
 
 def compiled(function: Callable, **options: Any) -> Any:
-    """`numba.njit` with these options, kept."""
+    """`numba.njit` with these options, kept; the function itself where there is no numba."""
+    if not support.HAS_NUMBA:
+        return function
     made: Any = numba.njit(**options)(function)
-    made._cache = _cache(function)
-    return made
+    files = _files_of(function)
+    return internals.keep(made, files) if files is not None else made
 
 
-def callback(signature: Any, **options: Any) -> Callable[[Callable], CFunc]:
+def callback(signature: Any, **options: Any) -> Callable[[Callable], Any]:
     """`numba.cfunc` with these options, kept."""
 
-    def compile_one(function: Callable) -> CFunc:
-        made: Any = CFunc(function, sigutils.normalize_signature(signature), {}, options)
-        made._cache = _cache(function)
-        made.compile()
-        return made
+    def compile_one(function: Callable) -> Any:
+        files = _files_of(function)
+        if files is None:
+            return numba.cfunc(signature, **options)(function)
+        return internals.kept_callback(function, signature, options, files)
 
     return compile_one
 
 
-def _cache(function: Callable) -> FunctionCache | NullCache:
-    try:
-        return _Cache(function)
-    except RuntimeError:  # no folder can be written
-        return NullCache()
-
-
-class _Cache(FunctionCache):
-    def __init__(self, function: Callable):
-        super().__init__(function)
-        locator = self._impl.locator
-        folder = Path(locator.get_cache_path())
-        self._cache_file = Files(folder, self._impl.filename_base, source_of(function))
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        with contextlib.suppress(OSError):
-            super().save_overload(sig, data)
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """As numba's, but without what only compiling needs: imports that take half a second."""
-        rtsys.initialize(target_context)
-        with self._guard_against_spurious_io_errors():
-            return self._load_overload(sig, target_context)
+def _files_of(function: Callable) -> "Files | None":
+    """The files of a function's signatures; None where nothing is kept."""
+    folder = cache.folder_for_compiled() if support.HAS_INTERNALS else None
+    return None if folder is None else Files(folder, function)
 
 
 def source_of(function: Callable) -> str:
@@ -103,11 +88,22 @@ def _content(path: str) -> str:
 
 
 class Files:
-    """The files of one function's signatures, in a folder; `stamp` is of its source."""
+    """The files of one function's signatures, in a folder of the user's own.
 
-    def __init__(self, folder: Path, name: str, stamp: object):
-        self.folder, self.name = folder, name
-        self._about = repr((numba.__version__, stamp))
+    Their names hold the function's and those of its file and of Python's version, so that
+    installations beside each other do not replace each other's.
+    """
+
+    def __init__(self, folder: Path, function: Any):
+        self.folder, self._function = folder, function
+        code = function.__code__
+        about = f"{code.co_filename} {sys.implementation.cache_tag}{getattr(sys, 'abiflags', '')}"
+        place = hashlib.blake2b(about.encode(), digest_size=6).hexdigest()
+        self.name = f"{code.co_name.strip('<>')}-{code.co_firstlineno}.{place}"
+
+    @functools.cached_property
+    def _about(self) -> str:
+        return repr((numba.__version__, source_of(self._function)))
 
     def flush(self) -> None:
         """Forget all signatures."""
@@ -115,32 +111,33 @@ class Files:
             path.unlink(missing_ok=True)
 
     def save(self, key: Any, data: Any) -> None:
-        """Keep what was compiled for a key; raises `OSError` where it cannot be written."""
+        """Keep what was compiled for a key, where it can be written."""
         path = self._path(key)
-        if path is None:
+        if path is None or cache.secret_key(self.folder) is None:
             return
-        payload = dumps(data)
-        file = tempfile.NamedTemporaryFile(dir=self.folder, delete=False)
-        try:
-            with file:
-                file.write(self._hash(key, payload) + payload)
-            os.replace(file.name, path)
-        except BaseException:
-            os.unlink(file.name)
-            raise
+        payload = internals.dumps(data)
+        with contextlib.suppress(OSError):
+            file = tempfile.NamedTemporaryFile(dir=self.folder, delete=False)
+            try:
+                with file:
+                    file.write(self._hash(key, payload) + payload)
+                os.replace(file.name, path)
+            except BaseException:
+                os.unlink(file.name)
+                raise
 
     def load(self, key: Any) -> Any:
         """What was compiled for a key; None where there is none."""
         path = self._path(key)
-        if path is None:
+        if path is None or cache.secret_key(self.folder) is None:
             return None
         try:
             content = path.read_bytes()
         except OSError:
             return None
         payload = content[_HASH:]
-        whole = content[:_HASH] == self._hash(key, payload)
-        return pickle.loads(payload) if whole else None
+        own = hmac.compare_digest(content[:_HASH], self._hash(key, payload))
+        return pickle.loads(payload) if own else None
 
     def _path(self, key: Any) -> Path | None:
         """The file of a key; None for one that holds addresses, which other processes share."""
@@ -151,5 +148,7 @@ class Files:
         return self.folder / f"{self.name}.{named}.nbc"
 
     def _hash(self, key: Any, payload: bytes) -> bytes:
+        secret = cache.secret_key(self.folder)
+        assert secret is not None
         about = f"{self._about}{key!r}".encode()
-        return hashlib.blake2b(about + b"\0" + payload, digest_size=_HASH).digest()
+        return hashlib.blake2b(about + b"\0" + payload, digest_size=_HASH, key=secret).digest()

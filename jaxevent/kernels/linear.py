@@ -7,11 +7,9 @@ all directions. What is left for each direction is a sum of products, for all of
 
 from typing import Any
 
-from llvmlite import ir
-from numba.core import types
-
 from jaxevent.kernels.expressions import Graph, Node, Untranslatable, needed
 from jaxevent.kernels.numeric import operation
+from jaxevent.kernels.support import ir, types
 
 
 def factors(result: Node, changes: set[Node], graph: Graph) -> dict[Node, Node]:

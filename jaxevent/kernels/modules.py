@@ -8,14 +8,19 @@ import tempfile
 from pathlib import Path
 from types import ModuleType
 
-import numba
-
 from jaxevent import cache
 from jaxevent.kernels import blocks, linear, numeric
+from jaxevent.kernels.expressions import Untranslatable
+from jaxevent.kernels.support import numba
 
 
 def module_of(text: str) -> ModuleType:
-    """The module of a text, from a file with its compiled functions beside it (`kept`)."""
+    """The module of a text, from a file with its compiled functions beside it (`kept`).
+
+    Raises `Untranslatable` where numba cannot be imported.
+    """
+    if numba is None:
+        raise Untranslatable("numba cannot be imported")
     about = f"{numba.__version__} {_shared()}\n{text}"
     name = f"kernel_{hashlib.blake2b(about.encode(), digest_size=8).hexdigest()}"
     folder = cache.folder_for_compiled() or Path(_own_folder().name)

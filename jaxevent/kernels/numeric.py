@@ -10,11 +10,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba.core import types
-from numba.extending import intrinsic
 
 from jaxevent.kernels import kept
+from jaxevent.kernels.support import intrinsic, ir, types
 
 F = np.float32
 INFINITE, NAN = F(np.inf), F(np.nan)
@@ -29,7 +27,8 @@ def part(function: Callable) -> Any:
 
 def operation(function: Callable) -> Any:
     """An operation of the compiler's own."""
-    return intrinsic(inspect.unwrap(function))
+    plain = inspect.unwrap(function)
+    return plain if intrinsic is None else intrinsic(plain)
 
 
 @operation

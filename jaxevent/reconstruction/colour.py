@@ -101,7 +101,9 @@ def colour_video(
     """
     name, frames, rgb = recording.name, recording.frames, recording.extra.get("rgb")
     if frames is None or rgb is None:
-        missing = "no frames" if frames is None else "no colour frames"
+        missing = "no colour frames"
+        if frames is None:
+            missing = f"no frames{recording.describe_left_out('frames')}"
         raise InputError(f"{name}: holds {missing}; add extra['rgb'] of its frames in colour")
     wanted = (len(frames), recording.height, recording.width, 3)
     if rgb.shape != wanted or rgb.dtype != np.uint8:

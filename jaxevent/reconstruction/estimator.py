@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator
+from jaxevent.events.clocks import check_clocks
 from jaxevent.reconstruction.clock import Timing, time_span
 from jaxevent.reconstruction.features import Features, ReadOut
 from jaxevent.reconstruction.live import LiveVideo
@@ -24,7 +25,8 @@ class ImageEstimator(Estimator[P]):
     none; `valid` is false where the intensity is not a finite number.
 
     Attributes:
-        fuses: Whether images rest on events and frames together, so that thresholds must suit both.
+        fuses: Whether images rest on events and frames together, so that thresholds must suit both
+            and their clocks agree.
     """
 
     family: ClassVar[str] = "reconstruction"
@@ -48,6 +50,14 @@ class ImageEstimator(Estimator[P]):
         """Raise `InputError` for a recording without data, or without what the method needs."""
         super().check(recording)
         recording.refuse_empty()
+
+    def check_clocks(self, recording: Recording, params: P) -> None:
+        """Raise `InputError` or warn if frames and events that it combines cannot be on one clock.
+
+        See `jaxevent.events.clocks`.
+        """
+        if self.fuses:
+            check_clocks(recording, params.clock_offset)
 
     @abc.abstractmethod
     def estimate(
@@ -132,6 +142,7 @@ class PixelEstimator(ImageEstimator[P]):
         """
         self.check(recording)
         params = self.Params() if params is None else params
+        self.check_clocks(recording, params)
         if not extrapolate:
             self.check_span(recording, times, params)
         return prepare(recording, times, Timing.of(params), filtering=self.filters)

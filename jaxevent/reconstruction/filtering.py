@@ -358,8 +358,21 @@ def _path_jvp(method: Filter, primals: tuple, tangents: tuple) -> tuple[Any, Any
             after.append(functools.reduce(jnp.add, [*terms, push]))
         return after, after
 
-    d_real = _over_tiles(linear, _real_tangents(lanes, d_lanes), place, (columns, pushed))
-    return path, _as_tangent(path, d_real)
+    def recursion(d_lanes: list[Array], pushed: list[Array]) -> list[Array]:
+        return _over_tiles(linear, d_lanes, place, (columns, pushed))
+
+    return path, _as_tangent(path, _linear(recursion, _real_tangents(lanes, d_lanes), pushed))
+
+
+def _linear(function: Callable, *arguments: Any) -> Any:
+    """Apply a linear function that scans.
+
+    JAX before 0.10 transposes a scan only where its own `linearize` found what is linear in it.
+    """
+    if jax.__version_info__ >= (0, 10):
+        return function(*arguments)
+    zeros = jax.tree.map(jnp.zeros_like, arguments)
+    return jax.linearize(function, *zeros)[1](*arguments)
 
 
 def _real(state: Any) -> list[Array]:

@@ -45,6 +45,8 @@ class ImageMethod(Protocol):
 
     def check(self, recording: Recording) -> None: ...
 
+    def check_clocks(self, recording: Recording, params: Any) -> None: ...
+
     def check_span(self, recording: Recording, times: Times, params: Any) -> None: ...
 
 
@@ -124,6 +126,7 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
         progress: bool | None = None,
     ):
         estimator.check(recording)
+        estimator.check_clocks(recording, params)
         self.estimator, self.recording, self.params = estimator, recording, params
         self.progress = progress
         self._compared = not estimator.fuses

@@ -105,9 +105,10 @@ def _check_request(
     """Raise `InputError` if there is nothing to register, or for times that make no sense."""
     frames = other.frames
     if frames is None or not len(recording.events):
+        empty, what = (other, "frames") if frames is None else (recording, "events")
         raise InputError(
-            f"{(other if frames is None else recording).name}: holds no "
-            f"{'frames' if frames is None else 'events'}, so there is nothing to register"
+            f"{empty.name}: holds no {what}{empty.describe_left_out(what)}, so there is nothing to "
+            "register"
         )
     if offset is not None and not math.isfinite(offset):
         raise InputError(f"the offset {offset} of the clocks is not possible; give seconds")

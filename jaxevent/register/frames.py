@@ -29,11 +29,11 @@ def read_frames(
 
     `path` is anything that `jaxevent.load` reads, whose frames are taken, or images as of
     `jaxevent.io.images`: a folder of PNG, TIFF, JPEG or .npy with timestamps.txt or images.txt
-    of lines "t name", or HDF5 of t and image. `exposure` (s) is that of the latter, which do not
-    tell it. With `reference`, of a recording its HDR images are taken if it holds any
-    (`extra["hdr"]` and `extra["hdr_t"]`), and `white` is the value of images that is intensity 1.
-    Colours of frames are kept in `extra["rgb"]`. `frames` chooses among several kinds of images of
-    a recording, as in `jaxevent.load`.
+    of lines "t name", or HDF5 of t and image. `exposure` (s) is that of the latter, where their
+    timestamps do not tell it. With `reference`, of a recording its HDR images are taken if it holds
+    any (`extra["hdr"]` and `extra["hdr_t"]`), and `white` is the value of images that is intensity
+    1. Colours of frames are kept in `extra["rgb"]`. `frames` chooses among several kinds of images
+    of a recording, as in `jaxevent.load`.
     Raises `InputError` for what cannot be read and where there are no frames.
     """
 
@@ -61,7 +61,10 @@ def read_frames(
                 recording, frames=Frames.of_checked(t, images, np.zeros(len(t), np.int64))
             )
     if recording.frames is None:
-        raise InputError(f"{path}: holds no frames; give the other camera's recording or images")
+        missing = recording.describe_left_out("frames")
+        raise InputError(
+            f"{path}: holds no frames{missing}; give the other camera's recording or images"
+        )
     return dataclasses.replace(recording, name=str(path))
 
 
@@ -84,7 +87,11 @@ def _read_series(
                 f"{images[0].shape}; give all images one size"
             )
         images.append(image)
-    length = np.full(len(series.t), round((exposure or 0) * 1e6), np.int64)
+    if exposure is not None and series.exposure.any():
+        raise InputError(f"{path}: its timestamps tell the exposures; leave out exposure")
+    length = series.exposure
+    if exposure is not None:
+        length = np.full(len(series.t), round(exposure * 1e6), np.int64)
     frames = Frames.of_checked(series.t, np.stack(images), length)
     height, width = images[0].shape
     if not reference:

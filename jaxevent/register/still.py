@@ -40,7 +40,11 @@ def register_still(
     cv2 = require("cv2", "vision")
     frames = recording.frames
     if frames is None:
-        raise InputError(f"{recording.name}: holds no frames that an image could be registered to")
+        missing = recording.describe_left_out("frames")
+        raise InputError(
+            f"{recording.name}: holds no frames that an image could be registered to{missing}; "
+            "give a recording with frames"
+        )
     image = np.asarray(image, np.float32)
     if image.ndim != 2 or not (image[np.isfinite(image)] >= 0).all() or min(image.shape) < 16:
         raise InputError(

@@ -26,7 +26,10 @@ def trigger_times(
     """
     triggers = recording.triggers
     if triggers is None or not len(triggers):
-        raise InputError(f"{recording.name}: holds no external triggers; leave out --triggers")
+        missing = recording.describe_left_out("triggers")
+        raise InputError(
+            f"{recording.name}: holds no external triggers{missing}; leave out --triggers"
+        )
     channels = np.unique(triggers.channel)
     if channel is None and len(channels) > 1:
         raise InputError(

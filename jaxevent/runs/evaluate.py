@@ -64,10 +64,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, overload
 
-import jax
 import jax.numpy as jnp
 
 import jaxevent
+from jaxevent.devices import double_precision
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
 from jaxevent.io import toml
@@ -437,7 +437,7 @@ def _compute(
         if known is not None:
             row = {"method": method, **known, "params": source.values()}
             return {"row": row, "picture": None}
-    with jax.enable_x64(double):
+    with double_precision(double):
         if isinstance(recording, str):
             recording = _opened.load(Path(recording), size, stream, progress)
         values, told = None, {}

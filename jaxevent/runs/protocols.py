@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
+from jaxevent.events.clocks import check_clocks
 from jaxevent.parameters import nearest
 from jaxevent.recording import Frames, Recording, microseconds
 
@@ -48,8 +49,9 @@ def held_out(recording: Recording, gap: int = GAP) -> tuple[Recording, Frames]:
     if frames is None or len(frames) <= gap:
         which = "second one" if gap == 2 else f"one but each {gap}th"
         raise InputError(
-            f"{recording.name}: has {0 if frames is None else len(frames)} frames; hiding every "
-            f"{which} needs at least {gap + 1}, so choose a recording with more"
+            f"{recording.name}: has {0 if frames is None else len(frames)} frames"
+            f"{recording.describe_left_out('frames')}; hiding every {which} needs at least "
+            f"{gap + 1}, so choose a recording with more"
         )
     _need_events(recording)
     hidden = slice(1, None, 2) if gap == 2 else np.flatnonzero(np.arange(len(frames)) % gap)
@@ -116,7 +118,8 @@ def reference(recording: Recording) -> tuple[Recording, Reference]:
     elif "HDR_mat" in extra:
         images, what, frames = extra["HDR_mat"], "HDR_mat", recording.frames
         if frames is None:
-            raise InputError(f"{name}: HDR_mat needs frames to tell its times; add frames")
+            missing = recording.describe_left_out("frames")
+            raise InputError(f"{name}: HDR_mat needs frames to tell its times{missing}; add frames")
         images, t = (images[None], frames.t[-1:]) if images.ndim == 2 else (images, frames.t)
         kind = frames.images.dtype
         white = 1.0 if kind.kind == "f" else float(np.iinfo(kind).max)
@@ -155,10 +158,11 @@ def divide(recording: Recording, protocol: str, gap: int = GAP) -> tuple[Recordi
     """What the protocol of that name gives of a recording, and the images that it asks for.
 
     Raises `InputError` for recordings that it cannot use, for an unknown protocol, and for a gap
-    of one that hides no frames.
+    of one that hides no frames. Clocks that cannot be one are refused or warned of.
     """
     if protocol not in PROTOCOLS:
         raise InputError(f"there is no protocol {protocol!r}; {nearest(protocol, PROTOCOLS)}")
+    check_clocks(recording)
     if protocol == "held-out":
         return held_out(recording, gap)
     if gap != GAP:

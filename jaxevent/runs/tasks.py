@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxevent import cache
-from jaxevent.devices import local
+from jaxevent.devices import double_precision, local
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.progress import bar
 from jaxevent.shown import a_kind
@@ -309,7 +309,7 @@ def _on_devices(
     def work(task: Task) -> dict[str, Any]:
         device = idle.get()
         try:
-            with jax.default_device(device), jax.enable_x64(double):
+            with jax.default_device(device), double_precision(double):
                 return _tried(function, task, folder, retries)
         finally:
             idle.put(device)

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.events import is_hot
+from jaxevent.events.clocks import compare_clocks
 from jaxevent.progress import bar
-from jaxevent.recording import EventSource, Frames, ImageSource, Recording, Triggers
+from jaxevent.recording import EventSource, ImageSource, Recording, Triggers
 
 BLOCK = 1 << 20  # events looked at together: 13 MB
 BIN = 10_000  # us over which the peak rate is taken
@@ -32,7 +33,7 @@ def describe(recording: Recording, progress: bool | None = None) -> list[tuple[s
             f"({(recording.stop - recording.start) / 1e6:.3f} s)",
         ),
         *_about_events(recording.events, recording.width, recording.height, progress),
-        *_about_frames(recording.frames),
+        *_about_frames(recording),
     ]
     if (camera := recording.camera) is not None:
         lens = "" if camera.model == "radtan" else f"{camera.model} "
@@ -52,7 +53,11 @@ def describe(recording: Recording, progress: bool | None = None) -> list[tuple[s
     lines.append(("ground truth", _truth(recording, recording.extra)))
     for name, values in recording.extra.items():
         lines.append((f"extra {name}", _value(values)))
-    lines += [(name, f"none: {why}") for name, why in recording.left_out.items()]
+    lines += [
+        (name, f"none: {why}")
+        for name, why in recording.left_out.items()
+        if name != "frames" and getattr(recording, name, None) is None
+    ]
     lines += [("note", text) for text in recording.notes]
     return lines
 
@@ -105,7 +110,10 @@ def _about_clocks(recording: Recording) -> list[str]:
                 f"{name}: {len(long)} intervals over 1.5 medians, the longest "
                 f"{steps[row] / 1000:.3f} ms after {part.t[row] / 1e6:.6f} s"
             )
-        if len(events):
+        if name == "frames":
+            if (mismatch := compare_clocks(recording)) is not None:
+                texts.append(f"{mismatch.text}; check the unit and the clock of both")
+        elif len(events):
             first, last = int(events[:1].t[0]), int(events[len(events) - 1 :].t[0])
             if part.t[-1] < first or part.t[0] > last:
                 texts.append(
@@ -192,9 +200,10 @@ def _short(rate: float) -> str:
     return f"{rate:.0f}"
 
 
-def _about_frames(frames: Frames | None) -> list[tuple[str, str]]:
+def _about_frames(recording: Recording) -> list[tuple[str, str]]:
+    frames = recording.frames
     if frames is None:
-        return [("frames", "none")]
+        return [("frames", f"none{recording.describe_left_out('frames')}")]
     height, width = frames.images.shape[1:]
     known = frames.exposure[frames.exposure > 0] / 1000
     if not len(known):

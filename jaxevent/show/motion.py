@@ -131,8 +131,9 @@ def fitted_velocity(recording: Recording, motion: Motion, span: float | int = 0.
     if recording.poses is None or recording.camera is None:
         raise InputError(
             f"{recording.name}: holds no {'poses' if recording.poses is None else 'calibration'}, "
-            f"which tell an {model.parts[0].name}; give --truth a table with the columns "
-            f"{', '.join(('t', *model.components))}"
+            f"which tell an {model.parts[0].name}"
+            f"{recording.describe_left_out('poses') or recording.describe_left_out('camera')}; "
+            f"give --truth a table with the columns {', '.join(('t', *model.components))}"
         )
     twists = from_poses(recording.poses, span)
     f = math.sqrt(recording.camera.fx * recording.camera.fy)

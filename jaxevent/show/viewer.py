@@ -223,7 +223,8 @@ def _layer_of_table(path: Path) -> _Layer:
 def _send_video(video: ImageSequence, recording: Recording, send: _Sender, name: str) -> None:
     if recording.frames is None:
         raise InputError(
-            f"{recording.name}: has no frames, whose times would be shown; store images"
+            f"{recording.name}: has no frames, whose times would be shown"
+            f"{recording.describe_left_out('frames')}; store images"
         )
     t = recording.frames.t
     send.images(f"image/{name}", t, lambda row: video(t[row]).mean[0])

@@ -48,6 +48,7 @@ def test_events_and_numbers_are_read_without_the_pickle(folder, in_memory, monke
     np.testing.assert_array_equal(recording.extra["K"], [[30, 0, 20], [0, 31, 15], [0, 0, 1]])
     np.testing.assert_array_equal(recording.extra["D"], [-0.1, 0.05, 0, 0])
     assert recording.extra["arrays_left_out"].tolist() == ["meta"]
+    assert "2 images in dataset_classical.npz are pickled" in recording.left_out["frames"]
     assert recording.camera is None and recording.poses is None and recording.frames is None
 
 

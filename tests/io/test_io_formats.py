@@ -464,6 +464,30 @@ def test_aedat_4_of_several_cameras(tmp_path):
     assert got.extra["streams_left_out"].tolist() == ["0 events"]
 
 
+def test_aedat_4_of_several_streams_of_frames(tmp_path):
+    pytest.importorskip("aedat")
+    events = formats.events_of(0, 100, SIZE)
+    images = np.arange(4, dtype=np.uint8)[:, None, None] * np.ones((30, 40), np.uint8)
+    path = tmp_path / "a.aedat4"
+    shots = {"images": images, "image_t": [1000, 1010, 3000, 3010], "cameras": 2}
+    path.write_bytes(formats.aedat4(events, SIZE, **shots))
+    got = load(path)
+    assert got.frames is None
+    remedy = "choose one with frames=1"
+    assert got.left_out == {
+        "frames": f"the streams 1, 2 hold some, of which none is chosen; {remedy}"
+    }
+    got = load(path, frames="2")
+    np.testing.assert_array_equal(got.frames.t, [1010, 3010])
+    np.testing.assert_array_equal(got.frames.images, images[1::2])
+    assert got.left_out == {}
+    with pytest.raises(InputError, match="has no stream of frames '0'; its .* of frames are 1, 2"):
+        load(path, frames="0")
+    path.write_bytes(formats.aedat4(events, SIZE, streams=0, **shots))
+    with pytest.raises(InputError, match="holds no events, and frames in the streams 0, 1; choose"):
+        load(path)
+
+
 # ROS
 
 

@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import pickle
 import sys
 from pathlib import Path
 
@@ -10,13 +11,14 @@ import numpy as np
 import pytest
 from numba.core import types
 
-from jaxevent import kernels
+from jaxevent import cache, kernels
 from jaxevent.kernels import kept, modules
 
 
 @pytest.fixture
 def half(tmp_path, monkeypatch):
     """Makes new dispatchers of a function in a file of its own, as new processes would."""
+    monkeypatch.setenv("JAXEVENT_CACHE", str(tmp_path / "kept"))
     (tmp_path / "halves.py").write_text("def half(x):\n    return x / 2\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "halves", raising=False)
@@ -25,7 +27,7 @@ def half(tmp_path, monkeypatch):
 
 
 def files_of(folder: Path) -> list[Path]:
-    return sorted(folder.glob("__pycache__/*.nbc"))
+    return sorted(folder.rglob("*.nbc"))
 
 
 CALLER = """
@@ -44,6 +46,7 @@ def third(x):
 
 @pytest.mark.parametrize("changed", [{"by": 6}, {"rate": 2}])
 def test_what_a_function_calls_or_reads_may_change(changed, tmp_path, monkeypatch):
+    monkeypatch.setenv("JAXEVENT_CACHE", str(tmp_path / "kept"))
     (tmp_path / "caller.py").write_text(CALLER)
     monkeypatch.syspath_prepend(tmp_path)
 
@@ -73,7 +76,7 @@ def test_signatures_compiled_at_the_same_time_keep_apart(half, tmp_path, monkeyp
 
     monkeypatch.setattr(os, "replace", interrupted)
     assert half()(3) == 1.5
-    monkeypatch.undo()
+    monkeypatch.setattr(os, "replace", replace)
     assert not others
     for value in (3, np.float32(3)):
         later = half()
@@ -140,14 +143,53 @@ def test_what_cannot_be_written_is_compiled_alone(half, tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "replace", full)
     assert half()(5) == 2.5
-    # Python keeps the module's bytecode there, by another way of replacing files.
-    left = [p for p in (tmp_path / "__pycache__").iterdir() if p.is_file()]
-    assert not [p for p in left if p.suffix != ".pyc"]
+    left = [p.name for p in (tmp_path / "kept").rglob("*") if p.is_file()]
+    assert left == ["key"]
+
+
+def test_nothing_is_kept_where_the_user_wants_it_so(half, tmp_path, monkeypatch):
+    monkeypatch.setenv("JAXEVENT_CACHE", "0")
+    assert half()(5) == 2.5
+    assert not files_of(tmp_path) and not (tmp_path / "kept").exists()
+
+
+class Intruder:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_a_file_that_another_user_signed_is_not_unpickled(half, tmp_path, monkeypatch):
+    """Its hash is right, but for the key."""
+    assert half()(5) == 2.5
+    (path,) = files_of(tmp_path)
+    mark = tmp_path / "ran"
+    seen = []
+    hash_of = kept.Files._hash
+    with monkeypatch.context() as watched:
+        watched.setattr(kept.Files, "_hash", lambda *a: seen.append(a) or hash_of(*a))
+        assert half()(5) == 2.5
+    files, key, _ = seen[-1]
+    forged = pickle.dumps(Intruder(mark))
+    own = hash_of(files, key, forged)
+    with monkeypatch.context() as another:
+        another.setattr(cache, "secret_key", lambda folder: b"another" * 4)
+        foreign = hash_of(files, key, forged)
+    path.write_bytes(foreign + forged)
+    assert half()(5) == 2.5 and not mark.exists()
+    # With the user's own key it is: the mark tells.
+    path.write_bytes(own + forged)
+    files.load(key)
+    assert mark.exists()
 
 
 def test_what_depends_on_addresses_is_not_kept(half, tmp_path):
     apply = kept.compiled(lambda f, x: f(x))
-    files = apply._cache._cache_file
+    files = apply._cache._files
     key = (types.Dispatcher(half()), "x")
     files.save(key, "data")
     assert files.load(key) is None

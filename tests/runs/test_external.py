@@ -329,7 +329,7 @@ def change(folder: Path, what: str) -> External:
     ("what", "said"),
     [
         ("none", "ecnn/small: there are no images of small here; correct images"),
-        ("no times", "there is no timestamps.txt or images.txt with the images' times"),
+        ("no times", "there is no timestamps.txt or images.txt or timestamp.txt with the"),
         ("other times", "there is no stamps.txt with"),
         ("few times", "holds 6 images, timestamps.txt 5 times"),
         ("no images", "e2vid/small: holds no images"),

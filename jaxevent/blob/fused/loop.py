@@ -5,18 +5,13 @@ order of `CELLS` and `WHOLE`. What differs from filter to filter are the functio
 which `target` writes; so this module is compiled once.
 """
 
-import warnings
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob.prepare import LONGEST
 from jaxevent.kernels import lean, lean_part
-
-# Functions that are passed as arguments are called through their address.
-warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
 
 CELLS = (
     "slot.gate.0", "slot.hits.0", "p.0", "p.1", "long.0", "xi.0", "xi.1", "size.0", "frame.0",

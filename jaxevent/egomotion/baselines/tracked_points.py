@@ -158,7 +158,8 @@ class TrackedPoints(OnHost[Params]):
         if frames is None or len(frames) < 2:
             raise InputError(
                 f"{recording.name}: has {0 if frames is None else len(frames)} frames and tracking "
-                "needs two; take a method that uses events, as voting or contrast"
+                f"needs two{recording.describe_left_out('frames')}; take a method that uses "
+                "events, as voting or contrast"
             )
 
 

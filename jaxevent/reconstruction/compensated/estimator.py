@@ -598,6 +598,7 @@ class MotionCompensated(ImageEstimator[Params]):
         """As `ImageEstimator.prepare`; motion is estimated here, with the params given."""
         self.check(recording)
         params = self.Params() if params is None else params
+        self.check_clocks(recording, params)
         wanted = np.atleast_1d(microseconds(times))
         if not extrapolate:
             self.check_span(recording, wanted, params)

@@ -7,10 +7,8 @@ from method to method are the functions of `FrameFunctions`, which `smoothing` w
 places of fields; so this module is compiled once.
 """
 
-import warnings
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,9 +22,6 @@ from jaxevent.reconstruction.fused.loop import (
     load_image,
     sum_segments,
 )
-
-# Functions that are passed as arguments are called through their address.
-warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
 
 
 class FrameFunctions(NamedTuple):

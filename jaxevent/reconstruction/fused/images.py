@@ -167,6 +167,7 @@ def prepared_by_kernel(
     if "rho_ref" in params.followed:
         return None
     method.check(recording)
+    method.check_clocks(recording, params)
     times = sorted_times(times)
     if not extrapolate:
         method.check_span(recording, times, params)

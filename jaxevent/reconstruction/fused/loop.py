@@ -7,10 +7,8 @@ method to method are the four functions of `Functions`, which `source` writes, a
 fields; so this module is compiled once.
 """
 
-import warnings
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,9 +20,6 @@ LOAD = 1  # into a field, which of `FrameRows.tables`, and of which frame
 FILL = 2  # a field, with half of a number
 SUM = 3  # into a column of `Given.totals`, the segments of a frame's exposure
 COUNT = 4  # into two fields, of ON and OFF, events from a time on and until another
-
-# Functions that are passed as arguments are called through their address.
-warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
 
 
 class Bands(NamedTuple):

@@ -11,17 +11,12 @@ particles, others in every batch, are scored too. Where one of them is off by mo
 all are scored, and after that nodes are more, or left out for some batches.
 """
 
-import warnings
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.kernels import compiled, fast_part, part
-
-# Functions that are passed as arguments are called through their address.
-warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
 
 CELLS = (
     "event.xi.0", "event.xi.1", "event.room.0", "event.room.1", "event.room.2",

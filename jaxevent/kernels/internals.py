@@ -1,0 +1,144 @@
+"""The private interfaces of numba that kernels use; `support` says with which releases.
+
+numba makes machine code of every function, and of what calls it once more, with the function
+inside. For a part, which compiled functions alone call, the first is left out: a fifth to a quarter
+of the time of compilation.
+
+What is compiled can be kept: a `KeptCache` takes the place of numba's own cache, which keeps an
+index of a function's signatures in a folder that others may write to.
+"""
+
+import hashlib
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import numba
+from numba.core import sigutils
+from numba.core.ccallback import CFunc
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, CompileResult
+from numba.core.runtime.nrt import rtsys
+from numba.core.serialize import dumps
+from numba.cpython import hashing  # noqa: F401  (its symbols: loaded code may refer to them)
+from numba.experimental import function_type  # noqa: F401  (the type of kernels as arguments)
+
+
+class _Library(JITCodeLibrary):
+    """Code to link into that of callers; no machine code is made of it."""
+
+    def finalize(self) -> None:
+        self._raise_if_finalized()
+        for library in dict.fromkeys(self._linking_libraries):
+            if hasattr(library, "_reload_init"):  # since numba 0.62
+                self._reload_init.update(library._reload_init)
+            self._final_module.link_in(library._get_module_for_linking(), preserve=True)
+        self._final_module.verify()
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        self._ensure_finalized()
+        return 0
+
+    @property
+    def codegen(self) -> Any:
+        return _NoEnvironment(self._codegen)
+
+
+class _NoEnvironment:
+    """A code generator that does not store what Python objects a function knows: it knows none."""
+
+    def __init__(self, codegen: Any):
+        self._codegen = codegen
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._codegen, name)
+
+    def set_env(self, name: str, environment: Any) -> None:
+        pass
+
+
+class _Compiler(Compiler):
+    def __init__(self, typing: Any, target: Any, library: Any, *rest: Any):
+        library = _Library(target.codegen(), "part") if library is None else library
+        super().__init__(typing, target, library, *rest)
+
+
+def part_of_others(function: Callable, **options: Any) -> Any:
+    """`numba.njit` with these options; called from Python it raises `TypeError`.
+
+    It may neither make arrays nor print, nor raise with anything but constants.
+    """
+    bare = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "pipeline_class": _Compiler}
+    made: Any = numba.njit(**bare, **options)(inspect.unwrap(function))  # ty: ignore[no-matching-overload]
+    made._insert, made._compile_for_args = _ignore, _refuse
+    return made
+
+
+def _ignore(*_: Any) -> None:
+    """Do not note for Python what was compiled: it would call nothing, and the process end."""
+
+
+def _refuse(*_: Any, **named: Any) -> None:
+    raise TypeError("this is for compiled functions to call, not for Python")
+
+
+class KeptCache:
+    """A cache for a function's compiled signatures, as numba's dispatchers use one.
+
+    `files` has the methods `load(key)`, `save(key, data)` and `flush()`; see `kept.Files`.
+    """
+
+    def __init__(self, function: Any, files: Any):
+        self._function, self._files = function, files
+        self._enabled = True
+
+    @property
+    def cache_path(self) -> str:
+        return str(self._files.folder)
+
+    def enable(self) -> None:
+        self._enabled = True
+
+    def disable(self) -> None:
+        self._enabled = False
+
+    def flush(self) -> None:
+        self._files.flush()
+
+    def load_overload(self, signature: Any, target: Any) -> Any:
+        """Load what was compiled for a signature, or return None.
+
+        numba refreshes the target first, for what only compiling needs: imports that take half a
+        second.
+        """
+        if not self._enabled:
+            return None
+        rtsys.initialize(target)
+        kept = self._files.load(self._key(signature, target.codegen()))
+        return None if kept is None else CompileResult._rebuild(target, *kept)
+
+    def save_overload(self, signature: Any, made: Any) -> None:
+        """Keep what was compiled for a signature, unless it holds addresses of this process."""
+        if self._enabled and not made.lifted and not made.library.has_dynamic_globals:
+            self._files.save(self._key(signature, made.codegen), made._reduce())
+
+    def _key(self, signature: Any, codegen: Any) -> Any:
+        cells = tuple(cell.cell_contents for cell in self._function.__closure__ or ())
+        about = self._function.__code__.co_code + (dumps(cells) if cells else b"")
+        return signature, codegen.magic_tuple(), hashlib.blake2b(about).hexdigest()
+
+
+def keep(dispatcher: Any, files: Any) -> Any:
+    """Have what `numba.njit` made keep its signatures in `files`; returns it."""
+    dispatcher._cache = KeptCache(dispatcher.py_func, files)
+    return dispatcher
+
+
+def kept_callback(function: Callable, signature: Any, options: dict[str, Any], files: Any) -> CFunc:
+    """`numba.cfunc` of a signature with these options, kept in `files`."""
+    made: Any = CFunc(function, sigutils.normalize_signature(signature), {}, options)
+    made._cache = KeptCache(function, files)
+    made.compile()
+    return made
