@@ -4,9 +4,18 @@ Kernels with derivatives are called from within JAX's programs, and use JAX for 
 parameters alone. While a program runs in the background and its caller begins another, such a call
 waits for both, for ever: 2 of 2 runs of 60 gradients with other work between them did not end, and
 2 of 2 ended when programs were run in turn.
+
+A forked process has none of the threads that JAX computes with, and would wait for them for ever.
+There JAX's programs are refused; kernels go on.
 """
 
+import os
 import sys
+from typing import Any, NoReturn
+
+from jaxevent.errors import InputError
+
+_left_behind = False  # whether the threads of JAX stayed in the parent of this process
 
 
 def run_in_turn() -> bool:
@@ -20,3 +29,29 @@ def run_in_turn() -> bool:
     if not backends_are_initialized():
         jax.config.update(setting, False)
     return jax.config.values.get(setting) is False
+
+
+def check_threads() -> None:
+    """Raise `InputError` in a forked process whose parent has computed with JAX."""
+    if _left_behind:
+        _refuse()
+
+
+def _refuse(*_: Any, **__: Any) -> NoReturn:
+    raise InputError(
+        "this process was forked from one that has computed with JAX, whose threads it lacks; "
+        'start it by spawn or forkserver, as multiprocessing.get_context("spawn") does'
+    )
+
+
+def _in_child() -> None:
+    global _left_behind
+    bridge, compiler = (sys.modules.get(f"jax._src.{n}") for n in ("xla_bridge", "compiler"))
+    if bridge is not None and bridge.backends_are_initialized():
+        _left_behind = True
+        if compiler is not None:  # of programs that nobody checks for
+            compiler.compile_or_get_cached = _refuse
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_in_child)

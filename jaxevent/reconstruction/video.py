@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent import dispatch
 from jaxevent.devices import accelerated
 from jaxevent.errors import InputError, require
 from jaxevent.estimator import Estimate
@@ -312,6 +313,7 @@ class Video(ImageSequence[P]):
 
     def _dispatch(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         """Batches of images on their way on the device."""
+        dispatch.check_threads()
         done, mine = 0, object()
         while done < len(times):
             window, reader, trajectory = self._window_of(int(times[done]))
@@ -403,6 +405,7 @@ class Video(ImageSequence[P]):
 
     def _filter(self, begin: Begin) -> tuple[FilteredWindow, Begin]:
         """Prepare and filter the window that begins there; and where the next one begins."""
+        dispatch.check_threads()
         window, features = self._windows.prepare(begin.start, begin.before)
         features = self._place(features)
         state = begin.state

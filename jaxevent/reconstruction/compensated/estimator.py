@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from jaxevent import dispatch
 from jaxevent.errors import InputError
 from jaxevent.estimator import Described, Estimate
 from jaxevent.reconstruction.clock import Clock, Timing, time_span
@@ -496,6 +497,7 @@ class CompensatedVideo(ImageSequence[Params]):
     @in_turn
     def _target(self, t: int) -> tuple[Followed, Fused]:
         if self._latest is None or self._latest[0] != t:
+            dispatch.check_threads()
             target = self.follow(t)
             self._latest = t, target, self._held(t, target)
         return self._latest[1:]
