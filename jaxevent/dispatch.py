@@ -46,7 +46,8 @@ def _refuse(*_: Any, **__: Any) -> NoReturn:
 
 def _in_child() -> None:
     global _left_behind
-    bridge, compiler = (sys.modules.get(f"jax._src.{n}") for n in ("xla_bridge", "compiler"))
+    bridge: Any = sys.modules.get("jax._src.xla_bridge")
+    compiler: Any = sys.modules.get("jax._src.compiler")
     if bridge is not None and bridge.backends_are_initialized():
         _left_behind = True
         if compiler is not None:  # of programs that nobody checks for

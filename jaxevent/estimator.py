@@ -200,10 +200,10 @@ class Estimator(abc.ABC, Generic[P]):
         """Pickle by the place at which it is found again, and is the same object."""
         return imported, (_place_of(self), Estimator, "method")
 
-    def __copy__(self) -> Self:
+    def __copy__(self) -> "Estimator[P]":
         return self
 
-    def __deepcopy__(self, known: Any) -> Self:
+    def __deepcopy__(self, known: Any) -> "Estimator[P]":
         return self
 
     def check(self, recording: Recording) -> None:
@@ -367,7 +367,7 @@ def _place_of(estimator: Estimator) -> str:
     own, main = "jaxevent.", ("__main__", "__mp_main__")
     rest = sorted(sys.modules, key=lambda name: (name in main, not name.startswith(own)))
     for name in (*first, *rest):
-        for key, value in list(vars(sys.modules.get(name, sys)).items()):
+        for key, value in list(getattr(sys.modules.get(name), "__dict__", {}).items()):
             if value is estimator:
                 return f"{name}:{key}"
     raise InputError(

@@ -86,8 +86,8 @@ def _parts(recording: Recording) -> dict[str, Any]:
 
 
 def _events_again(opening: Opening, name: str, count: int) -> Any:
-    found = opening.part(name)
-    if not isinstance(found, EventsInFile) or len(opening.part(name)) != count:
+    found: Any = opening.part(name)
+    if not isinstance(found, EventsInFile) or len(found) != count:
         raise _changed(opening, name)
     return found
 
@@ -96,10 +96,11 @@ def _images_again(
     opening: Opening, name: str, rows: Sequence[int], shape: tuple[int, ...], dtype: np.dtype
 ) -> Any:
     found: Any = opening.part(name)
-    fits = isinstance(found, ImagesInFile) and (found.shape[1:], found.dtype) == (shape, dtype)  # ty: ignore[unresolved-attribute]
-    if not fits or not set(rows) <= set(found._rows):
-        raise _changed(opening, name)
-    return found.of_file(rows)
+    if isinstance(found, ImagesInFile) and set(rows) <= set(found._rows):
+        part: Any = found.of_file(rows)
+        if (part.shape[1:], part.dtype) == (shape, dtype):
+            return part
+    raise _changed(opening, name)
 
 
 def _changed(opening: Opening, name: str) -> InputError:

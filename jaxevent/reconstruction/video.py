@@ -6,7 +6,7 @@ import itertools
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import Any, Generic, NamedTuple, Protocol, Self, TypeVar, runtime_checkable
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 import numpy as np
@@ -29,6 +29,7 @@ from jaxevent.sharing import Turns, refuse_to_pickle
 from jaxevent.shown import Shown
 
 P = TypeVar("P", bound=FrameParams)
+S = TypeVar("S", bound="ImageSequence")
 
 BEGINS = 32  # windows from which filtering can be taken up again
 BATCH = 8  # images read per call; 8 x 90,000 pixels stay in the second-level cache
@@ -119,8 +120,10 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
     at the given thresholds, see `consistency`.
     """
 
-    def __new__(cls, *given: Any, **options: Any) -> Self:
-        self = super().__new__(cls)
+    _made_of: tuple[tuple[Any, ...], dict[str, Any]]
+
+    def __new__(cls: type[S], *given: Any, **options: Any) -> S:
+        self = object.__new__(cls)
         self._made_of = given, options
         return self
 
@@ -222,8 +225,9 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
             raise InputError("times must be sorted to be read in batches; sort them")
         if not extrapolate:
             self.estimator.check_span(self.recording, times, self.params)
-        if not self._compared:
-            self._compared = True
+        with self._turns:
+            compared, self._compared = self._compared, True
+        if not compared:
             contradiction = events_contradict_frames(self.recording, self.params)
             if contradiction is not None:
                 warnings.warn(contradiction, stacklevel=2)
