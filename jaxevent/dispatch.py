@@ -4,12 +4,19 @@ Kernels with derivatives are called from within JAX's programs, and use JAX for 
 parameters alone. While a program runs in the background and its caller begins another, such a call
 waits for both, for ever: 2 of 2 runs of 60 gradients with other work between them did not end, and
 2 of 2 ended when programs were run in turn.
+
+A forked process has none of the threads that JAX computes with, and would wait for them for ever.
+There JAX's programs are refused; kernels go on.
 """
 
 import functools
+import os
 import sys
+from typing import Any, NoReturn
 
 from jaxevent.errors import InputError
+
+_left_behind = False  # whether the threads of JAX stayed in the parent of this process
 
 
 def run_in_turn() -> bool:
@@ -49,3 +56,30 @@ def check_platform() -> None:
             f"{f' ({reason})' if reason else ''}; unset it, or set JAX_PLATFORMS=cpu, or for an "
             "NVIDIA GPU look at what nvidia-smi says and install the extra gpu of jaxevent"
         ) from None
+
+
+def check_threads() -> None:
+    """Raise `InputError` in a forked process whose parent has computed with JAX."""
+    if _left_behind:
+        _refuse()
+
+
+def _refuse(*_: Any, **__: Any) -> NoReturn:
+    raise InputError(
+        "this process was forked from one that has computed with JAX, whose threads it lacks; "
+        'start it by spawn or forkserver, as multiprocessing.get_context("spawn") does'
+    )
+
+
+def _in_child() -> None:
+    global _left_behind
+    bridge: Any = sys.modules.get("jax._src.xla_bridge")
+    compiler: Any = sys.modules.get("jax._src.compiler")
+    if bridge is not None and bridge.backends_are_initialized():
+        _left_behind = True
+        if compiler is not None:  # of programs that nobody checks for
+            compiler.compile_or_get_cached = _refuse
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_in_child)

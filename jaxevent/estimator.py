@@ -16,6 +16,7 @@ import dataclasses
 import functools
 import importlib
 import inspect
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
@@ -195,6 +196,16 @@ class Estimator(abc.ABC, Generic[P]):
     def __repr__(self) -> str:
         return f"<{self.family} method {self.name!r}: {self.about.partition('. ')[0] or 'no text'}>"
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle by the place at which it is found again, and is the same object."""
+        return imported, (_place_of(self), Estimator, "method")
+
+    def __copy__(self) -> "Estimator[P]":
+        return self
+
+    def __deepcopy__(self, known: Any) -> "Estimator[P]":
+        return self
+
     def check(self, recording: Recording) -> None:
         """Raise `InputError` if the recording lacks what the estimator needs.
 
@@ -344,6 +355,25 @@ def _checked(step: str, method: Callable[..., Any]) -> Callable[..., Any]:
         return method(self, *args, **kwargs)
 
     return checked
+
+
+def _place_of(estimator: Estimator) -> str:
+    """The "package.module:object" that `imported` finds it by; raises `InputError` if none is.
+
+    That where its parameters are, which is where it was made, comes before modules that have it
+    from elsewhere.
+    """
+    first = [estimator.Params.__module__, type(estimator).__module__]
+    own, main = "jaxevent.", ("__main__", "__mp_main__")
+    rest = sorted(sys.modules, key=lambda name: (name in main, not name.startswith(own)))
+    for name in (*first, *rest):
+        for key, value in list(getattr(sys.modules.get(name), "__dict__", {}).items()):
+            if value is estimator:
+                return f"{name}:{key}"
+    raise InputError(
+        f"the method {estimator.name!r} cannot be pickled, as no module holds it; give it a name "
+        "in a module"
+    )
 
 
 def imported(path: str, kind: type[T], what: str) -> T:

@@ -98,5 +98,8 @@ class _Methods(Mapping[str, Estimator]):
         lines = [f"{family}: {', '.join(names(family))}" for family in HOMES]
         return "\n".join([f"<{len(self)} methods, each METHODS[name]>", *lines])
 
+    def __reduce__(self) -> str:
+        return "METHODS"
+
 
 METHODS: Mapping[str, Estimator] = _Methods()

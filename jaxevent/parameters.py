@@ -3,7 +3,7 @@
 import difflib
 import inspect
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
 
@@ -160,10 +160,10 @@ class Share(Number):
     """A share in [0, 1), stored as ln(p / (1 - p)), so 0 is stored as -inf and stays 0."""
 
     def physical(self, raw: Array) -> Array:
-        return jax.nn.sigmoid(raw)
+        return _elementwise("sigmoid", raw)
 
     def unconstrained(self, value: Array) -> Array:
-        return jnp.log(value) - jnp.log1p(-value)
+        return _elementwise("logit", value)
 
     def check_one(self, value: Any) -> None:
         super().check_one(value)
@@ -465,12 +465,24 @@ class Parameters(_Module):
             raise InputError(f"{path}: {error}") from None
 
 
+# By NumPy, and by JAX.
+_FUNCTIONS: Mapping[str, tuple[Callable, Callable]] = {
+    "exp": (np.exp, jnp.exp),
+    "log": (np.log, jnp.log),
+    "sigmoid": (lambda raw: 1 / (1 + np.exp(-raw)), jax.nn.sigmoid),
+    "logit": (lambda p: np.log(p) - np.log1p(-p), lambda p: jnp.log(p) - jnp.log1p(-p)),
+}
+
+
 def _elementwise(name: str, values: Array) -> Array:
     """A function of numbers, by NumPy where they are known: XLA compiles 60 ms for each shape."""
+    known_by, traced_by = _FUNCTIONS[name]
     if isinstance(values, Tracer):
-        return getattr(jnp, name)(values)
-    with np.errstate(divide="ignore"):  # the logarithm of 0
-        known = getattr(np, name)(np.asarray(values))
+        return traced_by(values)
+    with np.errstate(
+        divide="ignore", over="ignore"
+    ):  # the logarithm of 0, and what is stored of it
+        known = np.asarray(known_by(np.asarray(values)))
     # Without the type JAX compiles a copy.
     return jnp.asarray(known, jax.dtypes.canonicalize_dtype(known.dtype))
 

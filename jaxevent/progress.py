@@ -5,6 +5,7 @@ was begun last and is not over has the line; from 2 s on a thread keeps its time
 step ends.
 """
 
+import os
 import sys
 import threading
 import time
@@ -23,6 +24,16 @@ TICK = 0.5  # s between looks at the time
 
 _open: list[weakref.ref["Bar"]] = []  # the last one has the line
 _over = threading.Event()
+
+
+def _begin_anew() -> None:
+    """Leave to the parent of a forked process what it shows, and the lock."""
+    tqdm.set_lock(threading.RLock())
+    _open.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_begin_anew)
 
 
 class Bar(tqdm):  # ty: ignore[unsupported-base]

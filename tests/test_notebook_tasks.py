@@ -11,10 +11,6 @@ from pages import run_page
 import jaxevent
 from jaxevent.metrics import mse
 
-# Tables and recordings of arrays: remove this mark where `Recording.from_arrays` exists.
-pytestmark = pytest.mark.skipif(
-    not hasattr(jaxevent.Recording, "from_arrays"), reason="needs Recording.from_arrays"
-)
 PAGE = Path(__file__).parents[1] / "docs" / "notebook.md"
 
 

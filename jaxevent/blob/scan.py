@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
+from jaxevent import dispatch
 from jaxevent.blob.lifecycle import Log, State, begin
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Stretch
@@ -47,7 +48,13 @@ class ScanRun:
     """Tracks through chunks by `run`."""
 
     def __init__(self, filter: Filter, params: TrackerParams):
-        self._parts = filter, params
+        self._given = filter, params
+
+    @property
+    def _parts(self) -> tuple[Filter, TrackerParams]:
+        """What all its programs take; raises `InputError` where none can run."""
+        dispatch.check_threads()
+        return self._given
 
     def begin(self, features: Features) -> State:
         """No track yet."""

@@ -1,6 +1,5 @@
 """Tracks of many blobs in one stream of events, as a function of time."""
 
-import copy
 import dataclasses
 import functools
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,6 +21,7 @@ from jaxevent.blob.tables import TABLE_RATE, TABLE_UNITS, evenly, table_columns
 from jaxevent.errors import InputError
 from jaxevent.progress import bar
 from jaxevent.recording import Times, microseconds
+from jaxevent.sharing import Turns
 from jaxevent.shown import Shown
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class Tracks(Shown):
 
     Only the targets at the start of some stretches are kept, and what later events say of them.
     Reading tracks the stretches again that hold the times asked for, so that memory hardly grows
-    with the recording's length.
+    with the recording's length. Threads may share tracks, and tracks can be pickled and copied.
     """
 
     def __init__(
@@ -104,6 +104,7 @@ class Tracks(Shown):
         self._runner: Any = ScanRun(filter, params) if fused is None else fused
         self.start, self.stop = packing.start, packing.stop
         self._packing, self._progress = packing, progress
+        self._turns = Turns(f"tracks of {packing.recording.name}")
         self._begins: list[tuple[Mark, int, Any]] = []
         self._following: dict[Mark, Any] = {}  # of the last stretches, up to `KEPT`
         self._number(self._follow())
@@ -111,11 +112,15 @@ class Tracks(Shown):
     def __len__(self) -> int:
         return len(self.id)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what is found again where it is asked for."""
+        return {**{k: v for k, v in vars(self).items() if k != "_later"}, "_following": {}}
+
     @property
     def filtered(self) -> "Tracks":
         """The same tracks with states that rest on the events up to each time."""
-        other = copy.copy(self)
-        other.smooth = False
+        other = object.__new__(Tracks)
+        vars(other).update(vars(self), smooth=False)
         return other
 
     def __repr__(self) -> str:
@@ -322,7 +327,8 @@ class Tracks(Shown):
                 state, begins = self._runner.play(state, stretch.features)
                 following = None
                 if self.smooth:
-                    later = self._later  # fills what is kept
+                    with self._turns:
+                        later = self._later  # fills what is kept
                     following = self._following.get(now)
                     if following is None:
                         following, _ = self._look_back(stretch, begins, later)

@@ -34,7 +34,8 @@ ENOUGH = 6  # patches that tell a speed, at least
 MARGIN = 6  # px of a patch's image around it
 GRAIN = 2  # px of its pixels
 
-_latest: list[tuple[Any, Any, "Speed | None"]] = []  # of `usual_speed`: events, sensor, answer
+# Of `usual_speed`: events, sensor, answer.
+_latest: tuple[Any, Any, "Speed | None"] = (lambda: None, None, None)
 
 
 class Speed(NamedTuple):
@@ -78,12 +79,13 @@ def usual_speed(recording: Recording, camera: PinholeCamera | None = None) -> Sp
     answer is kept: the windows of each method, the choice of the model and scores ask for it.
     """
     asked = recording.width, recording.height, camera or recording.camera
-    for events, known, speed in _latest:
-        if events() is recording.events and known == asked:
-            return speed
+    global _latest
+    events, known, speed = _latest
+    if events() is recording.events and known == asked:
+        return speed
     speed = _measured(recording, asked[2])
     with contextlib.suppress(TypeError):  # a source of the user's own may not take references
-        _latest[:] = [(weakref.ref(recording.events), asked, speed)]
+        _latest = weakref.ref(recording.events), asked, speed
     return speed
 
 

@@ -25,6 +25,9 @@ class ChangedImages:
         self.dtype = images.dtype
         self.shape = (images.shape[0], size[1], size[0], *images.shape[3:])
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return np.asarray, (np.asarray(self),)
+
     def __getitem__(self, rows: Any) -> "ChangedImages":
         return ChangedImages(self._images[rows], self._change, (self.shape[2], self.shape[1]))
 

@@ -27,6 +27,7 @@ from jaxevent.arrays import times
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
 from jaxevent.io.options import ReadOptions
+from jaxevent.io.reopening import reopens
 from jaxevent.lenses import LENSES, find_model
 from jaxevent.recording import PER_FRAME, Events, Frames, Recording
 
@@ -73,6 +74,7 @@ READABLE = (
 )
 
 
+@reopens
 def load(
     path: str | os.PathLike[str],
     size: tuple[int, int] | None = None,
@@ -95,7 +97,8 @@ def load(
         in_memory: False leaves events and images in the file, at the memory of a few blocks. Those
             of HDF5 are then read and checked where they are asked for (`hdf5.StoredEvents`); other
             formats are decoded and checked once now and again then (`decoded.DecodedEvents`).
-            .npz, .mat and folders and zips of text are always read whole.
+            .npz, .mat and folders and zips of text are always read whole. Threads may share such a
+            recording; where it is pickled or copied, the file is loaded again.
         progress: Whether a bar is shown where it takes longer than two seconds; None: where
             somebody looks on.
         stream: Which camera, of a file that holds the events of several: a topic of a ROS bag,

@@ -9,6 +9,7 @@ events are asked for, at the memory of a few blocks.
 """
 
 import dataclasses
+import os
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
@@ -18,8 +19,10 @@ from numpy.typing import NDArray
 from jaxevent.errors import InputError, OrderError
 from jaxevent.io import checked_events, disorder, reading
 from jaxevent.io.options import ReadOptions
+from jaxevent.io.reopening import EventsInFile, ImagesInFile
 from jaxevent.progress import bar
 from jaxevent.recording import Events, EventSource, Triggers
+from jaxevent.sharing import Turns, in_turn
 
 BLOCK = 1 << 20  # events decoded together: 13 MB
 
@@ -152,7 +155,7 @@ class TriggerList:
         return found[order]
 
 
-class DecodedEvents:
+class DecodedEvents(EventsInFile):
     """Events left in a file that a decoder reads, an `EventSource`; see the module."""
 
     def __init__(
@@ -176,10 +179,12 @@ class DecodedEvents:
         self._stream: Iterator[tuple[Any, Columns]] = iter(())
         self._next = -1
         self.checked_size, self._source, self._origin = size, source, origin
+        self._turns, self._process = Turns(source), os.getpid()
 
     def __len__(self) -> int:
         return int(self._rows[-1])
 
+    @in_turn
     def __getitem__(self, rows: slice) -> Events:
         """Decode the events of a range of rows; the file must not have changed since."""
         start, stop, step = rows.indices(len(self))
@@ -195,6 +200,7 @@ class DecodedEvents:
             block += 1
         return _joined(pieces)
 
+    @in_turn
     def index(self, time: int) -> int:
         """The number of events earlier than `time` (us): at most one block is decoded."""
         block = int(np.searchsorted(self._first, time)) - 1
@@ -209,7 +215,9 @@ class DecodedEvents:
             if number in held:
                 return held[number]
         with reading(self._source):
-            if number != self._next:
+            # Of a forked process the parent, too, would move the place in an open file.
+            if number != self._next or self._process != os.getpid():
+                self._process = os.getpid()
                 self._stream = self._decode(self._states[number])
             columns = next((block for _, block in self._stream if len(block[0])), None)
         count = int(self._rows[number + 1] - self._rows[number])
@@ -233,7 +241,7 @@ class DecodedEvents:
         return events
 
 
-class DecodedImages:
+class DecodedImages(ImagesInFile):
     """Images (frames, height, width), or in colour (frames, height, width, 3), left in the file.
 
     `images(i)` decodes the images from number i on, in turn.
@@ -247,7 +255,7 @@ class DecodedImages:
         source: str,
     ):
         self._reader = _ImageReader(images, shape[1:], dtype, source)
-        self._rows: Any = range(shape[0])
+        self._rows = range(shape[0])
 
     @property
     def dtype(self) -> np.dtype:
@@ -257,22 +265,11 @@ class DecodedImages:
     def shape(self) -> tuple[int, ...]:
         return (len(self._rows), *self._reader.shape)
 
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def __getitem__(self, rows: slice | NDArray) -> "DecodedImages":
-        part = object.__new__(DecodedImages)
-        part._reader = self._reader
-        if isinstance(rows, slice):
-            part._rows = self._rows[rows]
-        else:
-            part._rows = [self._rows[i] for i in np.arange(len(self))[rows].tolist()]
-        return part
-
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
         images = np.empty(self.shape, self.dtype)
-        for i, row in enumerate(self._rows):
-            images[i] = self._reader.read(row)
+        with self._reader.turns:
+            for i, row in enumerate(self._rows):
+                images[i] = self._reader.read(row)
         return np.asarray(images, dtype)
 
 
@@ -288,12 +285,14 @@ class _ImageReader:
     ):
         self.shape, self.dtype = shape, dtype
         self._images, self._source = images, source
+        self.turns, self._process = Turns(source), os.getpid()
         self._stream: Iterator[NDArray] = iter(())
         self._next = -1
 
     def read(self, row: int) -> NDArray:
         with reading(self._source):
-            if row != self._next:
+            if row != self._next or self._process != os.getpid():
+                self._process = os.getpid()
                 self._stream = iter(self._images(row))
             image = next(self._stream, None)
         if image is None or image.shape != self.shape or image.dtype != self.dtype:

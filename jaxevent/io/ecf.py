@@ -46,7 +46,7 @@ class Records:
         self._stored, self._source = stored, source
         self._size: int = (stored.chunks or (1,))[0]
         self.shape, self.dtype = stored.shape, RECORD
-        self._range, self._kept = (0, 0), np.empty(0, RECORD)
+        self._kept = 0, 0, np.empty(0, RECORD)  # a range of rows, replaced as a whole
 
     def fields(self, name: str) -> "_Field":
         return _Field(self, name)
@@ -54,15 +54,15 @@ class Records:
     def __getitem__(self, rows: slice) -> NDArray:
         """Records of a range of rows; raises `InputError` where a chunk is damaged."""
         start, stop, _ = rows.indices(self.shape[0])
-        low, high = self._range
+        low, high, kept = self._kept
         if not low <= start <= stop <= high:
             size = self._size
             chunks = range(start // size, -(-stop // size))
             parts = [self._chunk(number) for number in chunks]
-            self._range = chunks.start * size, min(chunks.stop * size, self.shape[0])
-            self._kept = np.concatenate(parts) if parts else np.empty(0, RECORD)
-            low = self._range[0]
-        return self._kept[start - low : stop - low]
+            low, high = chunks.start * size, min(chunks.stop * size, self.shape[0])
+            kept = np.concatenate(parts) if parts else np.empty(0, RECORD)
+            self._kept = low, high, kept
+        return kept[start - low : stop - low]
 
     def _chunk(self, number: int) -> NDArray:
         first = number * self._size

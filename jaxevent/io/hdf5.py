@@ -30,7 +30,7 @@ refused before any memory is asked for.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +57,7 @@ from jaxevent.io.disorder import Columns, examine
 from jaxevent.io.hdf5_files import array, attribute, dataset, describe_images, open_file
 from jaxevent.io.options import ReadOptions
 from jaxevent.io.output import complete_hdf5
+from jaxevent.io.reopening import EventsInFile, ImagesInFile
 from jaxevent.io.time_units import (
     NAMES,
     Clock,
@@ -238,7 +239,7 @@ def clock_of_columns(
     return Clock(unit.name, int(first) + offset, int(last) + offset, is_float)
 
 
-class StoredEvents:
+class StoredEvents(EventsInFile):
     """Events left in an HDF5 file, an `EventSource`; pieces are read and checked when sliced.
 
     The file stays open for as long as this object lives.
@@ -371,12 +372,12 @@ class StoredEvents:
         return low, high
 
 
-class StoredImages:
+class StoredImages(ImagesInFile):
     """Images (frames, height, width) that stay in the file until np.asarray reads them."""
 
-    def __init__(self, dataset: h5py.Dataset, source: str, rows: Sequence[int] | None = None):
+    def __init__(self, dataset: h5py.Dataset, source: str):
         self._dataset, self._source = dataset, source
-        self._rows = range(len(dataset)) if rows is None else rows
+        self._rows = range(len(dataset))
 
     @property
     def dtype(self) -> np.dtype:
@@ -385,15 +386,6 @@ class StoredImages:
     @property
     def shape(self) -> tuple[int, ...]:
         return (len(self._rows), *self._dataset.shape[1:])
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def __getitem__(self, rows: slice | NDArray) -> "StoredImages":
-        if not isinstance(rows, slice):
-            chosen = np.arange(len(self))[rows].tolist()
-            return StoredImages(self._dataset, self._source, [self._rows[i] for i in chosen])
-        return StoredImages(self._dataset, self._source, self._rows[rows])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
         rows = self._rows

@@ -5,7 +5,7 @@ import inspect
 import os
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 import numpy as np
@@ -117,5 +117,12 @@ def over_rows(kernel: Callable, rows: int, *args: Any) -> None:
     except RuntimeError:  # the interpreter ends, and JAX waits for what it has begun
         kernel(0, rows, *args)
         return
-    for job in jobs:
-        job.result()
+    try:
+        for job in jobs:
+            job.result()
+    finally:
+        wait(jobs)  # interrupted, too: what they write is the caller's
+
+
+if hasattr(os, "register_at_fork"):  # the threads stay behind
+    os.register_at_fork(after_in_child=_workers.cache_clear)

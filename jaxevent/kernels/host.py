@@ -4,15 +4,36 @@ A few hundred operations on single numbers: XLA would compile longer than they t
 """
 
 import dataclasses
+import os
+import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
+from numba.core.compiler_lock import global_compiler_lock
 from numpy.typing import NDArray
 
 from jaxevent.kernels.expressions import ELEMENTWISE, Untranslatable
+
+T = TypeVar("T")
+_making = threading.RLock()  # of what all threads use
+
+
+def _wait_to_fork() -> None:
+    _making.acquire()
+    global_compiler_lock.acquire()
+
+
+def _go_on() -> None:
+    global_compiler_lock.release()
+    _making.release()
+
+
+# A thread that had them would keep them in the child for ever.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_wait_to_fork, after_in_parent=_go_on, after_in_child=_go_on)
 
 CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 
@@ -206,6 +227,15 @@ class HostProgram:
         return values if same else None
 
 
+def once(known: dict[Any, T], key: Any, make: Callable[[], T]) -> T:
+    """What is known of a key; made by the first thread that asks, while others wait."""
+    if key not in known:
+        with _making:
+            if key not in known:
+                known[key] = make()
+    return known[key]
+
+
 class Programs:
     """Programs of the same functions, each for a way that conditions on parameters chose.
 
@@ -225,11 +255,21 @@ class Programs:
 
         It is translated if there is none yet.
         """
+        found = self._find(inputs)
+        if found is not None:
+            return found
+        with _making:
+            found = self._find(inputs)
+            if found is not None:
+                return found
+            program = translate()
+            made = make(program)
+            self._made.append((program, made))
+        return program, made, program.host.values
+
+    def _find(self, inputs: list[NDArray]) -> tuple[Any, Any, list[NDArray]] | None:
         for program, made in self._made:
             values = program.host.again(inputs)
             if values is not None:
                 return program, made, values
-        program = translate()
-        made = make(program)
-        self._made.append((program, made))
-        return program, made, program.host.values
+        return None

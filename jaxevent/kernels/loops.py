@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.kernels.expressions import Graph, Level, Node, Untranslatable, needed
-from jaxevent.kernels.host import HostProgram, Programs
+from jaxevent.kernels.host import HostProgram, Programs, once
 from jaxevent.kernels.modules import module_of
 from jaxevent.kernels.text import Numbers, Place, Writer, import_functions
 from jaxevent.kernels.translate import FOLDS, KINDS, Known, OfParameters, Translation, Value
@@ -444,7 +444,7 @@ class Kernels:
         Raises `Untranslatable`.
         """
         given = [np.asarray(leaf) for leaf in jax.tree.leaves(params)]
-        programs = self._made.setdefault(key, Programs())
+        programs = once(self._made, key, Programs)
         program, (numbers, functions), values = programs.get(given, translate, self._compile)
         return Compiled(program, functions, numbers.of(values, np.dtype(float)))
 

@@ -22,6 +22,7 @@ from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.reconstruction.video import BATCH, ImageSequence
 from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.sharing import in_turn
 
 SMALLEST = 12  # pixels that OpenCV's search needs in width or height
 OUTLIERS = 1e-3  # of the greys of two frames, at either end, that do not set the range
@@ -159,6 +160,7 @@ class FlowVideo(ImageSequence[Params]):
             images = np.stack([self._image(int(frame), float(share)) for frame, share in places])
             yield times[batch], _estimate(images)
 
+    @in_turn
     def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.floating]:
         """The flow (T, H, W, 2) in px/s, x before y, at times as images are asked for; any order.
 

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent import dispatch
 from jaxevent.devices import accelerated
 from jaxevent.errors import InputError, require
 from jaxevent.estimator import Estimate
@@ -24,9 +25,11 @@ from jaxevent.reconstruction.reading import ImageReader
 from jaxevent.reconstruction.stream import StreamState
 from jaxevent.reconstruction.windows import WINDOW_EVENTS, EventWindow, WindowedRecording
 from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.sharing import Turns, refuse_to_pickle
 from jaxevent.shown import Shown
 
 P = TypeVar("P", bound=FrameParams)
+S = TypeVar("S", bound="ImageSequence")
 
 BEGINS = 32  # windows from which filtering can be taken up again
 BATCH = 8  # images read per call; 8 x 90,000 pixels stay in the second-level cache
@@ -112,10 +115,19 @@ class FilteredWindow(NamedTuple):
 class ImageSequence(Shown, abc.ABC, Generic[P]):
     """Images of a reconstruction: `image, variance, valid = sequence(times)`.
 
-    A subclass reads images in `_read`. Images do not depend on which others were asked for. Raises
-    `InputError` if the recording lacks what the estimator needs. The first reading warns where
-    events contradict frames at the given thresholds, see `consistency`.
+    A subclass reads images in `_read`. Images do not depend on which others were asked for. Threads
+    may share a sequence: they take turns, in calls as a whole, else image by image. A pickle or
+    copy holds what the sequence was made of, and is made anew of that. Raises `InputError` if the
+    recording lacks what the estimator needs. The first reading warns where events contradict frames
+    at the given thresholds, see `consistency`.
     """
+
+    _made_of: tuple[tuple[Any, ...], dict[str, Any]]
+
+    def __new__(cls: type[S], *given: Any, **options: Any) -> S:
+        self = object.__new__(cls)
+        self._made_of = given, options
+        return self
 
     def __init__(
         self,
@@ -130,6 +142,11 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
         self.estimator, self.recording, self.params = estimator, recording, params
         self.progress = progress
         self._compared = not estimator.fuses
+        self._turns = Turns(f"images of {recording.name}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        given, options = self._made_of
+        return functools.partial(type(self), **options), given
 
     @property
     @abc.abstractmethod
@@ -165,11 +182,12 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
         image, variance = np.empty((2, *shape), self.dtype)
         whole = Estimate(image, variance, np.empty(shape, bool))
         done = 0
-        for batch, part in self.batches(times[order], extrapolate):
-            rows = order[done : done + len(batch)]
-            for array, values in zip(whole, part, strict=True):
-                array[rows] = values
-            done += len(batch)
+        with self._turns:  # for all, so that nobody moves the sequence to and fro
+            for batch, part in self.batches(times[order], extrapolate):
+                rows = order[done : done + len(batch)]
+                for array, values in zip(whole, part, strict=True):
+                    array[rows] = values
+                done += len(batch)
         return whole
 
     def carry(
@@ -210,14 +228,15 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
             raise InputError("times must be sorted to be read in batches; sort them")
         if not extrapolate:
             self.estimator.check_span(self.recording, times, self.params)
-        if not self._compared:
-            self._compared = True
+        with self._turns:
+            compared, self._compared = self._compared, True
+        if not compared:
             contradiction = events_contradict_frames(self.recording, self.params)
             if contradiction is not None:
                 warnings.warn(contradiction, stacklevel=2)
         start, stop = self.recording.start, self.recording.stop
         with bar(total=len(times), desc="images", unit="image", progress=self.progress) as shown:
-            for batch, images in self._read(times):
+            for batch, images in self._turns.each(self._read(times)):
                 shape = (len(batch), self.recording.height, self.recording.width)
                 image, variance, valid = (
                     np.asarray(v)[: len(batch)].reshape(shape) for v in images
@@ -279,7 +298,13 @@ class Video(ImageSequence[P]):
         )
         self._begins = [Begin(None, self._windows.initial(), None)]
         self._open: FilteredWindow | None = None
+        self._coming: tuple[object, Any] = (None, None)  # the last images, and who asked for them
         self._future: dict[int | None, Any] | None = None  # by the start of the window
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self._devices:
+            refuse_to_pickle("images on chosen devices", "estimate again where they are needed")
+        return super().__reduce__()
 
     @property
     def dtype(self) -> np.dtype:
@@ -295,15 +320,20 @@ class Video(ImageSequence[P]):
 
     def _dispatch(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         """Batches of images on their way on the device."""
-        done = 0
+        dispatch.check_threads()
+        done, mine = 0, object()
         while done < len(times):
             window, reader, trajectory = self._window_of(int(times[done]))
             stop = window.stop
             end = len(times) if stop is None else int(np.searchsorted(times, stop))
             for first in range(done, end, self._batch):
                 batch = times[first : min(first + self._batch, end)]
+                asker, coming = self._coming
+                if asker is not mine:  # two readings of this one fit into the reader
+                    jax.block_until_ready(coming)
                 out = self._place(reader(batch))
                 images = _read(self.estimator, self.params, trajectory, out)
+                self._coming = mine, images
                 for leaf in images:
                     leaf.copy_to_host_async()
                 yield batch, images
@@ -382,6 +412,7 @@ class Video(ImageSequence[P]):
 
     def _filter(self, begin: Begin) -> tuple[FilteredWindow, Begin]:
         """Prepare and filter the window that begins there; and where the next one begins."""
+        dispatch.check_threads()
         window, features = self._windows.prepare(begin.start, begin.before)
         features = self._place(features)
         state = begin.state

@@ -35,7 +35,7 @@ class FusedRun:
 
     def __init__(self, filter: Filter, params: TrackerParams, packing: Packing):
         self.dtype = np.dtype(jnp.result_type(float))
-        self._filter, self._params = filter, params
+        self._filter, self._params, self._packing = filter, params, packing
         own = packing.own if len(packing.seeds.t) else {}
         owned = packing.joined is not None
         self._kernel = kernel_of(filter, params, own, owned, self.dtype)
@@ -51,6 +51,9 @@ class FusedRun:
             places = layout.cells if real else layout.whole
             columns = np.array([places[number] for number in names], np.int64)
             self._columns.append((real, columns, leaf.shape, leaf.dtype))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return FusedRun, (self._filter, self._params, self._packing)
 
     def begin(self, features: Features) -> State:
         """No track yet."""

@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 from scipy.optimize import minimize
 
+from jaxevent import dispatch
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.baselines.local_planes import Fit, held
 from jaxevent.egomotion.candidates import coordinates
@@ -467,6 +468,7 @@ def solve(params: Params, given: Given) -> Motion:
     held, and the next window is searched anew. For the covariance see `covariance`. The first and
     the last estimate are held to their windows' ends.
     """
+    dispatch.check_threads()
     windows = Windows(given.recording, params, given.model, given.camera, given.seed)
     if not len(windows):
         return Motion.nothing(given.model)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
+from jaxevent import dispatch
 from jaxevent.camera import PinholeCamera
 from jaxevent.devices import along, mesh
 from jaxevent.egomotion.candidates import Candidates, Expected, Gatherer
@@ -198,6 +199,7 @@ class Voting(MotionEstimator[Params]):
                 asked for and has no kernel.
         """
         self.check_options(seed=seed, progress=progress, smooth=smooth, cloud=cloud)
+        dispatch.check_threads()
         if params is None:
             found, _ = self.place(recording, model, camera)
             params = self.suit(recording, self.start(found), camera=camera).params

@@ -8,7 +8,6 @@ which is linear in the parameters' changes; so gradients in reverse cost the sam
 import abc
 import functools
 import itertools
-import threading
 import weakref
 from collections.abc import Sequence
 from typing import Any
@@ -33,6 +32,7 @@ from jaxevent.reconstruction.fused.pixel import Directions
 from jaxevent.reconstruction.fused.video import wants_kernel, without_kernel
 from jaxevent.reconstruction.windows import sorted_times
 from jaxevent.recording import Recording, Times
+from jaxevent.sharing import Turns
 
 IN_TURN = dispatch.run_in_turn()  # whether kernels may be called from within programs
 
@@ -54,7 +54,8 @@ class Divided(abc.ABC):
         self.pixels = recording.width * recording.height
         self.clock_offset = np.asarray(params.clock_offset)
         self._times = times - self.recording.origin
-        self._lock = threading.Lock()
+        self._made_of = method, recording, times, params
+        self._turns = Turns(f"images of {recording.name}")
         dead = params.without_gradient()
         numbers = [
             (leaf, k)
@@ -65,6 +66,9 @@ class Divided(abc.ABC):
         self.check(params, Directions(tuple(numbers), ("mean", "variance")))
         self.number = next(_numbers)
         _held[self.number] = self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), self._made_of
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Divided) and self._kind() == other._kind()
@@ -88,7 +92,7 @@ class Divided(abc.ABC):
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Images at some of the times, and their derivatives (times, pixels, images, lanes)."""
         wanted, places = np.unique(rows, return_inverse=True)
-        with self._lock:
+        with self._turns:
             images = self.make(self._times[wanted], params, directions)
         made = images.mean, images.variance, images.valid.view(bool), images.slopes
         if len(wanted) == len(rows) and (places == np.arange(len(rows))).all():
@@ -131,7 +135,10 @@ class FusedImages(eqx.Module):
 
     @classmethod
     def of(cls, held: Divided, times: int) -> "FusedImages":
-        return cls(np.asarray(held.number, np.int32), np.arange(times), held)
+        return _again(held, np.arange(times))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _again, (self.held, np.asarray(self.rows))
 
     def __call__(self, params: Any, *, variance: bool = True) -> Estimate:
         outputs = ("mean", "variance") if variance else ("mean",)
@@ -146,6 +153,11 @@ class FusedImages(eqx.Module):
     def over(self, devices: Sequence[Any]) -> "FusedImages":
         """Images of kernels are made on the host."""
         return self
+
+
+def _again(held: Divided, rows: NDArray) -> FusedImages:
+    """Images of what a pickle or copy holds, which has a number of its own."""
+    return FusedImages(np.asarray(held.number, np.int32), rows, held)
 
 
 def prepared_by_kernel(

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels.host import Programs
+from jaxevent.kernels.host import Programs, once
 from jaxevent.kernels.modules import module_of
 from jaxevent.reconstruction.fused.loop import Functions
 from jaxevent.reconstruction.fused.pixel import (
@@ -60,10 +60,11 @@ def program_of(
     """
     leaves, tree = jax.tree.flatten(params)
     key = (method, tree, tuple(np.shape(leaf) for leaf in leaves), exposed, dtype, directions)
-    if key not in _programs:
-        about = traced(method, observe, params, exposed, dtype, directions)
-        _programs[key] = about, Programs()
-    about, programs = _programs[key]
+    about, programs = once(
+        _programs,
+        key,
+        lambda: (traced(method, observe, params, exposed, dtype, directions), Programs()),
+    )
     given = [*host_inputs(about, params, fixed).values()]
     return programs.get(given, lambda: translated(about, params, fixed))
 
@@ -85,10 +86,12 @@ def kernel_of(
     program, modules, values = program_of(
         method, observe, params, fixed, exposed, dtype, directions
     )
-    if stride not in modules:
+
+    def made() -> tuple[Source, ModuleType]:
         source = write(program, stride)
-        modules[stride] = source, module_of(source.text)
-    source, module = modules[stride]
+        return source, module_of(source.text)
+
+    source, module = once(modules, stride, made)
     functions = Functions(module.events, module.images, module.tables, module.excess)
     numbers = source.values(values, dtype)
     return Kernel(functions, program, source, values, numbers)

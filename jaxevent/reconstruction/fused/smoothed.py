@@ -136,7 +136,7 @@ class SmoothedVideo(ImageSequence[P]):
 
     def _look_ahead(self) -> None:
         """Pass over all stretches once, to know at each what later ones say."""
-        links, last = list[NDArray](), len(self._stretches) - 1
+        states, links, last = list[NDArray](), list[NDArray](), len(self._stretches) - 1
         given = None
 
         def fields(names: tuple[str, ...]) -> NDArray:
@@ -146,14 +146,15 @@ class SmoothedVideo(ImageSequence[P]):
             total=last + 1, desc="look ahead", unit="stretch", progress=self.progress
         ) as shown:
             for place in range(last + 1):
-                self._states.append(fields(STATE))
+                states.append(fields(STATE))
                 for k, name in enumerate(LINK):
                     self._field(name)[:] = k == 0
                 given = self._filter(place, last > 0)
                 links.append(fields(LINK))
                 shown.update()
         assert given is not None
-        self._later = [np.zeros_like(self._states[0])]
+        later = [np.zeros_like(states[0])]
         while len(links) > 1:
-            self._later.insert(0, self._method.through(links.pop(), self._later[0]))
+            later.insert(0, self._method.through(links.pop(), later[0]))
+        self._states, self._later = states, later
         self._smooth(last, given)

@@ -8,6 +8,7 @@ kept of every frame (`ROW`, and what images need beside them).
 import dataclasses
 import functools
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any, Protocol, runtime_checkable
 
 import jax
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.kernels.expressions import Graph, Node, Untranslatable, needed, value_of
-from jaxevent.kernels.host import HostProgram, Programs
+from jaxevent.kernels.host import HostProgram, Programs, once
 from jaxevent.kernels.loops import Function, leaves_of, translate
 from jaxevent.kernels.modules import module_of
 from jaxevent.kernels.text import Numbers, Place, Writer, import_functions
@@ -375,13 +376,15 @@ def smoother_kernel(
     leaves, tree = jax.tree.flatten(_known(params, fixed, directions))
     shapes = tuple(np.shape(leaf) for leaf in leaves)
     key = method, tree, shapes, exposed, dtype, directions
-    program, modules, values = _programs.setdefault(key, Programs()).get(
+    program, modules, values = once(_programs, key, Programs).get(
         [np.asarray(leaf) for leaf in leaves],
         lambda: _translated(method, params, fixed, exposed, dtype, directions),
     )
-    if stride not in modules:
+
+    def made() -> tuple[Numbers, ModuleType]:
         text, numbers = _write(program, stride)
-        modules[stride] = numbers, module_of(text)
-    numbers, module = modules[stride]
+        return numbers, module_of(text)
+
+    numbers, module = once(modules, stride, made)
     functions = FrameFunctions(*(getattr(module, name) for name in FrameFunctions._fields))
     return FrameKernel(functions, program, numbers.of(values, dtype))

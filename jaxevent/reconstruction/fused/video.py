@@ -75,8 +75,9 @@ class FusedVideo(ImageSequence[P]):
             batch = times[done : min(end, done + room.times)]
             images = room.take(len(batch))
             last = int(batch[-1]) - origin
+            self._open = None  # until it is passed over up to a time that is known
             self._passes.run(window, last + 1, batch - origin, images)
-            self._done = last
+            self._open, self._done = window, last
             done += len(batch)
             made = Estimate(images.mean, images.variance, images.valid.view(bool))
             del images
@@ -98,6 +99,7 @@ class FusedVideo(ImageSequence[P]):
     def _finish(self, window: Window) -> Begin:
         """Pass over the rest of a window; where the next one begins."""
         assert window.stop is not None
+        self._open = None
         self._passes.run(window, window.stop - self._divided.origin)
         begin = Begin(window.stop, window.context, self._passes.state())
         if all(b.start != window.stop for b in self._begins):
