@@ -80,6 +80,13 @@ MUTATIONS = (
         "tests/reconstruction/test_own_filter.py -k gradients",
     ),
     Mutation(
+        "threads read one video at the same time",
+        "jaxevent/reconstruction/video.py",
+        "self._turns.each(self._read(times))",
+        "self._read(times)",
+        "tests/test_threads.py -k shared_video",
+    ),
+    Mutation(
         "filtering taken up again at a window forgets its state",
         "jaxevent/reconstruction/video.py",
         "        state = begin.state\n",

@@ -85,7 +85,10 @@ class Estimate(Described):
 
 
 class Result(Protocol):
-    """What `Estimator.estimate` returns: a function of time; reading it never changes it."""
+    """A function of time, as `Estimator.estimate` returns it; reading it never changes it.
+
+    Threads may share it, and it can be pickled and copied, or says in a sentence why not.
+    """
 
     def __call__(self, times: Times) -> Estimate:
         """The estimate at `times`: integers are microseconds, floats seconds."""
