@@ -143,7 +143,7 @@ class Disorder:
                 f"event {self.first.row} is at {self.first.after} us, earlier than the one before "
                 f"it at {self.first.before} us: "
             )
-        if self.events <= 2 * _EDGE:  # too few to tell faults apart
+        if self.events <= 2 * _EDGE and (self.resets or self.outliers):  # too few to tell apart
             return OrderError(f"{where.rstrip(': ')}; sort the events by time (stable)")
         return OrderError(
             f"{where}{'; '.join(faults)}; mend this with repair={repairs!r} or jaxevent convert "
