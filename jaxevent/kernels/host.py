@@ -12,10 +12,10 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
-from numba.core.compiler_lock import global_compiler_lock
 from numpy.typing import NDArray
 
 from jaxevent.kernels.expressions import ELEMENTWISE, Untranslatable
+from jaxevent.kernels.support import compiler_lock
 
 T = TypeVar("T")
 _making = threading.RLock()  # of what all threads use
@@ -23,11 +23,11 @@ _making = threading.RLock()  # of what all threads use
 
 def _wait_to_fork() -> None:
     _making.acquire()
-    global_compiler_lock.acquire()
+    compiler_lock.acquire()
 
 
 def _go_on() -> None:
-    global_compiler_lock.release()
+    compiler_lock.release()
     _making.release()
 
 

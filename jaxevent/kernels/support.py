@@ -7,11 +7,13 @@ imported, as beside a NumPy that it does not know, functions run as Python and X
 kernel would compute.
 """
 
+import contextlib
 import importlib
+import threading
 import warnings
 from typing import Any
 
-__all__ = ["HAS_INTERNALS", "HAS_NUMBA", "intrinsic", "ir", "is_tested", "numba", "types"]
+__all__ = ["HAS_INTERNALS", "HAS_NUMBA", "compiler_lock", "intrinsic", "ir", "numba", "types"]
 
 TESTED = ((0, 61), (0, 68))  # first and last release of numba whose private interfaces are used
 
@@ -19,6 +21,7 @@ numba: Any = None
 types: Any = None  # numba's types
 ir: Any = None  # LLVM's language
 intrinsic: Any = None  # decorator of an operation of the compiler's own
+compiler_lock: Any = threading.RLock()  # held while numba compiles
 
 
 def is_tested(version: str) -> bool:
@@ -46,6 +49,8 @@ except Exception as error:  # numba raises what it likes beside libraries that i
 if numba is not None:
     # Kernels take functions as arguments.
     warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
+    with contextlib.suppress(ImportError, AttributeError):  # private: may go in any release
+        compiler_lock = importlib.import_module("numba.core.compiler_lock").global_compiler_lock
 
 HAS_NUMBA = numba is not None
 HAS_INTERNALS = HAS_NUMBA and is_tested(numba.__version__)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from jaxevent import dispatch
 from jaxevent.devices import accelerated
-from jaxevent.errors import InputError, require
+from jaxevent.errors import InputError, InputWarning, require
 from jaxevent.estimator import Estimate
 from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
@@ -233,7 +233,7 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
         if not compared:
             contradiction = events_contradict_frames(self.recording, self.params)
             if contradiction is not None:
-                warnings.warn(contradiction, stacklevel=2)
+                warnings.warn(contradiction, InputWarning, stacklevel=2)
         start, stop = self.recording.start, self.recording.stop
         with bar(total=len(times), desc="images", unit="image", progress=self.progress) as shown:
             for batch, images in self._turns.each(self._read(times)):

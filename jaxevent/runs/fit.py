@@ -48,6 +48,7 @@ import io
 import json
 import math
 import time
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
@@ -55,7 +56,7 @@ from typing import Any, overload
 import jax
 
 from jaxevent import devices
-from jaxevent.errors import InputError, MissingExtra
+from jaxevent.errors import InputError, InputWarning, MissingExtra
 from jaxevent.io import load, toml
 from jaxevent.progress import stage
 from jaxevent.recording import Recording
@@ -255,7 +256,10 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
                 "the same"
             )
         done, found, write = _fit_tasks(plan, sources, key, out, progress, held)
-        rows = _score(plan, done, sources, progress)
+        with warnings.catch_warnings():
+            # At the start of a fit thresholds need not be the sensor's.
+            warnings.filterwarnings("ignore", ".*events contradict frames", InputWarning)
+            rows = _score(plan, done, sources, progress)
         params = {t.label: one.params for t, one in zip(plan.tasks, done, strict=True)}
         gained = findings.gains(plan.tasks, unseen(rows))
         fits = Fits(rows, params, found, gained, _text(plan.tasks, rows, found, gained))

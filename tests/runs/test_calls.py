@@ -271,11 +271,7 @@ def test_import_paths():
     assert import_path(lambda a, b: 0) is None
 
 
-def test_what_other_processes_cannot_have(tmp_path):
-    jaxevent.save(small(), tmp_path / "small.h5")
-    lazy = jaxevent.load(tmp_path / "small.h5", in_memory=False)
-    with pytest.raises(InputError, match="small, blend: cannot be sent to other processes"):
-        evaluate(lazy, blend, workers=1)
+def test_what_other_processes_cannot_have():
     with pytest.raises(InputError, match="cannot be sent to other processes"):
         evaluate(small(), lambda r, t: grey(r, t), workers=1)
 

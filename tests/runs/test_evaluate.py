@@ -177,7 +177,7 @@ def test_results_of_a_configuration(folder, monkeypatch):
         (ONE + 'params = "none.toml"', "method 1: .*none.toml: cannot be read"),
         (ONE + "params = { c_onn = 0.1 }", "method 1: .*'c_onn'; did you mean 'c_on'"),
         (ONE + 'params = { response = "srgb" }', "no parameter 'response'"),
-        (ONE + 'params = { c_on = "much" }', "c_on is much"),
+        (ONE + 'params = { c_on = "much" }', "c_on is 'much'"),
         (ONE + "params = { c_on = true }", "c_on is True"),
         (ONE + "params = { c_on = nan }", "c_on is nan"),
         (ONE + "params = { c_on = -1 }", "c_on is -1"),

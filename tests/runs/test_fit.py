@@ -407,6 +407,7 @@ def test_errors_by_hand(error, clipped):
         assert (slope[counted] != 0).all() and counted.sum() > 10
 
 
+@pytest.mark.filterwarnings("ignore:.*events contradict frames")
 def test_the_loss_bounds_the_evaluated_error():
     """It equals what evaluation says of images within [0, 1], and is more for others."""
     recording = moving()
