@@ -47,13 +47,14 @@ def add_reading(one: argparse.ArgumentParser, frames: bool = True) -> None:
     one.add_argument(
         "--stream",
         metavar="NAME",
-        help="which camera, of a file that holds several: a topic, left, right or a number",
+        help="which camera, of a file that holds several: a topic, left, right or a number; none "
+        "reads its images alone",
     )
     one.add_argument(
         "--camera",
         metavar="FILE",
         help="calibration of the camera instead of the recording's: camchain.yaml of Kalibr or "
-        "camera_info of ROS; FILE:NAME takes one of several",
+        "camera_info of ROS or OpenCV; FILE:NAME takes one of several",
     )
     one.add_argument(
         "--time-unit",

@@ -55,7 +55,7 @@ _UNREADABLE = {
     },
 }
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
-NO_FRAMES = "none"
+NONE = "none"  # of frames or events that are left out
 _PROPHESEE = re.compile(
     rb"^% *(evt|format|version|data file|end)\b", re.I | re.M
 )  # lines of its headers
@@ -102,7 +102,8 @@ def load(
         progress: Whether a bar is shown where it takes longer than two seconds; None: where
             somebody looks on.
         stream: Which camera, of a file that holds the events of several: a topic of a ROS bag,
-            "left" or "right" of MVSEC and M3ED, the number of a stream of AEDAT 4.
+            "left" or "right" of MVSEC and M3ED, the number of a stream of AEDAT 4. "none" leaves
+            events out: the frames of a bag or of AEDAT 4 may then be of another camera.
         trust: Whether HDF5 may be made of other files, by links, external storage or virtual
             datasets. Such a file can have any file read that you may read, or never end.
         frames: Which images become the frames, of a file that holds several kinds: a topic of a
@@ -113,7 +114,7 @@ def load(
             a counter, keep a "part" between resets, or several of them, as in "unwrap,sort"; see
             `jaxevent.io.disorder`. None refuses such times, and the message says what would help.
         camera: A calibration instead of the recording's: camchain.yaml of Kalibr or camera_info of
-            ROS in YAML, or FILE:NAME, a camera of several; see `jaxevent.io.calibration`.
+            ROS or OpenCV in YAML, or FILE:NAME, a camera of several; see `jaxevent.io.calibration`.
 
     Raises:
         InputError: The file is missing, damaged or of another format, or what it holds is not a
@@ -129,11 +130,13 @@ def load(
         raise InputError(
             f"time_unit = {time_unit!r} is not a unit of time; give 's', 'ms', 'us' or 'ns'"
         )
-    without_frames = frames == NO_FRAMES
+    without_frames, without_events = frames == NONE, stream == NONE
+    camera_name = None if without_events else stream
     name = None if without_frames else frames
     options = ReadOptions(
-        size, in_memory, progress, stream, name, time_unit, repair, without_frames
-    )
+        size, in_memory, progress, camera_name, name, time_unit, repair,
+        without_frames, without_events,
+    )  # fmt: skip
     with contextlib.ExitStack() as stack:
         if trust:
             from jaxevent.io.hdf5_files import trusting
@@ -147,6 +150,8 @@ def load(
             recording = _reader(path, options)(path, options)
     if without_frames:
         recording = _drop_frames(recording)
+    if without_events:
+        recording = dataclasses.replace(recording, events=Events.empty())
     recording.refuse_empty(str(path))
     if camera is not None:
         from jaxevent.io.calibration import read_camera

@@ -57,7 +57,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
         kind: [number for number, stream in streams.items() if stream["type"] == kind]
         for kind in ("events", "frame", "imus", "triggers")
     }
-    number, chosen = _choose(path, of_kind["events"], options.stream, streams)
+    number, chosen = _choose(path, of_kind["events"], options, streams)
     unchosen: dict[str, str] = {}
     for kind, field in (("frame", "frames"), ("imus", "imu"), ("triggers", "triggers")):
         several = of_kind[kind]
@@ -124,21 +124,22 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
 
 def _choose(
-    path: Path, several: list[int], stream: str | None, streams: dict[int, dict]
+    path: Path, several: list[int], options: ReadOptions, streams: dict[int, dict]
 ) -> tuple[int | None, dict[str, int]]:
     """The number of the stream of events, None where there is none, and it by its kind."""
+    stream = options.stream
     if stream is not None and stream not in map(str, several):
         raise InputError(
             f"{path}: has no stream of events {stream!r}; its streams of events are "
             f"{', '.join(map(str, several)) or 'none'}"
         )
-    if stream is None and len(several) > 1:
+    if stream is None and len(several) > 1 and not options.without_events:
         named = ", ".join(f"{n} ({streams[n]['width']}x{streams[n]['height']})" for n in several)
         raise InputError(
             f"{path}: holds {len(several)} streams of events, {named}; choose one with stream=, or "
             "with jaxevent convert --stream"
         )
-    if not several:
+    if not several or options.without_events:
         if not any(other["type"] == "frame" for other in streams.values()):
             raise InputError(f"{path}: holds no stream of events and none of frames")
         return None, {}

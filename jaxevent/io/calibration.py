@@ -1,4 +1,4 @@
-"""Cameras of calibration files in YAML: Kalibr's camchain, and camera_info of ROS.
+"""Cameras of calibration files in YAML: Kalibr's camchain, camera_info of ROS, OpenCV's.
 
 Kalibr (camchain-NAME.yaml) lists cam0, cam1 and on, each with
 
@@ -11,11 +11,13 @@ Kalibr (camchain-NAME.yaml) lists cam0, cam1 and on, each with
 
 and further fields that are passed over, timeshift_cam_imu among them. ROS (camera_info_manager)
 writes a single camera, with image_width, image_height, camera_matrix, distortion_model and
-distortion_coefficients; its name is camera_name.
+distortion_coefficients; its name is camera_name. OpenCV's program of calibration writes these too,
+with fisheye_model instead of a name, and its matrices under a tag of its own.
 """
 
 import dataclasses
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,7 @@ from jaxevent.errors import InputError, require
 from jaxevent.io import calibrated, reading, whole_number
 
 SUFFIXES = (".yaml", ".yml")
+_OF_OPENCV = re.compile(r"\A%YAML:1\.0[^\n]*|!!opencv-matrix\b")  # no YAML by its own rules
 _MOST_BYTES = 1 << 20  # of a file of a few cameras
 
 
@@ -63,7 +66,8 @@ def read_cameras(path: Path) -> dict[str, CalibratedCamera]:
     with reading(source):
         if path.stat().st_size > _MOST_BYTES:
             raise InputError(f"{path}: is too large for a calibration; give the YAML of cameras")
-        table: Any = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8-sig"))
+        text = _OF_OPENCV.sub("", path.read_text(encoding="utf-8-sig"))
+        table: Any = YAML(typ="safe", pure=True).load(text)
     if isinstance(table, Mapping):
         if "camera_matrix" in table:
             return {str(table.get("camera_name") or "camera"): _of_ros(table, source)}
@@ -72,7 +76,7 @@ def read_cameras(path: Path) -> dict[str, CalibratedCamera]:
             return _chain({str(name): table[name] for name in names}, source)
     raise InputError(
         f"{path}: holds no camera; give a camchain of Kalibr (cam0: intrinsics, ...) or "
-        "camera_info of ROS (camera_matrix, ...)"
+        "camera_info of ROS or OpenCV (camera_matrix, ...)"
     )
 
 
@@ -156,7 +160,8 @@ def _of_ros(table: Mapping[str, Any], source: str) -> CalibratedCamera:
         size = _size(table["image_width"], table["image_height"], source)
     matrix = _numbers(_data(table["camera_matrix"]), 9, f"{source}: camera_matrix: data")
     k = _data(table.get("distortion_coefficients")) or []
-    model = str(table.get("distortion_model") or "")
+    fisheye = "equidistant" if table.get("fisheye_model") else ""
+    model = str(table.get("distortion_model") or fisheye)
     return _camera(matrix[[0, 4, 2, 5]], model, k, source, (size, np.eye(4)))
 
 

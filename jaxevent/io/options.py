@@ -14,6 +14,7 @@ class ReadOptions:
         stream: Name of the camera whose events are read; None where the file holds one.
         frames: Name of the images that become the frames; None lets the reader choose.
         without_frames: Whether frames are left out.
+        without_events: Whether events are left out; frames are then those of a camera of its own.
         time_unit: Unit of the event times, "s", "ms", "us" or "ns"; None infers it.
         repair: Repairs of event times that go back; None refuses them.
         notes: Remarks that readers add, for `Recording.notes`.
@@ -27,4 +28,5 @@ class ReadOptions:
     time_unit: str | None = None
     repair: str | None = None
     without_frames: bool = False
+    without_events: bool = False
     notes: list[str] = dataclasses.field(default_factory=list, compare=False)

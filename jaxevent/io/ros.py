@@ -8,13 +8,15 @@ types that are not read are named in `extra["topics_left_out"]` and, where a fie
 `left_out`. A bag with several cameras needs the topic of the events. A bag without events is read
 for its frames.
 
-Of several topics of images under the events' name `image_raw` is taken, and images as they are
-rather than their compressed copies. Depth images (32FC1, compressedDepth, and 16UC1 of a topic
-named so) are never taken. `frames` names another topic, or "none".
+Of several topics of images under the events' name those are taken that can be read and have the
+sensor's size, then `image_raw`, then images as they are rather than their compressed copies. Depth
+images (32FC1, compressedDepth, and 16UC1 of a topic named so) are never taken, and those of another
+size are another camera's, which `register` brings onto the events' pixels. `frames` names another
+topic, or "none".
 
-Images are mono8, mono10, 12, 14 and 16, in colours of 8 or 16 bits, in a Bayer pattern of 8 or 16
-bits (interpolated, see `bayer`), or compressed as Pillow reads them. Those of 10 to 14 bits are
-shifted to 16.
+Images are mono8, mono10, 12, 14 and 16, in colours of 8 or 16 bits, YUV 4:2:2 (of which the luma is
+read), in a Bayer pattern of 8 or 16 bits (interpolated, see `bayer`), or compressed as Pillow reads
+them. Those of 10 to 14 bits are shifted to 16.
 
 Times are those of the messages' headers and of the events, not those of recording, as ROS time in
 us (nanoseconds are cut off). The exposure of images is unknown: 0. Colour images become grey
@@ -24,10 +26,11 @@ Decoder. The package rosbags reads the containers, see `bags`. importRosbag (GPL
 2. Both agree on bags of ROS 1 written by rosbags; of ROS 2, bags are read that rosbags wrote.
 """
 
+import contextlib
 import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,13 +51,17 @@ _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _IMU, _POSE = "sensor_msgs/msg/Imu", "geometry_msgs/msg/PoseStamped"
 _CAMERA = "sensor_msgs/msg/CameraInfo"
 _FIELDS = {_IMU: "imu", _POSE: "poses", _CAMERA: "camera"}
+_LUMA_AT = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}  # byte of a pixel's two
 _DEEP = {"mono10": 10, "mono12": 12, "mono14": 14}  # bits, of 16
 _CHANNELS = {
     "mono8": ("u1", 1),
     "8UC1": ("u1", 1),
     "mono16": ("u2", 1),
     "16UC1": ("u2", 1),
+    "8UC3": ("u1", 3),  # blue, green, red, as OpenCV has them
+    "8UC4": ("u1", 4),
     **{name: ("u2", 1) for name in _DEEP},
+    **{name: ("u1", 2) for name in _LUMA_AT},
     **{
         f"{order}{bits}": (f"u{bits // 8}", len(order))
         for order in ("rgb", "bgr", "rgba", "bgra")
@@ -68,6 +75,14 @@ _CHANNELS = {
 }
 
 
+class _Topic(NamedTuple):
+    """A topic of images, by its first one."""
+
+    is_depth: bool
+    is_read: bool  # its encoding
+    size: tuple[int, int] | None  # (width, height); None where a compressed image is damaged
+
+
 def read(path: Path, options: ReadOptions) -> Recording:
     """Read a bag. Raises `InputError` for bad input.
 
@@ -78,8 +93,11 @@ def read(path: Path, options: ReadOptions) -> Recording:
     with reading(source):
         bag = Bag(path)
         several, images = event_topics(bag), _image_topics(bag)
-    topic = _choose(bag, several, any(images.values()), options)
-    image, left_out = _choose_frames(path, bag, topic, images, options)
+    topic = _choose(bag, several, any(not one.is_depth for one in images.values()), options)
+    with reading(source):
+        events_of = None if topic is None else event_topic(bag, topic)
+    told = events_of.size if events_of else None
+    image, left_out = _choose_frames(bag, topic, images, options, options.size or told)
     chosen: dict[str, str | None] = {}
     for kind, field in _FIELDS.items():
         found = bag.beside(topic, held := bag.topics(kind))
@@ -95,8 +113,6 @@ def read(path: Path, options: ReadOptions) -> Recording:
         imu = _imu(bag, chosen[_IMU])
         poses = _poses(bag, chosen[_POSE])
         camera, of_lens = _camera(bag, chosen[_CAMERA])
-        events_of = None if topic is None else event_topic(bag, topic)
-    told = events_of.size if events_of else None
     otherwise = f"{path}: the events of {topic} do not tell the sensor's size;"
     size = sensor_size(options.size, told, frames=frames, otherwise=otherwise)
     events = decoded(events_of.decode, size, source, options) if events_of else Events.empty()
@@ -116,6 +132,8 @@ def read(path: Path, options: ReadOptions) -> Recording:
 def _choose(bag: Bag, topics: list[str], has_images: bool, options: ReadOptions) -> str | None:
     """The topic of the events; None in a bag of images alone."""
     path, stream = bag.path, options.stream
+    if options.without_events and has_images:
+        return None
     if stream is not None and stream not in topics:
         raise InputError(
             f"{path}: has no topic of events {stream!r}; its topics of events are "
@@ -138,24 +156,40 @@ def _choose(bag: Bag, topics: list[str], has_images: bool, options: ReadOptions)
     return stream or topics[0]
 
 
-def _image_topics(bag: Bag) -> dict[str, bool]:
-    """All topics of images, sorted, and whether they can be frames: depths cannot."""
+def _image_topics(bag: Bag) -> dict[str, _Topic]:
+    """All topics of images, sorted."""
+    from PIL import Image
+
     found = {}
     for topic in bag.topics(_IMAGE, _COMPRESSED):
         _, message = next(bag.decoded(topic))
         if bag.kind(topic) == _COMPRESSED:
-            found[topic] = "compressedDepth" not in message.format
-        else:
-            deep = message.encoding == "16UC1" and "depth" in topic.lower()
-            found[topic] = not deep and message.encoding not in ("32FC1", "64FC1")
+            size = None
+            # What is wrong with it is told where its images are read.
+            with contextlib.suppress(Exception), Image.open(io.BytesIO(message.data)) as opened:
+                size = opened.size
+            found[topic] = _Topic("compressedDepth" in message.format, True, size)
+            continue
+        encoding = message.encoding
+        is_depth = encoding in ("32FC1", "64FC1")
+        is_depth |= encoding == "16UC1" and "depth" in topic.lower()
+        size = (message.width, message.height)
+        found[topic] = _Topic(is_depth, encoding in _CHANNELS, size)
     return found
 
 
 def _choose_frames(
-    path: Path, bag: Bag, events: str | None, images: dict[str, bool], options: ReadOptions
+    bag: Bag,
+    events: str | None,
+    images: dict[str, _Topic],
+    options: ReadOptions,
+    size: tuple[int, int] | None,
 ) -> tuple[str | None, dict[str, str]]:
-    """The topic of the frames, None where none is chosen, and what that leaves out."""
-    several = [topic for topic, is_frame in images.items() if is_frame]
+    """The topic of the frames, None where none is chosen, and what that leaves out.
+
+    `size` is that of the sensor, None where it is not known.
+    """
+    several = [topic for topic, one in images.items() if not one.is_depth]
     listed = ", ".join(several)
     if options.without_frames:
         return None, {}
@@ -163,18 +197,31 @@ def _choose_frames(
         if options.frames not in several:
             held = "depths in" if options.frames in images else "no images in a topic"
             raise InputError(
-                f"{path}: holds {held} {options.frames!r}, and images in {listed or 'no topic'}; "
-                "correct frames= or --frames, or give none to read no frames"
+                f"{bag.path}: holds {held} {options.frames!r}, and images in "
+                f"{listed or 'no topic'}; correct frames= or --frames, or give none to read no "
+                "frames"
             )
         return options.frames, {}
     found = bag.beside(events, several)
     if len(several) > 1 and not found and len({_source_of(topic) for topic in several}) == 1:
         found = several
+
+    def fits(topic: str) -> bool:
+        return None in (size, images[topic].size) or images[topic].size == size
+
     for prefer in (
+        lambda topic: images[topic].is_read,
+        fits,
         lambda topic: _source_of(topic).rpartition("/")[2] == "image_raw",
         lambda topic: bag.kind(topic) == _IMAGE,
     ):
         found = [topic for topic in found if prefer(topic)] or found
+    if len(found) == 1 and not fits(found[0]):
+        (width, height), (across, down) = images[found[0]].size or (0, 0), size or (0, 0)
+        return None, {
+            "frames": f"the images of {found[0]} have {width}x{height} pixels, not the sensor's "
+            f"{across}x{down}; jaxevent register --images {found[0]} brings them onto it"
+        }
     if len(found) == 1:
         if len(several) > 1:
             others = ", ".join(topic for topic in several if topic != found[0])
@@ -265,6 +312,8 @@ def _image(bag: Bag, topic: str, message: Any) -> NDArray:
     row = message.width * channels * dtype.itemsize
     image = np.ascontiguousarray(rows[:, :row]).view(dtype)
     image = image.reshape(message.height, message.width, channels).astype(dtype.newbyteorder("="))
+    if encoding in _LUMA_AT:
+        return np.ascontiguousarray(image[..., _LUMA_AT[encoding]])
     if channels == 1:
         return _colours(image[..., 0] << (16 - _DEEP.get(encoding, 16)), encoding)
     return np.ascontiguousarray(image[..., :3] if encoding[0] == "r" else image[..., 2::-1])

@@ -27,14 +27,14 @@ def read_frames(
 ) -> Recording:
     """Another camera's frames, as a recording that need not hold events.
 
-        `path` is anything that `jaxevent.load` reads, whose frames are taken, or images as of
-        `jaxevent.io.images`: a folder of PNG, TIFF, JPEG or .npy with timestamps.txt or images.txt
-        of lines "t name", or HDF5 of t and image. `exposure` (s) is that of the latter, where their
+    `path` is anything that `jaxevent.load` reads, whose frames are taken, or images as of
+    `jaxevent.io.images`: a folder of PNG, TIFF, JPEG or .npy with timestamps.txt or images.txt of
+    lines "t name", or HDF5 of t and image. `exposure` (s) is that of the latter, where their
     timestamps do not tell it. With `reference`, of a recording its HDR images are taken if it holds
     any (`extra["hdr"]` and `extra["hdr_t"]`), and `white` is the value of images that is intensity
     1. Colours of frames are kept in `extra["rgb"]`. `frames` chooses among several kinds of images
-    of a recording, as in `jaxevent.load`.
-        Raises `InputError` for what cannot be read and where there are no frames.
+    of a recording, as in `jaxevent.load`; the events beside them may be of another camera, and are
+    left out. Raises `InputError` for what cannot be read and where there are no frames.
     """
 
     path = Path(path)
@@ -45,7 +45,8 @@ def read_frames(
             raise InputError(f"{path}: holds one kind of images; leave out frames")
         recording = _read_series(path, exposure, white, reference)
     else:
-        recording = load(path, in_memory=False, frames=frames, progress=progress)
+        stream = None if frames is None else "none"
+        recording = load(path, in_memory=False, stream=stream, frames=frames, progress=progress)
         if exposure is not None or white is not None:
             name = "exposure" if white is None else "white"
             raise InputError(f"{path}: is a recording, which tells its own; leave out {name}")

@@ -15,6 +15,7 @@ from jaxevent.egomotion.baselines import contrast_maximisation, local_planes, tr
 from jaxevent.egomotion.baselines.five_points import relative_motion
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Recording
+from jaxevent.simulate import motion_scene
 
 WIDTH, HEIGHT, F = 96, 72, 90.0
 CAMERA = PinholeCamera(F, F, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
@@ -224,6 +225,22 @@ def test_planes_find_the_motion(model, truth):
     assert len(motion) == 1 and motion.valid.all() and motion.lag[0] > 0
     assert np.linalg.norm(motion.mean[0] - truth) < 0.01 * np.linalg.norm(truth)
     assert np.linalg.eigvalsh(motion.covariance[0]).min() > 0
+
+
+def test_a_rotation_is_found_through_a_fisheye():
+    """Seen 45 degrees from the axis; taken for a lens without distortion, it is another one."""
+    lens = PinholeCamera(60, 60, 47.5, 35.5, (0.05, -0.01), "equidistant")
+    recording, source = motion_scene(
+        "rotation", seed=5, size=(96, 72), duration=0.12, speed=2, lens=lens
+    )
+    assert recording.camera == lens
+    params = planes.Params.of(dict(window=0.06, step=0.03))
+    errors = []
+    for camera in (None, lens.undistorted):
+        motion = planes.estimate(recording, params, model="rotation", camera=camera)
+        (omega,) = np.unique(source.twist(motion.t)[1].round(9), axis=0)
+        errors.append(np.linalg.norm(motion.mean[motion.valid].mean(0) - omega) / 2)
+    assert errors[0] < 0.04 and errors[1] > 0.1
 
 
 def test_planes_of_one_direction_are_lost():

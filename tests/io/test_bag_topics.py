@@ -15,6 +15,7 @@ from jaxevent.errors import InputError
 from jaxevent.events import undistort
 from jaxevent.io import ros_messages
 from jaxevent.recording import Events, Frames, Recording
+from jaxevent.register import read_frames
 
 pytest.importorskip("rosbags")
 
@@ -315,7 +316,11 @@ def test_other_encodings(tmp_path):
         "bgra8": rgba[..., [2, 1, 0, 3]],
         "rgb16": deep,
         "bgr16": deep[..., ::-1],
+        "8UC3": rgb[..., ::-1],
+        "8UC4": rgba[..., [2, 1, 0, 3]],
         "mono12": IMAGES.astype(np.uint16) << 4,
+        "yuv422": np.stack([255 - IMAGES, IMAGES], -1),
+        "yuv422_yuy2": np.stack([IMAGES, 255 - IMAGES], -1),
     }
     for encoding, stack in held.items():
         topic = {"/cam/image_raw": images(stack, encoding)}
@@ -323,18 +328,49 @@ def test_other_encodings(tmp_path):
         if encoding == "mono12":
             np.testing.assert_array_equal(got.frames.images, IMAGES.astype(np.uint16) << 8)
             continue
+        if encoding.startswith("yuv"):
+            np.testing.assert_array_equal(got.frames.images, IMAGES)
+            continue
         colours = deep if encoding.endswith("16") else rgb
         np.testing.assert_array_equal(got.frames.images, np.rint(colours @ [0.299, 0.587, 0.114]))
-        assert ("rgb" in got.extra) == encoding.endswith("8")
+        assert ("rgb" in got.extra) == (not encoding.endswith("16"))
 
 
 def test_encodings_that_are_not_read_can_be_left_out(tmp_path, capsys):
-    path = bag(tmp_path / "a.bag", {"/cam/image_raw": images(IMAGES, "yuv422")})
-    with pytest.raises(InputError, match="image_raw are encoded as 'yuv422'.*frames='none'"):
+    path = bag(tmp_path / "a.bag", {"/cam/image_raw": images(IMAGES, "nv21")})
+    with pytest.raises(InputError, match="image_raw are encoded as 'nv21'.*frames='none'"):
         jaxevent.load(path)
     assert_events(jaxevent.load(path, frames="none"))
-    fails(capsys, ["info", path], "yuv422", "--frames none")
+    fails(capsys, ["info", path], "nv21", "--frames none")
     assert cli.main(["info", str(path), "--frames", "none"]) == 0
+    topics = {"/cam/image_raw": images(IMAGES, "nv21"), "/cam/image_rect": images(255 - IMAGES)}
+    got = jaxevent.load(bag(tmp_path / "b.bag", topics))
+    np.testing.assert_array_equal(got.frames.images, 255 - IMAGES)
+
+
+def test_images_of_another_size_are_another_camera(tmp_path, capsys):
+    large = np.kron(IMAGES, np.ones((1, 2, 2), np.uint8))
+    path = bag(tmp_path / "a.bag", {"/rgb/image_raw": images(large)})
+    got = jaxevent.load(path)
+    assert_events(got)
+    assert got.frames is None
+    assert "24x20 pixels, not the sensor's 12x10" in got.describe_left_out("frames")
+    assert cli.main(["info", str(path)]) == 0
+    assert "register --images /rgb/image_raw" in capsys.readouterr().out
+    topics = {"/cam/image_raw": images(large), "/cam/image_small": images(IMAGES)}
+    got = jaxevent.load(bag(tmp_path / "b.bag", topics))
+    np.testing.assert_array_equal(got.frames.images, IMAGES)
+
+    other = read_frames(path, frames="/rgb/image_raw")
+    assert (other.width, other.height) == (24, 20) and not len(other.events)
+    np.testing.assert_array_equal(np.asarray(other.frames.images), large)
+    grid = np.eye(3) * [2, 2, 1]
+    np.savetxt(tmp_path / "H.csv", grid, delimiter=",")
+    words = ["register", path, "--frames", path, "--images", "/rgb/image_raw", "--offset", "0"]
+    words += ["--homography", tmp_path / "H.csv", "--out", tmp_path / "both.h5"]
+    assert cli.main([str(word) for word in words]) == 0
+    both = jaxevent.load(tmp_path / "both.h5")
+    assert both.frames.images.shape == IMAGES.shape and both.frames.t.tolist() == T
 
 
 def test_lenses_of_camera_info(tmp_path):

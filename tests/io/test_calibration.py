@@ -99,6 +99,34 @@ def test_a_recording_takes_the_camera_of_its_size(stored, capsys):
     )
 
 
+OF_OPENCV = """%YAML:1.0
+---
+image_width: 14
+image_height: 10
+fisheye_model: 1
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 60., 0., 7., 0., 61., 5., 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 4
+   cols: 1
+   dt: d
+   data: [ 0.1, 0.01, 0., 0. ]
+"""
+
+
+def test_a_file_of_opencv_is_read(stored):
+    path = stored / "opencv.yaml"
+    path.write_text(OF_OPENCV)
+    want = PinholeCamera(60, 61, 7, 5, (0.1, 0.01), "equidistant")
+    assert jaxevent.load(stored / "a.h5", camera=path).camera == want
+    path.write_text(OF_OPENCV.replace("fisheye_model: 1", "fisheye_model: 0"))
+    want = PinholeCamera(60, 61, 7, 5, (0.1, 0.01))
+    assert jaxevent.load(stored / "a.h5", camera=path).camera == want
+
+
 def test_a_rig_is_two_cameras_of_a_chain(stored):
     def assert_rig(rig, lenses, transform):
         assert (rig.events, rig.frames) == lenses

@@ -481,6 +481,8 @@ def test_aedat_4_of_several_streams_of_frames(tmp_path):
     np.testing.assert_array_equal(got.frames.t, [1010, 3010])
     np.testing.assert_array_equal(got.frames.images, images[1::2])
     assert got.left_out == {}
+    alone = load(path, stream="none", frames="2")
+    assert not len(alone.events) and alone.frames.t.tolist() == [1010, 3010]
     with pytest.raises(InputError, match="has no stream of frames '0'; its .* of frames are 1, 2"):
         load(path, frames="0")
     path.write_bytes(formats.aedat4(events, SIZE, streams=0, **shots))

@@ -34,6 +34,25 @@ def test_grid_of_a_plane_is_that_of_opencv(plane):
     np.testing.assert_allclose(grid[y, x], places[:, 0], atol=1e-6)
 
 
+def test_grid_between_fisheyes_is_that_of_opencv():
+    cv2 = pytest.importorskip("cv2")
+    one = PinholeCamera(70, 71, 63.5, 47.5, (0.05, -0.01, 2e-3, -1e-3), "equidistant")
+    two = PinholeCamera(80.0, 79.0, 101.0, 74.0, (-0.02, 0.01, -3e-3, 1e-3), "equidistant")
+    rig = Rig(one, two, RIG.rotation, RIG.translation)
+    grid = rig.grid(SIZE, OTHER, depth=2.0)
+    y, x = np.nonzero(~np.isnan(grid[..., 0]))
+    assert len(x) > 0.5 * SIZE[0] * SIZE[1]
+    matrix, other = (np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]]) for c in (one, two))
+    at = np.stack([x, y], 1)[:, None].astype(float)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-12)
+    ray = cv2.fisheye.undistortPoints(at, matrix, np.array(one.distortion), criteria=stop)[:, 0]
+    X = 2.0 * np.concatenate([ray, np.ones((len(ray), 1))], 1)[:, None]
+    turn = cv2.Rodrigues(RIG.rotation)[0]
+    k = np.array(two.distortion)
+    places, _ = cv2.fisheye.projectPoints(X, turn, RIG.translation[:, None], other, k)
+    np.testing.assert_allclose(grid[y, x], places[:, 0], atol=1e-6)
+
+
 def test_a_depth_map_is_the_plane_and_far_away_the_translation_does_not_matter():
     plane = (0.3, -0.2, 1.0, 1.5)
     ray = rays(ONE, SIZE)
