@@ -591,7 +591,8 @@ def estimates() -> Iterator[Case]:
 
 def mutated(column: str, value: int) -> Recording:
     """A recording whose arrays somebody changed after it was made."""
-    recording = kept()
+    own = {name: values.copy() for name, values in clean().items()}  # not those of other cases
+    recording = kept(**own)
     getattr(recording.events, column)[1000] = value
     return recording
 
