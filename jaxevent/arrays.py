@@ -25,7 +25,7 @@ NAMES = {
 LUMA = np.array([0.299, 0.587, 0.114])  # of red, green and blue, ITU-R 601
 MAX_PIXELS = 1 << 16  # of a side: coordinates are uint16
 MAX_TIME_US = 1 << 62  # 146,000 years: sums and differences of two times stay in int64
-_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
+SCALES: dict[str, float] = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}  # us in one unit
 _LUMA_16 = (19595, 38470, 7471)  # LUMA in units of 2^-16, as Pillow computes grey
 _BLOCK = 1 << 20  # values compared together, so that a check needs no memory to speak of
 _HELD_NOT_NUMBERS = {
@@ -40,7 +40,7 @@ _HELD_NOT_NUMBERS = {
 
 
 def find(names: Sequence[str]) -> dict[str, str] | None:
-    """Which of some names are t, x, y and p; None unless each is there, once."""
+    """The names of t, x, y and p among some; None unless each is there, once."""
     found = {}
     for field, aliases in NAMES.items():
         fitting = [name for name in names if str(name).strip().lower() in aliases]
@@ -67,12 +67,8 @@ def as_array(values: Any, what: str) -> NDArray:
     ):
         raise InputError(f"{what} is a {type(values).__name__}; give an array or a list of numbers")
     try:
-        if isinstance(values, np.ndarray) or not hasattr(values, "__dlpack__"):
-            array = np.asarray(values)
-        elif hasattr(values, "__array__"):
-            array = np.asarray(values)
-        else:
-            array = np.from_dlpack(values)
+        only_dlpack = hasattr(values, "__dlpack__") and not hasattr(values, "__array__")
+        array = np.from_dlpack(values) if only_dlpack else np.asarray(values)
     except Exception as error:  # whatever the library of the array raises
         reason = " ".join(str(error).split())[:150] or type(error).__name__
         raise InputError(
@@ -86,7 +82,7 @@ def as_array(values: Any, what: str) -> NDArray:
 
 
 def _is_spent(values: Iterable[Any]) -> bool:
-    """Whether these can be passed over only once, or have no order, as generators and files."""
+    """Tell what can be passed over only once or has no order, as generators and files."""
     return not (hasattr(values, "__len__") and hasattr(values, "__getitem__"))
 
 
@@ -144,7 +140,7 @@ def check_unit(time_unit: Any) -> None:
     """Raise `InputError` unless a unit of time is "s", "ms", "us" or "ns", or None."""
     if time_unit is not None and time_unit not in get_args(TimeUnit):
         raise InputError(
-            f"time_unit = {brief(time_unit)} is no unit of time; give 's', 'ms', 'us' or 'ns'"
+            f"time_unit = {brief(time_unit)} is not a unit of time; give 's', 'ms', 'us' or 'ns'"
         )
 
 
@@ -162,18 +158,12 @@ def as_times(values: Any, what: str, time_unit: TimeUnit | None = None) -> NDArr
             f"{what} is {t.dtype}, which tells no unit; give time_unit='s' (or 'ms', 'us', 'ns'), "
             "or integer microseconds"
         )
-    scale = 1.0 if time_unit is None else _US[time_unit]
+    unit = time_unit or "us"
     if t.dtype.kind == "f":
-        refuse_coarse_times(t, scale, what)
-        t = times(t, what, "row", scale) if len(t) else t
-    elif scale >= 1 and len(t):
-        check_span(t, what, "row", round(scale))
-        t = t.astype(np.int64, copy=False)
-        t = t * round(scale) if scale > 1 else t
-    elif len(t):
-        check_span(t, what, "row")
-        t = (t.astype(np.int64, copy=False) + 500) // 1000
-    return as_plain(t, np.int64)
+        refuse_coarse_times(t, SCALES[unit], what)
+    elif unit != "us":
+        check_span(t, what, "row", max(round(SCALES[unit]), 1))
+    return as_plain(to_microseconds(t, unit, what, "row") if len(t) else t, np.int64)
 
 
 def refuse_coarse_times(t: NDArray, scale: float, what: str) -> None:
@@ -210,6 +200,31 @@ def times(
     if not is_float:
         return values.astype(np.int64, copy=False)
     return np.rint(values * scale).astype(np.int64)
+
+
+def to_microseconds(
+    values: NDArray, unit: str, source: str, what: str, first_row: int = 0
+) -> NDArray[np.int64]:
+    """Convert times of a unit to int64 us.
+
+    Args:
+        values: (n,) times.
+        unit: "s", "ms", "us" or "ns"; nanoseconds are rounded.
+        source: Name of the file for messages.
+        what: "event", "image" or the like.
+        first_row: Row of the first time in the file.
+
+    Raises:
+        InputError: A time is not finite or too large for us.
+    """
+    if values.dtype.kind not in "iu" or unit == "us":
+        return times(values, source, what, SCALES[unit], first_row)
+    wide = values if values.dtype == np.uint64 else values.astype(np.int64)
+    if unit == "ns":
+        whole, rest = np.divmod(wide, wide.dtype.type(1000))
+        return times(whole, source, what, first_row=first_row) + (rest >= 500)
+    times(wide * np.float64(SCALES[unit]), source, what, 1.0, first_row)  # that they fit
+    return wide.astype(np.int64) * round(SCALES[unit])
 
 
 def check_span(

@@ -49,7 +49,7 @@ class PinholeCamera:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether straight lines may be seen bent."""
+        """True where straight lines may be seen bent."""
         return self.model == "equidistant" or any(self.distortion)
 
     @property

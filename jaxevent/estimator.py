@@ -29,8 +29,9 @@ from jax.core import Tracer
 from jaxevent.arrays import brief
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.parameters import Parameters, phrase, with_article
+from jaxevent.parameters import Parameters, phrase
 from jaxevent.recording import Events, Recording, Times, microseconds
+from jaxevent.shown import with_article
 
 P = TypeVar("P", bound=Parameters)
 T = TypeVar("T")
@@ -253,7 +254,7 @@ class Estimator(abc.ABC, Generic[P]):
 
     @property
     def by_parameters(self) -> str:
-        """How to differentiate it by parameters, for messages."""
+        """The way to differentiate it by parameters, for messages."""
         if not self.differentiable:
             return "choose another method, this one is no function of parameters to JAX"
         return (

@@ -69,12 +69,17 @@ def find(name: str, family: str | None = None) -> Estimator:
         if name not in known:
             raise UnknownMethod(f"there is no method {name!r}; {nearest(name, names(family))}")
         found = _load(known[name])
+    check_family(found, family, name)
+    return found
+
+
+def check_family(found: Estimator, family: str | None, name: str) -> None:
+    """Raise `InputError` for a method of another family than `family`; None allows all."""
     if family is not None and found.family != family:
         raise InputError(
             f"the method {name!r} is of {found.family}, not of {family}; "
             f"{nearest(name, names(family))}"
         )
-    return found
 
 
 class _Methods(Mapping[str, Estimator]):

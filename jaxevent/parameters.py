@@ -16,6 +16,7 @@ from jaxtyping import Array
 
 from jaxevent.dispatch import check_platform
 from jaxevent.errors import InputError
+from jaxevent.shown import with_article
 
 T = TypeVar("T", bound="Parameters")
 S = TypeVar("S", bound="Setting")
@@ -316,7 +317,7 @@ class Parameters(_Module):
 
     @property
     def is_gradient(self) -> bool:
-        """Whether it holds derivatives by parameters, or a step; false where it is traced."""
+        """True where it holds derivatives by parameters, or a step; false where it is traced."""
         return isinstance(self.point, Array | np.ndarray) and not (
             isinstance(self.point, Tracer) or np.any(np.asarray(self.point))
         )
@@ -501,7 +502,7 @@ def _plain(value: Any) -> Any:
 
 
 def _stored(number: Number, value: Any, dtype: Any = None) -> Array:
-    """What is stored of a value, which is checked unless it is traced."""
+    """Return what is stored of a value, which is checked unless it is traced."""
     dtype = jnp.result_type(float) if dtype is None else dtype
     if isinstance(value, Tracer):
         if not (
@@ -525,11 +526,6 @@ def _chosen(setting: Choice | Count, value: Any) -> Any:
     value = _plain(value)
     setting.check(value)
     return value
-
-
-def with_article(name: str) -> str:
-    """A name with its article: "a dict", "an Estimate"."""
-    return f"a{'n' * (name[0] in 'AEIOUaeiou')} {name}"
 
 
 def phrase(value: Any) -> str:

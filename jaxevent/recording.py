@@ -648,7 +648,7 @@ class Recording(Shown):
             arrays.coordinates("y", y, size, name),
             arrays.polarities(p, name),
         )
-        events.check(*size, name)
+        events.check_order(name)
         made = None
         if grey is not None:
             if frame_times is None:

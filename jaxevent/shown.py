@@ -15,8 +15,12 @@ class Shown:
 
 def a_kind(thing: Any) -> str:
     """The kind of a thing with its article: a Filter, an int."""
-    name = type(thing).__name__
-    return "None" if thing is None else f"a{'n' * (name[0] in 'aeiouAEIOU')} {name}"
+    return "None" if thing is None else with_article(type(thing).__name__)
+
+
+def with_article(name: str) -> str:
+    """A name with its article: "a dict", "an Estimate"."""
+    return f"a{'n' * (name[0] in 'AEIOUaeiou')} {name}"
 
 
 def plural(what: str, number: int) -> str:

@@ -52,7 +52,7 @@ class ScanRun:
 
     @property
     def _parts(self) -> tuple[Filter, TrackerParams]:
-        """What all its programs take; raises `InputError` where none can run."""
+        """Return the arguments of all its programs; raises `InputError` where none can run."""
         dispatch.check_threads()
         return self._given
 

@@ -62,7 +62,6 @@ _PROPHESEE = re.compile(
 _LINE = 1 << 12  # bytes of a line that are looked at
 _SMALL = 1 << 27  # bytes of arrays that every file may unfold to
 _MOST_COMPRESSED = 100  # times that a larger one may unfold to of its own bytes
-TIME_UNITS = ("s", "ms", "us", "ns")
 
 _COUNTS = {8: "eight", 9: "nine", 12: "twelve"}  # of the numbers of a camera
 
@@ -126,10 +125,7 @@ def load(
             f"size = {size} must be two positive numbers of pixels, (width, height), of at most "
             f"{arrays.MAX_PIXELS}"
         )
-    if time_unit not in (None, *TIME_UNITS):
-        raise InputError(
-            f"time_unit = {time_unit!r} is not a unit of time; give 's', 'ms', 'us' or 'ns'"
-        )
+    arrays.check_unit(time_unit)
     without_frames, without_events = frames == NONE, stream == NONE
     camera_name = None if without_events else stream
     name = None if without_frames else frames
@@ -159,7 +155,9 @@ def load(
         lens = read_camera(camera, (recording.width, recording.height))
         left_out = {name: why for name, why in recording.left_out.items() if name != "camera"}
         recording = dataclasses.replace(recording, camera=lens, left_out=left_out)
-    return dataclasses.replace(recording, notes=(*recording.notes, *options.notes))
+    if options.notes:
+        recording = dataclasses.replace(recording, notes=(*recording.notes, *options.notes))
+    return recording
 
 
 def _drop_frames(recording: Recording) -> Recording:
@@ -330,10 +328,8 @@ def _table_reader(path: Path, head: bytes) -> Reader | None:
 
 
 def _zip_reader(path: Path) -> Reader:
-    with reading(str(path)), zipfile.ZipFile(path) as archive:
+    with reading(str(path)), open_archive(path) as archive:
         names = archive.namelist()
-        unfolded = sum(member.file_size for member in archive.infolist())
-        check_unfolded(unfolded, path.stat().st_size, str(path))
         texts = find_event_texts(names)
         if texts and texts[0].rpartition("/")[2] != "events.txt":
             with archive.open(texts[0]) as file:
@@ -360,7 +356,7 @@ def find_event_texts(names: Sequence[str]) -> list[str]:
 
 
 def _is_table(line: bytes) -> bool:
-    """Whether a text that begins with a line can be events: width and height, or numbers."""
+    """Tell whether a text that begins with a line can be events: width and height, or numbers."""
     words = line.removeprefix(codecs.BOM_UTF8).split()
     return len(words) in (2, 4) and all(re.fullmatch(rb"[+-]?[\d.eE+-]+", word) for word in words)
 
@@ -451,6 +447,14 @@ def check_unfolded(size: int, stored: int, source: str) -> None:
             f"{_MOST_COMPRESSED} times as many; it is damaged or not a recording, else store it "
             "with less compression"
         )
+
+
+def open_archive(file: Path) -> zipfile.ZipFile:
+    """Open a zip archive; raises `InputError` where it claims to hold far more than it can."""
+    archive = zipfile.ZipFile(file)
+    unfolded = sum(member.file_size for member in archive.infolist())
+    check_unfolded(unfolded, file.stat().st_size, str(file))
+    return archive
 
 
 def checked_events(

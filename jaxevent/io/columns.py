@@ -38,19 +38,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent import arrays
-from jaxevent.arrays import NAMES
+from jaxevent.arrays import NAMES, to_microseconds
 from jaxevent.errors import InputError
 from jaxevent.io import reading
 from jaxevent.io.decoded import BLOCK, Columns, decoded
 from jaxevent.io.options import ReadOptions
-from jaxevent.io.time_units import (
-    SAMPLE,
-    InferredUnit,
-    infer_unit,
-    numbers_of_dates,
-    to_microseconds,
-    unit_of_name,
-)
+from jaxevent.io.time_units import SAMPLE, InferredUnit, infer_unit, numbers_of_dates, unit_of_name
 from jaxevent.recording import Recording
 
 NUMPY_MAGIC = b"\x93NUMPY"

@@ -35,16 +35,10 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.io import calibrated, reading, sensor_size, times, vectors, whole_number
+from jaxevent.io import calibrated, open_archive, reading, sensor_size, times, vectors, whole_number
 from jaxevent.io.decoded import DecodedImages, decoded
 from jaxevent.io.images import grey_of_bgr
-from jaxevent.io.numpy_files import (
-    events_decoder,
-    open_archive,
-    open_events,
-    read_header,
-    read_member,
-)
+from jaxevent.io.numpy_files import events_decoder, open_events, read_header, read_member
 from jaxevent.io.options import ReadOptions
 from jaxevent.lenses import LENSES, find_model
 from jaxevent.recording import Frames, Imu, Poses, Recording

@@ -26,11 +26,12 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.io import reading, sensor_size, whole_number
+from jaxevent.io.columns import first_and_last
 from jaxevent.io.decoded import DecodedImages, decoded
 from jaxevent.io.images import grey_of_bgr
 from jaxevent.io.numpy_files import events_decoder, open_events
 from jaxevent.io.options import ReadOptions
-from jaxevent.io.time_units import SAMPLE, clock_of, infer_unit
+from jaxevent.io.time_units import clock_of, infer_unit
 from jaxevent.recording import Frames, Recording
 
 
@@ -54,10 +55,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
     otherwise = f"{path}: neither metadata.json nor an image tells the sensor's size;"
     size = sensor_size(options.size, told, frames=None, otherwise=otherwise)
     count = len(columns["t"])
-    sample = {
-        name: np.concatenate([columns[name][:SAMPLE], columns[name][max(SAMPLE, count - 1) :]])
-        for name in "txy"
-    }
+    sample = first_and_last(lambda rows: {name: columns[name][rows] for name in "txy"}, count)
     usual = "s" if columns["t"].dtype.kind == "f" else "us"
     unit = infer_unit(sample, count, size, source, options, usual=usual)
     events = decoded(events_decoder(columns, unit.name, source), size, source, options)

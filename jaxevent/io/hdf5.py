@@ -38,6 +38,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import to_microseconds
 from jaxevent.errors import InputError, OrderError
 from jaxevent.io import (
     check_unfolded,
@@ -58,14 +59,7 @@ from jaxevent.io.hdf5_files import array, attribute, dataset, describe_images, o
 from jaxevent.io.options import ReadOptions
 from jaxevent.io.output import complete_hdf5
 from jaxevent.io.reopening import EventsInFile, ImagesInFile
-from jaxevent.io.time_units import (
-    NAMES,
-    Clock,
-    InferredUnit,
-    infer_unit,
-    to_microseconds,
-    unit_of_words,
-)
+from jaxevent.io.time_units import NAMES, Clock, InferredUnit, infer_unit, unit_of_words
 from jaxevent.progress import bar
 from jaxevent.recording import (
     EventColumns,
@@ -538,7 +532,7 @@ def _recording(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
 
 
 def _describe_frames(file: h5py.File, path: Path) -> dict[str, str]:
-    """What `Recording.left_out` says of frames in the file, or of DSEC's beside it."""
+    """Describe, for `Recording.left_out`, frames in the file, or those of DSEC beside it."""
     images = companions.images(path)
     if images is None:
         return describe_images(file)

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.arrays import LUMA
+from jaxevent.arrays import LUMA, SCALES
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.io import check_unfolded, reading
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.output import complete
-from jaxevent.io.time_units import NAMES, SCALES, unit_of_name
+from jaxevent.io.time_units import NAMES, unit_of_name
 from jaxevent.recording import microseconds
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")

@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import to_microseconds
 from jaxevent.errors import InputError
 from jaxevent.io import check_unfolded, reading, sensor_size, times
 from jaxevent.io.columns import (
@@ -43,14 +44,7 @@ from jaxevent.io.columns import (
 )
 from jaxevent.io.decoded import from_columns
 from jaxevent.io.options import ReadOptions
-from jaxevent.io.time_units import (
-    SAMPLE,
-    Clock,
-    InferredUnit,
-    clock_of,
-    infer_unit,
-    to_microseconds,
-)
+from jaxevent.io.time_units import SAMPLE, Clock, InferredUnit, clock_of, infer_unit
 from jaxevent.recording import Events, Frames, Recording
 
 _MATRIX, _COMPRESSED = 14, 15  # types of elements

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import to_microseconds
 from jaxevent.errors import InputError
 from jaxevent.io import pinhole, reading, sensor_size, vectors, whole_number
 from jaxevent.io.columns import (
@@ -44,7 +45,6 @@ from jaxevent.io.time_units import (
     infer_unit,
     numbers_of_dates,
     split_unit,
-    to_microseconds,
 )
 from jaxevent.recording import Frames, Imu, Recording
 

@@ -9,18 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import to_microseconds
 from jaxevent.errors import InputError
-from jaxevent.io import check_unfolded, reading
+from jaxevent.io import reading
 from jaxevent.io.decoded import BLOCK, Columns, Decoder
-from jaxevent.io.time_units import to_microseconds
-
-
-def open_archive(file: Path) -> zipfile.ZipFile:
-    """Open a zip archive; raises `InputError` where it claims to hold far more than it can."""
-    archive = zipfile.ZipFile(file)
-    unfolded = sum(member.file_size for member in archive.infolist())
-    check_unfolded(unfolded, file.stat().st_size, str(file))
-    return archive
 
 
 def read_member(archive: zipfile.ZipFile, name: str, source: str) -> NDArray:

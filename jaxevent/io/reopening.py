@@ -15,7 +15,7 @@ P = ParamSpec("P")
 
 
 class Opening:
-    """How a recording was opened: the arguments of `load`."""
+    """The arguments of `load` by which a recording was opened."""
 
     def __init__(self, arguments: tuple[Any, ...], options: dict[str, Any]):
         self.arguments, self.options = arguments, options
@@ -34,7 +34,7 @@ class Opening:
 
 
 class InFile:
-    """What stays in a file. A pickle or copy opens the file again, by its absolute path.
+    """A part that stays in a file. A pickle or copy opens the file again, by its absolute path.
 
     What `load` did not open is read, and held in memory.
     """

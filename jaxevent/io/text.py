@@ -26,13 +26,14 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.utils import CallbackIOWrapper
 
+from jaxevent.arrays import to_microseconds
 from jaxevent.errors import InputError
 from jaxevent.io import check_unfolded, find_event_texts, pinhole, reading, sensor_size
-from jaxevent.io.columns import find, is_time, signed, stated_unit, unsigned_off
+from jaxevent.io.columns import find, first_and_last, is_time, signed, stated_unit, unsigned_off
 from jaxevent.io.decoded import from_columns
 from jaxevent.io.images import kept_colours, read_grey_and_colour
 from jaxevent.io.options import ReadOptions
-from jaxevent.io.time_units import SAMPLE, clock_of, infer_unit, to_microseconds, unit_of_name
+from jaxevent.io.time_units import clock_of, infer_unit, unit_of_name
 from jaxevent.progress import bar
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
@@ -68,9 +69,7 @@ def _read(
     fields = find(names) or {name: name for name in "txyp"}
     t, x, y, p = (columns[names.index(fields[name])] for name in "txyp")
     stated = stated_unit(fields["t"], t)
-    sample = {"t": t[:SAMPLE], "x": x[:SAMPLE], "y": y[:SAMPLE]}
-    if len(t) > SAMPLE:
-        sample = {n: np.append(sample[n], v[-1]) for n, v in (("t", t), ("x", x), ("y", y))}
+    sample = first_and_last(lambda rows: {"t": t[rows], "x": x[rows], "y": y[rows]}, len(t))
     unit = infer_unit(sample, len(t), size, source, options, stated=stated, usual="s")
     is_known = stated is not None or options.time_unit is not None
     if unit.name == "s" and not is_known and _are_whole(t):

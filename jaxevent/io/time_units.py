@@ -31,11 +31,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import SCALES, to_microseconds
 from jaxevent.errors import InputError, InputWarning
-from jaxevent.io import times
 from jaxevent.io.options import ReadOptions
 
-SCALES = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}  # us in one unit
 NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 FEWEST_EVENTS = 300
 SAMPLE = 1 << 16  # events from which order, unit and signs are inferred
@@ -85,31 +84,6 @@ class InferredUnit(NamedTuple):
 
     name: str
     notes: tuple[str, ...] = ()
-
-
-def to_microseconds(
-    values: NDArray, unit: str, source: str, what: str, first_row: int = 0
-) -> NDArray[np.int64]:
-    """Convert times of a unit to int64 us.
-
-    Args:
-        values: (n,) times.
-        unit: "s", "ms", "us" or "ns"; nanoseconds are rounded.
-        source: Name of the file for messages.
-        what: "event", "image" or the like.
-        first_row: Row of the first time in the file.
-
-    Raises:
-        InputError: A time is not finite or too large for us.
-    """
-    if values.dtype.kind not in "iu" or unit == "us":
-        return times(values, source, what, SCALES[unit], first_row)
-    wide = values if values.dtype == np.uint64 else values.astype(np.int64)
-    if unit == "ns":
-        whole, rest = np.divmod(wide, wide.dtype.type(1000))
-        return times(whole, source, what, first_row=first_row) + (rest >= 500)
-    times(wide * np.float64(SCALES[unit]), source, what, 1.0, first_row)  # that they fit
-    return wide.astype(np.int64) * round(SCALES[unit])
 
 
 def unit_of_name(name: str) -> str | None:

@@ -25,14 +25,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import to_microseconds
 from jaxevent.errors import InputError
-from jaxevent.io import reading, sensor_size
+from jaxevent.io import open_archive, reading, sensor_size
 from jaxevent.io.columns import find
 from jaxevent.io.decoded import Columns, decoded
 from jaxevent.io.images import SUFFIXES, read_files
-from jaxevent.io.numpy_files import open_archive, read_member
+from jaxevent.io.numpy_files import read_member
 from jaxevent.io.options import ReadOptions
-from jaxevent.io.time_units import SAMPLE, clock_of, infer_unit, to_microseconds
+from jaxevent.io.time_units import SAMPLE, clock_of, infer_unit
 from jaxevent.recording import Frames, Recording
 
 _FOLDERS = (("events", "images"), ("events_aligned", "images_corrected"))
@@ -42,7 +43,7 @@ _MISPLACED = 0.5  # share of events outside the images that shows remapped coord
 
 
 def knows(folder: Path) -> bool:
-    """Whether a folder holds a recording."""
+    """Tell whether a folder holds a recording."""
     return any(_event_files(folder / name) for name, _ in _FOLDERS)
 
 

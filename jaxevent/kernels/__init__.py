@@ -43,7 +43,7 @@ def lean(function: Callable) -> Any:
 
 
 def lean_part(function: Callable) -> Any:
-    """The same for what such functions alone call; not for calls from Python."""
+    """Compile so what such functions alone call; not for calls from Python."""
     return _lean_inside(function, error_model="numpy", nogil=True, **_LEAN)
 
 
@@ -53,7 +53,7 @@ def fast(function: Callable) -> Any:
 
 
 def fast_part(function: Callable) -> Any:
-    """The same for what such functions alone call; not for calls from Python."""
+    """Compile so what such functions alone call; not for calls from Python."""
     return _lean_inside(function, nogil=True, **_LEAN, **_LOOSE)
 
 

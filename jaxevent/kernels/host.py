@@ -228,7 +228,7 @@ class HostProgram:
 
 
 def once(known: dict[Any, T], key: Any, make: Callable[[], T]) -> T:
-    """What is known of a key; made by the first thread that asks, while others wait."""
+    """Return the value of a key; the first thread that asks makes it, while others wait."""
     if key not in known:
         with _making:
             if key not in known:

@@ -22,6 +22,7 @@ from jaxevent.runs.own import Metric, find_method, import_path, named_metric
 from jaxevent.shown import a_kind
 
 PathLike = str | os.PathLike
+OF_TRUTH = ("positions", "truth")  # settings that take tables
 CALLED = "# As called from Python; of objects only the names are told.\n"
 
 
@@ -185,8 +186,12 @@ def _metric(given: Any) -> str | Metric:
 
 
 def settings_of(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a protocol or a fit, their values as TOML has them."""
-    return {name: plain(value) for name, value in given.items() if value is not None}
+    """Settings of a protocol or a fit as TOML has them, and tables of truth as `Tables`."""
+    return {
+        name: Tables.of(value) if name in OF_TRUTH else plain(value)
+        for name, value in given.items()
+        if value is not None
+    }
 
 
 def plain(value: Any) -> Any:

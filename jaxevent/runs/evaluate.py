@@ -92,7 +92,6 @@ from jaxevent.runs.config import (
     SIZE,
     STREAM,
     Check,
-    Tables,
     check,
     find_recordings,
     known_as,
@@ -204,12 +203,13 @@ def evaluate(*arguments: Any, **settings: Any) -> Evaluation:
     return _evaluate_objects(*arguments, **settings)
 
 
+# Arguments of both forms that say where rows are computed, and what may be replaced.
+WHERE = ("workers", "cluster", "scheduler_file", "retries", "replace")
 FORMS = Forms(
     'jaxevent.evaluate(recording, ["akf"])',
-    ("config", "out", "progress", "metrics", "workers", "cluster", "scheduler_file", "retries",
-     "replace"),
+    ("config", "out", "progress", "metrics", *WHERE),
     ("recordings", "methods", "protocol"),
-)  # fmt: skip
+)
 
 
 def _evaluate_file(
@@ -237,19 +237,12 @@ def _evaluate_objects(
     protocol: str | None = None,
     out: PathLike | None = None,
     progress: bool | None = None,
-    workers: int | None = None,
-    cluster: Any = None,
-    scheduler_file: PathLike | None = None,
-    retries: int = 2,
-    replace: bool = True,
     **settings: Any,
 ) -> Evaluation:
     if methods is None:
         raise InputError(f"no method is given; give a recording and methods, as {FORMS.example}")
+    where = {name: settings.pop(name) for name in WHERE if name in settings}
     table = settings_of({**settings, "protocol": protocol})
-    for name in ("positions", "truth"):
-        if name in table:
-            table[name] = Tables.of(settings[name])
     table |= {"recordings": recordings_of(recordings), "method": methods_of(methods)}
     further = metrics_of(metrics)
     if further:
@@ -261,11 +254,7 @@ def _evaluate_objects(
         Origin("evaluation", text.encode(), plan.inputs()),
         out,
         progress,
-        workers=workers,
-        cluster=cluster,
-        scheduler_file=scheduler_file,
-        retries=retries,
-        replace=replace,
+        **where,
     )
 
 

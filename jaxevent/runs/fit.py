@@ -70,7 +70,6 @@ from jaxevent.runs.calls import (
     settings_of,
 )
 from jaxevent.runs.checkpoint import finished_rows, restore, save
-from jaxevent.runs.config import Tables
 from jaxevent.runs.contents import digest
 from jaxevent.runs.family import Sources
 from jaxevent.runs.fit_config import Plan, Task, plan_of, read_plan
@@ -210,9 +209,6 @@ def _fit_objects(
             f"the method is {a_kind(method)}; give one Estimator, or its name, and fit others apart"
         )
     given = settings_of(settings)
-    for name in ("positions", "truth"):
-        if name in given:
-            given[name] = Tables.of(settings[name])
     entry = {"name": method, **{k: given.pop(k) for k in ENTRY if k in given}}
     table = {"recordings": recordings_of(recordings), **given, "method": [entry]}
     for split in ("validation", "test"):

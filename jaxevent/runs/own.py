@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent import methods
+from jaxevent.arrays import brief
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator, imported
 from jaxevent.parameters import nearest
@@ -190,11 +191,7 @@ def find_method(given: Any, family: str | None = None) -> Estimator | Function:
     if isinstance(found, Function):
         return found
     if isinstance(found, Estimator):
-        if family is not None and found.family != family:
-            raise InputError(
-                f"the method {found.name!r} is of {found.family}, not of {family}; "
-                f"{nearest(found.name, methods.names(family))}"
-            )
+        methods.check_family(found, family, found.name)
         return found
     what = repr(given) if isinstance(given, str) else _shown(given)
     if isinstance(found, type):
@@ -246,4 +243,4 @@ def _shown(thing: Any) -> str:
     shape = getattr(thing, "shape", None)
     if shape is not None and shape != ():
         return f"{getattr(thing, 'dtype', type(thing).__name__)} of shape {tuple(shape)}"
-    return " ".join(repr(thing).split())[:60]
+    return brief(thing)
