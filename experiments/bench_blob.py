@@ -14,8 +14,8 @@ import numpy as np
 from timing import cpu_seconds, least_cpu
 
 from jaxevent.blob import find, moment
+from jaxevent.blob.engine.tracking import FusedRun
 from jaxevent.blob.filters.ellipse import truncation
-from jaxevent.blob.fused.tracking import FusedRun
 from jaxevent.blob.lifecycle import begin as begin_state
 from jaxevent.blob.prepare import Packing
 from jaxevent.blob.steps import Batch

@@ -22,17 +22,17 @@ import numba
 import numpy as np
 
 from jaxevent.egomotion import voting
-from jaxevent.egomotion.batch_fit import photometric
-from jaxevent.egomotion.batch_fit import windows as batch
-from jaxevent.egomotion.batch_fit.equations import FREE, Unknowns, linearise
-from jaxevent.egomotion.batch_fit.path import Path, advanced
-from jaxevent.egomotion.batch_fit.placing import POWERS
-from jaxevent.egomotion.batch_fit.tracks import Scene
-from jaxevent.egomotion.batch_fit.weighing import subtract_mean
+from jaxevent.egomotion.bundle import photometric
+from jaxevent.egomotion.bundle import windows as batch
+from jaxevent.egomotion.bundle.equations import FREE, Unknowns, linearise
+from jaxevent.egomotion.bundle.path import Path, advanced
+from jaxevent.egomotion.bundle.placing import POWERS
+from jaxevent.egomotion.bundle.tracks import Scene
+from jaxevent.egomotion.bundle.weighing import subtract_mean
 from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.particle_filter import filtering
-from jaxevent.egomotion.particle_filter.fused.running import FusedRun
+from jaxevent.egomotion.particle_filter.engine.running import FusedRun
 from jaxevent.egomotion.particle_filter.parameters import Params
 from jaxevent.simulate import motion_scene
 

@@ -20,7 +20,7 @@ from bench_images import NUMBERS, OF_AKF, images, losses, program, stream
 from timing import least_cpu
 
 from jaxevent.io import load, save
-from jaxevent.reconstruction.fused import bands, passes
+from jaxevent.reconstruction.engine import bands, passes
 from jaxevent.recording import Events
 
 Seconds = defaultdict[str, float]

@@ -21,8 +21,8 @@ from unittest import mock
 from blob_scenes import drifting
 
 from jaxevent.blob import find, moment
-from jaxevent.blob.finding import search
-from jaxevent.blob.finding.stream import Stream
+from jaxevent.blob.search import search
+from jaxevent.blob.search.stream import Stream
 from jaxevent.io import load
 from jaxevent.recording import Recording
 from jaxevent.show.tracks import Output

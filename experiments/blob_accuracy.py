@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob import Found, moment
-from jaxevent.blob.finding.agility import fit_agility
-from jaxevent.blob.finding.paths import Path
+from jaxevent.blob.search.agility import fit_agility
+from jaxevent.blob.search.paths import Path
 from jaxevent.recording import Recording
 from jaxevent.simulate.blobs import Circle, Target, simulate_blobs
 

@@ -34,10 +34,10 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from jaxevent.blob import Found, find, moment
-from jaxevent.blob.finding.background import measure_background
-from jaxevent.blob.finding.detection import detect, measure_blobs
-from jaxevent.blob.finding.stream import Stream
 from jaxevent.blob.scores import score_tracks
+from jaxevent.blob.search.background import measure_background
+from jaxevent.blob.search.detection import detect, measure_blobs
+from jaxevent.blob.search.stream import Stream
 from jaxevent.io import load
 from jaxevent.recording import Recording
 from jaxevent.simulate.blobs import Truth

@@ -22,9 +22,9 @@ from pathlib import Path as Place
 import numpy as np
 
 import jaxevent
-from jaxevent.egomotion.batch_fit import equations, photometric
-from jaxevent.egomotion.batch_fit import windows as batch
-from jaxevent.egomotion.batch_fit.path import Path, advanced
+from jaxevent.egomotion.bundle import equations, photometric
+from jaxevent.egomotion.bundle import windows as batch
+from jaxevent.egomotion.bundle.path import Path, advanced
 
 CENTRES = 700_000, 1_500_000, 2_500_000  # us
 BEFORE = 100_000

@@ -28,8 +28,8 @@ import numpy as np
 import pandas as pd
 
 from jaxevent.egomotion import scores
-from jaxevent.egomotion.batch_fit import sequence
-from jaxevent.egomotion.batch_fit import windows as batch
+from jaxevent.egomotion.bundle import sequence
+from jaxevent.egomotion.bundle import windows as batch
 from jaxevent.simulate import SENSORS, Sensor, motion_scene
 
 CENTRE = 250_000  # us

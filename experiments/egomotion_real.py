@@ -42,7 +42,7 @@ from jaxevent import egomotion
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import batch, contrast, geometry, voting
 from jaxevent.egomotion.baselines.tracked_points import Params, followed, undistorted
-from jaxevent.egomotion.batch_fit.frames import offset
+from jaxevent.egomotion.bundle.frames import offset
 from jaxevent.egomotion.candidates import coordinates
 from jaxevent.errors import require
 

@@ -137,14 +137,14 @@ MUTATIONS = (
     ),
     Mutation(
         "conjugate gradients forget the direction before",
-        "jaxevent/egomotion/batch_fit/solving.py",
+        "jaxevent/egomotion/bundle/solving.py",
         "share = new / max(size, 1e-30)",
         "share = 0.0",
         "tests/egomotion/test_photometric_equations.py -k gradients",
     ),
     Mutation(
         "a step that costs more is not damped",
-        "jaxevent/egomotion/batch_fit/gauss_newton.py",
+        "jaxevent/egomotion/bundle/gauss_newton.py",
         "max(now.damping * HARDER, DAMP)",
         "now.damping",
         "tests/egomotion/test_gauss_newton.py -k accepted",
@@ -165,10 +165,10 @@ MUTATIONS = (
     ),
     Mutation(
         "a file of compiled code is unpickled whoever wrote it",
-        "jaxevent/kernels/kept.py",
+        "jaxevent/codegen/kept.py",
         "return pickle.loads(payload) if own else None",
         "return pickle.loads(payload)",
-        "tests/kernels/test_kept.py -k signed",
+        "tests/codegen/test_kept.py -k signed",
     ),
     Mutation(
         "a layer of the house imports upwards",

@@ -33,7 +33,7 @@ HOMES = {
     },
     "egomotion": {
         "voting": "jaxevent.egomotion.particle_filter.estimator:voting",
-        "batch": "jaxevent.egomotion.batch_fit.sequence:batch",
+        "batch": "jaxevent.egomotion.bundle.sequence:batch",
         "contrast": "jaxevent.egomotion.baselines.contrast_maximisation:contrast",
         "planes": "jaxevent.egomotion.baselines.local_planes:planes",
         "frames": "jaxevent.egomotion.baselines.tracked_points:frames",

@@ -11,10 +11,10 @@ import texture
 from together import in_child
 
 import jaxevent
-from jaxevent import kernels, progress
+from jaxevent import codegen, progress
+from jaxevent.codegen import host
 from jaxevent.errors import InputError
 from jaxevent.io import prophesee
-from jaxevent.kernels import host
 from jaxevent.sharing import Turns
 
 pytestmark = [
@@ -47,14 +47,14 @@ def test_images(name):
 
 
 def test_rows_are_divided_among_new_threads(monkeypatch):
-    monkeypatch.setattr(kernels, "THREADS", 2)
+    monkeypatch.setattr(codegen, "THREADS", 2)
 
     def numbered(begin, end, out):
         out[begin:end] = np.arange(begin, end)
 
     def fill():
         out = np.zeros(64)
-        kernels.over_rows(numbered, 64, out)
+        codegen.run_over_rows(numbered, 64, out)
         return out
 
     for out in (fill(), in_child(fill), fill()):

@@ -14,10 +14,10 @@ import texture
 from together import THREADS, at_once
 
 import jaxevent
+from jaxevent.codegen import host, run_over_rows
 from jaxevent.errors import InputError
 from jaxevent.io import prophesee
-from jaxevent.kernels import host, over_rows
-from jaxevent.reconstruction.fused import kernel, passes, pixel, smoothed, smoothing
+from jaxevent.reconstruction.engine import kernel, passes, pixel, smoothed, smoothing
 
 # The default thresholds are not those of the texture.
 pytestmark = pytest.mark.filterwarnings("ignore:moving. events contradict frames")
@@ -259,12 +259,12 @@ def test_what_is_interrupted_is_read_anew(monkeypatch, name, module):
         calls = itertools.count()
 
         def interrupted(*given, place=place, calls=calls):
-            over_rows(*given)
+            run_over_rows(*given)
             if next(calls) == place:
                 raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
-            patch.setattr(module, "over_rows", interrupted)
+            patch.setattr(module, "run_over_rows", interrupted)
             with pytest.raises(KeyboardInterrupt):
                 video(times)
         for row in (1, 6, 2):

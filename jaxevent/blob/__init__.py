@@ -10,9 +10,9 @@ from jaxevent.blob.filters.chi2 import chi2, chi2_split
 from jaxevent.blob.filters.constant_velocity import constant_velocity
 from jaxevent.blob.filters.moment import moment
 from jaxevent.blob.filters.moving_moments import moving_moments
-from jaxevent.blob.finding import Found, find
 from jaxevent.blob.losses import negative_log_likelihood, position_error, prepare_positions
 from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.search import Found, find
 from jaxevent.blob.states import TrackStates
 from jaxevent.blob.steps import Filter
 from jaxevent.blob.tracker import Tracker

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
-from jaxevent.blob.fused.tracking import FusedRun
+from jaxevent.blob.engine.tracking import FusedRun
 from jaxevent.blob.lifecycle import Log, State, begin
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import NEVER, Features, Numeric, Packing

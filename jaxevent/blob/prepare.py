@@ -17,14 +17,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
-from jaxevent.blob.finding.found import Found
-from jaxevent.blob.finding.paths import NOBODY, candidates, join
 from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.search.found import Found
+from jaxevent.blob.search.paths import NOBODY, candidates, join
 from jaxevent.blob.seeds import read_seeds, span_of
+from jaxevent.codegen import njit_noalloc
 from jaxevent.errors import InputError
 from jaxevent.estimator import Described
 from jaxevent.events.filters import supported
-from jaxevent.kernels import lean
 from jaxevent.recording import Recording, Times, check_times
 
 STEPS = (4, 8, 16, 32, 64, 128, 256)  # per chunk
@@ -377,7 +377,7 @@ def _leave_open(place: _Place, out: _Chunks) -> _Place:
     return _Place(chunk, 0, 0, place.at, place.previous, place.begin, 0, begun)
 
 
-@lean
+@njit_noalloc
 def _spread(t: Any, least: int, order: Any) -> None:
     """Spread runs of more than so many equal times in an order.
 
@@ -398,7 +398,7 @@ def _spread(t: Any, least: int, order: Any) -> None:
         begin = end
 
 
-@lean
+@njit_noalloc
 def _pack(given, first_row, final, bounds, place, out):
     """Fill chunks until they are full or events end: (full or ended, events used, place).
 

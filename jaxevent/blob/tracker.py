@@ -11,21 +11,21 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from jaxevent.blob.finding import Found, find
-from jaxevent.blob.fused.tracking import FusedRun
+from jaxevent.blob.engine.tracking import FusedRun
 from jaxevent.blob.lifecycle import State, shift
 from jaxevent.blob.live import LiveTracks
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Packing, ReadOut
 from jaxevent.blob.run import run
+from jaxevent.blob.search import Found, find
 from jaxevent.blob.smoother import Smoothed, at_end, look_back, nothing_later, tell_smoothed
 from jaxevent.blob.states import TrackStates, is_alive, tell
 from jaxevent.blob.steps import Filter
 from jaxevent.blob.targets import Slots
 from jaxevent.blob.tracks import Tracks
+from jaxevent.codegen.expressions import Untranslatable
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator, OptionKind, of_class
-from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.recording import Recording, Times, microseconds
 
 P = TypeVar("P", bound=TrackerParams)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.fused.tracking import FusedRun
+from jaxevent.blob.engine.tracking import FusedRun
 from jaxevent.blob.lifecycle import ENDS, Log
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Mark, Packing, Stretch

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from jaxevent.egomotion.baselines.contrast_maximisation import contrast
     from jaxevent.egomotion.baselines.local_planes import planes
     from jaxevent.egomotion.baselines.tracked_points import frames
-    from jaxevent.egomotion.batch_fit.sequence import batch
+    from jaxevent.egomotion.bundle.sequence import batch
     from jaxevent.egomotion.estimator import MotionEstimator
     from jaxevent.egomotion.models import MODELS, Model, find_model
     from jaxevent.egomotion.motion import Motion
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 # Loaded when first used: compiled preparation and SciPy are slow to import.
 _HOMES = {
-    "batch_fit.sequence": ("batch",),
+    "bundle.sequence": ("batch",),
     "baselines.contrast_maximisation": ("contrast",),
     "baselines.local_planes": ("planes",),
     "baselines.tracked_points": ("frames",),

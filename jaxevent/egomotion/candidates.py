@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
+from jaxevent.codegen import njit_noalloc
 from jaxevent.egomotion.geometry import undistorted
-from jaxevent.kernels import lean
 from jaxevent.recording import Recording
 
 READ_ROWS = 65536  # events read from a file at a time
@@ -251,7 +251,7 @@ class Filled(NamedTuple):
     history: NDArray
 
 
-@lean
+@njit_noalloc
 def _gather(stream, rules, latest, limits, gate, out, state, clock, scratch):
     """Fill batches from events: how many events were used, and whether all batches are full."""
     # Names of their own: numba reads arrays out of tuples anew in every loop.

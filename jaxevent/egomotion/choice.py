@@ -11,7 +11,7 @@ where both explain it alike.
 
 What patches take for a rotation may be a general motion whose parallax is less than a pixel in so
 short a time, so that it is asked again in longer windows, of which scenes are fitted with and
-without a translation (`batch_fit.translation`).
+without a translation (`bundle.translation`).
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion.batch_fit.translation import Guess, told
+from jaxevent.egomotion.bundle.translation import Guess, told
 from jaxevent.egomotion.candidates import coordinates
 from jaxevent.egomotion.geometry import rotation_basis
 from jaxevent.egomotion.models import MODELS, General, Model, Planar, Rotation

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
+from jaxevent.codegen import njit_noalloc
 from jaxevent.egomotion.candidates import coordinates
-from jaxevent.kernels import lean
 from jaxevent.recording import Recording
 
 PATCH = 24  # px
@@ -194,7 +194,7 @@ def look(
     return Look(middle, length, centre, count[taken], energy, ways)
 
 
-@lean
+@njit_noalloc
 def _energies(at, since, sign, patch, half, ways, images, energy):
     """Sums of squares of patches' signed images, of pixels of `GRAIN`, for every way."""
     side = images.shape[3]

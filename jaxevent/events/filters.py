@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.codegen import njit
 from jaxevent.errors import InputError
 from jaxevent.events.images import count_events
 from jaxevent.events.parts import Part, Size, duration, select, size_of
-from jaxevent.kernels import compiled
 from jaxevent.recording import Events, Recording, Times, microseconds
 
 LONG_AGO = np.iinfo(np.int64).min // 2  # us
@@ -90,7 +90,7 @@ def filter_background(
     return select(part, lambda e: supported(e.t, e.x, e.y, last, reach, neighbours))
 
 
-@compiled
+@njit
 def supported(t: Any, x: Any, y: Any, last: Any, reach: Any, neighbours: Any) -> Any:
     """Events of which `neighbours` of the 8 pixels around fired at most `reach` us before.
 
@@ -120,7 +120,7 @@ def filter_refractory(part: Part, period: int | float, *, size: Size | None = No
     return select(part, lambda e: _ready(e.t, e.x, e.y, last, dead))
 
 
-@compiled
+@njit
 def _ready(t, x, y, last, dead):
     """Events at least `dead` us after the last one kept at their pixel; `last` is written over."""
     kept = np.empty(len(t), np.bool_)

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
+from jaxevent.codegen import njit
 from jaxevent.errors import InputError
 from jaxevent.events.filters import LONG_AGO
 from jaxevent.events.parts import Part, Size, duration, pick, rewrite, select, size_of
-from jaxevent.kernels import compiled
 from jaxevent.recording import Events, ImageSource, Recording
 
 Change = Callable[[NDArray], NDArray]  # of images (n, H, W) or (n, H, W, 3)
@@ -146,7 +146,7 @@ def downsample(
     return _seen(part, _held(new), (width, height), mean, camera)  # ty: ignore[invalid-explicit-return]
 
 
-@compiled
+@njit
 def _first(t, x, y, p, last, period):
     """Events that are the first of their pixel, polarity and period; `last` is written over."""
     kept = np.empty(len(t), np.bool_)

@@ -23,8 +23,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.codegen import njit, njit_inlined
 from jaxevent.errors import InputError
-from jaxevent.kernels import compiled, part
 
 FILTER = 36559
 MOST = 65535  # events of a chunk
@@ -103,7 +103,7 @@ def decode(data: NDArray[np.uint8]) -> NDArray | None:
     return records
 
 
-@part
+@njit_inlined
 def _word(data, at, size):
     """A number of so many bytes."""
     value = np.uint64(0)
@@ -112,7 +112,7 @@ def _word(data, at, size):
     return np.int64(value)
 
 
-@part
+@njit_inlined
 def _runs(data, at, bits, size, out):
     """Fill `out` by runs of numbers of so many bytes, their counts the low bits; where they end."""
     most, i = (1 << bits) - 1, 0
@@ -132,7 +132,7 @@ def _runs(data, at, bits, size, out):
     return at
 
 
-@part
+@njit_inlined
 def _times(data, at, t):
     now, i = _word(data, at, 8), 0
     at += 8
@@ -158,7 +158,7 @@ def _times(data, at, t):
     return at
 
 
-@part
+@njit_inlined
 def _packed(data, at, width, i):
     """The i-th of numbers of `width` bits (24 or 12), of which three words hold four."""
     size, begin = width // 6, i % 4 * width  # bytes of a word; the bit where the number begins
@@ -169,7 +169,7 @@ def _packed(data, at, width, i):
     return both >> ((2 + first) * bits - begin - width) & ((1 << width) - 1)
 
 
-@compiled
+@njit
 def _decode(data, t, x, y, p):
     """Whether the chunk is whole; fills t, x, y and p."""
     n, kind = len(t), data[0] & 3

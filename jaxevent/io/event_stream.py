@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
+from jaxevent.codegen import njit
 from jaxevent.errors import InputError
 from jaxevent.io import reading
 from jaxevent.io.decoded import BLOCK, Columns, Tally, decoded
 from jaxevent.io.options import ReadOptions
-from jaxevent.kernels import compiled
 from jaxevent.recording import Recording
 
 MAGIC = b"Event Stream"
@@ -78,7 +78,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
     return Recording(path.stem, *size, events, extra=found.arrays())
 
 
-@compiled
+@njit
 def _decode(data, t, is_atis):
     """Whole events at the start of `data`, their number, the crossings, the bytes used, the time.
 

@@ -21,6 +21,8 @@ from jaxtyping import Array, Float, Int
 from jaxevent.devices import at_once
 from jaxevent.estimator import Described, Estimate
 from jaxevent.reconstruction.augment import FrameParams
+from jaxevent.reconstruction.engine.images import DividedEvents, prepared_by_kernel
+from jaxevent.reconstruction.engine.video import FusedVideo, video_by_kernel
 from jaxevent.reconstruction.estimator import P, PixelEstimator
 from jaxevent.reconstruction.features import (
     Features,
@@ -30,8 +32,6 @@ from jaxevent.reconstruction.features import (
     ReadOut,
     Tiles,
 )
-from jaxevent.reconstruction.fused.images import DividedEvents, prepared_by_kernel
-from jaxevent.reconstruction.fused.video import FusedVideo, video_by_kernel
 from jaxevent.reconstruction.layout import SHAPES, SLOTS
 from jaxevent.reconstruction.prepared import PreparedImages
 from jaxevent.reconstruction.video import ImageSequence, Video

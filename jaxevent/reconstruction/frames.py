@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled
-from jaxevent.kernels.host import evaluated
+from jaxevent.codegen import njit
+from jaxevent.codegen.host import evaluated
 from jaxevent.reconstruction.clock import Clock, rates
 from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Segments
 from jaxevent.reconstruction.memory import aligned
@@ -189,7 +189,7 @@ def make_start(clock: Clock, pixels: int, dtype: np.dtype) -> ImagePoints:
     )
 
 
-@compiled
+@njit
 def _cut_exposure(stream, weight, middle, row, edges, count):
     """Segments of constant brightness within one exposure; events `middle` on lie after its mid."""
     t, x, y, p = stream.t, stream.x, stream.y, stream.p

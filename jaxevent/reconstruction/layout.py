@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled
+from jaxevent.codegen import njit
 
 SHAPES = ((8, 4096), (64, 512), (512, 64))  # ranks, lanes of the three kinds of tile
 SLOTS = 8 * 4096
@@ -131,7 +131,7 @@ class Layout:
         )
 
 
-@compiled
+@njit
 def _busiest_first(counts):
     """Pixels by falling count, equal counts in pixel order: a counting sort."""
     top = counts.max() if len(counts) else 0

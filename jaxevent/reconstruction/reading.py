@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import lean
+from jaxevent.codegen import njit_noalloc
 from jaxevent.reconstruction.clock import Clock
 from jaxevent.reconstruction.features import ImagePoints, ReadOut
 from jaxevent.reconstruction.layout import SLOTS, SlotMap
@@ -154,7 +154,7 @@ class Reader:
         return ReadOut(points, out.slot, out.since)
 
 
-@lean
+@njit_noalloc
 def _read(stream, own, row, times, frame, counts, slot_map, states, dead, reach, origin, seen, out):
     """At each time, every pixel's last slot, the time since, and its counts in the piece.
 

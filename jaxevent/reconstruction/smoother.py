@@ -45,6 +45,10 @@ from jaxevent.reconstruction.augment import (
     segment_excess,
     unclipped,
 )
+from jaxevent.reconstruction.engine.images import prepared_by_kernel
+from jaxevent.reconstruction.engine.smoothed import SmoothedVideo
+from jaxevent.reconstruction.engine.smoothed_images import DividedFrames
+from jaxevent.reconstruction.engine.video import video_by_kernel
 from jaxevent.reconstruction.estimator import PixelEstimator
 from jaxevent.reconstruction.features import (
     Features,
@@ -53,10 +57,6 @@ from jaxevent.reconstruction.features import (
     Numeric,
     ReadOut,
 )
-from jaxevent.reconstruction.fused.images import prepared_by_kernel
-from jaxevent.reconstruction.fused.smoothed import SmoothedVideo
-from jaxevent.reconstruction.fused.smoothed_images import DividedFrames
-from jaxevent.reconstruction.fused.video import video_by_kernel
 from jaxevent.reconstruction.prepared import PreparedImages
 from jaxevent.reconstruction.video import ImageSequence, Video
 from jaxevent.recording import Recording, Times
@@ -509,7 +509,7 @@ class Smoother(PixelEstimator[Params]):
         return np.stack([message.h, message.J])
 
     def of_pixel(self, exposed: bool) -> dict[str, Callable[..., dict[str, Any]]]:
-        """What `run` and `read` do at one pixel, for kernels (`fused.smoothing`).
+        """What `run` and `read` do at one pixel, for kernels (`engine.smoothing`).
 
         Functions of parameters, what is known with them, and numbers that kernels keep by name.
         """

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled, lean, lean_part
+from jaxevent.codegen import njit, njit_noalloc, njit_noalloc_inlined
 from jaxevent.recording import Events, Recording
 
 
@@ -79,7 +79,7 @@ class EdgeCounts(NamedTuple):
     right: NDArray  # [frames, 2, pixels], right edges
 
 
-@compiled
+@njit
 def count_events(x, y, width, pixels):
     """The number of events at each pixel, (pixels,)."""
     counts = np.zeros(pixels, np.int32)
@@ -88,7 +88,7 @@ def count_events(x, y, width, pixels):
     return counts
 
 
-@lean_part
+@njit_noalloc_inlined
 def equivalent(gap, dead):
     """How many events one after the gap (us) at its pixel stands for."""
     if dead.rho == 0:
@@ -99,7 +99,7 @@ def equivalent(gap, dead):
     return 1e6 * gap / (rest * rest) if dead.growth else gap / rest
 
 
-@lean
+@njit_noalloc
 def note_latest(stream, last):
     """Bring the times of each pixel's last event, `last`, to the stream's end."""
     t, x, y = stream.t, stream.x, stream.y
@@ -107,7 +107,7 @@ def note_latest(stream, last):
         last[np.int64(y[i]) * stream.width + x[i]] = t[i]
 
 
-@lean
+@njit_noalloc
 def narrow(stream, base, t, cell):
     """Times (us) from a base and 2 pixel + (1 if ON) of events, in 32 bits."""
     for i in range(len(stream.t)):
@@ -122,7 +122,7 @@ def weigh(stream: Stream, last: NDArray[np.int64], dead: DeadTime) -> NDArray[np
     return out
 
 
-@lean
+@njit_noalloc
 def _weigh(stream, last, dead, out):
     t, x, y = stream.t, stream.x, stream.y
     for i in range(len(t)):
@@ -141,7 +141,7 @@ def count_before(stream: Stream, weight: NDArray, edges: NDArray, now: NDArray) 
     return out
 
 
-@lean
+@njit_noalloc
 def _count_before(stream, weight, edges, now, out):
     t, x, y, p = stream.t, stream.x, stream.y, stream.p
     i = 0
@@ -153,7 +153,7 @@ def _count_before(stream, weight, edges, now, out):
             out[e, 0, pixel], out[e, 1, pixel] = now[0, pixel], now[1, pixel]
 
 
-@compiled
+@njit
 def add_spread(stream, weight, edges, origin, reach, out):
     """Add to the counts at each edge the part of the pixel's next event that has happened."""
     t, x, y, p = stream.t, stream.x, stream.y, stream.p

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import compiled, lean, lean_part
+from jaxevent.codegen import njit, njit_noalloc, njit_noalloc_inlined
 from jaxevent.reconstruction.clock import FrameTimes
 from jaxevent.reconstruction.features import EventPoints, Tiles
 from jaxevent.reconstruction.layout import SHAPES, SLOTS, Layout
@@ -159,7 +159,7 @@ def _fill_tiles(
     return layout.lane_pixels()
 
 
-@lean
+@njit_noalloc
 def _sort(stream, top, bottom, origin, cursor, latest, order):
     """Events into pixel order, with the time since the 3x3 neighbourhood's previous event.
 
@@ -189,7 +189,7 @@ def _sort(stream, top, bottom, origin, cursor, latest, order):
             latest[middle + 1] = t[i]
 
 
-@compiled
+@njit
 def _fill(worker, workers, kind, order, times, counts, last, dead, slots):
     """Write the slots of 64 lanes at a time: 64 sequential streams in, whole cache lines out."""
     lane_count, counted, integer = len(kind.pixels), counts.start.dtype, np.int64
@@ -212,7 +212,7 @@ def _fill(worker, workers, kind, order, times, counts, last, dead, slots):
             last[pixel] = lanes.before[k] + times.origin
 
 
-@lean_part
+@njit_noalloc_inlined
 def _fill_lanes(lane0, mine, lanes, kind, order, times, counts, dead, slots):
     """Write the slots of the lanes from `lane0` on, of the pixels `mine`, and bring `lanes` on."""
     # Arrays get names of their own: reading them from tuples in the loop takes four times as long.

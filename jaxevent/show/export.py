@@ -9,11 +9,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.codegen import THREADS
 from jaxevent.errors import InputError
 from jaxevent.io.deflate import shuffled
 from jaxevent.io.description import CLOCK
 from jaxevent.io.output import complete, complete_hdf5
-from jaxevent.kernels import THREADS
 from jaxevent.progress import bar
 from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
 from jaxevent.reconstruction.video import BATCH, ImageSequence

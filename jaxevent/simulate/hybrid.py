@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.camera import Response, SCurve
+from jaxevent.codegen import njit_noalloc
 from jaxevent.errors import InputError
-from jaxevent.kernels import lean
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate.scenes import Source
 
@@ -297,7 +297,7 @@ def _events(
     return events, np.stack(np.divmod(hot, width)[::-1], 1)
 
 
-@lean
+@njit_noalloc
 def _cross(
     times, levels, on, off, refractory, reference, ready, noise_t, noise_p, following, last,
     out_t, out_pixel, out_p,

@@ -10,7 +10,7 @@ import pytest
 
 from jaxevent import blob
 from jaxevent.blob.association import share
-from jaxevent.blob.fused.tracking import FusedRun
+from jaxevent.blob.engine.tracking import FusedRun
 from jaxevent.blob.lifecycle import begin
 from jaxevent.blob.prepare import Packing
 from jaxevent.blob.run import Told, run_compiled

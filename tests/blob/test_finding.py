@@ -11,20 +11,20 @@ import pytest
 from scipy import stats
 
 from jaxevent import blob
-from jaxevent.blob.finding.agility import GRID, _log_likelihood, fit_agility
-from jaxevent.blob.finding.background import (
+from jaxevent.blob.search.agility import GRID, _log_likelihood, fit_agility
+from jaxevent.blob.search.background import (
     evidence,
     find_hot_lines,
     find_hot_pixels,
     measure_background,
 )
-from jaxevent.blob.finding.found import Found, most_events
-from jaxevent.blob.finding.lamps import without_lamps
-from jaxevent.blob.finding.parts import join_parts
-from jaxevent.blob.finding.paths import NOBODY, candidates, join
-from jaxevent.blob.finding.paths import Path as TargetPath
-from jaxevent.blob.finding.search import _lasting, _settled, _stitch
-from jaxevent.blob.finding.stream import Stream
+from jaxevent.blob.search.found import Found, most_events
+from jaxevent.blob.search.lamps import without_lamps
+from jaxevent.blob.search.parts import join_parts
+from jaxevent.blob.search.paths import NOBODY, candidates, join
+from jaxevent.blob.search.paths import Path as TargetPath
+from jaxevent.blob.search.search import _lasting, _settled, _stitch
+from jaxevent.blob.search.stream import Stream
 from jaxevent.blob.steps import Batch
 from jaxevent.blob.targets import Slots, look_ahead
 from jaxevent.errors import InputError

@@ -1,12 +1,13 @@
-"""Compiled loops of `jaxevent.blob.finding` beside slow programs that say the same."""
+"""Compiled loops of `jaxevent.blob.search` beside slow programs that say the same."""
 
 import numpy as np
 import pytest
 from scipy import ndimage
 
 from jaxevent.blob import moment
-from jaxevent.blob.finding import stream as stream_module
-from jaxevent.blob.finding.background import (
+from jaxevent.blob.prepare import Packing
+from jaxevent.blob.search import stream as stream_module
+from jaxevent.blob.search.background import (
     CELL,
     FINE,
     SLICES,
@@ -14,15 +15,14 @@ from jaxevent.blob.finding.background import (
     evidence,
     measure_dispersions,
 )
-from jaxevent.blob.finding.detection import FALSE_ALARMS, Blobs, Scale, detect, measure_blobs
-from jaxevent.blob.finding.found import Found
-from jaxevent.blob.finding.gates import CLAIMED, OWNS, Look
-from jaxevent.blob.finding.paths import Path as TargetPath
-from jaxevent.blob.finding.polarity import prefer_sharper
-from jaxevent.blob.finding.prediction import WIDTHS, choose_scored, predict, score
-from jaxevent.blob.finding.stream import Part, Pixels, Stream
-from jaxevent.blob.finding.targets import GATE, KNOWN, Expected, start_targets, update
-from jaxevent.blob.prepare import Packing
+from jaxevent.blob.search.detection import FALSE_ALARMS, Blobs, Scale, detect, measure_blobs
+from jaxevent.blob.search.found import Found
+from jaxevent.blob.search.gates import CLAIMED, OWNS, Look
+from jaxevent.blob.search.paths import Path as TargetPath
+from jaxevent.blob.search.polarity import prefer_sharper
+from jaxevent.blob.search.prediction import WIDTHS, choose_scored, predict, score
+from jaxevent.blob.search.stream import Part, Pixels, Stream
+from jaxevent.blob.search.targets import GATE, KNOWN, Expected, start_targets, update
 from jaxevent.recording import Events, Recording
 
 SIZE = WIDTH, HEIGHT = 96, 64

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from jaxevent import blob
-from jaxevent.blob.finding.background import Background
-from jaxevent.blob.finding.moving import (
+from jaxevent.blob.search.background import Background
+from jaxevent.blob.search.moving import (
     _looks_like_one,
     goes_own_way,
     measure_moving_background,
     pauses,
 )
-from jaxevent.blob.finding.paths import Path
-from jaxevent.blob.finding.scene import SceneMotion, measure_scene_motion
-from jaxevent.blob.finding.stream import Stream
+from jaxevent.blob.search.paths import Path
+from jaxevent.blob.search.scene import SceneMotion, measure_scene_motion
+from jaxevent.blob.search.stream import Stream
 from jaxevent.recording import Events, Recording
 from jaxevent.simulate.blobs import Circle, Line, Target, simulate_blobs
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxevent import blob
-from jaxevent.blob.fused.tracking import FusedRun
+from jaxevent.blob.engine.tracking import FusedRun
 from jaxevent.blob.prepare import Packing
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from jaxevent import blob
-from jaxevent.blob.finding.background import measure_background
-from jaxevent.blob.finding.paths import Path
-from jaxevent.blob.finding.stream import Stream
-from jaxevent.blob.finding.turning import Turn, _follow, _middle, _rate, _within
+from jaxevent.blob.search.background import measure_background
+from jaxevent.blob.search.paths import Path
+from jaxevent.blob.search.stream import Stream
+from jaxevent.blob.search.turning import Turn, _follow, _middle, _rate, _within
 from jaxevent.recording import Events, Recording
 
 FRAME, DURATION, HUB, RADIUS, OMEGA = (96, 80), 0.6, np.array([50.0, 38.0]), 22, -14.0

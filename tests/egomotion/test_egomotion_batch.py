@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import geometry
-from jaxevent.egomotion.batch_fit import frames, images, photometric, sequence, starts
-from jaxevent.egomotion.batch_fit import windows as batch
-from jaxevent.egomotion.batch_fit.depths import depths as look_for_depths
-from jaxevent.egomotion.batch_fit.frames import DARK, look_at, offset
-from jaxevent.egomotion.batch_fit.path import ROWS, Path, advanced, normalised, warp
-from jaxevent.egomotion.batch_fit.photometric import Report, compute_covariance
-from jaxevent.egomotion.batch_fit.tracks import Scene, misfits, placed
+from jaxevent.egomotion.bundle import frames, images, photometric, sequence, starts
+from jaxevent.egomotion.bundle import windows as batch
+from jaxevent.egomotion.bundle.depths import depths as look_for_depths
+from jaxevent.egomotion.bundle.frames import DARK, look_at, offset
+from jaxevent.egomotion.bundle.path import ROWS, Path, advanced, normalised, warp
+from jaxevent.egomotion.bundle.photometric import Report, compute_covariance
+from jaxevent.egomotion.bundle.tracks import Scene, misfits, placed
 from jaxevent.egomotion.twists import Twists
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Recording

@@ -7,7 +7,7 @@ import pytest
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import batch, contrast, find_model, truth, twists, voting
-from jaxevent.egomotion.batch_fit.translation import Told, together
+from jaxevent.egomotion.bundle.translation import Told, together
 from jaxevent.egomotion.candidates import coordinates
 from jaxevent.egomotion.choice import choose, decide
 from jaxevent.egomotion.geometry import A, B, rotation_basis

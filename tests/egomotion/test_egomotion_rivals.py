@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion.batch_fit import rivals
-from jaxevent.egomotion.batch_fit import windows as batch
-from jaxevent.egomotion.batch_fit.path import Path
-from jaxevent.egomotion.batch_fit.photometric import Report
-from jaxevent.egomotion.batch_fit.tracks import Scene
-from jaxevent.egomotion.batch_fit.windows import Params, Windows, inflation
+from jaxevent.egomotion.bundle import rivals
+from jaxevent.egomotion.bundle import windows as batch
+from jaxevent.egomotion.bundle.path import Path
+from jaxevent.egomotion.bundle.photometric import Report
+from jaxevent.egomotion.bundle.tracks import Scene
+from jaxevent.egomotion.bundle.windows import Params, Windows, inflation
 from jaxevent.egomotion.geometry import A, B
 from jaxevent.recording import Events, Recording
 

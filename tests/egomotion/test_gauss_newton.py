@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxevent.egomotion.batch_fit import gauss_newton, rows
-from jaxevent.egomotion.batch_fit.gauss_newton import Acceptance, accept
-from jaxevent.egomotion.batch_fit.path import SEGMENTS, Path, Prior
-from jaxevent.egomotion.batch_fit.placing import POWERS
+from jaxevent.egomotion.bundle import gauss_newton, rows
+from jaxevent.egomotion.bundle.gauss_newton import Acceptance, accept
+from jaxevent.egomotion.bundle.path import SEGMENTS, Path, Prior
+from jaxevent.egomotion.bundle.placing import POWERS
 
 K = 3
 HALF = 0.15

@@ -8,12 +8,12 @@ import pytest
 import scipy.linalg
 import scipy.ndimage
 
-from jaxevent.egomotion.batch_fit import coarse, solving, together
-from jaxevent.egomotion.batch_fit import equations as fit
-from jaxevent.egomotion.batch_fit.path import ROWS, SEGMENTS, Path, Prior
-from jaxevent.egomotion.batch_fit.rows import with_rows
-from jaxevent.egomotion.batch_fit.tracks import Scene, Tracks, read
-from jaxevent.egomotion.batch_fit.weighing import subtract_mean
+from jaxevent.egomotion.bundle import coarse, solving, together
+from jaxevent.egomotion.bundle import equations as fit
+from jaxevent.egomotion.bundle.path import ROWS, SEGMENTS, Path, Prior
+from jaxevent.egomotion.bundle.rows import with_rows
+from jaxevent.egomotion.bundle.tracks import Scene, Tracks, read
+from jaxevent.egomotion.bundle.weighing import subtract_mean
 
 pytestmark = pytest.mark.slow
 

@@ -11,7 +11,7 @@ from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import voting
 from jaxevent.egomotion.models import MODELS
 from jaxevent.egomotion.particle_filter import filtering
-from jaxevent.egomotion.particle_filter.fused.running import FusedRun
+from jaxevent.egomotion.particle_filter.engine.running import FusedRun
 from jaxevent.errors import InputError
 
 pytestmark = pytest.mark.slow

@@ -27,15 +27,15 @@ from test_reconstruction import (
 )
 
 import jaxevent
-from jaxevent import kernels
-from jaxevent.kernels import numeric
-from jaxevent.kernels.host import HostProgram, run
+from jaxevent import codegen
+from jaxevent.codegen import numeric
+from jaxevent.codegen.host import HostProgram, run
 from jaxevent.methods import METHODS
 from jaxevent.reconstruction.compensated.estimator import evidence
-from jaxevent.reconstruction.fused import bands, room
-from jaxevent.reconstruction.fused.images import FusedImages
-from jaxevent.reconstruction.fused.smoothed import SmoothedVideo
-from jaxevent.reconstruction.fused.video import FusedVideo
+from jaxevent.reconstruction.engine import bands, room
+from jaxevent.reconstruction.engine.images import FusedImages
+from jaxevent.reconstruction.engine.smoothed import SmoothedVideo
+from jaxevent.reconstruction.engine.video import FusedVideo
 from jaxevent.reconstruction.video import Video
 from jaxevent.recording import ColumnSource
 
@@ -117,7 +117,7 @@ def test_smoothers_of_one_kernel_equal_the_scan(monkeypatch):
     np.testing.assert_allclose(variance, scan.covariance, rtol=1e-9)
     np.testing.assert_array_equal(shown, scan.valid)
     assert 0.02 < shown.mean() < 0.9
-    monkeypatch.setattr(kernels, "THREADS", 1)
+    monkeypatch.setattr(codegen, "THREADS", 1)
     np.testing.assert_array_equal(images("numba").mean, mean)
     # Bands of three rows each.
     monkeypatch.setattr(bands, "STRIDES", (5 * 13,))
@@ -160,7 +160,7 @@ def test_bands_and_cores_do_not_change_a_bit(monkeypatch):
     layout = bands.BandLayout.of(11, 9)
     assert layout is not None and len(layout.edges) == 4
     np.testing.assert_array_equal(images(), whole)
-    monkeypatch.setattr(kernels, "THREADS", 1)
+    monkeypatch.setattr(codegen, "THREADS", 1)
     np.testing.assert_array_equal(images(), whole)
 
 

@@ -26,11 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
+from jaxevent.codegen import njit_noalloc
 from jaxevent.egomotion.candidates import NEVER, READ_ROWS, coordinates
 from jaxevent.egomotion.estimator import Given, OnHost
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import Calibration, Motion
-from jaxevent.kernels import lean
 from jaxevent.parameters import Choice, Count, Parameters, Positive
 from jaxevent.progress import bar
 from jaxevent.recording import Recording
@@ -263,7 +263,7 @@ class Rules(NamedTuple):
         )
 
 
-@lean
+@njit_noalloc
 def _planes(stream, wanted, position, surface, latest, scratch, rules, out):
     """Update the surface event by event, and fit a plane to it about each event."""
     # Names of their own: numba reads arrays out of tuples anew in every loop.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from jaxevent import dispatch
 from jaxevent.camera import PinholeCamera
+from jaxevent.codegen.expressions import Untranslatable
 from jaxevent.devices import along, mesh
 from jaxevent.egomotion.candidates import Candidates, Expected, Gatherer
 from jaxevent.egomotion.estimator import COMMON, Batch, MotionEstimator, Stretch, truth_of
@@ -21,14 +22,13 @@ from jaxevent.egomotion.geometry import length
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import Calibration, Motion
 from jaxevent.egomotion.particle_filter import filtering
+from jaxevent.egomotion.particle_filter.engine.running import FusedRun
 from jaxevent.egomotion.particle_filter.filtering import Info, Noise, State
-from jaxevent.egomotion.particle_filter.fused.running import FusedRun
 from jaxevent.egomotion.particle_filter.parameters import Params
 from jaxevent.egomotion.particle_filter.smoothing import smoothed
 from jaxevent.egomotion.patches import Speed
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
-from jaxevent.kernels.expressions import Untranslatable
 from jaxevent.progress import bar
 from jaxevent.recording import Recording, Times, check_times, microseconds
 

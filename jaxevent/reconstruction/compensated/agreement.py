@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.kernels import lean, lean_part, over_rows, room_over
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
 from jaxevent.reconstruction.compensated.instants import Instants
 from jaxevent.reconstruction.compensated.parameters import Params
 from jaxevent.reconstruction.compensated.warping import Along
@@ -201,7 +201,7 @@ class _Settings(NamedTuple):
     high: Any
 
 
-@lean_part
+@njit_noalloc_inlined
 def across(row, taps, padded, out):
     """`row` blurred along x; the image's border goes on."""
     w, reach = len(row), len(taps) // 2
@@ -217,7 +217,7 @@ def across(row, taps, padded, out):
             out[x] += tap * padded[i + x]
 
 
-@lean_part
+@njit_noalloc_inlined
 def down(image, y, taps, out):
     """The row y of an image that is blurred along y."""
     h, w = image.shape
@@ -229,7 +229,7 @@ def down(image, y, taps, out):
             out[x] += tap * row[x]
 
 
-@lean_part
+@njit_noalloc_inlined
 def _steep(image, y, out):
     """|grad|^2 in the row y."""
     h, w = image.shape
@@ -244,7 +244,7 @@ def _steep(image, y, out):
         out[x] = gx * gx + gy * gy
 
 
-@lean_part
+@njit_noalloc_inlined
 def _variance(V, inside, steep, settings, here, out):
     for x in range(len(V)):
         added = settings.place * steep[x] + settings.between
@@ -252,7 +252,7 @@ def _variance(V, inside, steep, settings, here, out):
         out[x] = base if here else base + added
 
 
-@lean_part
+@njit_noalloc_inlined
 def _add(L, clear, variance, seen, settings, total, mean):
     one = np.float32(1)
     for x in range(len(L)):
@@ -262,7 +262,7 @@ def _add(L, clear, variance, seen, settings, total, mean):
         mean[x] += R * L[x]
 
 
-@lean_part
+@njit_noalloc_inlined
 def _see(misfit, tolerance, most, seen):
     one = np.float32(1)
     for x in range(len(misfit)):
@@ -270,44 +270,44 @@ def _see(misfit, tolerance, most, seen):
         seen[x] = one / (one + ratio * ratio)
 
 
-@lean_part
+@njit_noalloc_inlined
 def _differ(L, M, variance, out):
     for x in range(len(L)):
         out[x] = (L[x] - M[x]) * (L[x] - M[x]) / variance[x]
 
 
-@lean_part
+@njit_noalloc_inlined
 def _copy(a, out):
     for x in range(len(a)):
         out[x] = a[x]
 
 
-@lean_part
+@njit_noalloc_inlined
 def _multiply(a, b, out):
     for x in range(len(a)):
         out[x] = a[x] * b[x]
 
 
-@lean_part
+@njit_noalloc_inlined
 def _divide(a, b, out):
     for x in range(len(a)):
         out[x] = a[x] / b[x]
 
 
-@lean
+@njit_noalloc
 def _blur_across(begin, end, image, taps, room, out):
     padded = room[begin]
     for y in range(begin, end):
         across(image[y], taps, padded, out[y])
 
 
-@lean
+@njit_noalloc
 def _blur_down(begin, end, image, taps, out):
     for y in range(begin, end):
         down(image, y, taps, out[y])
 
 
-@lean
+@njit_noalloc
 def _find_mean(begin, end, along, near, misfits, M, steep, settings, own, turn, taps, room, out):
     """The mean over instants of some rows; `misfits` are blurred across."""
     count, own_room = along.L.shape[0], room[begin]
@@ -330,7 +330,7 @@ def _find_mean(begin, end, along, near, misfits, M, steep, settings, own, turn, 
         _divide(mean, total, out[y])
 
 
-@lean
+@njit_noalloc
 def _find_misfits(begin, end, along, M, steep, settings, own, taps, room, padded, misfits):
     """Squared differences from M in parts of their variances, blurred across."""
     count = len(along.L)
@@ -343,7 +343,7 @@ def _find_misfits(begin, end, along, M, steep, settings, own, taps, room, padded
             across(ratio, taps, padded[begin], misfits[k, y])
 
 
-@lean_part
+@njit_noalloc_inlined
 def _gather(along, y, k, seen, variance, settings, place, out):
     """Add an instant to what the means are made of."""
     one, zero = np.float32(1), np.float32(0)
@@ -371,7 +371,7 @@ def _gather(along, y, k, seen, variance, settings, place, out):
         usual[x] += R * (one - clear[x]) * V[x]
 
 
-@lean_part
+@njit_noalloc_inlined
 def _exceed(L, clear, M, misfit, variance, settings, excess, weight):
     one, plainly, expected = np.float32(1), np.float32(PLAIN), np.float32(0.6)
     for x in range(len(L)):
@@ -383,13 +383,13 @@ def _exceed(L, clear, M, misfit, variance, settings, excess, weight):
         weight[x] += plain * eta
 
 
-@lean_part
+@njit_noalloc_inlined
 def _change(early, late, out):
     for x in range(len(out)):
         out[x] += (late[x] - early[x]) * (late[x] - early[x])
 
 
-@lean
+@njit_noalloc
 def _finish(begin, end, L, along, misfits, steep, settings, place, taps, room, out, excess, weight):
     """What is told of some rows; scatter is yet to be gathered."""
     count, _, w = along.L.shape
@@ -429,9 +429,9 @@ def blurred(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
     """`blur` of an image (h, w), in loops."""
     taps = taps_of(sigma)
     half, out = np.empty_like(image), np.empty_like(image)
-    room = room_over(len(image), image.shape[1] + len(taps))
-    over_rows(_blur_across, len(image), image, taps, room, half)
-    over_rows(_blur_down, len(image), half, taps, out)
+    room = row_scratch(len(image), image.shape[1] + len(taps))
+    run_over_rows(_blur_across, len(image), image, taps, room, half)
+    run_over_rows(_blur_down, len(image), half, taps, out)
     return out
 
 
@@ -447,12 +447,12 @@ def agree(params: Params, L: NDArray, along: Along, place: Place) -> Agreement:
     misfits = np.empty((count, h, w), np.float32)
     steep, M = np.empty((2, h, w), np.float32)
     seen_from = blurred(np.ascontiguousarray(L[own]), 1.0)
-    room, padded = room_over(h, 10 + 2 * count, w), room_over(h, w + len(taps))
+    room, padded = row_scratch(h, 10 + 2 * count, w), row_scratch(h, w + len(taps))
     for turn in range(3):
         given = (along, weights, misfits, seen_from, steep, settings, own, turn, taps)
-        over_rows(_find_mean, h, *given, room, M)
+        run_over_rows(_find_mean, h, *given, room, M)
         given = (along, M, steep, settings, own, taps, room, padded)
-        over_rows(_find_misfits, h, *given, misfits)
+        run_over_rows(_find_misfits, h, *given, misfits)
         seen_from = M.copy()
     images = np.empty((8, h, w), np.float32)
     M, total, scatter, near, near_information, frame_information, activity, usual = images
@@ -461,6 +461,6 @@ def agree(params: Params, L: NDArray, along: Along, place: Place) -> Agreement:
     out = Agreement(*told, parts, seen, usual)
     excess, weight = np.empty((2, h, w), np.float32)
     given = (L, along, misfits, steep, settings, place, taps, room)
-    over_rows(_finish, h, *given, out, excess, weight)
+    run_over_rows(_finish, h, *given, out, excess, weight)
     scatter = np.maximum(blurred(excess, SCATTER) / blurred(weight, SCATTER), 0)
     return out._replace(scatter=scatter)

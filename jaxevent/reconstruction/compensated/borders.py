@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import lean, lean_part, over_rows, room_over
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
 from jaxevent.reconstruction.compensated.agreement import across, down, taps_of
 from jaxevent.reconstruction.compensated.trajectories import (
     Row,
@@ -56,18 +56,18 @@ class _Room(NamedTuple):
 
     @classmethod
     def over(cls, rows: int, columns: int, instants: int, taps: int) -> "_Room":
-        """For `over_rows`."""
+        """For `run_over_rows`."""
         return cls(
             Row.over(rows, columns),
-            room_over(rows, 3, instants, columns),
-            room_over(rows, 6, columns),
+            row_scratch(rows, 3, instants, columns),
+            row_scratch(rows, 6, columns),
             np.empty((rows, 2, columns)),
             np.empty((rows, columns), np.int32),
-            room_over(rows, columns + taps),
+            row_scratch(rows, columns + taps),
         )
 
 
-@lean_part
+@njit_noalloc_inlined
 def _read(image, pixel, part, level, V):
     """Log intensity and variance of a packed image at points, bilinear."""
     h, w, _ = image.shape
@@ -82,7 +82,7 @@ def _read(image, pixel, part, level, V):
         V[i] = a * upper[x0, 1] + b * upper[x1, 1] + c * lower[x0, 1] + d * lower[x1, 1]
 
 
-@lean_part
+@njit_noalloc_inlined
 def _cost(count, begin, images, s, near, y, floor, nu, room):
     """How badly images (K, h, w, 4) agree along the paths of a row's first points.
 
@@ -114,14 +114,14 @@ def _cost(count, begin, images, s, near, y, floor, nu, room):
         costs[i] = nu * np.float32(total[i])
 
 
-@lean_part
+@njit_noalloc_inlined
 def _apart(own, other):
     """By how many px at the farthest instant two paths differ, at most."""
     x = abs(other[0] - own[0]) + abs(other[2] - own[2])
     return max(x, abs(other[1] - own[1]) + abs(other[3] - own[3]))
 
 
-@lean_part
+@njit_noalloc_inlined
 def _alike(paths, y, x, offsets):
     """Whether no path nearby differs from a pixel's own."""
     h, w, _ = paths.shape
@@ -133,7 +133,7 @@ def _alike(paths, y, x, offsets):
     return True
 
 
-@lean_part
+@njit_noalloc_inlined
 def _list(y, n, step, paths, offsets, enough, begin, room):
     """Write down the pixels of a row to compare along the `n`th path, with it; how many."""
     h, w, _ = paths.shape
@@ -153,7 +153,7 @@ def _list(y, n, step, paths, offsets, enough, begin, room):
     return count
 
 
-@lean
+@njit_noalloc
 def _try(begin, end, images, s, near, step, paths, offsets, floor, nu, taps, room, out):
     """Costs (n, h, w) of every `step`-th pixel along both axes: of the paths at offsets (n, 2).
 
@@ -176,7 +176,7 @@ def _try(begin, end, images, s, near, step, paths, offsets, floor, nu, taps, roo
             across(other, taps, padded, out[n, y])
 
 
-@lean
+@njit_noalloc
 def _take(begin, end, costs, moves, every, margin, taps, whose, lines, out):
     """Whose path each pixel takes by costs that are blurred along x; `whose` are those so far."""
     h, w = whose.shape
@@ -222,10 +222,10 @@ def choose(
         costs = np.empty((len(OFFSETS), rows, columns), np.float32)
         room = _Room.over(rows, columns, len(s), len(taps))
         given = (images, s, near, every, some, OFFSETS * far, *rules, taps, room)
-        over_rows(_try, rows, *given, costs)
+        run_over_rows(_try, rows, *given, costs)
         given = (costs, OFFSETS * every * far, every, margin, taps, whose, room.lines)
         whose = np.empty_like(whose)
-        over_rows(_take, rows, *given, whose)
+        run_over_rows(_take, rows, *given, whose)
     return whose
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
-from jaxevent.kernels import lean, over_rows
+from jaxevent.codegen import njit_noalloc, run_over_rows
 from jaxevent.reconstruction.augment import clipped_side, clipping_bound, unclipped
 from jaxevent.reconstruction.compensated.agreement import MISFIT, blur, steepness
 from jaxevent.reconstruction.compensated.fusion import Fused
@@ -101,7 +101,7 @@ def returned(error: Array, shares: Array, D: Array) -> Array:
     return sample(parts, Y, X).sum(0)
 
 
-@lean
+@njit_noalloc
 def _smear(begin, end, L, D, B, shares):
     n, count, h, w, _ = D.shape
     one = np.float32(1)
@@ -121,7 +121,7 @@ def _smear(begin, end, L, D, B, shares):
                 B[k, y, x] = np.log(total / np.float32(count))
 
 
-@lean
+@njit_noalloc
 def _return(begin, end, error, shares, D, out):
     n, count, h, w, _ = D.shape
     one = np.float32(1)
@@ -147,14 +147,14 @@ def _return(begin, end, error, shares, D, out):
 def _quickly_smeared(L: NDArray, D: NDArray) -> tuple[NDArray, NDArray]:
     """`smeared`, in loops."""
     B, shares = np.empty((len(D), *L.shape), np.float32), np.empty(D.shape[:-1], np.float32)
-    over_rows(_smear, len(L), L, D, B, shares)
+    run_over_rows(_smear, len(L), L, D, B, shares)
     return B, shares
 
 
 def _quickly_returned(error: NDArray, shares: NDArray, D: NDArray) -> NDArray:
     """`returned`, in loops."""
     out = np.empty(error.shape[1:], np.float32)
-    over_rows(_return, len(out), error, shares, D, out)
+    run_over_rows(_return, len(out), error, shares, D, out)
     return out
 
 

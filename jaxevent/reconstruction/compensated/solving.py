@@ -5,35 +5,35 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import lean, lean_part
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 
 
-@lean_part
+@njit_noalloc_inlined
 def _add_product(a, b, out):
     for x in range(len(out)):
         out[x] += a[x] * b[x]
 
 
-@lean_part
+@njit_noalloc_inlined
 def _add_difference(weight, a, b, out):
     for x in range(len(out)):
         out[x] += weight[x] * (a[x] - b[x])
 
 
-@lean_part
+@njit_noalloc_inlined
 def _scale_and_add(factor, a, out):
     """out = factor out + a."""
     for x in range(len(out)):
         out[x] = factor * out[x] + a[x]
 
 
-@lean_part
+@njit_noalloc_inlined
 def _add_scaled(factor, a, out):
     for x in range(len(out)):
         out[x] += factor * a[x]
 
 
-@lean_part
+@njit_noalloc_inlined
 def _times(N, i, q, out):
     """Symmetric 4 x 4 matrices of a row of nodes, times vectors (4, columns)."""
     for c in range(len(out)):  # numbers that are not known are not unrolled: less to compile
@@ -44,7 +44,7 @@ def _times(N, i, q, out):
             _add_product(N[low * (7 - low) // 2 + high, i], q[e], out[c])
 
 
-@lean_part
+@njit_noalloc_inlined
 def _rough(q, across, down, i, out):
     """The weighted graph Laplacian (columns,) of a channel in a row; all are padded by a node."""
     width = len(out)
@@ -56,7 +56,7 @@ def _rough(q, across, down, i, out):
     _add_difference(down[i + 1], here, q[i + 2, 1:-1], out)
 
 
-@lean_part
+@njit_noalloc_inlined
 def _invert(N, added, room, out):
     """The inverse (10 entries) of a symmetric 4 x 4 matrix with `added` on its diagonal."""
     # Cholesky, in double precision: nodes without texture are nearly singular.
@@ -132,7 +132,7 @@ def solve(
     return d
 
 
-@lean
+@njit_noalloc
 def _solve(N, b, p, across, down, smooth, ridge, iterations, room, d):
     # Channels come first here, and rows of nodes are what loops go over at once.
     rows, columns, channels = p.shape

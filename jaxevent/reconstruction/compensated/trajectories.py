@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.kernels import lean, lean_part, over_rows, room_over
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
 from jaxevent.reconstruction.compensated.solving import solve
 
 CHANNELS = 4  # of packed images: log intensity, its variance, its gradient along x and y
@@ -37,11 +37,11 @@ class Smoothness(NamedTuple):
 def pack(L: NDArray, V: NDArray) -> NDArray[np.float32]:
     """Images and their variances (K, h, w) with gradients: (K, h, w, 4)."""
     out = np.empty((*L.shape, CHANNELS), np.float32)
-    over_rows(_pack, L.shape[1], np.asarray(L, np.float32), np.asarray(V, np.float32), out)
+    run_over_rows(_pack, L.shape[1], np.asarray(L, np.float32), np.asarray(V, np.float32), out)
     return out
 
 
-@lean_part
+@njit_noalloc_inlined
 def _gradient(image, y, x):
     """Along x and y; five taps: exact for polynomials of degree 4."""
     h, w = image.shape
@@ -53,7 +53,7 @@ def _gradient(image, y, x):
     return gx * twelfth, gy * twelfth
 
 
-@lean
+@njit_noalloc
 def _pack(begin, end, L, V, out):
     count, h, w = L.shape
     for k in range(count):
@@ -64,7 +64,7 @@ def _pack(begin, end, L, V, out):
                 out[k, y, x, 2], out[k, y, x, 3] = _gradient(L[k], y, x)
 
 
-@lean
+@njit_noalloc
 def _halve(begin, end, images, room, out):
     """Blur by `_TAPS` along both axes and keep every second: half the size."""
     count, h, w = images.shape
@@ -87,11 +87,11 @@ def halve(images: NDArray[np.float32]) -> NDArray[np.float32]:
     """Images (K, h, w) at half the resolution, rounded up."""
     count, h, w = images.shape
     out = np.empty((count, (h + 1) // 2, (w + 1) // 2), np.float32)
-    over_rows(_halve, out.shape[1], images, room_over(out.shape[1], w), out)
+    run_over_rows(_halve, out.shape[1], images, row_scratch(out.shape[1], w), out)
     return out
 
 
-@lean_part
+@njit_noalloc_inlined
 def between(values, y, x, out):
     """Values (rows, columns, 4) of nodes at the pixel y, x, bilinear."""
     rows, columns, _ = values.shape
@@ -111,7 +111,7 @@ def between(values, y, x, out):
         out[c] = top + fy * (bottom - top)
 
 
-@lean_part
+@njit_noalloc_inlined
 def around(X, Y, h, w):
     """Whether a point lies in an image, the pixels around it (or its border) and its place there.
 
@@ -137,13 +137,13 @@ class Row(NamedTuple):
 
     @classmethod
     def over(cls, rows: int, points: int) -> "Row":
-        """For `over_rows`."""
-        path, part = room_over(rows, 4, points), room_over(rows, 2, points)
-        x, inside = room_over(rows, points), room_over(rows, points)
+        """For `run_over_rows`."""
+        path, part = row_scratch(rows, 4, points), row_scratch(rows, 2, points)
+        x, inside = row_scratch(rows, points), row_scratch(rows, points)
         return cls(path, x, np.empty((rows, 2, points), np.int32), part, inside)
 
 
-@lean_part
+@njit_noalloc_inlined
 def locate(path, x, y, s, size, pixel, part, inside):
     """Where points of a row are at an instant; arguments are as the parts of a `Row`."""
     h, w = size
@@ -163,7 +163,7 @@ def locate(path, x, y, s, size, pixel, part, inside):
         part[0, i], part[1, i] = X - np.float32(x0), Y - np.float32(y0)
 
 
-@lean_part
+@njit_noalloc_inlined
 def weigh(V, inside, floor, W):
     """The information of values of these variances."""
     one = np.float32(1)
@@ -171,7 +171,7 @@ def weigh(V, inside, floor, W):
         W[i] = one / (V[i] + floor) if inside[i] > 0 else OUTSIDE
 
 
-@lean_part
+@njit_noalloc_inlined
 def robust_means(values, W, near, nu, R, sums, means):
     """Means of values (K, points) with information W, and their weights R in it.
 
@@ -198,7 +198,7 @@ def robust_means(values, W, near, nu, R, sums, means):
             means[i] = mean[i] / total[i]
 
 
-@lean_part
+@njit_noalloc_inlined
 def _read(image, pixel, part, k, points):
     """An image's channels at points, bilinear: (4, K, points)."""
     h, w, _ = image.shape
@@ -215,7 +215,7 @@ def _read(image, pixel, part, k, points):
             )
 
 
-@lean
+@njit_noalloc
 def _fetch(begin, end, images, s, near, p, floor, nu, row, W, sums, points, M):
     """Images along trajectories of some rows, (h, 4, K, w): L, weight R, gradient; their mean."""
     count, h, w, _ = images.shape
@@ -238,13 +238,13 @@ def _fetch(begin, end, images, s, near, p, floor, nu, row, W, sums, points, M):
         robust_means(points[y, 0], info, near, nu, points[y, 1], sums[begin], M[y])
 
 
-@lean_part
+@njit_noalloc_inlined
 def _add_product(a, b, out):
     for i in range(len(out)):
         out[i] += a[i] * b[i]
 
 
-@lean_part
+@njit_noalloc_inlined
 def _add_equations(points, s, M, slope, room, sums):
     """Add those of each pixel of a row to sums (14, w): N (10) and b (4).
 
@@ -282,7 +282,7 @@ def _add_equations(points, s, M, slope, room, sums):
             at += 1
 
 
-@lean
+@njit_noalloc
 def _linearise(begin, end, points, s, M, room, N, b, edge):
     """Normal equations of the nodes of some rows: N (10 entries), b (4); and |grad M|."""
     h, w = M.shape
@@ -317,7 +317,7 @@ def soften(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return out
 
 
-@lean
+@njit_noalloc
 def _soften(values, row, out):
     rows, columns, channels = values.shape
     for i in range(rows):
@@ -335,7 +335,7 @@ def _soften(values, row, out):
                 ) / np.float32(8)
 
 
-@lean
+@njit_noalloc
 def _weigh_differences(p, edge, reach, smoothness, across, down):
     """Weights of the differences between neighbouring nodes; `reach` is the horizon."""
     rows, columns, _ = p.shape
@@ -356,12 +356,12 @@ def _weigh_differences(p, edge, reach, smoothness, across, down):
                     down[i, j] = weight
 
 
-@lean_part
+@njit_noalloc_inlined
 def _median(a, b, c):
     return max(min(a, b), min(max(a, b), c))
 
 
-@lean
+@njit_noalloc
 def _move(p, d, farthest, moved, sorted_rows, out):
     """p + d, each channel of d no longer than `farthest`, then the median of 3 x 3 nodes.
 
@@ -439,8 +439,10 @@ def fetch(
     """What `_fetch` writes: of every pixel its instants' points, and their mean."""
     count, h, w, _ = images.shape
     points, M = np.empty((h, 4, count, w), np.float32), np.empty((h, w), np.float32)
-    room = Row.over(h, w), room_over(h, count, w), room_over(h, 2, w)
-    over_rows(_fetch, h, images, s, near, p, np.float32(floor), np.float32(nu), *room, points, M)
+    room = Row.over(h, w), row_scratch(h, count, w), row_scratch(h, 2, w)
+    run_over_rows(
+        _fetch, h, images, s, near, p, np.float32(floor), np.float32(nu), *room, points, M
+    )
     return points, M
 
 
@@ -451,8 +453,8 @@ def linearise(
     h, w = M.shape
     shape = -(-h // 2), -(-w // 2)
     N, b = np.empty((*shape, 10), np.float32), np.empty((*shape, 4), np.float32)
-    edge, room = np.empty(shape, np.float32), room_over(shape[0], 12 + 15, w)
-    over_rows(_linearise, shape[0], points, s, M, room, N, b, edge)
+    edge, room = np.empty(shape, np.float32), row_scratch(shape[0], 12 + 15, w)
+    run_over_rows(_linearise, shape[0], points, s, M, room, N, b, edge)
     return N, b, edge
 
 
@@ -482,7 +484,7 @@ def by_clock(
     return np.einsum("ab,ijbc->ijac", change, paths).reshape(p.shape).astype(np.float32)
 
 
-@lean
+@njit_noalloc
 def _resize(p, out, scale):
     """Nodes at another resolution, bilinear, displacements times `scale`."""
     rows, columns, channels = p.shape
@@ -591,7 +593,7 @@ def follow(
     return motion
 
 
-@lean
+@njit_noalloc
 def _advect(begin, end, p, s, out):
     rows, columns, _ = p.shape
     half = np.float32(0.5)  # nodes per px
@@ -619,11 +621,11 @@ def advect(p: NDArray[np.float32], s: float, unit: float) -> NDArray[np.float32]
         unit: What 1 stands for on the new clock, in units of the old one.
     """
     out = np.empty_like(p)
-    over_rows(_advect, len(p), p, np.float32(s), out)
+    run_over_rows(_advect, len(p), p, np.float32(s), out)
     return out * np.array([unit, unit, unit**2, unit**2], np.float32)
 
 
-@lean
+@njit_noalloc
 def _spread(begin, end, p, out):
     for y in range(begin, end):
         for x in range(out.shape[1]):
@@ -633,5 +635,5 @@ def _spread(begin, end, p, out):
 def spread(p: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
     """The paths of all pixels, (h, w, 4), from those of nodes."""
     out = np.empty((*size, 4), np.float32)
-    over_rows(_spread, size[0], p, out)
+    run_over_rows(_spread, size[0], p, out)
     return out

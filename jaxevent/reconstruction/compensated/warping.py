@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.kernels import lean, lean_part, over_rows, room_over
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
 from jaxevent.reconstruction.compensated.trajectories import Row, locate
 from jaxevent.reconstruction.features import Numeric
 
@@ -23,7 +23,7 @@ class Along(NamedTuple):
     inside: Float[Numeric, "k h w"]  # 1, or 0 beyond the image's border
 
 
-@lean_part
+@njit_noalloc_inlined
 def _cubic(part, out):
     """The weights (4, points) of the four pixels around each point."""
     a, one, two, three = np.float32(CUBIC), np.float32(1), np.float32(2), np.float32(3)
@@ -37,7 +37,7 @@ def _cubic(part, out):
         out[3, i] = one - out[0, i] - out[1, i] - out[2, i]
 
 
-@lean_part
+@njit_noalloc_inlined
 def _read_bilinear(image, pixel, part, out):
     h, w = image.shape
     one = np.float32(1)
@@ -50,7 +50,7 @@ def _read_bilinear(image, pixel, part, out):
         out[i] = a * upper[x0] + b * upper[x1] + c * lower[x0] + d * lower[x1]
 
 
-@lean_part
+@njit_noalloc_inlined
 def _read_bicubic(image, pixel, across, down, out):
     h, w = image.shape
     for i in range(len(out)):
@@ -70,7 +70,7 @@ def _read_bicubic(image, pixel, across, down, out):
         out[i] = total
 
 
-@lean
+@njit_noalloc
 def _warp(begin, end, L, V, clear, s, paths, row, weights, out):
     count, h, w = L.shape
     path, pixel, part, at = row.path[begin], row.pixel[begin], row.part[begin], row.x[begin]
@@ -94,7 +94,7 @@ def warp(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, paths: NDArray) -> 
     """Images (K, h, w) float32 at instants s (K,) along the paths of pixels, (h, w, 4)."""
     _, h, w = L.shape
     out = Along(*(np.empty(L.shape, np.float32) for _ in range(4)))
-    over_rows(_warp, h, L, V, clear, s, paths, Row.over(h, w), room_over(h, 8, w), out)
+    run_over_rows(_warp, h, L, V, clear, s, paths, Row.over(h, w), row_scratch(h, 8, w), out)
     return out
 
 

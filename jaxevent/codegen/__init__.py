@@ -1,0 +1,128 @@
+"""How loops over events are compiled for the host."""
+
+import functools
+import inspect
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.codegen import kept, support
+
+# numba makes two functions more of each. The one for those that call it by its address is left out;
+# without the one for Python a call from there would end the process.
+_USUAL: dict[str, Any] = {"nogil": True}
+# Counting references to arrays is two thirds of a function that takes many of them.
+_LEAN: dict[str, Any] = {}
+if support.HAS_INTERNALS:
+    from jaxevent.codegen.internals import part_of_others
+
+    _USUAL |= {"no_cfunc_wrapper": True}
+    _LEAN |= {"_nrt": False}
+# Sums in any order, so that several are taken at once.
+_LOOSE: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz"}}
+
+
+def njit(function: Callable) -> Any:
+    """Compile with numba, without the argument checks that tests wrap around functions."""
+    return kept.compiled(inspect.unwrap(function), **_USUAL)
+
+
+def njit_inlined(function: Callable) -> Any:
+    """The same for what compiled functions alone call: they are kept, with it inside."""
+    return _inside(function, error_model="numpy", **_USUAL)
+
+
+def njit_noalloc(function: Callable) -> Any:
+    """Compile as `compiled` does, in less time, what makes no arrays of its own."""
+    return kept.compiled(inspect.unwrap(function), **_USUAL, **_LEAN)
+
+
+def njit_noalloc_inlined(function: Callable) -> Any:
+    """Compile so what such functions alone call; not for calls from Python."""
+    return _lean_inside(function, error_model="numpy", nogil=True, **_LEAN)
+
+
+def njit_fastmath(function: Callable) -> Any:
+    """Compile as `lean` does, sums in whatever order is fastest: the same one every time."""
+    return kept.compiled(inspect.unwrap(function), **_USUAL, **_LEAN, **_LOOSE)
+
+
+def njit_fastmath_inlined(function: Callable) -> Any:
+    """Compile so what such functions alone call; not for calls from Python."""
+    return _lean_inside(function, nogil=True, **_LEAN, **_LOOSE)
+
+
+def _inside(function: Callable, **options: Any) -> Any:
+    """`numba.njit`, not kept; the function itself where there is no numba."""
+    plain = inspect.unwrap(function)
+    return support.numba.njit(**options)(plain) if support.HAS_NUMBA else plain
+
+
+def _lean_inside(function: Callable, **options: Any) -> Any:
+    return (part_of_others if support.HAS_INTERNALS else _inside)(function, **options)
+
+
+class ZeroedScratch:
+    """Arrays of zeros that functions fill and make 0 again: one of each shape for each thread.
+
+    To lay out a new one takes longer than a few events of a large image.
+    """
+
+    def __init__(self, dtype: Any):
+        self.dtype, self._threads = dtype, threading.local()
+
+    def __call__(self, *shape: int) -> NDArray:
+        """The array of a shape."""
+        if not hasattr(self._threads, "known"):
+            self._threads.known = {}
+        known: dict[tuple[int, ...], NDArray] = self._threads.known
+        if shape not in known:
+            known[shape] = np.zeros(shape, self.dtype)
+        return known[shape]
+
+
+THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def row_scratch(rows: int, *shape: int) -> NDArray[np.float32]:
+    """Room for kernels of `run_over_rows`, (rows, ...): who begins with a row has that of this row.
+
+    Memory is taken by what is written alone.
+    """
+    return np.empty((rows, *shape), np.float32)
+
+
+@functools.cache
+def _workers() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(THREADS)
+
+
+def run_over_rows(kernel: Callable, rows: int, *args: Any) -> None:
+    """Call `kernel(begin, end, *args)` for parts of the rows, each on a thread of its own.
+
+    Kernels release the interpreter's lock. What they compute must not depend on the parts.
+    """
+    parts = min(THREADS, rows)
+    if parts <= 1:
+        kernel(0, rows, *args)
+        return
+    edges = [rows * part // parts for part in range(parts + 1)]
+    try:
+        jobs = [_workers().submit(kernel, *edges[k : k + 2], *args) for k in range(parts)]
+    except RuntimeError:  # the interpreter ends, and JAX waits for what it has begun
+        kernel(0, rows, *args)
+        return
+    try:
+        for job in jobs:
+            job.result()
+    finally:
+        wait(jobs)  # interrupted, too: what they write is the caller's
+
+
+if hasattr(os, "register_at_fork"):  # the threads stay behind
+    os.register_at_fork(after_in_child=_workers.cache_clear)

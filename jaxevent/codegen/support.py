@@ -1,0 +1,61 @@
+"""The interfaces of numba that this process can use: all that kernels want, public ones, or none.
+
+Kernels are compiled in less time, and kept for later processes, by interfaces that numba may change
+in any release. They are used with the releases of `TESTED` alone. With another release functions
+are compiled by `numba.njit` in every process: later, with equal results. Where numba cannot be
+imported, as beside a NumPy that it does not know, functions run as Python and XLA compiles what a
+kernel would compute.
+"""
+
+import contextlib
+import importlib
+import threading
+import warnings
+from typing import Any
+
+__all__ = ["HAS_INTERNALS", "HAS_NUMBA", "compiler_lock", "intrinsic", "ir", "numba", "types"]
+
+TESTED = ((0, 61), (0, 68))  # first and last release of numba whose private interfaces are used
+
+numba: Any = None
+types: Any = None  # numba's types
+ir: Any = None  # LLVM's language
+intrinsic: Any = None  # decorator of an operation of the compiler's own
+compiler_lock: Any = threading.RLock()  # held while numba compiles
+
+
+def is_tested(version: str) -> bool:
+    """Return whether the private interfaces of this version of numba are known."""
+    numbers = version.split(".")[:2]
+    if not all(number.isdecimal() for number in numbers):
+        return False
+    return TESTED[0] <= tuple(int(number) for number in numbers) <= TESTED[1]
+
+
+try:
+    import numba
+    from llvmlite import ir
+    from numba import types
+    from numba.extending import intrinsic
+except Exception as error:  # numba raises what it likes beside libraries that it does not know
+    numba = None
+    reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+    warnings.warn(
+        f"numba cannot be imported ({reason}), so that XLA compiles what it can and all else runs "
+        "many times slower; install a numba that fits your NumPy, as pip install -U numba does",
+        stacklevel=2,
+    )
+
+if numba is not None:
+    # Kernels take functions as arguments.
+    warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
+    with contextlib.suppress(ImportError, AttributeError):  # private: may go in any release
+        compiler_lock = importlib.import_module("numba.core.compiler_lock").global_compiler_lock
+
+HAS_NUMBA = numba is not None
+HAS_INTERNALS = HAS_NUMBA and is_tested(numba.__version__)
+if HAS_INTERNALS:
+    try:
+        importlib.import_module("jaxevent.codegen.internals")
+    except (ImportError, AttributeError):  # a build of numba that lacks some of them
+        HAS_INTERNALS = False
