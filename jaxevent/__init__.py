@@ -11,7 +11,7 @@ programs are kept in the user's cache folder: `jaxevent.cache` says how to chang
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from jaxevent import cache, dispatch, shown
+from jaxevent import cache, deprecated, dispatch, shown
 
 if TYPE_CHECKING:
     from jaxevent import (
@@ -114,6 +114,7 @@ __all__ = [
 ]
 
 cache.keep_compiled()
+deprecated.install()
 dispatch.run_in_turn()
 
 
@@ -128,7 +129,7 @@ def __getattr__(name: str) -> Any:
     if name in _MODULES:
         return importlib.import_module(f"jaxevent.{_MODULES[name]}")
     if name not in _HOME_OF:
-        raise AttributeError(f"module 'jaxevent' has no attribute {name!r}")
+        return deprecated.renamed_names(__name__)(name)
     return getattr(importlib.import_module(_HOME_OF[name]), name)
 
 

@@ -17,6 +17,7 @@ from jaxevent.blob.states import TrackStates
 from jaxevent.blob.steps import Filter
 from jaxevent.blob.tracker import Tracker
 from jaxevent.blob.tracks import Tracks
+from jaxevent.deprecated import renamed_names
 
 __all__ = [
     "Filter",
@@ -35,3 +36,5 @@ __all__ = [
     "position_error",
     "prepare_positions",
 ]
+
+__getattr__ = renamed_names(__name__)

@@ -24,6 +24,8 @@ All speak of the camera's own twist (T, Omega) in its axes, x to the right, y do
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from jaxevent.deprecated import renamed_names
+
 if TYPE_CHECKING:
     from jaxevent.egomotion import (
         candidates,
@@ -100,7 +102,7 @@ def __getattr__(name: str) -> Any:
     if name in _MODULES:
         return importlib.import_module(f"{__name__}.{name}")
     if name not in _HOME_OF:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return renamed_names(__name__)(name)
     return getattr(importlib.import_module(f"{__name__}.{_HOME_OF[name]}"), name)
 
 

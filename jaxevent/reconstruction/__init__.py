@@ -3,6 +3,8 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from jaxevent.deprecated import renamed_names
+
 if TYPE_CHECKING:
     from jaxevent.reconstruction.compensated import mc
     from jaxevent.reconstruction.complementary import cf, cf_augmented, high_pass
@@ -39,7 +41,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name not in _HOME_OF:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return renamed_names(__name__)(name)
     return getattr(importlib.import_module(f"{__name__}.{_HOME_OF[name]}"), name)
 
 
