@@ -215,10 +215,10 @@ def blob_bench() -> tuple[dict[str, float], dict[str, float]]:
             if len(weight) == 1:  # as the tracker does
                 batch = Batch(batch.xi, 0 * weight, batch.polarity)
             state = blob.update(params, blob.predict(params, state, dt), batch, weight)
-            now = blob.expected(params, state)
+            now = blob.predicted_measurement(params, state)
             return state, None if length else jax.numpy.concatenate([now.p, now.size])
 
-        begin = blob.start(params, start.astype(dt.dtype), jax.numpy.full((), 20.0, dt.dtype))
+        begin = blob.init(params, start.astype(dt.dtype), jax.numpy.full((), 20.0, dt.dtype))
         if not length:
             return jax.lax.scan(step, begin, (dt, batch))[1]
         parts = jax.tree.map(lambda a: a.reshape(-1, length, *a.shape[1:]), (dt, batch))

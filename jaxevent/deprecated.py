@@ -4,6 +4,7 @@
 `__getattr__ = renamed_names(__name__)`; modules that moved are found by `RenamedModules`.
 """
 
+import functools
 import importlib
 import importlib.abc
 import importlib.machinery
@@ -11,7 +12,9 @@ import sys
 import types
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 # The full name until this release, and the one from now on.
 RENAMED: dict[str, str] = {}
@@ -66,6 +69,37 @@ class RenamedAttribute:
     def __get__(self, instance: Any, owner: type) -> Any:
         warn_renamed(f"{owner.__name__}.{self.old}", f"{owner.__name__}.{self.new}")
         return getattr(owner if instance is None else instance, self.new)
+
+
+def renamed_fields(**names: str) -> Callable[[type[T]], type[T]]:
+    """Make a decorator that lets a dataclass take and give fields by their old names too.
+
+    Args:
+        names: The new name of each field by its old one.
+
+    Returns:
+        The decorator of the dataclass.
+    """
+
+    def decorate(cls: Any) -> Any:
+        init = cls.__init__
+
+        @functools.wraps(init)
+        def __init__(self: Any, *args: Any, **values: Any) -> None:
+            for old, new in names.items():
+                if old in values:
+                    warn_renamed(f"{cls.__name__}.{old}", f"{cls.__name__}.{new}")
+                    values[new] = values.pop(old)
+            init(self, *args, **values)
+
+        cls.__init__ = __init__
+        for old, new in names.items():
+            attribute = RenamedAttribute(new)
+            attribute.__set_name__(cls, old)
+            setattr(cls, old, attribute)
+        return cls
+
+    return decorate
 
 
 class RenamedModules(importlib.abc.MetaPathFinder, importlib.abc.Loader):

@@ -1,11 +1,12 @@
 """Old public names give what has the new ones, with a warning."""
 
+import dataclasses
 import importlib
 from importlib.machinery import ModuleSpec
 
 import pytest
 
-from jaxevent import deprecated
+from jaxevent import blob, deprecated
 
 
 @pytest.mark.parametrize("old", sorted(deprecated.RENAMED))
@@ -33,3 +34,13 @@ def test_unknown_names_are_refused_as_ever():
         deprecated.renamed_names("jaxevent.blob")("nonsense")
     with pytest.raises(ModuleNotFoundError):
         importlib.import_module("jaxevent.nonsense")
+
+
+def test_filters_of_users_may_have_the_old_names_of_steps():
+    own = blob.moment.filter
+    for old, new in (("share", "association_weights"), ("expected", "predicted_measurement")):
+        mine = lambda *given: None  # noqa: E731
+        with pytest.warns(DeprecationWarning, match=f"use Filter.{new}"):
+            filter = dataclasses.replace(own, **{old: mine})
+        with pytest.warns(DeprecationWarning, match=f"use Filter.{new}"):
+            assert getattr(filter, new) is getattr(filter, old) is mine

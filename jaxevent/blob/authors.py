@@ -77,7 +77,7 @@ def take(
     batch: Batch,
 ) -> Taken:
     """One target after an event (`batch`) at a time, `since` seconds after its last update."""
-    fixed, now = lax.stop_gradient((params, filter.expected(params, state)))
+    fixed, now = lax.stop_gradient((params, filter.predicted_measurement(params, state)))
     idle = (time - memory.assigned).astype(radius.dtype) * 1e-6
     followed = gate_radius(fixed, radius, now.size.max(), idle)
     radius = jnp.where(memory.adapting, followed, radius)
@@ -135,7 +135,7 @@ def remember(
     filter: Filter, params: TrackerParams, state: Any, memory: Memory, time: Int[Array, ""]
 ) -> Memory:
     """What any target remembers after an event, of this target or not."""
-    variances = jnp.diagonal(lax.stop_gradient(filter.expected(params, state)).P_p)
+    variances = jnp.diagonal(lax.stop_gradient(filter.predicted_measurement(params, state)).P_p)
     due = time >= memory.display
     adapting = jnp.where(due, (variances < KNOWN).all(), memory.adapting)
     display = memory.display + DISPLAY * due.astype(jnp.int32)

@@ -166,7 +166,9 @@ def expect(filter: Filter, params: TrackerParams, slot: Slots, stop: Array) -> E
     """What one target expects at a chunk's end."""
     params = own_params(params, slot.own)
     dt = jnp.where(slot.id >= 0, seconds(jnp.maximum(stop - slot.last, 0), slot.gate), 0)
-    return filter.expected(params, predict(filter, params, lax.stop_gradient(slot.state), dt))
+    return filter.predicted_measurement(
+        params, predict(filter, params, lax.stop_gradient(slot.state), dt)
+    )
 
 
 class Verdict(eqx.Module):

@@ -89,7 +89,7 @@ def look_back(filter: Filter, params: TrackerParams, path: Slots, later: Later) 
 
     `later` (targets,) is what is known at its end.
     """
-    moments = lambda slot: filter.moments(own_params(params, slot.own), slot.state)  # noqa: E731
+    moments = lambda slot: filter.readout(own_params(params, slot.own), slot.state)  # noqa: E731
     told = jax.vmap(jax.vmap(moments))(path)
     before, then, now = (
         jax.tree.map(lambda a, s=s: a[s], part)
@@ -134,7 +134,7 @@ def tell_smoothed(
     own = own_params(params, slot.own)
     dt = seconds(jnp.maximum(time - slot.last, 0), slot.gate)
     state = predict(filter, own, slot.state, dt, _stands_still(own, slot, later, time))
-    x, P = filter.moments(own, state)
+    x, P = filter.readout(own, state)
     F = _transition(filter, params, slot, later, time).T
     x = x + P @ (F @ later.r)
     P = P + P @ F @ later.N @ F.T @ P
@@ -155,7 +155,7 @@ def _update_of(
     params = own_params(params, before.own)
     dt = seconds(time - before.last, before.gate)
     still = stands_still(params, dt)
-    x0, P0 = filter.moments(params, predict(filter, params, before.state, dt, still))
+    x0, P0 = filter.readout(params, predict(filter, params, before.state, dt, still))
     x, P = now
     touched = (time != before.last) | (x != then[0]).any() | (P != then[1]).any()
     e = x - x0

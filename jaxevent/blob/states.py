@@ -69,5 +69,5 @@ def tell(
     params = own_params(params, slot.own)
     dt = seconds(jnp.maximum(time - slot.last, 0), slot.gate)
     state = predict(filter, params, slot.state, dt)
-    mean, covariance = canonical(*filter.moments(params, state))
+    mean, covariance = canonical(*filter.readout(params, state))
     return mean, covariance, seconds(time - slot.heard, slot.gate)

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxevent.blob import association
 from jaxevent.blob.association import Expected
+from jaxevent.deprecated import renamed_fields
 
 T = TypeVar("T")
 
@@ -34,48 +35,56 @@ def _go_on(params: Any, state: T, known: bool) -> T:
     return state
 
 
+@renamed_fields(
+    start="init",
+    expected="predicted_measurement",
+    moments="readout",
+    halt="zero_velocity",
+    share="association_weights",
+)
 @dataclasses.dataclass(frozen=True)
 class Filter:
-    """The steps of one target: pure functions, which the tracker maps over all targets.
+    """Steps of one target: pure functions, which the tracker maps over all targets.
 
     A state is any pytree of arrays. One filter differs from another by
     `dataclasses.replace(filter, update=...)`.
 
     Attributes:
-        start: `start(params, position, size)` is the state of a resting round blob: centre (2,)
-            and size () in px.
-        predict: `predict(params, state, dt)` is the state dt >= 0 seconds later, without events;
-            exact over any gap.
-        update: `update(params, state, batch, weight)` is the state after the events of a step.
-            `weight` (M,) in [0, 1] multiplies an event's information; a step whose weights are all
-            0 changes nothing. Events are compared with the position at their own age.
-        expected: `expected(params, state)` is what the filter expects of events at the state's
-            time.
-        moments: `moments(params, state)` is the mean (8,) and the covariance (8, 8) of (px, py, vx,
-            vy, lambda1, lambda2, theta, q), lambda in px.
-        halt: `halt(params, state, known)` is the state of a target that stands still: its velocity
-            is 0, and is either known or as uncertain as at the start. By default the state as it
-            is.
-        transition: `transition(params, dt, still)` is the matrix (8, 8) by which `predict` moves
-            the mean of `moments` in dt seconds, or, where `still`, moves it between two halts. The
-            smoother needs it; None: the filter's states cannot be smoothed.
-        gate: `gate(params, expected, radius, e)` says whether a residual (2,) is a possible event
-            of the target.
-        log_likelihood: `log_likelihood(params, expected, e)` is ln(2 pi p) of that residual.
-        share: `share(params, inside, density)` shares one event out among all targets: its weights
-            (targets,), from the gates that hold it and its log likelihoods.
+        init: `init(params, position, size)` returns the state of a round blob at rest: centre
+            (2,) and size () in px.
+        predict: `predict(params, state, dt)` returns the state dt >= 0 seconds later, without
+            events; exact over any gap.
+        update: `update(params, state, batch, weight)` returns the state after the events of a
+            step. `weight` (M,) in [0, 1] multiplies the information of each event; a step whose
+            weights are all 0 changes nothing. Each event is compared with the position at its age.
+        predicted_measurement: `predicted_measurement(params, state)` returns the distribution of
+            events at the state's time, a `PredictedMeasurement`.
+        readout: `readout(params, state)` returns the mean (8,) and the covariance (8, 8) of (px,
+            py, vx, vy, lambda1, lambda2, theta, q), lambda in px.
+        zero_velocity: `zero_velocity(params, state, known)` returns the state at rest: its velocity
+            is 0, either exactly or with the variance of a new track. The default returns the state
+            unchanged.
+        transition: `transition(params, dt, static)` returns the matrix (8, 8) by which `predict`
+            moves the mean of `readout` in dt seconds, at rest where `static`. The smoother needs
+            it; None: states of this filter cannot be smoothed.
+        gate: `gate(params, predicted, radius, e)` returns whether an event with the residual (2,)
+            may belong to the target.
+        log_likelihood: `log_likelihood(params, predicted, e)` returns ln(2 pi p) of that residual.
+        association_weights: `association_weights(params, inside, log_likelihood)` returns the
+            weight (targets,) of one event for each target, from the gates that contain it and its
+            log-likelihoods.
     """
 
-    start: Callable[[Any, Array, Array], Any]
+    init: Callable[[Any, Array, Array], Any]
     predict: Callable[[Any, Any, Array], Any]
     update: Callable[[Any, Any, Batch, Array], Any]
-    expected: Callable[[Any, Any], Expected]
-    moments: Callable[[Any, Any], tuple[Array, Array]]
-    halt: Callable[[Any, Any, bool], Any] = _go_on
+    predicted_measurement: Callable[[Any, Any], Expected]
+    readout: Callable[[Any, Any], tuple[Array, Array]]
+    zero_velocity: Callable[[Any, Any, bool], Any] = _go_on
     transition: Callable[[Any, Array, Array], Array] | None = None
     gate: Callable[[Any, Expected, Array, Array], Array] = association.gate
     log_likelihood: Callable[[Any, Expected, Array], Array] = association.log_likelihood
-    share: Callable[[Any, Array, Array], Array] = association.share
+    association_weights: Callable[[Any, Array, Array], Array] = association.share
 
 
 def choose(hit: Array, new: T, old: T) -> T:

@@ -116,7 +116,7 @@ def start_states(
     """States of targets (targets, ...) at rest at the positions given."""
 
     def start(own: dict[str, Array], xi: Array, size: Array) -> Any:
-        return filter.start(own_params(params, own), xi, size)
+        return filter.init(own_params(params, own), xi, size)
 
     return jax.vmap(start)(own, xi, size)
 
@@ -155,14 +155,14 @@ def predict(
     `still` says so instead where the silence is known to last longer.
     """
     still = stands_still(params, dt) if still is None else still
-    state = choose(still, filter.halt(params, state, True), state)
+    state = choose(still, filter.zero_velocity(params, state, True), state)
     state = filter.predict(params, state, dt)
-    return choose(still, filter.halt(params, state, False), state)
+    return choose(still, filter.zero_velocity(params, state, False), state)
 
 
 def place(filter: Filter, params: TrackerParams, slots: Slots) -> tuple[Array, Array, Array]:
     """Position, velocity and time of the last update of all targets."""
-    of_one = lambda slot: filter.expected(own_params(params, slot.own), slot.state)  # noqa: E731
+    of_one = lambda slot: filter.predicted_measurement(own_params(params, slot.own), slot.state)  # noqa: E731
     now = jax.vmap(of_one)(slots)
     return now.p, now.v, slots.last
 
@@ -182,7 +182,7 @@ def look_ahead(
     alive = time - slot.heard <= limit
     dt = jnp.where(alive, seconds(jnp.maximum(time - slot.last, 0), batch.xi), 0)
     state = predict(filter, params, slot.state, dt)
-    expected = filter.expected(params, state)
+    expected = filter.predicted_measurement(params, state)
     e = batch.xi - (expected.p - expected.v * batch.age[:, None])
     density = jax.vmap(filter.log_likelihood, (None, None, 0))(params, expected, e)
 
@@ -281,7 +281,7 @@ def step(
     if params.association == "authors":
         slots, ahead, weight = update_nearest(filter, params, slots, ahead, time, batch, valid)
     else:
-        shares = jax.vmap(functools.partial(filter.share, params), 1, 1)
+        shares = jax.vmap(functools.partial(filter.association_weights, params), 1, 1)
         weight = shares(ahead.inside, ahead.density)
         update = functools.partial(update_slot, filter, params)
         slots = jax.vmap(update, (0, 0, None, None, 0))(slots, ahead, time, batch, weight)

@@ -300,7 +300,7 @@ def test_moving_moments_are_weighted_sums():
     center, when = w @ x, w @ t
     e, s = x - center, t - when
     spread = (w * e.T) @ e + w[0] * 144 * np.eye(2)
-    ahead = jax.jit(tracker_of(name).filter.expected)(params, state)
+    ahead = jax.jit(tracker_of(name).filter.predicted_measurement)(params, state)
     np.testing.assert_allclose(ahead.p, center, rtol=1e-10)
     np.testing.assert_allclose(ahead.v, (w * s) @ e / (w @ s**2), rtol=1e-9)
     np.testing.assert_allclose(ahead.spread, spread, rtol=1e-10)
@@ -526,7 +526,7 @@ def reports(name, params, xi, dt, size, gate, m):
     age = one * jnp.arange(m)[::-1] * dt
 
     def report(state):
-        mean, P = filter.moments(params, state)
+        mean, P = filter.readout(params, state)
         return mean, jnp.diagonal(P), P[:2, :2]
 
     def run(xi):

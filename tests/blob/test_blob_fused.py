@@ -134,7 +134,7 @@ def test_a_filter_without_kernel_is_scanned():
     mine = dataclasses.replace(
         blob.moment,
         name="strange",
-        filter=dataclasses.replace(blob.moment.filter, share=strange),
+        filter=dataclasses.replace(blob.moment.filter, association_weights=strange),
     )
     rec = crossing(np.random.default_rng(2), 50)
     with pytest.raises(InputError, match="no kernel"):

@@ -468,7 +468,7 @@ def test_events_near_two_paths_are_taken_by_no_third_target():
     xi = jnp.array([[20.0, 20], [20, 21], [21, 20], [90, 90], [90, 90]])
     owner = jnp.array([[0, 1], [1, 2], [2, NOBODY], [0, NOBODY], [0, 1]])
     batch = Batch(xi, jnp.zeros(5), jnp.ones(5))
-    state = filter.start(params, jnp.array([20.0, 20]), jnp.array(5.0))
+    state = filter.init(params, jnp.array([20.0, 20]), jnp.array(5.0))
     zero = jnp.zeros((), jnp.int32)
     inside = []
     for k in range(3):

@@ -30,7 +30,7 @@ class _Reading(NamedTuple):
     def moved(self, params, slot, dt, silence):
         own = own_params(params, slot.own)
         state = predict(self.filter, own, slot.state, dt, stands_still(own, silence))
-        x, P = self.filter.moments(own, state)
+        x, P = self.filter.readout(own, state)
         return {"x": x, "P": P}
 
     def passed(self, params, slot, dt, silence):

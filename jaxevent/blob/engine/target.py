@@ -104,7 +104,7 @@ class _Target(NamedTuple):
     single: bool  # whether a step has one event
 
     def begin(self, params: Any, own: Any, xi: Any, size: Any) -> Any:
-        return self.filter.start(own_params(params, own), xi, size)
+        return self.filter.init(own_params(params, own), xi, size)
 
     def start(self, params: Any, slot: Any, xi: Any, size: Any) -> dict[str, Any]:
         gate = start_gate(params, size).astype(xi.dtype)
@@ -126,7 +126,7 @@ class _Target(NamedTuple):
         """A step of one event and of the one target that is alive."""
         batch = _aged(batch, self.single)
         seen = look_ahead(self.filter, params, slot, limit, time, batch, valid, owner)
-        shares = jax.vmap(functools.partial(self.filter.share, params), 1, 1)
+        shares = jax.vmap(functools.partial(self.filter.association_weights, params), 1, 1)
         weight = shares(seen.inside[None], seen.density[None])[0]
         return {
             "slot": update_slot(self.filter, params, slot, seen, time, batch, weight),
@@ -145,7 +145,7 @@ class _Target(NamedTuple):
         return {"verdict": judge(params, frame, slot, now, inside, found, stop)}
 
     def shared(self, params, held, density):
-        return {"weight": self.filter.share(params, held, density)}
+        return {"weight": self.filter.association_weights(params, held, density)}
 
 
 def program_of(
@@ -341,4 +341,4 @@ def kernel_of(
 
 def shares_apart(filter: Filter) -> bool:
     """Whether an event that one gate alone holds is weighed by that target alone."""
-    return filter.share is share
+    return filter.association_weights is share
