@@ -14,7 +14,7 @@ import pytest
 
 import jaxevent
 from jaxevent.blob import chi2, negative_log_likelihood
-from jaxevent.blob.authors import WAITING
+from jaxevent.blob.authors import MAX_PENDING
 from jaxevent.cli import main
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
@@ -97,10 +97,10 @@ def stream(t, xi, p):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("waiting", [1, 20, WAITING + 5])
+@pytest.mark.parametrize("waiting", [1, 20, MAX_PENDING + 5])
 def test_events_of_one_time_are_replayed(waiting):
     """They act as if they had come one after the other until the next event, in its place."""
-    rng, most = np.random.default_rng(waiting), min(waiting, WAITING)
+    rng, most = np.random.default_rng(waiting), min(waiting, MAX_PENDING)
     few = rng.integers(20, 28, (5, 2))
     tied, n = rng.integers(20, 28, (waiting, 2)), len(few)
     t, gap = 100 + 50 * np.arange(n), 3 * most  # us
@@ -126,7 +126,9 @@ def test_the_nearest_target_alone_may_take_an_event():
     slots = followed(stream(10 * np.arange(5), xi, [1, 1, 1, 0, 0]), seeds)
     np.testing.assert_array_equal(slots.hits, [[1, 0], [1, 0], [1, 0], [1, 1], [1, 2]])
     assert (np.diff(slots.state.x[:4, 0], axis=0) == 0).all()
-    np.testing.assert_array_equal(slots.memory.assigned[-1] - slots.memory.seen[-1], [-20, 0])
+    np.testing.assert_array_equal(
+        slots.reference.last_nearest[-1] - slots.reference.last_event[-1], [-20, 0]
+    )
 
 
 @pytest.mark.slow

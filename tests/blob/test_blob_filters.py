@@ -11,10 +11,9 @@ from scipy import integrate, linalg
 from traced import FULL, products
 
 from jaxevent import blob
-from jaxevent.blob.association import share
-from jaxevent.blob.filters.ellipse import truncation
+from jaxevent.blob.filter import EventBatch, association_weights
+from jaxevent.blob.filters.motion import gated_moments
 from jaxevent.blob.quantities import inverse_ttc, log_size
-from jaxevent.blob.steps import Batch
 
 TRACKERS = ("moment", "chi2_split", "chi2", "constant_velocity")
 
@@ -30,23 +29,23 @@ def params_of(name="moment", **values):
 def scanned(name, params, position, size, events, gate=None, report=None):
     """`report(state)` after each step; a gate in standard deviations sets weights to 0."""
     steps = tracker_of(name).filter
-    report = report or (lambda state: steps.moments(params, state))
+    report = report or (lambda state: steps.readout(params, state))
 
     def step(state, event):
         dt, xi, age, polarity, weight = event
         state = steps.predict(params, state, dt)
         if gate:
-            ahead = steps.expected(params, state)
+            ahead = steps.predicted_measurement(params, state)
             e = xi - (ahead.p - ahead.v * age[:, None])
             inverse = jnp.linalg.inv(ahead.spread + ahead.P_p)
             distance = jnp.einsum("mi,ij,mj->m", e, inverse, e)
             if params.gate_shape == "circle":
                 distance = (e**2).sum(1) / ahead.size.max() ** 2
             weight = weight * (distance < gate**2)
-        state = steps.update(params, state, Batch(xi, age, polarity), weight)
+        state = steps.update(params, state, EventBatch(xi, age, polarity), weight)
         return state, report(state)
 
-    start = steps.start(params, jnp.asarray(position), jnp.asarray(size))
+    start = steps.init(params, jnp.asarray(position), jnp.asarray(size))
     return jax.lax.scan(step, start, events)
 
 
@@ -134,7 +133,7 @@ def residual_rows(params, x, xi, age, polarity, weight):
 
 def moment_oracle(_, params, position, size, events):
     x, P = started(params, position, size)
-    kappa, fourth = (float(a) for a in truncation(params))
+    kappa, fourth = (float(a) for a in gated_moments(params))
     for dt, xi, age, polarity, weight in zip(*events, strict=True):
         x, P = predicted(params, x, P, dt)
         if weight.sum() > 0:
@@ -310,7 +309,7 @@ def test_moving_moments_are_weighted_sums():
 @pytest.mark.parametrize("gate", [1.0, 2.0, 3.0])
 def test_truncation_factors_are_integrals_over_the_gate(gate):
     params = params_of(gate=gate, gate_shape="ellipse")
-    kappa, fourth = truncation(params)
+    kappa, fourth = gated_moments(params)
 
     def mean(f, size=1.0):
         """Over (size z1, z2) that fall into the gate, for z standard normal."""
@@ -401,7 +400,7 @@ def test_no_weight_and_no_events(name):
     for tau_q in (0.0, 0.05):
         params = params_of(name, tau_q=tau_q, polarity_offset=name != "chi2_split")
         state = later(name, params, random_events(0, 40, 2))
-        batch = Batch(jnp.array([[1.0, jnp.nan], [2e9, 3]]), jnp.zeros(2), jnp.ones(2))
+        batch = EventBatch(jnp.array([[1.0, jnp.nan], [2e9, 3]]), jnp.zeros(2), jnp.ones(2))
         after = update(params, state, batch, jnp.zeros(2))
         for new, old in zip(leaves(after), leaves(state), strict=True):
             np.testing.assert_array_equal(new, old)
@@ -432,8 +431,8 @@ def test_nothing_breaks_the_numbers(name, float32, optimised):
     steps = tracker_of(name).filter
 
     def report(state):
-        mean, P = steps.moments(params, state)
-        ahead = steps.expected(params, state)
+        mean, P = steps.readout(params, state)
+        ahead = steps.predicted_measurement(params, state)
         scale = jnp.sqrt(jnp.diagonal(P))
         skew = (jnp.abs(P - P.T) / (scale * scale[:, None] + 1e-30)).max()
         return mean, jnp.diagonal(P), skew, jnp.linalg.det(ahead.spread), ahead.P_p
@@ -470,13 +469,13 @@ def test_gradient_of_the_likelihood():
         def step(state, event):
             dt, xi, age, polarity, weight = event
             state = steps.predict(params, state, dt)
-            ahead = steps.expected(params, state)
+            ahead = steps.predicted_measurement(params, state)
             S = ahead.spread + ahead.P_p
             e = xi[0] - ahead.p
             nll = e @ jnp.linalg.inv(S) @ e / 2 + jnp.log(jnp.linalg.det(S)) / 2
-            return steps.update(params, state, Batch(xi, age, polarity), weight), nll
+            return steps.update(params, state, EventBatch(xi, age, polarity), weight), nll
 
-        start = steps.start(params, jnp.zeros(2), jnp.asarray(8.0))
+        start = steps.init(params, jnp.zeros(2), jnp.asarray(8.0))
         return jax.lax.scan(step, start, events)[1].sum()
 
     params = params_of("moment")
@@ -603,8 +602,12 @@ def test_one_target_shares_with_clutter_alone(clutter):
     params = blob.moment.Params(clutter=clutter)
     for density in (-3.0, 2.0, -200.0, 90.0):
         other = jnp.array([False, True]), jnp.array([50.0, density])
-        one = share(params, jnp.array([True]), jnp.array([density]))
-        np.testing.assert_allclose(one[0], share(params, *other)[1], rtol=1e-5, atol=1e-30)
-        assert share(params, jnp.array([False]), jnp.array([density]))[0] == 0
-    slope = jax.grad(lambda d: share(params, jnp.array([True]), d[None])[0])(jnp.array(-200.0))
+        one = association_weights(params, jnp.array([True]), jnp.array([density]))
+        np.testing.assert_allclose(
+            one[0], association_weights(params, *other)[1], rtol=1e-5, atol=1e-30
+        )
+        assert association_weights(params, jnp.array([False]), jnp.array([density]))[0] == 0
+    slope = jax.grad(lambda d: association_weights(params, jnp.array([True]), d[None])[0])(
+        jnp.array(-200.0)
+    )
     assert np.isfinite(slope)

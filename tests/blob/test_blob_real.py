@@ -9,8 +9,8 @@ import pytest
 
 import jaxevent
 from jaxevent.blob import Tracks, moment
-from jaxevent.blob.prepare import Packing
-from jaxevent.blob.run import run_compiled
+from jaxevent.blob.prepare import ChunkPacker
+from jaxevent.blob.run import XlaRunner, run_compiled
 from jaxevent.recording import Events, Recording
 
 SCRIPT = Path(__file__).parents[2] / "experiments" / "blob_real.py"
@@ -34,8 +34,8 @@ def dot(data):
 
 def follow(recording, params, steps, chunks):
     """`estimate` with chunks of a size that suits short slices."""
-    packing = Packing(recording, params, steps=steps, chunks=chunks)
-    return Tracks(moment.filter, packing, params)
+    packing = ChunkPacker(recording, params, steps=steps, chunks=chunks)
+    return Tracks(XlaRunner(moment.filter, params), packing)
 
 
 def test_reference_finds_a_known_path(real):
@@ -80,7 +80,7 @@ def test_tail_of_the_dot_begins_no_track(real, dot, float32):
     begun = {}
     for surround in (1.0, 2.0):
         params = moment.Params(preset="fast", **real.DOT_FOUND, surround=surround)
-        packing = Packing(cut, params, steps=64, chunks=128)
+        packing = ChunkPacker(cut, params, steps=64, chunks=128)
         mark, state = packing.first, None
         while mark is not None:  # in the program of `follow`
             stretch = packing.pack(mark)

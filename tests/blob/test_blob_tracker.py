@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from jaxevent import blob
-from jaxevent.blob.prepare import Packing
-from jaxevent.blob.states import canonical
-from jaxevent.blob.steps import Batch
+from jaxevent.blob.filter import EventBatch
+from jaxevent.blob.prepare import ChunkPacker
+from jaxevent.blob.run import XlaRunner
+from jaxevent.blob.track import canonical_ellipse
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
@@ -68,15 +69,17 @@ def pair():
 def follow(rec, params=None, seeds=None, detect=False, steps=64, chunks=32, tracker=blob.moment):
     """`estimate` with chunks of one size, so that few programs are compiled."""
     params = params or Params()
-    packing = Packing(
+    packing = ChunkPacker(
         rec, params, seeds, detect=detect or seeds is None, steps=steps, chunks=chunks
     )
-    return Tracks(tracker.filter, packing, params)
+    return Tracks(XlaRunner(tracker.filter, params), packing)
 
 
 @functools.cache
 def _steps_of(f):
-    return tuple(jax.jit(one) for one in (f.start, f.predict, f.expected, f.update, f.moments))
+    return tuple(
+        jax.jit(one) for one in (f.init, f.predict, f.predicted_measurement, f.update, f.readout)
+    )
 
 
 def oracle(rec, params, seeds, tracker=blob.moment):
@@ -132,7 +135,7 @@ def oracle(rec, params, seeds, tracker=blob.moment):
             best = int(np.argmax(weights[:, place]))
             whose.append((best if found else -1, weights[best, place]))
         fill = M - len(step)
-        batch = Batch(
+        batch = EventBatch(
             jnp.array([(e.x[r], e.y[r]) for r in step + step[-1:] * fill], float),
             jnp.array(ages + [0.0] * fill),
             jnp.array([1.0 if e.p[r] else -1.0 for r in step + step[-1:] * fill]),
@@ -147,7 +150,7 @@ def oracle(rec, params, seeds, tracker=blob.moment):
         for path in paths:
             t, state = [one for one in path if one[0] <= time][-1]
             state = predict(params, state, jnp.asarray((time - t) * 1e-6))
-            rows.append(canonical(*moments(params, state)))
+            rows.append(canonical_ellipse(*moments(params, state)))
         return [np.stack(part) for part in zip(*rows, strict=True)]
 
     return np.array([k for k, _ in whose]), np.array([w for _, w in whose]), np.mean(loss), at
@@ -209,7 +212,7 @@ def test_chunks_and_windows_do_not_matter(pair):
     # Not to the last bit: compilers round one size of a loop's arrays otherwise than another.
     same(parts(other(times, extrapolate=True)), expected, exact=False)
     same(parts(other(times[::-1], extrapolate=True)), [v[::-1] for v in expected], exact=False)
-    assert np.array_equal(other.death, whole.death) and len(other._begins) > 10
+    assert np.array_equal(other.death, whole.death) and len(other._checkpoints) > 10
 
 
 @pytest.mark.slow
@@ -358,7 +361,7 @@ def test_prefilter():
         kept.append(len(pixels) >= 2)
     kept = np.flatnonzero(kept)
     for steps, chunks in ((4, 3), (64, 100)):
-        packing = Packing(rec, params, [], steps=steps, chunks=chunks)
+        packing = ChunkPacker(rec, params, [], steps=steps, chunks=chunks)
         mark, rows = packing.first, []
         while mark is not None:
             stretch = packing.pack(mark)
@@ -379,7 +382,7 @@ def line_by_line(seed=0):
 
 def test_steps_hold_events_of_all_lines_of_one_time():
     rec = line_by_line()
-    packing = Packing(rec, Params(events_per_step=8), [(100.0, 90.0, 25.0)], steps=5, chunks=3)
+    packing = ChunkPacker(rec, Params(events_per_step=8), [(100.0, 90.0, 25.0)], steps=5, chunks=3)
     mark, rows, far = packing.first, [], []
     while mark is not None:
         stretch = packing.pack(mark)

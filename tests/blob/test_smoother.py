@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jaxevent import blob
-from jaxevent.blob.engine.tracking import FusedRun
-from jaxevent.blob.prepare import Packing
+from jaxevent.blob.engine.runner import KernelRunner
+from jaxevent.blob.prepare import ChunkPacker
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
@@ -38,9 +38,9 @@ def walk():
 
 
 def follow(recording, params, seeds, tracker, steps=64, chunks=32, **options):
-    packing = Packing(recording, params, seeds, steps=steps, chunks=chunks, **options)
-    kernel = FusedRun(tracker.filter, params, packing)
-    return Tracks(tracker.filter, packing, params, smooth=True, fused=kernel)
+    packing = ChunkPacker(recording, params, seeds, steps=steps, chunks=chunks, **options)
+    runner = KernelRunner(tracker.filter, params, detect=packing.detect)
+    return Tracks(runner, packing, smooth=True)
 
 
 def all_at_once(recording, M, size, start, times):
@@ -150,11 +150,11 @@ def test_stretches_chunks_and_births_do_not_matter(three):
     tracks = follow(rec, params, None, tracker, steps=64, chunks=64)
     short = follow(rec, params, None, tracker, steps=4, chunks=3)
     assert len(tracks) >= 3 and (tracks.death < tracks.stop).any()
-    assert len(short._later) > len(short._begins) > 8
+    assert len(short._segment_infos) > len(short._checkpoints) > 8
     for one, other in zip(tracks(times), short(times), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8)
-    assert len(short._following) == len(short._later)
-    short._following = {}  # as where there is no room for what later events say
+    assert len(short._kept_infos) == len(short._segment_infos)
+    short._kept_infos = {}  # as where there is no room for what later events say
     for one, other in zip(tracks(times), short(times), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8)
     # At its end a track rests on the same events either way.

@@ -67,7 +67,7 @@ def test_the_turn_of_events_is_what_it_was_made():
     own = _within(stream, bright > 4 * np.median(bright))
     centre = _middle(own)
     assert np.hypot(*(centre - HUB)) < 0.8
-    # Told a rate that is a third too small.
+    # ChunkInfo a rate that is a third too small.
     scene = _follow(own, Turn(0.67 * OMEGA, centre), 0.006)
     angle = np.unwrap(np.arctan2(scene.maps[:, 1, 0], scene.maps[:, 0, 0]))
     np.testing.assert_allclose(angle, OMEGA * (scene.t - scene.t[0]), atol=0.05)

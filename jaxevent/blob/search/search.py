@@ -24,7 +24,7 @@ from jaxevent.blob.search.scale import Choice, choose_scale
 from jaxevent.blob.search.stream import Stream
 from jaxevent.blob.search.targets import FAINT, GATE, HOLD, REACH, SEEN, larger
 from jaxevent.blob.search.turning import join_turning
-from jaxevent.blob.seeds import span_of
+from jaxevent.blob.seeds import tracking_span
 from jaxevent.progress import stage
 from jaxevent.recording import Recording
 
@@ -63,7 +63,7 @@ def find(
     Raises:
         InputError: There is no time between `start` and `stop`.
     """
-    stream = Stream(recording, *span_of(recording, start, stop))
+    stream = Stream(recording, *tracking_span(recording, start, stop))
     if len(stream) < FEWEST:
         return Found((), (), 0, 0.0, recording)
     found: list[Path] = []
