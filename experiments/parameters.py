@@ -5,14 +5,14 @@ from typing import Any
 import jaxevent
 from jaxevent.estimator import Estimator
 from jaxevent.methods import HOMES
-from jaxevent.parameters import Choice, Parameters, Share, shown
+from jaxevent.parameters import Choice, Parameters, UnitInterval, format_value
 
 TITLES = {"reconstruction": "Reconstruction", "blob": "Tracking", "egomotion": "Egomotion"}
 
 
 def cell(value: Any) -> str:
     """A value as TOML has it."""
-    return str(value).lower() if isinstance(value, bool) else shown(value).replace("'", '"')
+    return str(value).lower() if isinstance(value, bool) else format_value(value).replace("'", '"')
 
 
 def rows(method: Estimator) -> list[str]:
@@ -24,7 +24,7 @@ def rows(method: Estimator) -> list[str]:
         fixed = kind.settings()
     for name, setting in kind.settings().items():
         meaning = setting.meaning
-        if isinstance(setting, Share):
+        if isinstance(setting, UnitInterval):
             meaning += "; in [0, 1)"
         if isinstance(setting, Choice):
             meaning += f"; one of {', '.join(map(cell, setting.options))}"

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
+from jaxevent.display import HtmlRepr
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.estimator import Estimate
 from jaxevent.recording import Recording, Times, check_times, microseconds
-from jaxevent.shown import Shown
 
 if TYPE_CHECKING:
     import pandas
@@ -82,7 +82,7 @@ class Calibration(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Motion(Shown):
+class Motion(HtmlRepr):
     """An estimated motion: `mean, covariance, valid = motion(times)`.
 
     The components are those of its `model`: of planar motion the image velocity (px/s), of a
