@@ -217,7 +217,7 @@ class Placed:
 
 
 def test_few_batches_are_spread_and_many_are_shared_out(monkeypatch):
-    monkeypatch.setattr(devices, "local", lambda: ["a", "b", "c"])
+    monkeypatch.setattr(devices, "local_devices", lambda: ["a", "b", "c"])
     monkeypatch.setattr(jax, "device_put", lambda batch, device: device)
     batches: list[Any] = [Placed() for _ in range(5)]
     assert devices.BatchPlacement(None)(batches) == ["a", "b", "c", "a", "b"]
@@ -245,13 +245,13 @@ def test_an_error_of_one_process_is_one_of_all(monkeypatch):
     monkeypatch.setattr(jax, "process_count", lambda: 2)
     for index, mine in ((0, refuse), (1, lambda: 5)):
         monkeypatch.setattr(jax, "process_index", lambda index=index: index)
-        monkeypatch.setattr(devices, "gathered", lambda said: ["no such file", None])
+        monkeypatch.setattr(devices, "allgather", lambda said: ["no such file", None])
         with pytest.raises(InputError, match="no such file"):
             devices.on_all_processes(mine)
-        monkeypatch.setattr(devices, "gathered", lambda said: [("error", "no such file"), ("", 0)])
+        monkeypatch.setattr(devices, "allgather", lambda said: [("error", "no such file"), ("", 0)])
         with pytest.raises(InputError, match="no such file"):
             devices.on_process_zero(mine)
-    monkeypatch.setattr(devices, "gathered", lambda said: [("value", 7), said])
+    monkeypatch.setattr(devices, "allgather", lambda said: [("value", 7), said])
     assert devices.on_process_zero(refuse) == 7  # what process 1 would say is not asked
     assert devices.partition_batches([10, 11, 12]) == [devices.REMOTE, 11, devices.REMOTE]
 
