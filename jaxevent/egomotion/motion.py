@@ -67,8 +67,8 @@ class Calibration(NamedTuple):
     factor C + share^2 |m|^2 + speed^2 m m' + change^2 (d d' + b b'),
 
     d the change of the motion within what an estimate sees and b by how much it bends there.
-    Chosen on simulated scenes: `experiments/studies/predicted_errors.md`. `behind` adds what a real lens
-    makes.
+    See `experiments/studies/predicted_errors.md` for their choice. `behind` adds what a real
+    lens makes.
     """
 
     factor: float = 1.0
