@@ -53,6 +53,7 @@ def add(commands: Any) -> None:
 
 
 def run(
+    *,
     config: Path,
     out: Path,
     recordings: list[str] | None,

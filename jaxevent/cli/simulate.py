@@ -107,6 +107,7 @@ def _add_settings(one: Any) -> None:
 
 
 def run(
+    *,
     video: Path | None,
     scene: str | None,
     objects: bool,

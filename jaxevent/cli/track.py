@@ -111,6 +111,7 @@ def _add_quantities(one: Any) -> None:
 
 
 def run(
+    *,
     path: Path,
     method: str,
     params: Path | None,
