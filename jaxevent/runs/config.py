@@ -104,7 +104,7 @@ def _table(given: Any) -> Any:
         return pd.DataFrame(given).reset_index(drop=True)
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"what is true is {describe_type(given)} that is no table ({error}); give a "
+            f"the ground truth is {describe_type(given)} that is no table ({error}); give a "
             "DataFrame, the path of a CSV file, or a mapping from recordings' names to them"
         ) from None
 

@@ -91,7 +91,7 @@ MEASURES = (
 
 
 RECORDED = ("poses", "gyro")  # truth that recordings hold themselves
-OF_TRUTH = ("gyro_bias", "imu_rotation", "depth")  # settings that say what is true
+OF_TRUTH = ("gyro_bias", "imu_rotation", "depth")  # settings of the ground truth
 
 
 def model_of(options: Mapping[str, Any]) -> type[Model]:

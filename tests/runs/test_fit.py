@@ -649,7 +649,7 @@ class Killed(BaseException):
 
 def interrupted(monkeypatch, after: int) -> None:
     """Let the next fit die between its n-th checkpoint and the one after."""
-    save, count = jaxevent.runs.fit.save, 0
+    save, count = jaxevent.runs.fit.save_checkpoint, 0
 
     def dying(*arguments):
         nonlocal count
@@ -658,7 +658,7 @@ def interrupted(monkeypatch, after: int) -> None:
         count += 1
         save(*arguments)
 
-    monkeypatch.setattr(jaxevent.runs.fit, "save", dying)
+    monkeypatch.setattr(jaxevent.runs.fit, "save_checkpoint", dying)
 
 
 def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
