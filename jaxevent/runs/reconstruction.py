@@ -335,7 +335,7 @@ class ImageGoal(Goal):
     gap: int = GAP
 
     @property
-    def part(self) -> str:
+    def part_name(self) -> str:
         return "window" if self.loss.error is None else "image"
 
     @property
