@@ -108,8 +108,8 @@ def add_output(
 def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Check the outputs of a command, and yield the options that its `run` takes.
 
-    All paths among the options that are no outputs are inputs. Within the block, written files record
-    that the command line `words` made them from these inputs. Raises `InputError` like
+    All paths among the options that are no outputs are inputs. Within the block, written files
+    record that the command line `words` made them from these inputs. Raises `InputError` like
     `jaxevent.io.places.check`.
     """
     outputs = options.get("outputs", {})
