@@ -14,7 +14,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 # The full name until this release, and the one from now on.
-RENAMED: dict[str, str] = {}
+RENAMED: dict[str, str] = {
+    "jaxevent.blob.Found": "jaxevent.blob.TargetSearchResult",
+}
 # Modules that have another name or are part of another one.
 MOVED_MODULES: dict[str, str] = {}
 
