@@ -16,9 +16,31 @@ from typing import Any
 # The full name until this release, and the one from now on.
 RENAMED: dict[str, str] = {
     "jaxevent.blob.Found": "jaxevent.blob.TargetSearchResult",
+    "jaxevent.confidence.Finding": "jaxevent.confidence.ParameterInterval",
+    "jaxevent.confidence.Findings": "jaxevent.confidence.FitIntervals",
+    "jaxevent.confidence.Parted": "jaxevent.confidence.PartwiseLoss",
+    "jaxevent.confidence.examine": "jaxevent.confidence.confidence_intervals",
+    "jaxevent.devices.ELSEWHERE": "jaxevent.devices.REMOTE",
+    "jaxevent.devices.Elsewhere": "jaxevent.devices.RemoteBatch",
+    "jaxevent.devices.accelerated": "jaxevent.devices.has_accelerator",
+    "jaxevent.devices.along": "jaxevent.devices.shard",
+    "jaxevent.devices.local": "jaxevent.devices.local_devices",
+    "jaxevent.devices.mesh": "jaxevent.devices.make_mesh",
+    "jaxevent.estimator.Described": "jaxevent.estimator.ShortRepr",
+    "jaxevent.parameters.Share": "jaxevent.parameters.UnitInterval",
+    "jaxevent.parameters.nearest": "jaxevent.parameters.suggest_name",
+    "jaxevent.parameters.shown": "jaxevent.parameters.format_value",
+    "jaxevent.tuning.Believed": "jaxevent.tuning.LossWithPrior",
+    "jaxevent.tuning.Fitted": "jaxevent.tuning.FitResult",
+    "jaxevent.tuning.Weighted": "jaxevent.tuning.WeightedBatch",
+    "jaxevent.tuning.loss_of": "jaxevent.tuning.evaluate_loss",
+    "jaxevent.tuning.slopes": "jaxevent.tuning.loss_and_grad",
 }
 # Modules that have another name or are part of another one.
-MOVED_MODULES: dict[str, str] = {}
+MOVED_MODULES: dict[str, str] = {
+    "jaxevent.sharing": "jaxevent.locks",
+    "jaxevent.shown": "jaxevent.display",
+}
 
 
 def warn_renamed(old: str, new: str) -> None:

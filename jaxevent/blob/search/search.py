@@ -30,10 +30,10 @@ from jaxevent.blob.search.stream import Stream
 from jaxevent.blob.search.window_tracker import WindowTracker
 from jaxevent.blob.seeds import span_of
 from jaxevent.deprecated import RenamedAttribute
+from jaxevent.display import plural
 from jaxevent.errors import InputError
 from jaxevent.progress import stage
 from jaxevent.recording import Recording
-from jaxevent.shown import plural
 
 # Coefficients of x^3, x^2 and x in 1 + sqrt(2) x + x^2 + x^3 / (3 sqrt(2)), see
 # `max_events_per_step`.
