@@ -461,7 +461,7 @@ def test_candidates_are_those_of_a_slow_loop():
 
     def distance(path, i):
         """Minus twice the log likelihood, up to a constant; inf: it is not near."""
-        seen = np.abs(path.t - t[i]).min() <= path.window / 2
+        seen = np.abs(path.t - t[i]).min() <= path.window / 2 and t[i] < path.end
         if not seen or path.polarity not in (None, on[i]):
             return np.inf
         S = path.C * (1 + 2 / path.n)[:, None, None] + 0.1 * np.eye(2)
