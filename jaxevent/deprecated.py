@@ -15,6 +15,7 @@ from typing import Any
 
 # The full name until this release, and the one from now on.
 RENAMED: dict[str, str] = {
+    "jaxevent.blob.Found": "jaxevent.blob.TargetSearchResult",
     "jaxevent.confidence.Finding": "jaxevent.confidence.ParameterInterval",
     "jaxevent.confidence.Findings": "jaxevent.confidence.FitIntervals",
     "jaxevent.confidence.Parted": "jaxevent.confidence.PartwiseLoss",
