@@ -60,16 +60,28 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates, uniform_filter
 
 import jaxevent
-from jaxevent.reconstruction.compensated import estimator, fusion, trajectories
-from jaxevent.reconstruction.compensated.agreement import agree
+from jaxevent.reconstruction.compensated import fusion, trajectories
 from jaxevent.reconstruction.compensated.estimator import (
+    PYRAMID_VARIANCE_FACTOR,
     CompensatedVideo,
-    Followed,
-    fuse_images,
-    place_of,
+    TrajectoryEstimate,
+    fuse_target,
+    make_layout,
 )
-from jaxevent.reconstruction.compensated.exposures import Shots, constrain
-from jaxevent.reconstruction.compensated.warping import Along, displaced, warp
+from jaxevent.reconstruction.compensated.exposures import (
+    AdjacentFrames,
+    ExposureModel,
+    constrain_image,
+)
+from jaxevent.reconstruction.compensated.images import InstantImages
+from jaxevent.reconstruction.compensated.normal_equations import CostParams
+from jaxevent.reconstruction.compensated.robust_mean import robust_mean
+from jaxevent.reconstruction.compensated.warp import (
+    WarpedImages,
+    displacements,
+    interpolate_paths,
+    warp,
+)
 from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.reconstruction.windows import WINDOW_EVENTS
 from jaxevent.simulate import TESTING, Objects, Pan, Sensor, scene, simulate
@@ -91,8 +103,8 @@ mc = jaxevent.METHODS["mc"]
 
 
 def truly_along(
-    target: Followed, source: Objects, t: int, grown: float = 0.0
-) -> tuple[Along, NDArray[np.bool_]]:
+    target: TrajectoryEstimate, source: Objects, t: int, grown: float = 0.0
+) -> tuple[WarpedImages, NDArray[np.bool_]]:
     """A target's images along the true trajectories, and where the points are hidden.
 
     The trajectories of pixels within `grown` (px) of an object are that object's.
@@ -114,10 +126,10 @@ def truly_along(
         for n, (image, order) in enumerate(((L[k], 3), (V[k], 1), (clear[k] * 1.0, 1))):
             warped[n, k] = map_coordinates(image, [Y, X], order=order, mode="nearest")
         warped[3, k] = (-0.5 <= X) & (w - 0.5 >= X) & (-0.5 <= Y) & (h - 0.5 >= Y)
-    return Along(*warped), hidden
+    return WarpedImages(*warped), hidden
 
 
-def by_nodes(target: Followed, source: Objects, t: int) -> NDArray[np.float32]:
+def by_nodes(target: TrajectoryEstimate, source: Objects, t: int) -> NDArray[np.float32]:
     """The paths of pixels where the true motion is the mean of 2 x 2 pixels at each node."""
     s = target.instants.s.astype(float)
     moved = np.stack(
@@ -127,7 +139,7 @@ def by_nodes(target: Followed, source: Objects, t: int) -> NDArray[np.float32]:
     v, a = np.linalg.lstsq(np.stack([s, s**2], 1), moved.reshape(count, -1), rcond=None)[0]
     paths = np.concatenate([v.reshape(h, w, 2), a.reshape(h, w, 2)], -1)
     nodes = paths.reshape(h // 2, 2, w // 2, 2, 4).mean((1, 3)).astype(np.float32)
-    return trajectories.spread(nodes, (h, w))
+    return interpolate_paths(nodes, (h, w))
 
 
 def regions(source: Objects, t: int, frames: NDArray[np.int64]) -> dict[str, NDArray[np.bool_]]:
@@ -157,26 +169,29 @@ def regions(source: Objects, t: int, frames: NDArray[np.int64]) -> dict[str, NDA
     }
 
 
-def along_paths(target: Followed, paths: NDArray[np.float32]) -> Along:
+def along_paths(target: TrajectoryEstimate, paths: NDArray[np.float32]) -> WarpedImages:
     """A target's images along paths (h, w, 4)."""
     clear = np.asarray(target.clear, np.float32)
     return warp(target.L, target.V, clear, target.instants.s, paths)
 
 
-def fused_along(params: Any, target: Followed, along: Along) -> tuple[fusion.Fused, NDArray]:
+def fused_along(
+    params: Any, target: TrajectoryEstimate, along: WarpedImages
+) -> tuple[fusion.FusedImage, NDArray]:
     """What is made of a target's images along trajectories, and the ingredients (3, h, w)."""
-    place = place_of(target.instants, target.clear, len(target.instants))
-    told = fusion.compare(
-        agree(params, target.L, along, place), fusion.views(target.L, target.V, along, place)
+    layout = make_layout(target.instants, target.clear, len(target.instants))
+    given = fusion.fusion_features(
+        robust_mean(params, target.L, along, layout),
+        fusion.reference_images(target.L, target.V, along, layout),
     )
-    return fusion.decide(params, told), np.asarray(told.ingredients)
+    return fusion.fuse_candidates(params, given), np.asarray(given.candidates)
 
 
 def object_images(
     video: CompensatedVideo, source: Objects, t: int, all_cases: bool
 ) -> dict[str, NDArray[np.floating]]:
     """Log intensities of the smoother and of `mc` with parts of it replaced by the truth."""
-    target = video.follow(t)
+    target = video.trajectories(t)
     true, hidden = truly_along(target, source, t)
     cases = {"`mc`, motion found": along_paths(target, target.paths)}
     if all_cases:
@@ -186,7 +201,7 @@ def object_images(
     for grown in GROWN if all_cases else ():
         along, _ = truly_along(target, source, t, grown)
         cases[f"true motion, objects {grown:g} px larger"] = along
-    images = {"smoother": target.L[target.instants.own]}
+    images = {"smoother": target.L[target.instants.target]}
     for name, along in cases.items():
         images[name] = np.asarray(fused_along(video.params, target, along)[0].L)
     return images
@@ -210,7 +225,7 @@ def objects(folder: Path) -> Iterator[str]:
             images = object_images(video, source, t, True)
             for name, image in object_images(other, source, t, False).items():
                 images[f"{name}, faultless sensor"] = image
-            instants = video.follow(t).instants
+            instants = video.trajectories(t).instants
             where = regions(source, t, instants.t[[instants.before, instants.after]])
             images = {n: np.exp(image) - float(params.I0) for n, image in images.items()}
             for name, image in {"`flow`": frames_alone, **images}.items():
@@ -228,7 +243,7 @@ def objects(folder: Path) -> Iterator[str]:
         yield f"| {name} | {cells[0] / most:.2f} | {text} |"
 
 
-def truly_moved(target: Followed, source: Pan | Objects, t: int) -> NDArray[np.float64]:
+def truly_moved(target: TrajectoryEstimate, source: Pan | Objects, t: int) -> NDArray[np.float64]:
     """How far points go from a target to each of its instants, (K, h, w, 2)."""
     times = [float(at) * 1e-6 for at in target.instants.t]
     if isinstance(source, Pan):
@@ -239,7 +254,7 @@ def truly_moved(target: Followed, source: Pan | Objects, t: int) -> NDArray[np.f
     return np.array([source.displacement(t * 1e-6, at)[0] for at in times], float)
 
 
-def as_parabolas(target: Followed, moved: NDArray[np.float64]) -> NDArray[np.float32]:
+def as_parabolas(target: TrajectoryEstimate, moved: NDArray[np.float64]) -> NDArray[np.float32]:
     """Paths (h, w, 4) of what `truly_moved` tells; instants near the target decide."""
     s = target.instants.s.astype(float)
     count, h, w, _ = moved.shape
@@ -256,7 +271,7 @@ def ladder(
     video: CompensatedVideo, source: Pan | Objects, t: int, all_cases: bool
 ) -> tuple[dict[str, NDArray], float]:
     """Log intensities of a target with parts of `mc` replaced by the truth, and `common`."""
-    target, params = video.follow(t), video.params
+    target, params = video.trajectories(t), video.params
     paths = as_parabolas(target, truly_moved(target, source, t))
     hidden: NDArray[np.bool_] = np.zeros(target.L.shape, bool)
     if isinstance(source, Pan):
@@ -265,12 +280,12 @@ def ladder(
         true, hidden = truly_along(target, source, t)
     by_parabolas, _ = fused_along(params, target, along_paths(target, paths))
     exactly, ingredients = fused_along(params, target, true)
-    own = target.instants.own
+    own = target.instants.target
     base = np.float32(0) if target.smooth is None else target.smooth[own]
     images = {
         "smoother": target.L[own],
         "`mc`": np.log(video(np.array([t])).mean[0] + params.I0) - base,
-        "motion found, not held": fuse_images(params, target).L,
+        "motion found, not held": fuse_target(params, target).L,
         "true motion as parabolas": held(video, target, by_parabolas, paths, t),
         "true motion, not held": exactly.L,
         "true motion": held(video, target, exactly, paths, t),
@@ -285,21 +300,23 @@ def ladder(
 
 def held(
     video: CompensatedVideo,
-    target: Followed,
-    fused: fusion.Fused,
+    target: TrajectoryEstimate,
+    fused: fusion.FusedImage,
     paths: NDArray[np.float32],
     t: int,
 ) -> NDArray:
     """What is fused, held to the exposures along paths (h, w, 4) where frames are steady."""
-    shutter = video.follow.shutter
-    if shutter.samples is None or target.smooth is not None:
+    exposures = video.trajectories.exposures
+    if exposures.samples is None or target.smooth is not None:
         return np.asarray(fused.L)
-    taken, frames = shutter(t, target.instants), FrameImages(video.recording, np.dtype(np.float32))
-    low, high = int(taken.frame.min()), int(taken.frame.max()) + 1
+    adjacent = exposures(t, target.instants)
+    frames = FrameImages(video.recording, np.dtype(np.float32))
+    low, high = int(adjacent.frame.min()), int(adjacent.frame.max()) + 1
     grey, intensity, _, gain = frames.read(slice(low, high), high - low)
-    rows = taken.frame - low
-    shots = Shots(grey[rows], intensity[rows], frames.response(), gain[rows])
-    return np.asarray(constrain(video.params, fused, paths, taken, shots, shutter.samples).L)
+    rows = adjacent.frame - low
+    images = AdjacentFrames(grey[rows], intensity[rows], frames.response(), gain[rows])
+    model = ExposureModel(adjacent, images, paths)
+    return np.asarray(constrain_image(video.params, fused, model, exposures.samples).L)
 
 
 def misses(
@@ -309,10 +326,8 @@ def misses(
 
     Of `mc`; of images between the frames alone; of these without their mean over time.
     """
-    target, p = video.follow(t), video.params
+    target, p = video.trajectories(t), video.params
     instants, L, V, *_ = target
-    numbers = (float(v) for v in (p.smooth, p.jump, p.edge, p.straight))
-    settings = float(p.floor), float(p.robust), trajectories.Smoothness(*numbers)
     order = np.arange(len(instants))
     beside = [instants.before, instants.after]
     inner = (order > instants.before) & (order < instants.after)
@@ -320,15 +335,16 @@ def misses(
     s = instants.s[inner]
 
     def found(images: NDArray) -> NDArray:
-        pyramid = trajectories.Pyramid(images, float(p.caution) * V[inner], estimator.FADE)
-        plan = trajectories.stages(s, instants.first)
-        motion = trajectories.follow(pyramid, s, plan, *settings)
-        return trajectories.spread(motion.at(0, *L.shape[1:]).p, L.shape[1:])
+        variance = float(p.caution) * V[inner]
+        pyramid = trajectories.ImagePyramid(images, variance, PYRAMID_VARIANCE_FACTOR)
+        plan = trajectories.plan_stages(s, instants.first_horizon)
+        motion = trajectories.estimate_trajectories(pyramid, s, plan, CostParams.of(p))
+        return interpolate_paths(motion.at_level(0, L.shape[1:]).p, L.shape[1:])
 
     seen = L[inner]
     each = (target.paths, found(seen), found(seen - seen.mean(0)))
     at = jnp.asarray(instants.s[beside])
-    ends = [moved - np.asarray(displaced(jnp.asarray(path), at)) for path in each]
+    ends = [moved - np.asarray(displacements(jnp.asarray(path), at)) for path in each]
     medians = [float(np.median(np.linalg.norm(one, axis=-1))) for one in (moved, *ends)]
     return medians[0], medians[1], medians[2], medians[3]
 
@@ -407,7 +423,7 @@ def panned(
     return X, Y
 
 
-def truly_panned(target: Followed, source: Pan, t: int) -> Along:
+def truly_panned(target: TrajectoryEstimate, source: Pan, t: int) -> WarpedImages:
     """A target's images along the true trajectories of a pan."""
     instants, L, V, clear, *_ = target
     h, w = L.shape[1:]
@@ -417,16 +433,16 @@ def truly_panned(target: Followed, source: Pan, t: int) -> Along:
         for n, (image, order) in enumerate(((L[k], 3), (V[k], 1), (clear[k] * 1.0, 1))):
             warped[n, k] = map_coordinates(image, [Y, X], order=order, mode="nearest")
         warped[3, k] = (-0.5 <= X) & (w - 0.5 >= X) & (-0.5 <= Y) & (h - 0.5 >= Y)
-    return Along(*warped)
+    return WarpedImages(*warped)
 
 
 def pan_images(
     video: CompensatedVideo, source: Pan, t: int, level: NDArray
-) -> tuple[dict[str, NDArray[np.floating]], Along]:
+) -> tuple[dict[str, NDArray[np.floating]], WarpedImages]:
     """Log intensities of the smoother, of `mc`, and of the best ingredients; the true paths."""
-    target = video.follow(t)
+    target = video.trajectories(t)
     true = truly_panned(target, source, t)
-    images = {"smoother": target.L[target.instants.own]}
+    images = {"smoother": target.L[target.instants.target]}
     found = along_paths(target, target.paths)
     for motion, along in {"found": found, "true": true}.items():
         fused, ingredients = fused_along(video.params, target, along)
@@ -496,7 +512,7 @@ def brights(folder: Path, fitted: Path | None = None) -> Iterator[str]:
         assert recording.frames is not None
         times, truths = recording.extra["hdr_t"], recording.extra["hdr"]
         _, high = recording.extra.get("clip", (0.01, 1.0))
-        _, _, clear = estimator.Images(recording, params, WINDOW_EVENTS)(recording.frames.t)
+        _, _, clear = InstantImages(recording, params, WINDOW_EVENTS)(recording.frames.t)
         never = ~(clear > 0).any(0)
         rows = np.unique(np.linspace(2, len(times) - 3, 4).round().astype(int))
         image, P, _ = mc.estimate(recording, params, progress=False)(times[rows])
@@ -533,7 +549,7 @@ def thresholds(folder: Path) -> Iterator[str]:
                     bright = square[truth > 1].mean() if (truth > 1).any() else np.nan
                     errors[learn].append((bright, square.mean()))
                     if learn:
-                        counts.append(video.follow.images.factors is not None)
+                        counts.append(video.trajectories.images.factors is not None)
         cells = [np.exp(np.nanmean(np.log(errors[learn]), 0)) for learn in (False, True)]
         text = " | ".join(", ".join(f"{v:.4f}" for v in cell) for cell in cells)
         yield f"| {mismatch:g} | {text} | {sum(counts)} of {len(counts)} |"

@@ -31,7 +31,7 @@ import jaxevent
 from jaxevent.camera import UnknownResponse
 from jaxevent.metrics import ssim
 from jaxevent.reconstruction.compensated import estimator, fusion
-from jaxevent.reconstruction.compensated.parameters import OTHERS, SIGNS, Params
+from jaxevent.reconstruction.compensated.params import FALLBACKS, FEATURES, Params
 from jaxevent.recording import Frames
 from jaxevent.runs.protocols import frame_times
 from jaxevent.simulate import FITTING, SENSORS, TESTING, Objects, Pan, Sensor, scene, simulate
@@ -45,6 +45,17 @@ REAL = 2.0
 RARE = (6.25,)  # Hz, of frames so far apart that motion is hardly found
 BLURS = ((0.02, 0.05, 0.1), (25.0, 100.0, 300.0))  # s; px/s
 CUTS, AWAY = 4, (1, 2, 4, 8)  # places at which a recording is cut; frames from there
+# Parts of `FusionFeatures` that are kept of an image.
+FIELDS = (
+    "candidates",
+    "in_place",
+    "features",
+    "image_variance",
+    "beyond",
+    "rest",
+    "stationary",
+    "intervals_away",
+)
 GAPS = {2: 12, 4: 12, 8: 12, 16: 8}  # frames from one that is given to the next: images scored
 # What `jaxevent fit` finds with the likelihood of frames: configs/fit_slider_depth.toml, and the
 # same for davis346_street.
@@ -268,22 +279,15 @@ def ended(path: Path, params: Params) -> Iterator[tuple]:
 
 
 def compared(targets: Iterator[tuple]) -> Iterator[dict[str, Any]]:
-    compare = jax.jit(fusion.compare)
+    features = jax.jit(fusion.fusion_features)
     for label, video, t, truth, hdr in targets:
-        target = video.follow(t)
+        target = video.trajectories(t)
         if target.smooth is not None:  # nor is its brightness that of its images
             continue
-        told = compare(*estimator.look(video.params, target))
+        given = features(*estimator.compare_images(video.params, target))
         yield {
             "label": label,
-            "ingredients": np.asarray(told.ingredients),
-            "known": np.asarray(told.known),
-            "signs": np.asarray(told.signs),
-            "usual": np.asarray(told.usual),
-            "beyond": np.asarray(told.beyond),
-            "rest": np.asarray(told.rest),
-            "stays": np.asarray(told.stays),
-            "far": np.asarray(told.far),
+            **{name: np.asarray(getattr(given, name)) for name in FIELDS},
             "truth": truth.astype(np.float32),
             "I0": float(video.params.I0),
             "hdr": hdr,
@@ -307,7 +311,7 @@ def noise_in(row: dict[str, Any], noises: dict[str, float]) -> np.ndarray:
 def difficulty(row: dict[str, Any]) -> float:
     """What the first two ingredients get wrong, so that hard images do not outweigh."""
     known = (row["I0"], row["truth"], row["hdr"])
-    return float(np.sqrt(np.prod([errors(L, *known).mean() for L in row["ingredients"][:2]])))
+    return float(np.sqrt(np.prod([errors(L, *known).mean() for L in row["candidates"][:2]])))
 
 
 def weight(row: dict[str, Any], noises: dict[str, float]) -> float:
@@ -317,8 +321,8 @@ def weight(row: dict[str, Any], noises: dict[str, float]) -> float:
 
 def _doubted(row: dict[str, Any]) -> np.ndarray:
     """The signs by which the variance is told."""
-    given = (row["signs"], row["known"], row["beyond"] > 0, row["far"])
-    return np.asarray(fusion.signs_of_doubt(*map(jnp.asarray, given)))
+    given = (row["features"], row["in_place"], row["beyond"] > 0, row["intervals_away"])
+    return np.asarray(fusion.variance_features(*map(jnp.asarray, given)))
 
 
 def _standardised(X: jnp.ndarray) -> tuple[jnp.ndarray, jnp.ndarray, jnp.ndarray]:
@@ -343,9 +347,9 @@ def fit(
     def some(image):
         return image.reshape(*image.shape[:-2], -1)[..., ::sub]
 
-    X = column(lambda r: some(r["signs"]).T)
-    Y = column(lambda r: some(r["ingredients"]).T)
-    known = column(lambda r: some(np.log(r["known"]))[:, None])
+    X = column(lambda r: some(r["features"]).T)
+    Y = column(lambda r: some(r["candidates"]).T)
+    known = column(lambda r: some(np.log(r["in_place"]))[:, None])
     truth = column(lambda r: some(r["truth"]))
     I0 = column(lambda r: np.full(len(some(r["truth"])), r["I0"]))
     R = column(lambda r: some(noise_in(r, noises)))
@@ -392,7 +396,7 @@ def fit(
         W = W / spread
         return W.at[..., -1].add(-(W[..., :-1] * mean[:-1]).sum(-1))
 
-    start = jnp.zeros((len(OTHERS), len(SIGNS) + 1)).at[:, -1].set(jnp.array([-2.0, -3.0]))
+    start = jnp.zeros((len(FALLBACKS), len(FEATURES) + 1)).at[:, -1].set(jnp.array([-2.0, -3.0]))
     W, found = descend(loss, start)
     squares = (choose(W) - level) ** 2
     start = jnp.zeros(X.shape[1]).at[-1].set(jnp.log(squares.mean()))
@@ -416,24 +420,17 @@ def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:
     The last columns: which part of pixels is not valid; and among these and among the valid ones,
     which part is wrong by more than `vague`.
     """
-    decide = jax.jit(fusion.decide)
+    fuse_candidates = jax.jit(fusion.fuse_candidates)
     table: dict[str, list] = {}
     for r in rows:
-        told = fusion.Comparison(
-            jnp.asarray(r["ingredients"]),
-            jnp.asarray(r["known"]),
-            jnp.asarray(r["signs"]),
-            jnp.zeros((3, 1, 1)),
-            jnp.zeros((2, 1, 1)),
-            jnp.asarray(r["usual"]),
-            jnp.asarray(r["beyond"]),
-            jnp.asarray(r["rest"]),
-            jnp.asarray(r["stays"]),
-            jnp.asarray(r["far"]),
+        given = fusion.FusionFeatures(
+            shares=jnp.zeros((3, 1, 1)),
+            visible=jnp.zeros((2, 1, 1)),
+            **{name: jnp.asarray(r[name]) for name in FIELDS},
         )
-        fused = decide(params, told)
+        fused = fuse_candidates(params, given)
         line = []
-        for L in (*r["ingredients"], np.asarray(fused.L)):
+        for L in (*r["candidates"], np.asarray(fused.L)):
             line.append(float(errors(L, r["I0"], r["truth"], r["hdr"]).mean()) * 100)
         shown = (np.exp(np.asarray(fused.L)) - r["I0"]).clip(0, 1).astype(np.float32)
         line.append(float(ssim(shown, r["truth"])) if not r["hdr"] else np.nan)
