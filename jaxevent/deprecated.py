@@ -16,6 +16,20 @@ from typing import Any
 
 # The full name until this release, and the one from now on.
 RENAMED: dict[str, str] = {
+    "jaxevent.confidence.Finding": "jaxevent.confidence.ParameterInterval",
+    "jaxevent.confidence.Findings": "jaxevent.confidence.FitIntervals",
+    "jaxevent.confidence.Parted": "jaxevent.confidence.PartwiseLoss",
+    "jaxevent.confidence.examine": "jaxevent.confidence.confidence_intervals",
+    "jaxevent.devices.ELSEWHERE": "jaxevent.devices.REMOTE",
+    "jaxevent.devices.Elsewhere": "jaxevent.devices.RemoteBatch",
+    "jaxevent.devices.accelerated": "jaxevent.devices.has_accelerator",
+    "jaxevent.devices.along": "jaxevent.devices.shard",
+    "jaxevent.devices.local": "jaxevent.devices.local_devices",
+    "jaxevent.devices.mesh": "jaxevent.devices.make_mesh",
+    "jaxevent.estimator.Described": "jaxevent.estimator.ShortRepr",
+    "jaxevent.parameters.Share": "jaxevent.parameters.UnitInterval",
+    "jaxevent.parameters.nearest": "jaxevent.parameters.suggest_name",
+    "jaxevent.parameters.shown": "jaxevent.parameters.format_value",
     "jaxevent.reconstruction.compensated.MotionCompensated": "jaxevent.reconstruction.compensated.MotionCompensation",
     "jaxevent.reconstruction.compensated.estimator.Followed": "jaxevent.reconstruction.compensated.estimator.TrajectoryEstimate",
     "jaxevent.reconstruction.compensated.estimator.Follower": "jaxevent.reconstruction.compensated.estimator.TrajectoryEstimator",
@@ -78,6 +92,11 @@ RENAMED: dict[str, str] = {
     "jaxevent.reconstruction.compensated.trajectories.stages": "jaxevent.reconstruction.compensated.trajectories.plan_stages",
     "jaxevent.reconstruction.compensated.trajectories.step": "jaxevent.reconstruction.compensated.trajectories.gauss_newton_step",
     "jaxevent.reconstruction.compensated.trajectories.weigh": "jaxevent.reconstruction.compensated.normal_equations.fill_information",
+    "jaxevent.tuning.Believed": "jaxevent.tuning.LossWithPrior",
+    "jaxevent.tuning.Fitted": "jaxevent.tuning.FitResult",
+    "jaxevent.tuning.Weighted": "jaxevent.tuning.WeightedBatch",
+    "jaxevent.tuning.loss_of": "jaxevent.tuning.evaluate_loss",
+    "jaxevent.tuning.slopes": "jaxevent.tuning.loss_and_grad",
 }
 # Modules that have another name or are part of another one.
 MOVED_MODULES: dict[str, str] = {
@@ -85,6 +104,8 @@ MOVED_MODULES: dict[str, str] = {
     "jaxevent.reconstruction.compensated.borders": "jaxevent.reconstruction.compensated.trajectories",
     "jaxevent.reconstruction.compensated.implicit": "jaxevent.reconstruction.compensated.normal_equations",
     "jaxevent.reconstruction.compensated.parameters": "jaxevent.reconstruction.compensated.params",
+    "jaxevent.sharing": "jaxevent.locks",
+    "jaxevent.shown": "jaxevent.display",
 }
 
 

@@ -23,7 +23,8 @@ from scipy.ndimage import map_coordinates
 from jaxevent import dispatch
 from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.errors import InputError
-from jaxevent.estimator import Described, Estimate
+from jaxevent.estimator import Estimate, ShortRepr
+from jaxevent.locks import synchronized
 from jaxevent.reconstruction.clock import Clock, Timing, time_span
 from jaxevent.reconstruction.compensated.exposures import (
     AdjacentExposures,
@@ -103,7 +104,6 @@ from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.reconstruction.windows import WINDOW_EVENTS, prepare
 from jaxevent.recording import Recording, Times, microseconds
-from jaxevent.sharing import in_turn
 
 N_SPEED_PROBES = 6  # instants at which the speed of the image is measured
 PYRAMID_VARIANCE_FACTOR = 0.35  # from one resolution to half of it
@@ -114,7 +114,7 @@ MAX_COST_RATIO = 0.97  # of the cost by the motion clock to that by time, to tak
 FUSED_VARIANCE_FACTOR = 3.0  # on the variance of the fused image that motion is refined with
 
 
-class PreparedTargets(Described):
+class PreparedTargets(ShortRepr):
     """Targets to read images of: their instants, and the motion of their points."""
 
     instants: ReadOut  # all instants of all targets, sorted
@@ -524,7 +524,7 @@ class CompensatedVideo(ImageSequence[Params]):
         return np.dtype(jnp.result_type(float))
 
     @property
-    @in_turn
+    @synchronized
     def trajectories(self) -> TrajectoryEstimator:
         """The estimator of the targets' motion; made when first needed."""
         if self._trajectories is None:
@@ -535,7 +535,7 @@ class CompensatedVideo(ImageSequence[Params]):
 
     follow = RenamedAttribute("trajectories")
 
-    @in_turn
+    @synchronized
     def _target(self, t: int) -> tuple[TrajectoryEstimate, FusedImage]:
         if self._latest is None or self._latest[0] != t:
             dispatch.check_threads()
@@ -576,7 +576,7 @@ class CompensatedVideo(ImageSequence[Params]):
         for t in wanted.tolist():
             yield self._target(t)
 
-    @in_turn
+    @synchronized
     def carry(
         self, images: NDArray[np.floating], at: NDArray[np.int64], to: int
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
@@ -601,7 +601,7 @@ class CompensatedVideo(ImageSequence[Params]):
         carried = _carry(np.asarray(images, np.float32), s, target.paths)
         return np.asarray(carried), np.asarray(_visibility(self.params, M, warped))
 
-    @in_turn
+    @synchronized
     def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.float32]:
         """Return the optical flow of the points that are visible at some times.
 
@@ -619,7 +619,7 @@ class CompensatedVideo(ImageSequence[Params]):
         ]
         return np.stack(found)
 
-    @in_turn
+    @synchronized
     def sources(self, times: Times, extrapolate: bool = False) -> dict[str, NDArray[np.float32]]:
         """Return the shares of the sources of each pixel.
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision
-from jaxevent.estimator import Described
+from jaxevent.estimator import ShortRepr
 from jaxevent.reconstruction.compensated.images import smooth_part
 from jaxevent.reconstruction.compensated.params import FALLBACKS, FEATURES, Params
 from jaxevent.reconstruction.compensated.robust_mean import (
@@ -116,7 +116,7 @@ def after_weight(layout: InstantLayout) -> Numeric:
     return jnp.where(a == b, 0, jnp.clip(-layout.s[a] / interval, 0, jnp.float32(1)))
 
 
-class FusedImage(Described):
+class FusedImage(ShortRepr):
     """An image of log intensity, its variance and its sources."""
 
     L: Float[Array, "h w"]
@@ -125,7 +125,7 @@ class FusedImage(Described):
     visible: Float[Array, "2 h w"]  # 1 where the frame before, after, sees the point, else 0
 
 
-class FusionFeatures(Described):
+class FusionFeatures(ShortRepr):
     """The candidates of a fusion, and the features that decide between them."""
 
     candidates: Float[Array, "3 h w"]  # log intensity along trajectories, smoothed, blended

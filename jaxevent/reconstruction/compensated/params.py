@@ -1,6 +1,6 @@
 """Parameters of the motion-compensated reconstruction."""
 
-from jaxevent.parameters import Choice, Number, Positive, Share
+from jaxevent.parameters import Choice, Number, Positive, UnitInterval
 from jaxevent.reconstruction import smoother
 
 # Features of a pixel that decide between the candidates; `fusion.fusion_features` computes them.
@@ -65,7 +65,7 @@ class Params(smoother.Params):
 
     sigma_pixel = Positive(0.004, "intensity", "noise of a frame's pixel, along trajectories")
     floor = Positive(2e-4, "(ln I)^2", "least variance of an image read between pixels")
-    information = Share(
+    information = UnitInterval(
         0.15, "1", "weight of an instant without frame, as errors of instants are correlated"
     )
     sigma_place = Positive(0.1, "px", "error of trajectories where images are fused")
