@@ -58,7 +58,15 @@ class CostParams(NamedTuple):
 
     @classmethod
     def of(cls, params: Params, convert: Callable[[Any], Any] = np.float32) -> "CostParams":
-        """Take the parameters of the cost from those of `mc`, converted to a type of number."""
+        """Take the parameters of the cost from those of `mc`.
+
+        Args:
+            params: Parameters of `mc`.
+            convert: Conversion of each number.
+
+        Returns:
+            The parameters.
+        """
         return cls(*(convert(getattr(params, name)) for name in cls._fields))
 
 
@@ -82,7 +90,15 @@ class PackedImages(NamedTuple):
 
     @classmethod
     def of(cls, pixels: NDArray[np.float32], s: NDArray[np.float32]) -> "PackedImages":
-        """Add the weights, which fall with the distance from the target."""
+        """Add the weights, which fall with the distance from the target.
+
+        Args:
+            pixels: (K, h, w, 4) packed images; see `trajectories.pack_images`.
+            s: (K,) times relative to the target, -1..1.
+
+        Returns:
+            Images with weights.
+        """
         return cls(pixels, s, np.exp(-2 * (s / horizon_of(s)) ** 2).astype(np.float32))
 
 
@@ -101,19 +117,33 @@ class TrajectorySamples(NamedTuple):
 
 @njit_noalloc_inlined
 def fill_information(V, inside, floor, W):
-    """Write the information of values with variances V."""
+    """Write the information of values.
+
+    Args:
+        V: (points,) their variances, (ln I)^2.
+        inside: (points,) 1, or 0 beyond the image's border.
+        floor: Variance to add, (ln I)^2.
+        W: (points,) output, the information.
+    """
     one = np.float32(1)
     for i in range(len(V)):
         W[i] = one / (V[i] + floor) if inside[i] > 0 else OUTSIDE_INFORMATION
 
 
 @njit_noalloc_inlined
-def robust_means(values, W, near, nu, R, means, sums):
-    """Write robust means of values (K, points) with information W, and their weights R.
+def robust_means(values, W, near, nu, out):
+    """Write robust means of values.
 
-    First the near instants alone determine the mean; then all of them. `sums` (2, points) is
-    scratch.
+    First the near instants determine the mean; then all of them.
+
+    Args:
+        values: (K, points) values.
+        W: (K, points) their information.
+        near: (K,) weights of the instants to begin with.
+        nu: Standardised squared residual beyond which weights fall.
+        out: Output, the weights R (K, points) and means (points,), and scratch (2, points).
     """
+    R, means, sums = out
     one, total, mean = np.float32(1), sums[0], sums[1]
     for turn in range(3):
         for i in range(len(means)):
@@ -168,7 +198,8 @@ def _sample(begin, end, inputs, scratch, out):
             locate_points(np.float32(y), images.s[k], (h, w), w, row)
             _read_channels(images.pixels[k], pixel, part, k, points[y])
             fill_information(points[y, 1, k], inside, cost.floor, info[k])
-        robust_means(points[y, 0], info, images.near, cost.robust, points[y, 1], M[y], sums[begin])
+        found = (points[y, 1], M[y], sums[begin])
+        robust_means(points[y, 0], info, images.near, cost.robust, found)
 
 
 def sample_trajectories(

@@ -225,7 +225,14 @@ def visibility(
 
 @njit_noalloc_inlined
 def blur_along_x(row, taps, padded, out):
-    """Blur a row; the image's border goes on."""
+    """Blur a row; the image's border goes on.
+
+    Args:
+        row: (w,) the row.
+        taps: (n,) the filter, n odd.
+        padded: (w + n,) scratch.
+        out: (w,) output.
+    """
     w, reach = len(row), len(taps) // 2
     for x in range(reach):
         padded[x] = row[0]
@@ -241,7 +248,14 @@ def blur_along_x(row, taps, padded, out):
 
 @njit_noalloc_inlined
 def blur_along_y(image, y, taps, out):
-    """Write the row y of an image that is blurred along y."""
+    """Blur an image along y, for one of its rows.
+
+    Args:
+        image: (h, w) the image.
+        y: The row.
+        taps: (n,) the filter, n odd.
+        out: (w,) output.
+    """
     h, w = image.shape
     for x in range(w):
         out[x] = np.float32(0)

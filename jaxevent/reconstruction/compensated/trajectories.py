@@ -279,7 +279,16 @@ def plan_stages(s: NDArray, first_horizon: float, coarsest: int = 4) -> list[Sta
 
 
 def node_shape(height: int, width: int, level: int) -> tuple[int, int]:
-    """Return the rows and columns of nodes for images of a full size (px) at a level."""
+    """Return the number of nodes at a level of resolution.
+
+    Args:
+        height: Height of the full image, px.
+        width: Width of the full image, px.
+        level: 0 for full resolution, 1 for half of it, and so on.
+
+    Returns:
+        Rows and columns.
+    """
     return -(-height // 2 ** (level + 1)), -(-width // 2 ** (level + 1))
 
 
@@ -290,7 +299,15 @@ class NodeTrajectories(NamedTuple):
     level: int  # 0: full resolution
 
     def at_level(self, level: int, size: tuple[int, int]) -> "NodeTrajectories":
-        """Convert to another level of images of a full size (height, width)."""
+        """Convert to another resolution.
+
+        Args:
+            level: 0 for full resolution, 1 for half of it, and so on.
+            size: Height and width of the full image, px.
+
+        Returns:
+            The trajectories at that level.
+        """
         p, now = self
         while now != level:
             finer = now > level
@@ -427,7 +444,7 @@ def _evaluate_cost(count, begin, y, inputs, scratch):
         locate_points(y, s[k], (h, w), count, (path, x, pixel, part, inside))
         _read_levels(images.pixels[k], pixel, part, level[k, :count], W[k])
         fill_information(W[k, :count], inside, inputs.cost.floor, W[k])
-    robust_means(level, W, images.near, nu, R, means, lines[:2])
+    robust_means(level, W, images.near, nu, (R, means, lines[:2]))
     for i in range(count):
         total[i], product[i] = 0.0, 1.0
     for k in range(len(s)):

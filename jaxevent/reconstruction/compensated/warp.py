@@ -235,14 +235,6 @@ def _read_bicubic(image, pixel, weights, out):
         out[i] = total
 
 
-class _WarpInputs(NamedTuple):
-    L: NDArray[np.float32]  # (K, h, w)
-    V: NDArray[np.float32]
-    clear: NDArray[np.float32]
-    s: NDArray[np.float32]  # (K,)
-    paths: NDArray[np.float32]  # (h, w, 4)
-
-
 @njit_noalloc
 def _warp(begin, end, inputs, scratch, cubic, out):
     L, V, clear, s, paths = inputs
@@ -280,8 +272,8 @@ def warp(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, paths: NDArray) -> 
     """
     _, h, w = L.shape
     out = WarpedImages(*(np.empty(L.shape, np.float32) for _ in range(4)))
-    inputs, scratch = _WarpInputs(L, V, clear, s, paths), RowScratch.allocate(h, w)
-    run_over_rows(_warp, h, inputs, scratch, row_scratch(h, 8, w), out)
+    inputs = (L, V, clear, s, paths)
+    run_over_rows(_warp, h, inputs, RowScratch.allocate(h, w), row_scratch(h, 8, w), out)
     return out
 
 
