@@ -4,6 +4,7 @@ import abc
 import dataclasses
 from typing import Any, ClassVar
 
+from jaxevent.deprecated import renamed_methods
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator
 from jaxevent.events.clocks import check_clocks
@@ -89,6 +90,7 @@ class ImageEstimator(Estimator[P]):
         return ScannedImages(features, out, self)
 
 
+@renamed_methods(filters="is_event_driven", looks_ahead="needs_future", start="init_state")
 @dataclasses.dataclass(frozen=True, repr=False)
 class PixelEstimator(ImageEstimator[P]):
     """A reconstruction method to which every pixel is one of its own, in windows of events."""
@@ -99,16 +101,16 @@ class PixelEstimator(ImageEstimator[P]):
 
     @property
     @abc.abstractmethod
-    def filters(self) -> bool:
+    def is_event_driven(self) -> bool:
         """Whether it passes over single events."""
 
     @property
-    def looks_ahead(self) -> bool:
+    def needs_future(self) -> bool:
         """Whether `run` needs what later windows say."""
         return False
 
     @abc.abstractmethod
-    def start(self, params: P, features: Features) -> Any:
+    def init_state(self, params: P, features: Features) -> Any:
         """The state at the recording's start, from the features of its first window."""
 
     @abc.abstractmethod
@@ -145,7 +147,7 @@ class PixelEstimator(ImageEstimator[P]):
         self.check_clocks(recording, params)
         if not extrapolate:
             self.check_span(recording, times, params)
-        return prepare(recording, times, Timing.of(params), filtering=self.filters)
+        return prepare(recording, times, Timing.of(params), filtering=self.is_event_driven)
 
     def estimate(
         self, recording: Recording, params: P | None = None, **options: Any
@@ -167,7 +169,7 @@ class PixelEstimator(ImageEstimator[P]):
         a recording's further arrays, for a camera response. Raises `InputError` for a method that
         looks ahead.
         """
-        if self.looks_ahead:
+        if self.needs_future:
             raise InputError(f"the method {self.name!r} needs what comes later; use akf")
         self.check_options(**options)
         params = self.Params() if params is None else params

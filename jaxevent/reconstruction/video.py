@@ -58,12 +58,12 @@ class PixelMethod(ImageMethod, Protocol):
     """What a video needs of its estimator; see `estimator.PixelEstimator`."""
 
     @property
-    def filters(self) -> bool: ...
+    def is_event_driven(self) -> bool: ...
 
     @property
-    def looks_ahead(self) -> bool: ...
+    def needs_future(self) -> bool: ...
 
-    def start(self, params: Any, features: Features) -> Any: ...
+    def init_state(self, params: Any, features: Features) -> Any: ...
 
     def run(
         self, params: Any, features: Features, state: Any = None, future: Any = None
@@ -75,7 +75,7 @@ class PixelMethod(ImageMethod, Protocol):
 # jax.jit returns before the result is there; eqx.filter_jit waits for it.
 @functools.partial(jax.jit, static_argnums=0)
 def _start(estimator: PixelMethod, params, features: Features):
-    return estimator.start(params, features)
+    return estimator.init_state(params, features)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -292,7 +292,7 @@ class Video(ImageSequence[P]):
             recording,
             Timing.of(params),
             len(devices),
-            filtering=estimator.filters,
+            filtering=estimator.is_event_driven,
             events=window_events,
             reuse=True,
         )
@@ -350,7 +350,7 @@ class Video(ImageSequence[P]):
 
     def _window_of(self, time: int) -> FilteredWindow:
         """The filtered window that contains `time`; windows on the way are filtered in order."""
-        if self.estimator.looks_ahead and self._future is None:
+        if self.estimator.needs_future and self._future is None:
             self._look_ahead()
         if self._open is not None and self._open.contains(time):
             return self._open
@@ -405,7 +405,7 @@ class Video(ImageSequence[P]):
                     break
         message, future = links[-1][1], {starts[-1]: None}
         for place in range(len(starts) - 1, 0, -1):
-            message = links[place][0].before(message)
+            message = links[place][0].apply(message)
             future[starts[place - 1]] = message
         self._future = future
         self._open = filtered  # the last window has nothing later to know of

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.reconstruction.clock import Clock, Timing
-from jaxevent.reconstruction.features import Features, Growth, ReadOut
+from jaxevent.reconstruction.features import DeadTimeDerivative, Features, ReadOut
 from jaxevent.reconstruction.frames import (
     FrameImages,
     make_frame_features,
@@ -364,7 +364,10 @@ def prepare(
         rho = np.asarray(timing.rho_ref, features.frames.grey.dtype)
         features, out = (
             eqx.tree_at(
-                lambda v: v.growth, value, Growth(by.counts(), rho), is_leaf=lambda v: v is None
+                lambda v: v.growth,
+                value,
+                DeadTimeDerivative(by.counts(), rho),
+                is_leaf=lambda v: v is None,
             )
             for value, by in zip((features, out), made(True), strict=True)
         )

@@ -342,10 +342,10 @@ class Shown(PixelEstimator):
     """A method whose images are what it is given to read, with the variance 0.3."""
 
     @property
-    def filters(self):
+    def is_event_driven(self):
         return False
 
-    def start(self, params, features):
+    def init_state(self, params, features):
         return None
 
     def run(self, params, features, state=None, future=None):

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.compensated.parameters import Params
 from jaxevent.reconstruction.features import FrameFeatures
-from jaxevent.reconstruction.smoother import Gaussian, Measured, Smoother
+from jaxevent.reconstruction.smoother import FrameMeasurements, Gaussian, Smoother
 
 
 class Shown(NamedTuple):
@@ -29,7 +29,9 @@ class Evidence(Smoother):
     variance (sigma_pixel / (I + I0))^2 + 1e-4, deblurred as far as events tell of the exposure.
     """
 
-    def keep(self, params: Params, frames: FrameFeatures, measured: Measured, events: Any) -> Shown:
+    def frame_info(
+        self, params: Params, frames: FrameFeatures, measured: FrameMeasurements, events: Any
+    ) -> Shown:
         z, V = measured.z, (params.sigma_pixel * measured.slope) ** 2 + 1e-4
         if events is not None:
             blurred = jnp.log(frames.intensity + params.I0)
@@ -41,7 +43,7 @@ class Evidence(Smoother):
             z, V = blurred + trust * change, V + trust * error
         return Shown(z, V, measured.clear)
 
-    def tell(self, params: Params, state: Gaussian, kept: Shown, here: Array) -> Estimate:
+    def readout(self, params: Params, state: Gaussian, kept: Shown, here: Array) -> Estimate:
         L = jnp.log(jnp.maximum(jnp.exp(state.m) - params.I0, 0) + params.I0)
         shown = here & (kept.clear > 0.5)
         V = jnp.where(shown, jnp.minimum(state.P, kept.V), state.P)

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, run_over_rows
-from jaxevent.reconstruction.augment import clipped_side, clipping_bound, unclipped
+from jaxevent.reconstruction.augment import clipped_side, clipping_bound, unclipped_weight
 from jaxevent.reconstruction.compensated.agreement import MISFIT, blur, steepness
 from jaxevent.reconstruction.compensated.fusion import Fused
 from jaxevent.reconstruction.compensated.parameters import Params
@@ -207,7 +207,7 @@ def _look(
     return _Seen(
         read(jnp.log(light)),
         (params.sigma_pixel * read(1 / light)) ** 2 + 1e-4,
-        read(unclipped(params, shots)) * inside * blurred,
+        read(unclipped_weight(params, shots)) * inside * blurred,
         jax.tree.map(lambda part: jnp.where(side == 0, 0, part), said),
     )
 

@@ -49,7 +49,7 @@ class Divided(abc.ABC):
     """
 
     def __init__(self, method: Any, recording: Recording, times: NDArray[np.int64], params: Any):
-        self.recording = DividedRecording(recording, Timing.of(params), method.filters)
+        self.recording = DividedRecording(recording, Timing.of(params), method.is_event_driven)
         self.method, self.dtype = method, self.recording.dtype
         self.pixels = recording.width * recording.height
         self.clock_offset = np.asarray(params.clock_offset)

@@ -113,14 +113,14 @@ class DividedRecording:
         """
         fixed, clock = self.fixed(clock_offset), self.windows.clock
         return kernel_of(
-            method, method.observe, params, fixed, clock.exposed, self.dtype, self.layout.stride,
-            directions,
+            method, method.frame_model, params, fixed, clock.exposed, self.dtype,
+            self.layout.stride, directions,
         )  # fmt: skip
 
     def check(self, method: Any, params: Any, clock_offset: Any, directions: Directions) -> None:
         """Raise `Untranslatable` if there can be no such kernel."""
         fixed, exposed = self.fixed(clock_offset), self.windows.clock.exposed
-        program_of(method, method.observe, params, fixed, exposed, self.dtype, directions)
+        program_of(method, method.frame_model, params, fixed, exposed, self.dtype, directions)
 
     def fixed(self, clock_offset: Any) -> dict[str, NDArray]:
         """What is known with the parameters."""

@@ -155,6 +155,6 @@ class SmoothedVideo(ImageSequence[P]):
         assert given is not None
         later = [np.zeros_like(states[0])]
         while len(links) > 1:
-            later.insert(0, self._method.through(links.pop(), later[0]))
+            later.insert(0, self._method.apply_message_map(links.pop(), later[0]))
         self._states, self._later = states, later
         self._smooth(last, given)

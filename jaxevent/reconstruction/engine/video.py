@@ -51,7 +51,7 @@ class FusedVideo(ImageSequence[P]):
     ):
         super().__init__(estimator, recording, params, progress=progress)
         self._divided = DividedRecording(
-            recording, Timing.of(params), estimator.filters, window_events
+            recording, Timing.of(params), estimator.is_event_driven, window_events
         )
         # Divided for the parameters' own clock: the lag is exactly 0.
         kernel = self._divided.kernel(estimator, params, params.clock_offset)
