@@ -66,7 +66,10 @@ RENAMED: dict[str, str] = {
     "jaxevent.reconstruction.smoother.step_between": "jaxevent.reconstruction.smoother.change_between",
 }
 # Modules that have another name or are part of another one.
-MOVED_MODULES: dict[str, str] = {}
+MOVED_MODULES: dict[str, str] = {
+    "jaxevent.reconstruction.clock": "jaxevent.reconstruction.frames",
+    "jaxevent.reconstruction.prepared": "jaxevent.reconstruction.estimator",
+}
 
 
 def warn_renamed(old: str, new: str) -> None:

@@ -12,6 +12,8 @@ kinds of tile are made of: as much work for each, and none waits for another.
 
 import abc
 import dataclasses
+import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -26,7 +28,10 @@ from jaxevent.deprecated import renamed_methods
 from jaxevent.devices import AXIS, along
 from jaxevent.devices import mesh as devices_mesh
 from jaxevent.estimator import Described
-from jaxevent.reconstruction.layout import LANES
+
+SHAPES = ((8, 4096), (64, 512), (512, 64))  # ranks, lanes of the three kinds of tile
+SLOTS = 8 * 4096
+LANES = 64  # of the narrowest tile; on several devices each has a part of every so many lanes
 
 # Prepared on the host, where they stay until a jitted function takes them.
 if TYPE_CHECKING:
@@ -335,3 +340,20 @@ def _weighted(counting: Counting, factors: list[Any]) -> Counting:
     return dataclasses.replace(
         weighted, growth=DeadTimeDerivative(times(growth.counts), growth.rho_ref)
     )
+
+
+_count_arrays = itertools.count()
+
+
+def aligned(shape: tuple[int, ...], dtype: Any, empty: bool = False) -> NDArray:
+    """An array of zeros (or anything) whose data start at a multiple of 64 bytes.
+
+    XLA takes it without a copy.
+    """
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    # Large arrays all begin at the same place of a memory page. Written side by side they would
+    # share one set of the cache; every array begins some lines further than the one before.
+    stagger = 64 * (next(_count_arrays) * 5 % 64)
+    memory = (np.empty if empty else np.zeros)(size + stagger + 64, np.uint8)
+    begin = -memory.ctypes.data % 64 + stagger
+    return memory[begin : begin + size].view(dtype).reshape(shape)

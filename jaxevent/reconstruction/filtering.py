@@ -24,8 +24,10 @@ from jaxevent.estimator import Described, Estimate
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.engine.images import DividedEvents, prepared_by_kernel
 from jaxevent.reconstruction.engine.video import FusedVideo, video_by_kernel
-from jaxevent.reconstruction.estimator import P, PixelEstimator
+from jaxevent.reconstruction.estimator import P, PixelEstimator, PreparedImages
 from jaxevent.reconstruction.features import (
+    SHAPES,
+    SLOTS,
     Features,
     FrameFeatures,
     Numeric,
@@ -33,8 +35,6 @@ from jaxevent.reconstruction.features import (
     ReadOut,
     Tiles,
 )
-from jaxevent.reconstruction.layout import SHAPES, SLOTS
-from jaxevent.reconstruction.prepared import PreparedImages
 from jaxevent.reconstruction.video import ImageSequence, Video
 from jaxevent.recording import Recording, Times
 

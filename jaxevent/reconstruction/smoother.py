@@ -50,7 +50,7 @@ from jaxevent.reconstruction.engine.images import prepared_by_kernel
 from jaxevent.reconstruction.engine.smoothed import SmoothedVideo
 from jaxevent.reconstruction.engine.smoothed_images import DividedFrames
 from jaxevent.reconstruction.engine.video import video_by_kernel
-from jaxevent.reconstruction.estimator import PixelEstimator
+from jaxevent.reconstruction.estimator import PixelEstimator, PreparedImages
 from jaxevent.reconstruction.features import (
     Features,
     FrameFeatures,
@@ -58,7 +58,6 @@ from jaxevent.reconstruction.features import (
     Numeric,
     ReadOut,
 )
-from jaxevent.reconstruction.prepared import PreparedImages
 from jaxevent.reconstruction.video import ImageSequence, Video
 from jaxevent.recording import Recording, Times
 

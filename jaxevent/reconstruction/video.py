@@ -18,12 +18,16 @@ from jaxevent.errors import InputError, InputWarning, require
 from jaxevent.estimator import Estimate
 from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.consistency import events_contradict_frames
 from jaxevent.reconstruction.features import Features, ReadOut, over_pixels, pixel_mesh
-from jaxevent.reconstruction.reading import ImageReader
+from jaxevent.reconstruction.frames import Timing
 from jaxevent.reconstruction.stream import StreamState
-from jaxevent.reconstruction.windows import WINDOW_EVENTS, EventWindow, WindowedRecording
+from jaxevent.reconstruction.windows import (
+    WINDOW_EVENTS,
+    EventWindow,
+    ImageReader,
+    WindowedRecording,
+)
 from jaxevent.recording import Recording, Times, microseconds
 from jaxevent.sharing import Turns, refuse_to_pickle
 from jaxevent.shown import Shown
@@ -248,18 +252,6 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
                 shown.update(len(batch))
 
 
-def _windows_of(
-    recording: Recording, timing: Timing, devices: int, **options: Any
-) -> WindowedRecording:
-    """A recording in windows: prepared on a GPU where images are made on one, else on the host."""
-    if accelerated() and devices < 2:
-        from jaxevent.reconstruction.on_device import DeviceWindows  # others need not load it
-
-        if DeviceWindows.serves(timing):
-            return DeviceWindows(recording, timing, **options)
-    return WindowedRecording(recording, timing, **options)
-
-
 class Video(ImageSequence[P]):
     """Images of a reconstruction: `image, variance, valid = video(times)`.
 
@@ -288,10 +280,9 @@ class Video(ImageSequence[P]):
         self._devices, self._factors = devices, factors
         self._mesh = pixel_mesh(devices)
         self._batch = DEVICE_BATCH if accelerated() else BATCH
-        self._windows = _windows_of(
+        self._windows = WindowedRecording(
             recording,
             Timing.of(params),
-            len(devices),
             filtering=estimator.is_event_driven,
             events=window_events,
             reuse=True,

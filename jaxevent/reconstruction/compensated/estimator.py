@@ -23,7 +23,6 @@ from scipy.ndimage import map_coordinates
 from jaxevent import dispatch
 from jaxevent.errors import InputError
 from jaxevent.estimator import Described, Estimate
-from jaxevent.reconstruction.clock import Clock, Timing, time_span
 from jaxevent.reconstruction.compensated import borders, trajectories
 from jaxevent.reconstruction.compensated.agreement import Agreement, Place, agree, place_of, shown
 from jaxevent.reconstruction.compensated.course import TIME, course_of
@@ -71,7 +70,7 @@ from jaxevent.reconstruction.compensated.warping import (
 )
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.features import Features, Numeric, ReadOut
-from jaxevent.reconstruction.frames import FrameImages
+from jaxevent.reconstruction.frames import Clock, FrameImages, Timing, time_span
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.reconstruction.windows import WINDOW_EVENTS, prepare
 from jaxevent.recording import Recording, Times, microseconds

@@ -24,12 +24,12 @@ from jaxevent.codegen.expressions import Untranslatable
 from jaxevent.devices import accelerated, full_precision
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
-from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.engine.loop import Images
 from jaxevent.reconstruction.engine.passes import DividedRecording, Passes
 from jaxevent.reconstruction.engine.pixel import Directions
 from jaxevent.reconstruction.engine.video import wants_kernel, without_kernel
 from jaxevent.reconstruction.features import Numeric
+from jaxevent.reconstruction.frames import Timing
 from jaxevent.reconstruction.windows import sorted_times
 from jaxevent.recording import Recording, Times
 from jaxevent.sharing import Turns

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from jaxevent.codegen import run_over_rows
 from jaxevent.estimator import Estimate
 from jaxevent.progress import bar
-from jaxevent.reconstruction.clock import Clock, Timing
 from jaxevent.reconstruction.engine.frame_loop import (
     GivenFrames,
     filter_frames,
@@ -24,6 +23,7 @@ from jaxevent.reconstruction.engine.frame_passes import FramePasses, Stretch
 from jaxevent.reconstruction.engine.passes import DividedRecording
 from jaxevent.reconstruction.engine.room import ImageRoom
 from jaxevent.reconstruction.engine.smoothing import LATER, LINK, STATE, SmoothingMethod
+from jaxevent.reconstruction.frames import Clock, Timing
 from jaxevent.reconstruction.video import ImageSequence, P
 from jaxevent.recording import Recording
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from jaxevent.codegen.expressions import Untranslatable
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
-from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.engine.passes import DividedRecording, Held, Passes, Window
 from jaxevent.reconstruction.engine.room import ImageRoom
 from jaxevent.reconstruction.engine.timeline import NEVER
+from jaxevent.reconstruction.frames import Timing
 from jaxevent.reconstruction.stream import StreamState
 from jaxevent.reconstruction.video import BEGINS, ImageSequence, P
 from jaxevent.recording import Recording
