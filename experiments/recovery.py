@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 import jaxevent
-from jaxevent.confidence import Findings, examine
+from jaxevent.confidence import FitIntervals, confidence_intervals
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.runs.blob import FAMILY as BLOBS
 from jaxevent.runs.egomotion import Loss
@@ -84,10 +84,10 @@ def from_model(
 
 def found_by(
     loss: Any, start: Any, names: list[str], batches: Any, settings: Settings, search: Any = None
-) -> Findings:
+) -> FitIntervals:
     """What a fit finds, with its intervals."""
     fit = optimise(loss, start, names, batches, settings=settings, search=search)
-    return examine(loss, start, fit.params, names, batches, search, settings.forward)
+    return confidence_intervals(loss, start, fit.params, names, batches, search, settings.forward)
 
 
 def by_frames(recording: Recording, start: Any, names: list[str], search: Any, iterations: int):
@@ -99,7 +99,7 @@ def by_frames(recording: Recording, start: Any, names: list[str], search: Any, i
     return found_by(problem.objective, start, names, problem, settings, search)
 
 
-Recovered = tuple[dict[str, float], Findings]
+Recovered = tuple[dict[str, float], FitIntervals]
 
 
 def model_recovery(

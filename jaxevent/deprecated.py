@@ -19,6 +19,20 @@ T = TypeVar("T")
 
 # The full name until this release, and the one from now on.
 RENAMED: dict[str, str] = {
+    "jaxevent.confidence.Finding": "jaxevent.confidence.ParameterInterval",
+    "jaxevent.confidence.Findings": "jaxevent.confidence.FitIntervals",
+    "jaxevent.confidence.Parted": "jaxevent.confidence.PartwiseLoss",
+    "jaxevent.confidence.examine": "jaxevent.confidence.confidence_intervals",
+    "jaxevent.devices.ELSEWHERE": "jaxevent.devices.REMOTE",
+    "jaxevent.devices.Elsewhere": "jaxevent.devices.RemoteBatch",
+    "jaxevent.devices.accelerated": "jaxevent.devices.has_accelerator",
+    "jaxevent.devices.along": "jaxevent.devices.shard",
+    "jaxevent.devices.local": "jaxevent.devices.local_devices",
+    "jaxevent.devices.mesh": "jaxevent.devices.make_mesh",
+    "jaxevent.estimator.Described": "jaxevent.estimator.ShortRepr",
+    "jaxevent.parameters.Share": "jaxevent.parameters.UnitInterval",
+    "jaxevent.parameters.nearest": "jaxevent.parameters.suggest_name",
+    "jaxevent.parameters.shown": "jaxevent.parameters.format_value",
     "jaxevent.reconstruction.augment.Augmented": "jaxevent.reconstruction.augment.AugmentedFrame",
     "jaxevent.reconstruction.augment.BetweenFrames": "jaxevent.reconstruction.augment.FrameInterpolation",
     "jaxevent.reconstruction.augment.Blended": "jaxevent.reconstruction.augment.LinearBlend",
@@ -64,11 +78,18 @@ RENAMED: dict[str, str] = {
     "jaxevent.reconstruction.smoother.share_events": "jaxevent.reconstruction.smoother.redistribute_images",
     "jaxevent.reconstruction.smoother.shared": "jaxevent.reconstruction.smoother.redistribute_events",
     "jaxevent.reconstruction.smoother.step_between": "jaxevent.reconstruction.smoother.change_between",
+    "jaxevent.tuning.Believed": "jaxevent.tuning.LossWithPrior",
+    "jaxevent.tuning.Fitted": "jaxevent.tuning.FitResult",
+    "jaxevent.tuning.Weighted": "jaxevent.tuning.WeightedBatch",
+    "jaxevent.tuning.loss_of": "jaxevent.tuning.evaluate_loss",
+    "jaxevent.tuning.slopes": "jaxevent.tuning.loss_and_grad",
 }
 # Modules that have another name or are part of another one.
 MOVED_MODULES: dict[str, str] = {
     "jaxevent.reconstruction.clock": "jaxevent.reconstruction.frames",
     "jaxevent.reconstruction.prepared": "jaxevent.reconstruction.estimator",
+    "jaxevent.sharing": "jaxevent.locks",
+    "jaxevent.shown": "jaxevent.display",
 }
 
 

@@ -19,8 +19,8 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
-from jaxevent.devices import at_once
-from jaxevent.estimator import Described, Estimate
+from jaxevent.devices import loop_unroll
+from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.engine.images import DividedEvents, prepared_by_kernel
 from jaxevent.reconstruction.engine.video import FusedVideo, video_by_kernel
@@ -94,7 +94,7 @@ class FrameModel(eqx.Module):
         return self(points).level
 
 
-class Trajectory(Described):
+class Trajectory(ShortRepr):
     """A filtered window: enough to read an image at any time inside it."""
 
     frame_model: FrameModel
@@ -286,7 +286,7 @@ def _over_tiles(step: Callable, lanes: Any, place: LaneBlock, slots: Any) -> Any
     def use(ranks: int, width: int, lanes: Any, tile: Any) -> tuple[Any, Any]:
         tile = jax.tree.map(lambda v: v.reshape(ranks, width), tile)
         mine = jax.tree.map(lambda s: s[:width], lanes)
-        end, out = lax.scan(step, mine, tile, unroll=at_once(UNROLLED))
+        end, out = lax.scan(step, mine, tile, unroll=loop_unroll(UNROLLED))
         lanes = jax.tree.map(lambda s, e: jnp.concatenate([e, s[width:]]), lanes, end)
         return lanes, jax.tree.map(jnp.ravel, out)
 

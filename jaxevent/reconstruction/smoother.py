@@ -32,7 +32,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.deprecated import renamed_methods, renamed_names
-from jaxevent.estimator import Described, Estimate
+from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.parameters import Choice, Positive
 from jaxevent.reconstruction.augment import (
     CertaintyParams,
@@ -178,7 +178,7 @@ class CensoredPixels(Protocol):
     def bound(self) -> Any: ...
 
 
-class SmoothedWindow(Described):
+class SmoothedWindow(ShortRepr):
     """A smoothed window: enough to read an image at any time inside it."""
 
     past: Gaussian  # [frames, pixels], after the frame

@@ -45,7 +45,7 @@ from jaxevent.blob.losses import Positions
 from jaxevent.blob.prepare import Features, packing_key
 from jaxevent.errors import InputError
 from jaxevent.io.output import finite, values_of
-from jaxevent.parameters import Parameters, nearest
+from jaxevent.parameters import Parameters, suggest_name
 from jaxevent.recording import Recording
 from jaxevent.runs import blob_positions
 from jaxevent.runs.blob_positions import Known, Targets, seed_at, span_of_events
@@ -331,7 +331,7 @@ class Blobs(Family):
         assert isinstance(params, TrackerParams)
         loss = settings.get("loss", "likelihood")
         if loss not in LOSSES:
-            raise InputError(f"there is no loss {loss!r}; {nearest(loss, LOSSES)}")
+            raise InputError(f"there is no loss {loss!r}; {suggest_name(loss, LOSSES)}")
         if loss == "positions" and settings.get("positions") is None:
             raise InputError(
                 "the loss 'positions' needs tables of them; give their name beside the "

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxevent import methods
+from jaxevent.display import describe_type
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
 from jaxevent.io.output import values_of
@@ -19,7 +20,6 @@ from jaxevent.parameters import Parameters, read_toml
 from jaxevent.recording import Recording
 from jaxevent.runs.config import Named, Tables
 from jaxevent.runs.own import Metric, find_method, import_path, named_metric
-from jaxevent.shown import a_kind
 
 PathLike = str | os.PathLike
 OF_TRUTH = ("positions", "truth")  # settings that take tables
@@ -94,7 +94,9 @@ def _recording(given: Any) -> str | Recording:
         return given
     if is_path(given):
         return os.fspath(given)
-    raise InputError(f"recordings hold {a_kind(given)}; give jaxevent.Recording objects or paths")
+    raise InputError(
+        f"recordings hold {describe_type(given)}; give jaxevent.Recording objects or paths"
+    )
 
 
 def methods_of(given: Any) -> list[dict[str, Any]]:
@@ -229,12 +231,12 @@ def described(value: Any) -> Any:
         return value
     if isinstance(value, Estimator) or callable(value):
         return method_name(value)
-    return a_kind(value)
+    return describe_type(value)
 
 
 def _listed(given: Any, what: str, of: str) -> Sequence[Any]:
     if not isinstance(given, Iterable):
-        raise InputError(f"{what} are {a_kind(given)}; give a list of {of}")
+        raise InputError(f"{what} are {describe_type(given)}; give a list of {of}")
     return list(given)
 
 

@@ -12,10 +12,10 @@ from jaxevent.errors import InputError
 from jaxevent.io.output import complete
 from jaxevent.runs.fit_config import Plan
 from jaxevent.splits import SPLITS
-from jaxevent.tuning import Fitted, Run, begin
+from jaxevent.tuning import FitResult, Run, begin
 
 
-def save(path: Path, digest: str, done: Sequence[Fitted], run: Run | None) -> None:
+def save(path: Path, digest: str, done: Sequence[FitResult], run: Run | None) -> None:
     """Write a checkpoint: a line of JSON, then the arrays as equinox stores them."""
     header = {
         "digest": digest,
@@ -28,7 +28,9 @@ def save(path: Path, digest: str, done: Sequence[Fitted], run: Run | None) -> No
         eqx.tree_serialise_leaves(file, arrays)
 
 
-def restore(content: bytes, path: Path, digest: str, plan: Plan) -> tuple[list[Fitted], Run | None]:
+def restore(
+    content: bytes, path: Path, digest: str, plan: Plan
+) -> tuple[list[FitResult], Run | None]:
     """The methods done and the one under way, if any, of a checkpoint."""
     with io.BytesIO(content) as file:
         try:
@@ -51,7 +53,7 @@ def restore(content: bytes, path: Path, digest: str, plan: Plan) -> tuple[list[F
                 raise
             raise InputError(f"{path}: is not a checkpoint; remove it to start anew") from error
     done = [
-        Fitted(task.params.with_raw(raw), *rest)
+        FitResult(task.params.with_raw(raw), *rest)
         for task, raw, rest in zip(tasks, raws, ended, strict=True)
     ]
     return done, None if under_way is None else Run(position, *under_way)

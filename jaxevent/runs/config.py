@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from jaxevent import datasets
+from jaxevent.display import describe_type
 from jaxevent.errors import InputError
-from jaxevent.parameters import Parameters, nearest, read_toml
+from jaxevent.parameters import Parameters, read_toml, suggest_name
 from jaxevent.recording import Recording
-from jaxevent.shown import a_kind
 
 P = TypeVar("P", bound=Parameters)
 
@@ -56,7 +56,8 @@ class Tables:
             if name in self.given:
                 return self.given[name]
         raise InputError(
-            f"{recording}: no table of what is true has this name; {nearest(recording, self.given)}"
+            f"{recording}: no table of the ground truth has this name; "
+            f"{suggest_name(recording, self.given)}"
         )
 
 
@@ -100,7 +101,7 @@ def _table(given: Any) -> Any:
         return pd.DataFrame(given).reset_index(drop=True)
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"what is true is {a_kind(given)} that is no table ({error}); give a "
+            f"what is true is {describe_type(given)} that is no table ({error}); give a "
             "DataFrame, the path of a CSV file, or a mapping from recordings' names to them"
         ) from None
 
@@ -154,7 +155,7 @@ SIZE: Check = (
 def check(table: Mapping[str, Any], known: Mapping[str, Check]) -> None:
     for name, value in table.items():
         if name not in known:
-            raise InputError(f"there is no setting {name!r}; {nearest(name, known)}")
+            raise InputError(f"there is no setting {name!r}; {suggest_name(name, known)}")
         accepts, text = known[name]
         if not accepts(value):
             raise InputError(f"{name} is {str(value)[:60]!r}; give {text}")
@@ -163,7 +164,7 @@ def check(table: Mapping[str, Any], known: Mapping[str, Check]) -> None:
 def one_of(value: str, what: str, known: Sequence[str]) -> str:
     """The value; raises `InputError` unless it is one of those known."""
     if value not in known:
-        raise InputError(f"there is no {what} {value!r}; {nearest(value, known)}")
+        raise InputError(f"there is no {what} {value!r}; {suggest_name(value, known)}")
     return value
 
 

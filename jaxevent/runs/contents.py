@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from jaxevent.display import describe_type
 from jaxevent.errors import InputError
 from jaxevent.io import load
 from jaxevent.io.companions import companions
@@ -20,7 +21,6 @@ from jaxevent.io.output import complete
 from jaxevent.parameters import Parameters
 from jaxevent.progress import bar
 from jaxevent.recording import EventSource, Recording
-from jaxevent.shown import a_kind
 
 
 class Opened(threading.local):
@@ -192,7 +192,7 @@ def _feed(thing: Any, update: Callable[[Any], None]) -> None:
             update(np.ascontiguousarray(thing[first : first + rows]).tobytes())
     else:
         raise InputError(
-            f"{a_kind(thing)} in a recording or a setting has no content that can be "
+            f"{describe_type(thing)} in a recording or a setting has no content that can be "
             "compared; remove it"
         )
 

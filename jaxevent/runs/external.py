@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.io.images import TIMES, Scale, Series, read_series
-from jaxevent.parameters import nearest
+from jaxevent.parameters import suggest_name
 from jaxevent.runs.family import Source
 
 Normalise = Literal["none", "affine"]
@@ -63,7 +63,7 @@ class External(Source):
         known = {field.name: field for field in dataclasses.fields(cls) if field.name != "folder"}
         for name, value in table.items():
             if name not in known:
-                raise InputError(f"there is no setting {name!r}; {nearest(name, known)}")
+                raise InputError(f"there is no setting {name!r}; {suggest_name(name, known)}")
             if name in ("images", "timestamps"):
                 if not isinstance(value, str) or not value:
                     raise InputError(f"{name} is {value!r}; give a path")

@@ -4,7 +4,7 @@ from typing import Any
 
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator, imported
-from jaxevent.parameters import nearest
+from jaxevent.parameters import suggest_name
 from jaxevent.runs.family import Family, Protocol
 
 HOMES = {
@@ -19,7 +19,7 @@ def family_of(method: Estimator) -> Family:
     if method.family not in HOMES:
         raise InputError(
             f"the method {method.name!r} is of the family {method.family!r}; "
-            f"{nearest(method.family, HOMES)}"
+            f"{suggest_name(method.family, HOMES)}"
         )
     return find_family(method.family)
 
@@ -32,5 +32,5 @@ def find_protocol(name: Any) -> tuple[Protocol, str]:
     """The protocol of that name and its family's; raises `InputError` naming the nearest."""
     known = {protocol: family for family in HOMES for protocol in find_family(family).protocols}
     if name not in known:
-        raise InputError(f"there is no protocol {name!r}; {nearest(str(name), known)}")
+        raise InputError(f"there is no protocol {name!r}; {suggest_name(str(name), known)}")
     return find_family(known[name]).protocols[name], known[name]

@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from jaxevent.devices import shared_out
+from jaxevent.devices import partition_batches
 from jaxevent.estimator import Estimator
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
@@ -111,7 +111,9 @@ class LastBatches:
 def share_out(parts: Sequence[Any], batches: Sequence[Any]) -> Batches:
     """The batches of parts by their `split`, those of other processes left to them."""
     pairs = list(zip(parts, batches, strict=True))
-    fit, validation = (shared_out([b for part, b in pairs if part.split == s]) for s in (0, 1))
+    fit, validation = (
+        partition_batches([b for part, b in pairs if part.split == s]) for s in (0, 1)
+    )
     return fit, validation
 
 

@@ -5,31 +5,31 @@ from typing import Any
 
 import numpy as np
 
-from jaxevent.confidence import Finding, examine
+from jaxevent.confidence import ParameterInterval, confidence_intervals
 from jaxevent.io.output import finite
 from jaxevent.runs.fit_config import Task
 from jaxevent.show.report import lay_out
-from jaxevent.tuning import Batches, Fitted
+from jaxevent.tuning import Batches, FitResult
 
 TITLES = ("method", "parameter", "start", "found", "95 % interval", "unit", "")
 INDEPENDENT = "measurements, taken as independent"
 
 
-def find(task: Task, one: Fitted, problem: Callable[[Any], Batches]) -> list[dict[str, Any]]:
+def find(task: Task, one: FitResult, problem: Callable[[Any], Batches]) -> list[dict[str, Any]]:
     """A row for each number that a method's fit found or searched, as results.json holds it.
 
     `low` and `high` are the ends of the interval, None where it is open or there is none;
     `interval` says it in words and `of` what it was told from.
     """
-    told = examine(
+    told = confidence_intervals(
         task.loss, task.params, one.params, task.names, problem, task.search,
         task.settings.forward,
     )  # fmt: skip
     of = f"{told.parts} {task.goal.part}s" if told.parts else INDEPENDENT
-    return [_row(task, finding, of) for finding in told.findings]
+    return [_row(task, finding, of) for finding in told.intervals]
 
 
-def _row(task: Task, one: Finding, of: str) -> dict[str, Any]:
+def _row(task: Task, one: ParameterInterval, of: str) -> dict[str, Any]:
     ends = {k: None if v is None else finite(v) for k, v in (("low", one.low), ("high", one.high))}
     return {
         "method": task.label,

@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 
 from jaxevent import methods
 from jaxevent.arrays import brief
+from jaxevent.display import describe_type
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator, imported
-from jaxevent.parameters import nearest
+from jaxevent.parameters import suggest_name
 from jaxevent.recording import Recording
-from jaxevent.shown import a_kind
 
 # Keys of rows that are no measures: no metric may have their names.
 RESERVED = (
@@ -80,7 +80,7 @@ def find_metrics(given: Iterable[Any], known: Collection[str]) -> list[Metric]:
     for one in given:
         if isinstance(one, str) and ":" not in one:
             if one not in known:
-                raise InputError(f"there is no metric {one!r}; {nearest(one, known)}")
+                raise InputError(f"there is no metric {one!r}; {suggest_name(one, known)}")
             continue
         metric = one if isinstance(one, Metric) else _metric(one)
         if metric.name in known or metric.name in RESERVED:
@@ -103,8 +103,8 @@ def named_metric(given: Any, function: Any, name: str | None = None) -> Metric:
     """A metric by its own name or another; raises `InputError` for what is none, naming `given`."""
     if not callable(function) or isinstance(function, type):
         raise InputError(
-            f"the metric {given!r} is {a_kind(function)}, which cannot be called; give a function "
-            "of an estimate and the truth"
+            f"the metric {given!r} is {describe_type(function)}, which cannot be called; give a "
+            "function of an estimate and the truth"
         )
     name = name or getattr(function, "__name__", None) or getattr(function, "name", None)
     if not isinstance(name, str) or name == "<lambda>":
@@ -198,8 +198,8 @@ def find_method(given: Any, family: str | None = None) -> Estimator | Function:
         raise InputError(f"the method {what} is a class; give an object of it")
     if not callable(found):
         raise InputError(
-            f"the method {what} is {a_kind(found)}, not an Estimator; give a name, an Estimator or "
-            "a function of a recording and times"
+            f"the method {what} is {describe_type(found)}, not an Estimator; give a name, an "
+            "Estimator or a function of a recording and times"
         )
     return Function(getattr(found, "__name__", type(found).__name__), found)
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.events.clocks import check_clocks
-from jaxevent.parameters import nearest
+from jaxevent.parameters import suggest_name
 from jaxevent.recording import Frames, Recording, microseconds
 
 GAP = 2  # every second frame is given
@@ -161,7 +161,7 @@ def divide(recording: Recording, protocol: str, gap: int = GAP) -> tuple[Recordi
     of one that hides no frames. Clocks that cannot be one are refused or warned of.
     """
     if protocol not in PROTOCOLS:
-        raise InputError(f"there is no protocol {protocol!r}; {nearest(protocol, PROTOCOLS)}")
+        raise InputError(f"there is no protocol {protocol!r}; {suggest_name(protocol, PROTOCOLS)}")
     check_clocks(recording)
     if protocol == "held-out":
         return held_out(recording, gap)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.devices import ELSEWHERE
+from jaxevent.devices import REMOTE
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters
 from jaxevent.reconstruction.augment import FrameParams
@@ -225,7 +225,7 @@ class Problem:
     """The batches of a method's fit and of its validation: `problem(params)`.
 
     Of several processes each prepares its own parts; in place of the others' batches are
-    `devices.ELSEWHERE`.
+    `devices.REMOTE`.
 
     They are prepared when first asked for and again for params that differ in what preparation
     fixes (`clock.Timing`). `weights` are those of dark, well exposed and bright pixels of HDR
@@ -261,7 +261,7 @@ class Problem:
             used = self._used(part, splits)
             mine = number % jax.process_count() == jax.process_index()
             made = self._batches(part, used, params) if mine and used else []
-            for s, batch in made if mine else [(s, ELSEWHERE) for s in used]:
+            for s, batch in made if mine else [(s, REMOTE) for s in used]:
                 batches[s].append(batch)
         return batches
 

@@ -30,10 +30,10 @@ import jax
 import jax.numpy as jnp
 
 from jaxevent import cache
-from jaxevent.devices import double_precision, local
+from jaxevent.devices import double_precision, local_devices
+from jaxevent.display import describe_type
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.progress import bar
-from jaxevent.shown import a_kind
 
 CONNECT = 30  # s that a scheduler has to answer
 LEAVE = 5  # s that a process has to end
@@ -106,7 +106,7 @@ class Place:
             or isinstance(getattr(self.cluster, "scheduler_address", None), str)
         ):
             raise InputError(
-                f"the cluster is {a_kind(self.cluster)}; give the address of a Dask "
+                f"the cluster is {describe_type(self.cluster)}; give the address of a Dask "
                 "scheduler, as HOST:PORT, a distributed.Client or a cluster"
             )
 
@@ -168,7 +168,7 @@ def run(
         done = _in_processes(function, todo, folder, retries, place.workers)
     elif place.remote:
         done = _on_cluster(function, todo, folder, retries, place)
-    elif len(todo) >= len(devices := local()) > 1:
+    elif len(todo) >= len(devices := local_devices()) > 1:
         done = _on_devices(function, todo, folder, retries, devices)
     else:
         done = _here(function, todo, folder, retries)
@@ -404,7 +404,7 @@ def _serve(connection: multiprocessing.connection.Connection, threads: int, numb
             os._exit(1)
 
     threading.Thread(target=leave, daemon=True).start()
-    devices = local()
+    devices = local_devices()
     if len(devices) > 1:
         jax.config.update("jax_default_device", devices[number % len(devices)])
     while True:

@@ -337,7 +337,7 @@ def test_images_are_shared_out_in_a_fixed_pattern():
 
 
 @dataclasses.dataclass(frozen=True)
-class Shown(PixelEstimator):
+class HtmlRepr(PixelEstimator):
     """A method whose images are what it is given to read, with the variance 0.3."""
 
     @property
@@ -382,7 +382,7 @@ def test_errors_by_hand(error, clipped):
     weights = np.linspace(0.5, 2, len(truth))[None]
     weights[0, 3] = 0
     shown, true = jnp.asarray(image[None]), jnp.asarray(truth[None])
-    method = Shown("shown", jaxevent.akf.Params)
+    method = HtmlRepr("shown", jaxevent.akf.Params)
     objective = Objective(method, error, clipped)
     one = jnp.asarray(1.0)
 
@@ -523,7 +523,9 @@ def test_thresholds_and_clock_are_recovered(fitted):
 
     def loss(offset: float) -> float:
         shifted = edi.Params(**{**params.values(), "clock_offset": offset})
-        return float(jaxevent.tuning.loss_of(problem.objective, shifted, problem(shifted)[0][0]))
+        return float(
+            jaxevent.tuning.evaluate_loss(problem.objective, shifted, problem(shifted)[0][0])
+        )
 
     scan = [float(offset) for offset in np.arange(0.003, 0.008, 0.00025)]
     losses = [loss(offset) for offset in scan]
@@ -599,7 +601,7 @@ def test_gradients_of_a_reconstruction_agree():
     params = edi.Params(clock_offset=0.004)
     batch = problem(params)[0][0]
     raw = {name: params.raw[name] + jnp.array([0, 0.1]) for name in ("c_on", "I0")}
-    slopes = functools.partial(jaxevent.tuning.slopes, problem.objective)
+    slopes = functools.partial(jaxevent.tuning.loss_and_grad, problem.objective)
     forward, reverse = (slopes(mode, params, raw, batch) for mode in (True, False))
     np.testing.assert_allclose(forward[0], reverse[0], rtol=1e-12)
     for name in raw:
