@@ -29,8 +29,8 @@ from jaxevent.blob.seeds import Seeds, read_seeds
 from jaxevent.blob.track import TrackBuffer, TrackStates, is_alive, readout
 from jaxevent.errors import InputError
 from jaxevent.events.tail import Tail
+from jaxevent.locks import TurnLock, refuse_to_pickle, synchronized
 from jaxevent.recording import Events, Recording, Times, microseconds
-from jaxevent.sharing import Turns, in_turn, refuse_to_pickle
 
 STEPS_PER_CHUNK, CHUNKS_PER_RUN = 64, 8
 FIRST_DETECTED_ID = 1 << 20  # serial number of the first detected target; seeds have lower ones
@@ -65,7 +65,7 @@ class LiveTracks:
         detect: bool,
     ):
         self.params, self._filter, self._runner = runner.params, filter, runner
-        self._turns = Turns("live tracks")
+        self._turns = TurnLock("live tracks")
         self._tail = Tail(*size)
         self._recording = Recording("live", *size, self._tail)
         self._detect = detect
@@ -88,19 +88,19 @@ class LiveTracks:
         refuse_to_pickle("live tracks", "keep what they tell, live(times)")
 
     @property
-    @in_turn
+    @synchronized
     def start(self) -> int:
         """The first time (us) of which states are still available."""
         self._require_packer()
         return self._cursor.start
 
     @property
-    @in_turn
+    @synchronized
     def stop(self) -> int:
         """The time (us) of the last event, or the begin of tracking if there is none."""
         return max(self._require_packer().start, self._tail.last)
 
-    @in_turn
+    @synchronized
     def add(self, events: Events) -> None:
         """Add events that are not earlier than those before; raises `InputError` for bad ones."""
         if self._start is not None and isinstance(events, Events):
@@ -112,7 +112,7 @@ class LiveTracks:
             self._start_tracking(int(events.t[0]))
         self._run_complete_chunks()
 
-    @in_turn
+    @synchronized
     def add_target(
         self, x: float | int, y: float | int, size: float | int, time: int | float | None = None
     ) -> int:
@@ -136,7 +136,7 @@ class LiveTracks:
         self._add_seeds([(x, y, size) if time is None else (x, y, size, time)])
         return self._n_ids - 1
 
-    @in_turn
+    @synchronized
     def __call__(self, times: Times) -> TrackStates:
         """Read out the targets that are alive at one of some times.
 

@@ -18,12 +18,12 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.search.found import Found
-from jaxevent.blob.search.paths import NOBODY, candidates, join
+from jaxevent.blob.search import TargetSearchResult
+from jaxevent.blob.search.paths import NO_OWNER, owner_candidates, tabulate_paths
 from jaxevent.blob.seeds import read_seeds, tracking_span
 from jaxevent.codegen import njit_noalloc
 from jaxevent.errors import InputError
-from jaxevent.estimator import Described
+from jaxevent.estimator import ShortRepr
 from jaxevent.events.filters import supported
 from jaxevent.recording import Recording, Times, check_times
 
@@ -38,7 +38,7 @@ NEVER_US = np.iinfo(np.int64).max
 Numeric = Array | np.ndarray
 
 
-class Features(Described):
+class Features(ShortRepr):
     """Chunks of steps of M events; a padding event is not valid and has its step's time."""
 
     t: Int[Numeric, "chunks steps M"]  # us since the chunk's start
@@ -51,14 +51,14 @@ class Features(Described):
     seed: Int[Numeric, " seeds"]  # the chunk at whose start each seed begins; -1: not in these
     seed_xi: Float[Numeric, "seeds 2"]  # px
     seed_size: Float[Numeric, " seeds"]  # px; 0: lambda0
-    owner: Int[Numeric, "chunks steps M 2"] | None  # see `candidates`; None: any track
+    owner: Int[Numeric, "chunks steps M 2"] | None  # see `owner_candidates`; None: any track
     overrides: dict[str, Float[Numeric, " seeds"]]  # parameters (`raw`) of single seeds
     frame: Float[Numeric, " 2"]  # width and height, px
     detect: bool = eqx.field(static=True)
     grid_shape: tuple[int, int] = eqx.field(static=True)  # rows and columns of the clutter grid
 
 
-class ReadoutTimes(Described):
+class ReadoutTimes(ShortRepr):
     """Location of times in the chunks of `Features`."""
 
     chunk: Int[Numeric, " times"]
@@ -127,7 +127,7 @@ class ChunkPacker:
         stop: int | float | None = None,
         detect: bool | None = None,
         *,
-        found: Found | None = None,
+        found: TargetSearchResult | None = None,
         steps: int | None = None,
         chunks: int | None = None,
         events_per_segment: int = 0,
@@ -151,12 +151,12 @@ class ChunkPacker:
         self.joined = self.found_ends = None
         self.overrides: dict[str, Numeric] = {}
         if found is not None and len(found):
-            self.joined = join(found.paths)
+            self.joined = tabulate_paths(found.paths)
             # A target seen in the last window but one goes on to the end.
             self.found_ends = np.array(
                 [end if p.end >= end - p.window else p.end for p in found.paths], np.int64
             )
-            self.overrides |= found.own(params)
+            self.overrides |= found.per_target_values(params)
         self.seeds = read_seeds(recording, seeds, begin, end)
         # Without births and tentative tracks less is to be decided.
         self.period = max(1, round((1 if detect else 10) * 1e6 * float(params.cycle)))
@@ -199,7 +199,7 @@ class ChunkPacker:
             np.zeros(self.chunks, np.int32),
             np.zeros(self.chunks, bool),
             np.full(len(self.seeds.t), -1, np.int32),
-            np.full((*(shape if self.joined is not None else (0, 0, 0)), 2), NOBODY, np.int32),
+            np.full((*(shape if self.joined is not None else (0, 0, 0)), 2), NO_OWNER, np.int32),
         )
         stop = NEVER_US if more else self.stop
         limits = _ChunkLimits(self.start, stop, self.period, self.seeds.t)
@@ -239,8 +239,8 @@ class ChunkPacker:
         part = events[first:last]
         accepted, owner = self._prefilter(part, first), np.empty((0, 2), np.int32)
         if self.joined is not None:
-            owner = candidates(part, self.joined, CANDIDATE_SIGMAS)
-            accepted &= owner[:, 0] != NOBODY
+            owner = owner_candidates(part, self.joined, CANDIDATE_SIGMAS)
+            accepted &= owner[:, 0] != NO_OWNER
         order = np.arange(len(part))
         _spread_ties(part.t, len(part) if self._as_stored else MAX_TIES, order)
         order = order[begin - first : end - first]

@@ -45,7 +45,7 @@ class TrackBuffer(eqx.Module):
     last_apart: Int[Array, "*targets"]  # last more than a lambda away from all older tracks
     id: Int[Array, "*targets"]  # serial number; -1: free
     confirmed: Bool[Array, "*targets"]
-    overrides: dict[str, Float[Array, "*targets"]]  # `raw` parameters of one target, see `Found`
+    overrides: dict[str, Float[Array, "*targets"]]  # `raw` parameters of single targets
     reference: ReferenceState | None = None  # of `association = "authors"`
 
 

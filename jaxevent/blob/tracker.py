@@ -18,7 +18,7 @@ from jaxevent.blob.live import LiveTracks
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import ChunkPacker, Features, ReadoutTimes
 from jaxevent.blob.run import XlaRunner, run
-from jaxevent.blob.search import Found, find
+from jaxevent.blob.search import TargetSearchResult, find
 from jaxevent.blob.smoother import (
     SmoothedTracks,
     backward_pass,
@@ -49,7 +49,7 @@ class Tracker(Estimator[P]):
     family: ClassVar[str] = "blob"
     option_kinds: ClassVar[Mapping[str, OptionKind]] = {
         **Estimator.option_kinds,
-        "found": of_class(Found),
+        "found": of_class(TargetSearchResult),
     }
     options: frozenset[str] = dataclasses.field(
         default=frozenset({"seeds", "start", "stop", "detect", "found", "smooth", "compiler"}),
@@ -66,7 +66,7 @@ class Tracker(Estimator[P]):
         start: int | float | None = None,
         stop: int | float | None = None,
         detect: bool | None = None,
-        found: Found | None = None,
+        found: TargetSearchResult | None = None,
         extrapolate: bool = False,
     ) -> tuple[Features, ReadoutTimes]:
         """Prepare all events of a recording, or of a part of it, for `run`.
@@ -208,7 +208,7 @@ class Tracker(Estimator[P]):
         start: int | float | None = None,
         stop: int | float | None = None,
         detect: bool | None = None,
-        found: Found | None = None,
+        found: TargetSearchResult | None = None,
         smooth: bool | None = None,
         compiler: str | None = None,
         progress: bool | None = None,
@@ -311,12 +311,12 @@ class Tracker(Estimator[P]):
             raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
 
     def _make_runner(
-        self, params: P, compiler: str | None, detect: bool, found: Found | None = None
+        self, params: P, compiler: str | None, detect: bool, found: TargetSearchResult | None = None
     ) -> KernelRunner | XlaRunner:
         """Make the runner of segments: by numba where it has a kernel, else by XLA."""
         if compiler == "xla":
             return XlaRunner(self.filter, params)
-        overrides = tuple(found.own(params)) if found else ()
+        overrides = tuple(found.per_target_values(params)) if found else ()
         try:
             return KernelRunner(
                 self.filter, params, detect=detect, overrides=overrides, has_owners=bool(found)

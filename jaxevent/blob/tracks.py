@@ -15,11 +15,12 @@ from jaxevent.blob.lifecycle import END_REASONS, LifecycleLog
 from jaxevent.blob.prepare import ChunkPacker, PackingCursor, Segment
 from jaxevent.blob.run import count_numbers
 from jaxevent.blob.track import TrackStates
+from jaxevent.deprecated import renamed_names
+from jaxevent.display import HtmlRepr
 from jaxevent.errors import InputError
+from jaxevent.locks import TurnLock
 from jaxevent.progress import bar
 from jaxevent.recording import Times, microseconds
-from jaxevent.sharing import Turns
-from jaxevent.shown import Shown
 
 if TYPE_CHECKING:
     import pandas
@@ -111,7 +112,7 @@ def _concatenate_states(parts: Sequence[TrackStates]) -> TrackStates:
     return TrackStates(mean, covariance, valid, idle, parts[0].id)
 
 
-class Tracks(Shown):
+class Tracks(HtmlRepr):
     """Tracks of a recording: `mean, covariance, valid = tracks(times)`.
 
     Times, arrays of shape (tracks,): `birth`, `death` (the first moment without the track; for one
@@ -140,7 +141,7 @@ class Tracks(Shown):
         self.recording, self.params, self.smooth = packer.recording, runner.params, smooth
         self.start, self.stop = packer.start, packer.stop
         self._runner, self._packer, self._progress = runner, packer, progress
-        self._turns = Turns(f"tracks of {packer.recording.name}")
+        self._turns = TurnLock(f"tracks of {packer.recording.name}")
         self._checkpoints: list[tuple[PackingCursor, int, Any]] = []
         # The result of the backward pass in the last segments, up to `MAX_KEPT_NUMBERS`.
         self._kept_infos: dict[PackingCursor, Any] = {}
@@ -523,3 +524,6 @@ class Tracks(Shown):
         self.ended = tuple(END_REASONS[reason] for _, reason in ends)
         self._id_of = np.full(max([-1, *history.birth]) + 2, -1)  # its last serves the serial -1
         self._id_of[self._serial] = self.id
+
+
+__getattr__ = renamed_names(__name__)
