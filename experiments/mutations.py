@@ -131,8 +131,8 @@ MUTATIONS = (
     Mutation(
         "blob: nearest association takes the farthest",
         "jaxevent/blob/filter.py",
-        "jnp.argmax(density)",
-        "jnp.argmin(density)",
+        "jnp.argmax(value)",
+        "jnp.argmin(value)",
         "tests/blob/test_blob_tracker.py -k plain_loop",
     ),
     Mutation(

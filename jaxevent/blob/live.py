@@ -85,7 +85,7 @@ class LiveTracks:
         return f"LiveTracks({method}, {r.width}x{r.height}, {len(self._tail):,} events)"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        refuse_to_pickle("live tracks", "keep what they tell, live(times)")
+        refuse_to_pickle("live tracks", "keep the states, live(times)")
 
     @property
     @synchronized
@@ -154,8 +154,8 @@ class LiveTracks:
         us = np.atleast_1d(microseconds(times))
         if len(us) and us.min() < self.start:
             raise InputError(
-                f"states at {us.min()} us were asked for, but those before {self.start} us are "
-                "forgotten; ask before more events are added"
+                f"states at {us.min()} us are not available, those before {self.start} us are "
+                "forgotten; read before more events are added"
             )
         states = [self._read(int(time)) for time in us]
         ids = np.array(sorted({int(one) for numbers, *_ in states for one in numbers}), np.int64)
@@ -202,7 +202,7 @@ class LiveTracks:
                     one.t[0] = self.stop
                 if one.t[0] < self._cursor.start:
                     raise InputError(
-                        f"the target begins at {one.t[0]} us, but what was before "
+                        f"the target begins at {one.t[0]} us, but everything before "
                         f"{self._cursor.start} us is forgotten; give a later time"
                     )
                 self._insert_seed(self._n_ids, one)
@@ -221,7 +221,7 @@ class LiveTracks:
         self._seed_ids.insert(at, number)
 
     def _make_room(self) -> None:
-        """Drop the seeds whose targets have ended, and if all are alive double the capacity.
+        """Drop the seeds of ended targets; if all are alive, double the capacity.
 
         A seed has the buffer's entry with its index, so both are moved alike.
         """

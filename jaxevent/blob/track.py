@@ -59,7 +59,7 @@ class NewTracks(eqx.Module):
 
 
 class StepEvents(eqx.Module):
-    """The events of one step, with whose they may be."""
+    """The events of one step, with the tracks that may own them."""
 
     time: Int[Array, ""]  # us since the chunk's start
     batch: EventBatch
@@ -109,7 +109,7 @@ class TrackStates(Estimate):
 
     @property
     def theta_valid(self) -> Any:
-        """Where theta and q are defined, (times, tracks): lambda1 > 1.15 lambda2."""
+        """Validity of theta and q, (times, tracks): lambda1 > 1.15 lambda2."""
         return self.valid & (self.mean[..., 4] > THETA_RATIO * self.mean[..., 5])
 
 
@@ -277,7 +277,7 @@ def predict_and_gate(
     gates = jax.vmap(filter.gate, (None, None, None, 0))
     inside = gates(fixed, now, radius, residual)
     if events.owner is not None:
-        # Of two possible owners only those whose gate holds the event count.
+        # A single possible owner takes the event outside its gate too.
         inside = (events.owner == track.id).any(1) & (inside | (events.owner[:, 1] < 0))
     inside &= alive & events.valid
     near = gates(fixed, now, jnp.maximum(fixed.surround, 1) * radius, residual) & alive
@@ -409,7 +409,7 @@ def run_steps(
 
     def step(tracks: TrackBuffer, part: Any) -> tuple[TrackBuffer, StepInfo]:
         times, xi, polarity, valid, owner = part
-        # A single event's is 0 for the compiler too, which leaves out what it would multiply.
+        # A single event's age is 0 for the compiler too, which then omits its products.
         age = to_seconds(times[-1] - times, xi) if len(times) > 1 else jnp.zeros_like(xi[:, 0])
         events = StepEvents(times[-1], EventBatch(xi, age, polarity), valid, owner)
         tracks, prediction, weight = _update_tracks(filter, params, tracks, limits, events)

@@ -88,7 +88,7 @@ class _History:
     death: dict[int, tuple[int, int]] = dataclasses.field(default_factory=dict)
 
     def add(self, segment: Segment, log: LifecycleLog) -> None:
-        """Enter those of a segment."""
+        """Add the changes of a segment."""
         log = jax.tree.map(np.asarray, log)
         end = segment.start + segment.features.stop
         at = np.nonzero(log.confirmed & (log.id_before >= 0))

@@ -145,7 +145,7 @@ class _TrackSteps(NamedTuple):
         long = predicted.size.max()
         return {"evidence.predicted": predicted, "p": predicted.p, "long": long}
 
-    def decide(
+    def decide_track(
         self, params: Any, frame: Any, track: Any, evidence: Any, stop: Any
     ) -> dict[str, Any]:
         return {"decision": decide_track(params, frame, track, evidence, stop)}
@@ -251,7 +251,7 @@ def trace_track(
         "update": (steps.update, update, single),
         "limit": (steps.limit, {"track": track}, True),
         "measurement": (steps.measurement, at_stop, True),
-        "decide": (steps.decide, decide, True),
+        "decide": (steps.decide_track, decide, True),
     }
     traced = {
         name: translate(function, params, values, graph, host, alone)

@@ -40,7 +40,9 @@ class WindowParams(TrackerParams):
     """Parameters of `chi2_split`."""
 
     n = Count(10, "", "steps in the window of squared residuals")
-    beta = Positive(0.01, "", "variance of the position over that of the events, in the window")
+    beta = Positive(
+        0.01, "", "ratio of the position's variance to that of the events, in the window"
+    )
 
 
 class Params(WindowParams):
@@ -48,15 +50,15 @@ class Params(WindowParams):
 
     target = Choice(
         ("2n+4", "2n"),
-        "what the window's sum is driven to; 2n is biased by sqrt((n+1)/(n-1))",
+        "expected sum of the window; 2n biases sizes by sqrt((n+1)/(n-1))",
     )
     current_in_jacobian = Choice(
-        (False, True), "whether the newest event's residual acts on p and theta in the window"
+        (False, True), "whether the newest event's residual acts on p and theta through the window"
     )
     formulation = Choice(
         ("corrected", "authors"),
-        "authors leaves the newest event out of the window, has no guards and keeps lambda itself "
-        "as state",
+        "authors: leaves the newest event out of the window, has no guards, and has lambda in "
+        "the state, not its logarithm",
     )
 
     presets = {
@@ -133,7 +135,7 @@ class ResidualWindow(eqx.Module):
         )
 
 
-class State(eqx.Module):
+class Chi2State(eqx.Module):
     """Joint state and window of residuals."""
 
     x: Float[Array, " d"]  # px py vx vy lambda1 lambda2 theta q [dx dy]; lambda or its log
@@ -147,13 +149,13 @@ class State(eqx.Module):
         return jnp.exp(self.x[4:6]) if self.logarithmic else self.x[4:6]
 
 
-def _init(params: WindowParams, position: Array, size: Array, logarithmic: bool) -> State:
+def _init(params: WindowParams, position: Array, size: Array, logarithmic: bool) -> Chi2State:
     none = jnp.zeros_like(position)
     P_size = params.P0_lambda / params.lambda0**2 if logarithmic else params.P0_lambda
     blocks = [position, none, (jnp.log(size) if logarithmic else size) + none, none]
     P = [params.P0_p, params.P0_p, params.P0_v, params.P0_v, P_size, P_size]
     P += [params.P0_theta, params.P0_q] + [params.P0_d] * 2 * params.polarity_offset
-    return State(
+    return Chi2State(
         jnp.concatenate(blocks + [none] * params.polarity_offset),
         jnp.diag(jnp.stack(P)).astype(position.dtype),
         ResidualWindow.empty(params.n, position.dtype),
@@ -161,7 +163,7 @@ def _init(params: WindowParams, position: Array, size: Array, logarithmic: bool)
     )
 
 
-def _predict(params: WindowParams, state: State, dt: Array, authors: bool) -> State:
+def _predict(params: WindowParams, state: Chi2State, dt: Array, authors: bool) -> Chi2State:
     x, P = state.x, state.P
     to_theta, to_q, tt, tq, qq = turn_transition(params, dt)
     pp, pv, vv = params.Q_p * dt, params.Q_v * dt**2 / 2, params.Q_v * dt
@@ -210,7 +212,7 @@ class _Measurement(NamedTuple):
 
 
 def _rotate_residuals(
-    params: WindowParams, state: State, batch: EventBatch, weight: Array
+    params: WindowParams, state: Chi2State, batch: EventBatch, weight: Array
 ) -> _Residuals:
     x = state.x
     m = weight.sum()
@@ -228,7 +230,7 @@ def _rotate_residuals(
     return _Residuals(m, age, (share * sign).sum(), cos, sin, state.size, mean, energy)
 
 
-def _limit_variances(params: WindowParams, state: State) -> tuple[Array, Array]:
+def _limit_variances(params: WindowParams, state: Chi2State) -> tuple[Array, Array]:
     """Limit variances in P; return too whether the position is certain enough for the shape."""
     P = state.P
     limits = {0: P_POSITION_MAX, 1: P_POSITION_MAX, 6: params.P_theta_max}
@@ -238,7 +240,7 @@ def _limit_variances(params: WindowParams, state: State) -> tuple[Array, Array]:
     for i, limit in limits.items():
         keep[i] = limit / jnp.maximum(jnp.maximum(P[i, i], limit), 1e-30)
     keep = jnp.stack(keep)
-    # Covariances shrink as much as variances: the gain of a velocity stays what it was.
+    # Covariances shrink as much as variances: the gain of a velocity does not change.
     P = P * keep[:, None] * keep + jnp.diag((keep - keep**2) * jnp.diagonal(P))
     a, b, c = lax.stop_gradient((P[0, 0], P[0, 1], P[1, 1]))
     radius = (a + c) / 2 + jnp.hypot((a - c) / 2, b)
@@ -247,7 +249,7 @@ def _limit_variances(params: WindowParams, state: State) -> tuple[Array, Array]:
 
 def _measure_mean(
     params: WindowParams,
-    state: State,
+    state: Chi2State,
     residuals: _Residuals,
     trusted: Array,
     on_size: Array | None,
@@ -278,7 +280,7 @@ def _measure_mean(
     return found
 
 
-def _size_derivative(state: State) -> Array:
+def _size_derivative(state: Chi2State) -> Array:
     """Return the derivative of lambda by its component of the state, (2,)."""
     return state.size if state.logarithmic else jnp.ones_like(state.size)
 
@@ -309,15 +311,15 @@ def _clip_state(params: WindowParams, x: Array, logarithmic: bool) -> Array:
 # ---- chi2: one sum.
 
 
-def init(params: Params, position: Array, size: Array) -> State:
+def init(params: Params, position: Array, size: Array) -> Chi2State:
     return _init(params, position, size, params.formulation == "corrected")
 
 
-def predict(params: Params, state: State, dt: Array) -> State:
+def predict(params: Params, state: Chi2State, dt: Array) -> Chi2State:
     return _predict(params, state, dt, params.formulation == "authors")
 
 
-def update(params: Params, state: State, batch: EventBatch, weight: Array) -> State:
+def update(params: Params, state: Chi2State, batch: EventBatch, weight: Array) -> Chi2State:
     authors = params.formulation == "authors"
     residuals = _rotate_residuals(params, state, batch, weight)
     P, trusted = (state.P, jnp.bool(True)) if authors else _limit_variances(params, state)
@@ -348,17 +350,17 @@ def update(params: Params, state: State, batch: EventBatch, weight: Array) -> St
     if not authors:
         x = _clip_state(params, x, state.logarithmic)
     window = where_tree(trusted, window, state.window)
-    return where_tree(residuals.m > 0, State(x, P, window, state.logarithmic), state)
+    return where_tree(residuals.m > 0, Chi2State(x, P, window, state.logarithmic), state)
 
 
-def predicted_measurement(params: WindowParams, state: State) -> PredictedMeasurement:
+def predicted_measurement(params: WindowParams, state: Chi2State) -> PredictedMeasurement:
     x, size = state.x, state.size
     return PredictedMeasurement(
         x[:2], x[2:4], ellipse_covariance(x[6], size), state.P[:2, :2], size
     )
 
 
-def zero_velocity(params: WindowParams, state: State, known: bool) -> State:
+def zero_velocity(params: WindowParams, state: Chi2State, known: bool) -> Chi2State:
     moving = np.zeros(len(state.x))
     moving[[2, 3, 7]] = 1  # velocity and turn rate
     keep = jnp.asarray(1 - moving, state.x.dtype)
@@ -369,7 +371,7 @@ def zero_velocity(params: WindowParams, state: State, known: bool) -> State:
     return dataclasses.replace(state, x=keep * state.x, P=P)
 
 
-def readout(params: WindowParams, state: State) -> tuple[Array, Array]:
+def readout(params: WindowParams, state: Chi2State) -> tuple[Array, Array]:
     x, P = state.x[:8], state.P[:8, :8]
     if state.logarithmic:
         size = state.size
@@ -382,7 +384,9 @@ def readout(params: WindowParams, state: State) -> tuple[Array, Array]:
 # ---- chi2_split: one sum per axis.
 
 
-def _update_split(params: WindowParams, state: State, batch: EventBatch, weight: Array) -> State:
+def _update_split(
+    params: WindowParams, state: Chi2State, batch: EventBatch, weight: Array
+) -> Chi2State:
     residuals = _rotate_residuals(params, state, batch, weight)
     P, trusted = _limit_variances(params, state)
     push = jnp.concatenate([residuals.energy, residuals.m[None]])
@@ -407,7 +411,7 @@ def _update_split(params: WindowParams, state: State, batch: EventBatch, weight:
     x, P = _update_scalars(state.x, P, measurements)
     x = _clip_state(params, x, True)
     window = where_tree(trusted, window, state.window)
-    return where_tree(residuals.m > 0, State(x, P, window, True), state)
+    return where_tree(residuals.m > 0, Chi2State(x, P, window, True), state)
 
 
 chi2 = Tracker(

@@ -10,7 +10,7 @@ from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.tracker import Tracker
 
 
-class State(eqx.Module):
+class ConstantVelocityState(eqx.Module):
     """A moving centre and its initial size."""
 
     motion: LinearMotion
@@ -21,31 +21,41 @@ class Params(TrackerParams):
     """Parameters of `constant_velocity`."""
 
 
-def init(params: TrackerParams, position: Array, size: Array) -> State:
-    return State(LinearMotion.init(params, position), size.astype(position.dtype))
+def init(params: TrackerParams, position: Array, size: Array) -> ConstantVelocityState:
+    return ConstantVelocityState(LinearMotion.init(params, position), size.astype(position.dtype))
 
 
-def predict(params: TrackerParams, state: State, dt: Array) -> State:
-    return State(state.motion.predict(params, dt), state.size)
+def predict(
+    params: TrackerParams, state: ConstantVelocityState, dt: Array
+) -> ConstantVelocityState:
+    return ConstantVelocityState(state.motion.predict(params, dt), state.size)
 
 
-def update(params: TrackerParams, state: State, batch: EventBatch, weight: Array) -> State:
+def update(
+    params: TrackerParams, state: ConstantVelocityState, batch: EventBatch, weight: Array
+) -> ConstantVelocityState:
     m = weight.sum()
     _, mean, factors = state.motion.residuals(batch, weight)
     R = state.size**2 * jnp.eye(2, dtype=state.size.dtype)
-    return where_tree(m > 0, State(state.motion.update(mean, factors, R, m), state.size), state)
+    return where_tree(
+        m > 0, ConstantVelocityState(state.motion.update(mean, factors, R, m), state.size), state
+    )
 
 
-def predicted_measurement(params: TrackerParams, state: State) -> PredictedMeasurement:
+def predicted_measurement(
+    params: TrackerParams, state: ConstantVelocityState
+) -> PredictedMeasurement:
     size = state.size * jnp.ones_like(state.motion.x[0])
     return predicted_ellipse(state.motion, 0 * state.size, size)
 
 
-def zero_velocity(params: TrackerParams, state: State, known: bool) -> State:
-    return State(state.motion.zero_velocity(params, known), state.size)
+def zero_velocity(
+    params: TrackerParams, state: ConstantVelocityState, known: bool
+) -> ConstantVelocityState:
+    return ConstantVelocityState(state.motion.zero_velocity(params, known), state.size)
 
 
-def readout(params: TrackerParams, state: State) -> tuple[Array, Array]:
+def readout(params: TrackerParams, state: ConstantVelocityState) -> tuple[Array, Array]:
     two = jnp.ones_like(state.motion.x[0])
     return join_blocks(state.motion, state.size * two, 0 * two, 0 * two, jnp.zeros(4, two.dtype))
 

@@ -31,7 +31,7 @@ class Params(TrackerParams):
     """Parameters of `moment`."""
 
 
-class State(eqx.Module):
+class MomentState(eqx.Module):
     """Motion, log sizes and (theta, q), without covariance between the three."""
 
     motion: LinearMotion
@@ -41,10 +41,10 @@ class State(eqx.Module):
     P_turn: Float[Array, " 3"]  # theta theta, theta q, q q
 
 
-def init(params: TrackerParams, position: Array, size: Array) -> State:
+def init(params: TrackerParams, position: Array, size: Array) -> MomentState:
     two = jnp.ones_like(position)
     P_turn = jnp.stack([params.P0_theta, jnp.zeros_like(params.P0_q), params.P0_q])
-    return State(
+    return MomentState(
         LinearMotion.init(params, position),
         jnp.log(size) * two,
         params.P0_lambda / params.lambda0**2 * two,
@@ -53,11 +53,11 @@ def init(params: TrackerParams, position: Array, size: Array) -> State:
     )
 
 
-def predict(params: TrackerParams, state: State, dt: Array) -> State:
+def predict(params: TrackerParams, state: MomentState, dt: Array) -> MomentState:
     to_theta, to_q, tt, tq, qq = turn_transition(params, dt)
     theta, q = state.turn
     a, b, d = state.P_turn
-    return State(
+    return MomentState(
         state.motion.predict(params, dt),
         state.log_size,
         state.P_size + params.Q_lambda * dt / jnp.exp(state.log_size) ** 2,
@@ -84,7 +84,9 @@ class _Residuals(NamedTuple):
     cross: Array  # its covariance
 
 
-def update(params: TrackerParams, state: State, batch: EventBatch, weight: Array) -> State:
+def update(
+    params: TrackerParams, state: MomentState, batch: EventBatch, weight: Array
+) -> MomentState:
     m = weight.sum()
     e, mean, factors = state.motion.residuals(batch, weight)
     age = -factors[1]
@@ -104,13 +106,15 @@ def update(params: TrackerParams, state: State, batch: EventBatch, weight: Array
         ]
     )
     residuals = _Residuals(m, u, share, age, size, P, cross)
-    new = State(
+    new = MomentState(
         motion, *_update_size(params, state, residuals), *_update_turn(params, state, residuals)
     )
     return where_tree(m > 0, new, state)
 
 
-def _update_size(params: TrackerParams, state: State, residuals: _Residuals) -> tuple[Array, Array]:
+def _update_size(
+    params: TrackerParams, state: MomentState, residuals: _Residuals
+) -> tuple[Array, Array]:
     """Update log sizes and their variances by u_i^2 / V_i - 1."""
     m, size = residuals.m, residuals.size
     kappa, fourth = gated_moments(params)
@@ -129,7 +133,9 @@ def _update_size(params: TrackerParams, state: State, residuals: _Residuals) -> 
     return log_size, P_size * noise / total
 
 
-def _update_turn(params: TrackerParams, state: State, residuals: _Residuals) -> tuple[Array, Array]:
+def _update_turn(
+    params: TrackerParams, state: MomentState, residuals: _Residuals
+) -> tuple[Array, Array]:
     """Update (theta, q) and their covariance by u1 u2 / sqrt(V1 V2)."""
     m, size, age, u = residuals.m, residuals.size, residuals.age, residuals.u
     kappa, fourth = gated_moments(params)
@@ -157,19 +163,19 @@ def _update_turn(params: TrackerParams, state: State, residuals: _Residuals) -> 
     return turn, P_turn / total
 
 
-def predicted_measurement(params: TrackerParams, state: State) -> PredictedMeasurement:
+def predicted_measurement(params: TrackerParams, state: MomentState) -> PredictedMeasurement:
     return predicted_ellipse(state.motion, state.turn[0], jnp.exp(state.log_size))
 
 
-def zero_velocity(params: TrackerParams, state: State, known: bool) -> State:
+def zero_velocity(params: TrackerParams, state: MomentState, known: bool) -> MomentState:
     theta, q = state.turn
     tt, tq, qq = state.P_turn
     P_turn = jnp.stack([tt, 0 * tq, 0 * qq if known else params.P0_q + 0 * qq])
     motion = state.motion.zero_velocity(params, known)
-    return State(motion, state.log_size, state.P_size, jnp.stack([theta, 0 * q]), P_turn)
+    return MomentState(motion, state.log_size, state.P_size, jnp.stack([theta, 0 * q]), P_turn)
 
 
-def readout(params: TrackerParams, state: State) -> tuple[Array, Array]:
+def readout(params: TrackerParams, state: MomentState) -> tuple[Array, Array]:
     size = jnp.exp(state.log_size)
     tt, tq, qq = state.P_turn
     return join_blocks(

@@ -235,7 +235,7 @@ def log_size_step(step: Array, derivative: Array) -> Array:
 
     Without P_p and a gate, log lambda of variance P is lambda^2 of an inverse gamma distribution of
     the shape 1 / (4 P). Its update by u^2 multiplies lambda^2 by 1 + 2 step, `step` being that of
-    the Kalman filter, and has the same variance. From a size that is twofold too large the Kalman
+    the Kalman filter, and has the same variance. From a size twice too large the Kalman
     filter's variance would shrink long before the size is right, as u^2 / V - 1 is never below -1.
     """
     return jnp.log1p(jnp.maximum(derivative * step, -0.999)) / jnp.maximum(derivative, 1e-15)

@@ -16,7 +16,7 @@ from jaxevent.blob.tracker import Tracker
 from jaxevent.parameters import Positive
 
 
-class State(eqx.Module):
+class WeightedMoments(eqx.Module):
     """Weighted moments of the events; times are ages at the state's time."""
 
     mass: Float[Array, ""]
@@ -33,18 +33,20 @@ class Params(TrackerParams):
     tau_moments = Positive(0.002, "s", "time constant of the window")
 
 
-def init(params: Params, position: Array, size: Array) -> State:
+def init(params: Params, position: Array, size: Array) -> WeightedMoments:
     none = jnp.zeros((), position.dtype)
     around = size**2 * jnp.eye(2, dtype=position.dtype)
-    return State(none + 1, position, none, around, 0 * position, none)
+    return WeightedMoments(none + 1, position, none, around, 0 * position, none)
 
 
-def predict(params: Params, state: State, dt: Array) -> State:
+def predict(params: Params, state: WeightedMoments, dt: Array) -> WeightedMoments:
     mass = state.mass * jnp.exp(-dt / params.tau_moments)
     return dataclasses.replace(state, mass=mass, age=state.age + dt)
 
 
-def update(params: Params, state: State, batch: EventBatch, weight: Array) -> State:
+def update(
+    params: Params, state: WeightedMoments, batch: EventBatch, weight: Array
+) -> WeightedMoments:
     m = weight.sum()
     share = weight / jnp.where(m > 0, m, 1)
     xi = jnp.where(weight[:, None] > 0, batch.xi, 0)
@@ -64,11 +66,13 @@ def update(params: Params, state: State, batch: EventBatch, weight: Array) -> St
         (1 - new) * a + new * b + new * (1 - new) * c
         for a, b, c in zip(old, own, between, strict=True)
     )
-    moved = State(mass, state.center + new * d, state.age - new * dt, around, drift, duration)
+    moved = WeightedMoments(
+        mass, state.center + new * d, state.age - new * dt, around, drift, duration
+    )
     return where_tree(m > 0, moved, state)
 
 
-def predicted_measurement(params: Params, state: State) -> PredictedMeasurement:
+def predicted_measurement(params: Params, state: WeightedMoments) -> PredictedMeasurement:
     theta, size = ellipse_axes(state.spread)
     size = jnp.clip(size, params.lambda_min, params.lambda_max)
     around = ellipse_covariance(theta, size)
@@ -78,7 +82,7 @@ def predicted_measurement(params: Params, state: State) -> PredictedMeasurement:
     )
 
 
-def readout(params: Params, state: State) -> tuple[Array, Array]:
+def readout(params: Params, state: WeightedMoments) -> tuple[Array, Array]:
     theta, size = ellipse_axes(state.spread)
     v, P_p, P_v = _fit_line(state)
     motion = LinearMotion((state.center, v), (P_p, 0 * P_p, P_v))
@@ -87,7 +91,7 @@ def readout(params: Params, state: State) -> tuple[Array, Array]:
     return join_blocks(motion, size, size**2 / (2 * mass), turn, jnp.zeros(4, theta.dtype))
 
 
-def _fit_line(state: State) -> tuple[Array, Array, Array]:
+def _fit_line(state: WeightedMoments) -> tuple[Array, Array, Array]:
     """Fit a line: the velocity, and the covariances of position and velocity."""
     known = state.duration > 0
     duration = jnp.where(known, state.duration, 1)
