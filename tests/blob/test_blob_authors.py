@@ -54,7 +54,7 @@ def followed(recording, seeds, **values):
     return jax.tree.map(lambda a: np.asarray(a)[:, 1:][valid], slots)
 
 
-CASES = [("blob_mini", True), ("lights_mini", True), ("ties_mini", True), ("ties_mini", False)]
+CASES = [("lights_mini", True), ("ties_mini", False)]
 
 
 @pytest.mark.slow
@@ -97,7 +97,7 @@ def stream(t, xi, p):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("waiting", [1, 20, MAX_PENDING + 5])
+@pytest.mark.parametrize("waiting", [20, MAX_PENDING + 5])
 def test_events_of_one_time_are_replayed(waiting):
     """They act as if they had come one after the other until the next event, in its place."""
     rng, most = np.random.default_rng(waiting), min(waiting, MAX_PENDING)

@@ -252,18 +252,10 @@ def constant_velocity_oracle(_, params, position, size, events):
 
 
 SETTINGS = [
-    (1, "moment", {"gate_shape": "circle"}, moment_oracle),
     (3, "moment", {"gate": 2.5, "polarity_offset": True, "tau_q": 0.01}, moment_oracle),
-    (1, "chi2_split", {"n": 7, "gate_shape": "circle"}, window_oracle),
-    (
-        3,
-        "chi2_split",
-        {"gate_shape": "circle", "polarity_offset": True, "tau_q": 0.01, "beta": 0.2},
-        window_oracle,
-    ),
+    (3, "chi2_split", {"gate_shape": "circle", "tau_q": 0.01, "beta": 0.2}, window_oracle),
     (3, "chi2", {"n": 7, "target": "2n"}, window_oracle),
-    (1, "chi2", {"polarity_offset": True, "beta": 0.2, "n": 1}, window_oracle),
-    (1, "chi2", {"current_in_jacobian": True}, window_oracle),
+    (1, "chi2", {"polarity_offset": True, "current_in_jacobian": True}, window_oracle),
     (3, "constant_velocity", {"polarity_offset": True}, constant_velocity_oracle),
 ]
 
@@ -306,8 +298,8 @@ def test_moving_moments_are_weighted_sums():
     np.testing.assert_allclose(ahead.P_p, spread / mass, rtol=1e-9)
 
 
-@pytest.mark.parametrize("gate", [1.0, 2.0, 3.0])
-def test_truncation_factors_are_integrals_over_the_gate(gate):
+def test_truncation_factors_are_integrals_over_the_gate():
+    gate = 2.0
     params = params_of(gate=gate, gate_shape="ellipse")
     kappa, fourth = gated_moments(params)
 
@@ -344,8 +336,7 @@ def authors_states(params, position, size, events):
     return scanned("chi2", params, position, size, events, report=lambda s: (s.x, s.P))[1]
 
 
-@pytest.mark.parametrize("name", ["blob_mini", "lights_mini", "ties_mini"])
-@pytest.mark.parametrize("offset", [False, True])
+@pytest.mark.parametrize(("name", "offset"), [("lights_mini", False), ("ties_mini", True)])
 def test_the_authors_updates(data, name, offset):
     with np.load(data.parent / "golden" / "aeb" / f"{name}.npz") as file:
         prefix = "upd10" if offset else "upd8"
@@ -412,7 +403,7 @@ def test_no_weight_and_no_events(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*TRACKERS, "moving_moments"])
+@pytest.mark.parametrize("name", ["moment", "chi2_split", "chi2", "moving_moments"])
 def test_nothing_breaks_the_numbers(name, float32, optimised):
     """Gaps of 1000 s, equal times and sizes, far outliers, no weight, 10,000 events at a pixel."""
     params = params_of(name, polarity_offset=True, gate_shape="ellipse")
@@ -545,7 +536,7 @@ def errors(name, params, truth, xi, dt, size, gate=None, m=1):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("n", "target"), [(5, "2n"), (20, "2n"), (5, "2n+4")])
+@pytest.mark.parametrize(("n", "target"), [(5, "2n"), (5, "2n+4")])
 def test_bias_of_the_paper_and_without_it(n, target):
     """The stationary size of eq. 11-23 is sqrt((n + 1) / (n - 1)) times the true one."""
     dt, size = 1e-5, 8.0
@@ -560,12 +551,7 @@ def test_bias_of_the_paper_and_without_it(n, target):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "gate", "m"),
-    [
-        ("moment", None, 1),
-        ("moment", "ellipse", 32),
-        ("moment", "circle", 1),
-        ("chi2_split", "ellipse", 1),
-    ],
+    [("moment", None, 1), ("moment", "ellipse", 32), ("chi2_split", "ellipse", 1)],
 )
 def test_errors_are_as_large_as_predicted(name, gate, m):
     """With truth of the model's own noise; of sizes that stay constant the variance is half P."""
@@ -579,9 +565,7 @@ def test_errors_are_as_large_as_predicted(name, gate, m):
     assert np.abs(bias).max() < 0.025, bias
     assert 0.7 < position[:, tail].mean() < 1.3
     nees = nees[:, tail].mean((0, 1))
-    # A circle cuts the long axis only; the filters know of it only where it is an ellipse.
-    sizes = nees[4:6] if gate != "circle" else nees[5:6]
-    assert ((0.7 < sizes) & (sizes < 1.3)).all(), nees
+    assert ((0.7 < nees[4:6]) & (nees[4:6] < 1.3)).all(), nees
 
 
 @pytest.mark.slow

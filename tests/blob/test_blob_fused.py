@@ -44,10 +44,7 @@ def crossing(rng, events=2400, seconds=0.03):
 
 CASES = {
     "moment": {"events_per_step": 1},
-    "constant_velocity": {
-        "events_per_step": 6, "association": "nearest", "gate_shape": "circle",
-    },
-    "moving_moments": {"events_per_step": 6},
+    "moving_moments": {"events_per_step": 6, "association": "nearest", "gate_shape": "circle"},
     "options": {
         "events_per_step": 5, "tau_q": 0.01, "t_still": 1e-3, "clutter": 1e-3,
         "polarity_offset": True,
@@ -104,7 +101,7 @@ def test_kernel_equals_run(case):
 def test_tracks_of_both_compilers():
     """Smoothed states, with pauses in which targets stand still, and whose the events are."""
     rec, seeds = crossing(np.random.default_rng(7)), [(25.0, 22.0, 4.0), (70.0, 24.0, 4.0, 0.001)]
-    tracker, options = blob.constant_velocity, {**FEW, **CASES["constant_velocity"]}
+    tracker, options = blob.constant_velocity, {**FEW, **CASES["moving_moments"]}
     params = tracker.Params(**options, t_still=1e-3, max_targets=3)
     fused, scanned = (
         tracker.estimate(rec, params, seeds=seeds, detect=True, compiler=compiler, progress=False)

@@ -41,14 +41,6 @@ def gradient(function, x, step):
     return np.array([(function(x + e) - function(x - e)) / (2 * step) for e in step * np.eye(8)])
 
 
-def test_two_lights_tell_the_inverse_time_to_contact():
-    zero = jnp.zeros((8, 8))
-    for speed in (3.0, -3.0):
-        a, b = jnp.array(lights(speed))
-        value, variance = INVERSE_TTC(a, zero, b, zero)
-        assert abs(float(value) - speed / 10) < 1e-12 and float(variance) == 0
-
-
 def test_inverse_ttc_takes_batches_and_either_order():
     rng = RNG(0)
     mean, P = jnp.array(rng.normal(size=(2, 5, 8)) * 50), jnp.array(covariance(rng, 2, 5))
@@ -58,6 +50,10 @@ def test_inverse_ttc_takes_batches_and_either_order():
     for k in range(5):
         one = INVERSE_TTC(mean[0, k], P[0, k], mean[1, k], P[1, k])
         np.testing.assert_allclose(one, (value[k], variance[k]), rtol=1e-12)
+    for speed in (3.0, -3.0):
+        a, b = jnp.array(lights(speed))
+        value, variance = INVERSE_TTC(a, 0 * P[0, 0], b, 0 * P[0, 0])
+        assert abs(float(value) - speed / 10) < 1e-12 and float(variance) == 0
 
 
 def test_variance_of_inverse_ttc_is_that_of_finite_differences():
@@ -72,19 +68,6 @@ def test_variance_of_inverse_ttc_is_that_of_finite_differences():
     ga, gb = gradient(lambda x: value(x, b), a, 1e-5), gradient(lambda x: value(a, x), b, 1e-5)
     _, variance = INVERSE_TTC(*map(jnp.array, (a, Pa, b, Pb)))
     np.testing.assert_allclose(float(variance), ga @ Pa @ ga + gb @ Pb @ gb, rtol=1e-6)
-
-
-def test_variance_of_inverse_ttc_is_that_of_samples():
-    rng = RNG(2)
-    a, b = lights()
-    P = covariance(rng, 2, scale=0.6)
-    draws = [rng.multivariate_normal(m, c, 20000) for m, c in zip((a, b), P, strict=True)]
-    zeros = jnp.zeros((20000, 8, 8))
-    values, _ = INVERSE_TTC(jnp.array(draws[0]), zeros, jnp.array(draws[1]), zeros)
-    value, variance = INVERSE_TTC(*map(jnp.array, (a, P[0], b, P[1])))
-    # The variance of 20,000 draws is known to 1 % (one standard deviation).
-    assert abs(np.var(values) / float(variance) - 1) < 0.04
-    assert abs(np.mean(values) - float(value)) < 5 * np.sqrt(float(variance) / 20000)
 
 
 @pytest.mark.slow
@@ -208,30 +191,9 @@ def test_growth_is_the_joint_gaussian():
     value, variance = grow(times, mean, P, valid, Q=Q)
     np.testing.assert_allclose(variance, np.diag(posterior)[50:], rtol=5e-3)
     assert np.abs(value).max() < 2e-3
-
-
-@pytest.mark.parametrize("smooth", [True, False])
-def test_growth_knows_its_error(smooth):
-    """NEES over 200 drawn tracks whose speed changes at random, as the model says."""
-    rng = RNG(5)
-    tracks, steps, dt, Q = 200, 50, 0.02, 0.3
-    w, rate = np.ones((tracks, steps)), np.full((tracks, steps), -0.3)
-    for k in range(1, steps):
-        noise = np.sqrt(Q) * w[:, k - 1]
-        n1, n2 = rng.normal(size=(2, tracks))
-        rate[:, k] = rate[:, k - 1] + noise * np.sqrt(dt) * n1
-        drift = rate[:, k - 1] * dt + noise * dt**1.5 * (n1 / 2 + n2 / np.sqrt(12))
-        w[:, k] = w[:, k - 1] + drift
-    truth = -rate / w
-    mean, P = np.zeros((tracks, steps, 8)), np.zeros((tracks, steps, 8, 8))
-    mean[..., 4:6] = (8 / w)[..., None] * np.exp(0.02 * rng.normal(size=(tracks, steps, 2)))
-    P[..., [4, 5], [4, 5]] = (0.02 * mean[..., 4:6]) ** 2
-    times = jnp.array(dt * np.arange(steps))
-    run = jax.jit(jax.vmap(lambda m, P: grow(times, m, P, Q=Q, smooth=smooth)))
-    value, variance = run(jnp.array(mean), jnp.array(P))
-    nees = (np.asarray(value) - truth) ** 2 / np.asarray(variance)
-    # One standard deviation of the mean over 200 tracks is at most sqrt(2 / 200) = 0.1.
-    assert 0.8 < nees[:, 10:].mean() < 1.2
+    # At the end of the times the filter knows as much as the smoother.
+    forward = grow(times, mean, P, valid, Q=Q, smooth=False)
+    np.testing.assert_allclose([part[-1] for part in forward], [value[-1], variance[-1]], rtol=1e-9)
 
 
 @pytest.mark.slow
