@@ -65,32 +65,32 @@ def test_kernel_equals_run(case):
     seeds = [(25.0, 22.0, 4.0), (70.0, 24.0, 4.0, 0.001)]
     rec = crossing(np.random.default_rng(7))
     packing = ChunkPacker(rec, params, seeds, detect=True, steps=16, chunks=40)
-    state, mark, kernel = None, packing.first, KernelRunner(tracker.filter, params, detect=True)
+    state, cursor, kernel = None, packing.first, KernelRunner(tracker.filter, params, detect=True)
     number = 0
-    while mark is not None:
-        stretch = packing.pack(mark)
-        mark, number = stretch.next, number + 1
+    while cursor is not None:
+        segment = packing.pack(cursor)
+        cursor, number = segment.next, number + 1
         if state is None:
-            state = init_state(tracker.filter, params, stretch.features)
-        end, log = kernel.run(state, stretch.features)
-        got = end, ChunkInfo(log, kernel.chunk_starts(kernel.record(state, stretch.features)[1]))
+            state = init_state(tracker.filter, params, segment.features)
+        end, log = kernel.run(state, segment.features)
+        got = end, ChunkInfo(log, kernel.chunk_starts(kernel.record(state, segment.features)[1]))
         before = state
-        state, told = run_compiled(tracker.filter, params, state, stretch.features)
+        state, told = run_compiled(tracker.filter, params, state, segment.features)
         expected = state, dataclasses.replace(told, association=None)
         paths = jax.tree_util.tree_flatten_with_path(expected)[0]
         for (path, one), other in zip(paths, jax.tree.leaves(got), strict=True):
-            name = f"{jax.tree_util.keystr(path)} of stretch {number}"
+            name = f"{jax.tree_util.keystr(path)} of segment {number}"
             assert other.dtype == one.dtype, name
             np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9, err_msg=name)
-    # Of the last stretch also what is read, filtered, as the first chunk with a pause begins.
-    _, updates = kernel.record(before, stretch.features)
-    ends = np.asarray(stretch.features.t)[:, 0, -1]  # of the chunks' first steps
+    # Of the last segment also the readout, filtered, as the first chunk with a pause begins.
+    _, updates = kernel.record(before, segment.features)
+    ends = np.asarray(segment.features.t)[:, 0, -1]  # of the chunks' first steps
     chunk = int(np.flatnonzero((ends > 1) & (np.asarray(told.tracks.id) >= 0).any(1))[0])
     slots = jax.tree.map(lambda a: a[chunk], told.tracks)
     read = jax.jit(jax.vmap(functools.partial(readout, tracker.filter, params), (0, None)))
     wanted, id = np.asarray(slots.id)[None] >= 0, np.asarray(slots.id, np.int64)
-    times = stretch.start[[chunk]] + ends[chunk] - 1
-    got = kernel.readout(stretch, updates, None, times, id, wanted)
+    times = segment.start[[chunk]] + ends[chunk] - 1
+    got = kernel.readout(segment, updates, None, times, id, wanted)
     for one, other in zip(got, read(slots, ends[chunk] - 1), strict=True):
         np.testing.assert_allclose(one[wanted], other[wanted[0]], rtol=1e-9, atol=1e-9)
     log = np.asarray(told.log.end_reason)

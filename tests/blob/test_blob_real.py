@@ -81,11 +81,11 @@ def test_tail_of_the_dot_begins_no_track(real, dot, float32):
     for surround in (1.0, 2.0):
         params = moment.Params(preset="fast", **real.DOT_FOUND, surround=surround)
         packing = ChunkPacker(cut, params, steps=64, chunks=128)
-        mark, state = packing.first, None
-        while mark is not None:  # in the program of `follow`
-            stretch = packing.pack(mark)
-            state, _ = run_compiled(moment.filter, params, state, stretch.features)
-            mark = stretch.next
+        cursor, state = packing.first, None
+        while cursor is not None:  # in the program of `follow`
+            segment = packing.pack(cursor)
+            state, _ = run_compiled(moment.filter, params, state, segment.features)
+            cursor = segment.next
         begun[surround] = int(state.next_id)
     assert begun[2.0] == 1 < begun[1.0]
 

@@ -359,13 +359,13 @@ def test_prefilter():
     kept = np.flatnonzero(kept)
     for steps, chunks in ((4, 3), (64, 100)):
         packing = ChunkPacker(rec, params, [], steps=steps, chunks=chunks)
-        mark, rows = packing.first, []
-        while mark is not None:
-            stretch = packing.pack(mark)
-            t = stretch.start[:, None, None] + stretch.features.t
-            row = stretch.row[stretch.features.valid]
-            assert np.array_equal(t[stretch.features.valid], e.t[row])
-            rows, mark = [*rows, *row], stretch.next
+        cursor, rows = packing.first, []
+        while cursor is not None:
+            segment = packing.pack(cursor)
+            t = segment.start[:, None, None] + segment.features.t
+            row = segment.row[segment.features.valid]
+            assert np.array_equal(t[segment.features.valid], e.t[row])
+            rows, cursor = [*rows, *row], segment.next
         assert np.array_equal(rows, kept) and 0 < len(kept) < len(e) / 2
 
 
@@ -380,14 +380,14 @@ def line_by_line(seed=0):
 def test_steps_hold_events_of_all_lines_of_one_time():
     rec = line_by_line()
     packing = ChunkPacker(rec, Params(events_per_step=8), [(100.0, 90.0, 25.0)], steps=5, chunks=3)
-    mark, rows, far = packing.first, [], []
-    while mark is not None:
-        stretch = packing.pack(mark)
-        valid, row = stretch.features.valid, stretch.row
-        assert np.array_equal((stretch.start[:, None, None] + stretch.features.t)[valid],
+    cursor, rows, far = packing.first, [], []
+    while cursor is not None:
+        segment = packing.pack(cursor)
+        valid, row = segment.features.valid, segment.row
+        assert np.array_equal((segment.start[:, None, None] + segment.features.t)[valid],
             rec.events.t[row[valid]])  # fmt: skip
         far += list(rec.events.y[row[valid.all(-1)]].mean(-1) - 90)
-        rows, mark = [*rows, *row[valid]], stretch.next
+        rows, cursor = [*rows, *row[valid]], segment.next
     assert sorted(rows) == list(range(len(rec.events)))
     # Of 8 events drawn at random it is 5.3 px, of 8 that follow each other 14.
     assert len(far) > 1000 and np.std(far) < 4

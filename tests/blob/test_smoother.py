@@ -142,8 +142,8 @@ DETECTED = {
 
 
 @pytest.mark.slow
-def test_stretches_chunks_and_births_do_not_matter(three):
-    """One long stretch, and many short ones of which only some beginnings are kept."""
+def test_segments_chunks_and_births_do_not_matter(three):
+    """One long segment, and many short ones of which only some beginnings are kept."""
     (rec, _), tracker = three, blob.constant_velocity
     params = tracker.Params(**DETECTED)
     times = np.linspace(rec.start, rec.stop, 41).astype(np.int64)
