@@ -5,6 +5,7 @@
 """
 # ruff: noqa: E501, one entry of the table is one line
 
+import functools
 import importlib
 import importlib.abc
 import importlib.machinery
@@ -12,10 +13,13 @@ import sys
 import types
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar, cast
+
+T = TypeVar("T")
 
 # The full name until this release, and the one from now on.
 RENAMED: dict[str, str] = {
+    "jaxevent.blob.Found": "jaxevent.blob.TargetSearchResult",
     "jaxevent.confidence.Finding": "jaxevent.confidence.ParameterInterval",
     "jaxevent.confidence.Findings": "jaxevent.confidence.FitIntervals",
     "jaxevent.confidence.Parted": "jaxevent.confidence.PartwiseLoss",
@@ -30,6 +34,19 @@ RENAMED: dict[str, str] = {
     "jaxevent.parameters.Share": "jaxevent.parameters.UnitInterval",
     "jaxevent.parameters.nearest": "jaxevent.parameters.suggest_name",
     "jaxevent.parameters.shown": "jaxevent.parameters.format_value",
+    "jaxevent.reconstruction.augment.Augmented": "jaxevent.reconstruction.augment.AugmentedFrame",
+    "jaxevent.reconstruction.augment.BetweenFrames": "jaxevent.reconstruction.augment.FrameInterpolation",
+    "jaxevent.reconstruction.augment.Blended": "jaxevent.reconstruction.augment.LinearBlend",
+    "jaxevent.reconstruction.augment.Greys": "jaxevent.reconstruction.augment.GreyFrames",
+    "jaxevent.reconstruction.augment.Held": "jaxevent.reconstruction.augment.ZeroOrderHold",
+    "jaxevent.reconstruction.augment.Level": "jaxevent.reconstruction.augment.LogIntensityModel",
+    "jaxevent.reconstruction.augment.Nothing": "jaxevent.reconstruction.augment.NoFrames",
+    "jaxevent.reconstruction.augment.belief": "jaxevent.reconstruction.augment.effective_certainty",
+    "jaxevent.reconstruction.augment.believed_rate": "jaxevent.reconstruction.augment.frame_information",
+    "jaxevent.reconstruction.augment.bounded_ratio": "jaxevent.reconstruction.augment.bound_ratio",
+    "jaxevent.reconstruction.augment.brightness": "jaxevent.reconstruction.augment.integrate_counts",
+    "jaxevent.reconstruction.augment.deblurred": "jaxevent.reconstruction.augment.deblur_level",
+    "jaxevent.reconstruction.augment.unclipped": "jaxevent.reconstruction.augment.unclipped_weight",
     "jaxevent.reconstruction.compensated.MotionCompensated": "jaxevent.reconstruction.compensated.MotionCompensation",
     "jaxevent.reconstruction.compensated.estimator.Followed": "jaxevent.reconstruction.compensated.estimator.TrajectoryEstimate",
     "jaxevent.reconstruction.compensated.estimator.Follower": "jaxevent.reconstruction.compensated.estimator.TrajectoryEstimator",
@@ -92,6 +109,38 @@ RENAMED: dict[str, str] = {
     "jaxevent.reconstruction.compensated.trajectories.stages": "jaxevent.reconstruction.compensated.trajectories.plan_stages",
     "jaxevent.reconstruction.compensated.trajectories.step": "jaxevent.reconstruction.compensated.trajectories.gauss_newton_step",
     "jaxevent.reconstruction.compensated.trajectories.weigh": "jaxevent.reconstruction.compensated.normal_equations.fill_information",
+    "jaxevent.reconstruction.complementary.Pull": "jaxevent.reconstruction.complementary.ConstantRateModel",
+    "jaxevent.reconstruction.complementary.advance": "jaxevent.reconstruction.complementary.predict",
+    "jaxevent.reconstruction.complementary.jump": "jaxevent.reconstruction.complementary.event_update",
+    "jaxevent.reconstruction.direct.Direct": "jaxevent.reconstruction.direct.DirectFrameModel",
+    "jaxevent.reconstruction.direct.advance": "jaxevent.reconstruction.direct.predict",
+    "jaxevent.reconstruction.filtering.Observer": "jaxevent.reconstruction.filtering.FrameModel",
+    "jaxevent.reconstruction.filtering.Place": "jaxevent.reconstruction.filtering.LaneBlock",
+    "jaxevent.reconstruction.filtering.State": "jaxevent.reconstruction.filtering.PixelState",
+    "jaxevent.reconstruction.filtering.log_intensity": "jaxevent.reconstruction.filtering.readout_log_intensity",
+    "jaxevent.reconstruction.filtering.without_variance": "jaxevent.reconstruction.filtering.init_without_variance",
+    "jaxevent.reconstruction.kalman.Augmentation": "jaxevent.reconstruction.kalman.AugmentedFrameModel",
+    "jaxevent.reconstruction.kalman.advance": "jaxevent.reconstruction.kalman.predict",
+    "jaxevent.reconstruction.kalman.initial": "jaxevent.reconstruction.kalman.init",
+    "jaxevent.reconstruction.kalman.jump": "jaxevent.reconstruction.kalman.event_update",
+    "jaxevent.reconstruction.kalman.noise": "jaxevent.reconstruction.kalman.process_noise",
+    "jaxevent.reconstruction.kalman.within": "jaxevent.reconstruction.kalman.refractory_indicator",
+    "jaxevent.reconstruction.smoother.Link": "jaxevent.reconstruction.smoother.MessageMap",
+    "jaxevent.reconstruction.smoother.Measured": "jaxevent.reconstruction.smoother.FrameMeasurements",
+    "jaxevent.reconstruction.smoother.Passage": "jaxevent.reconstruction.smoother.SmoothedWindow",
+    "jaxevent.reconstruction.smoother.Rows": "jaxevent.reconstruction.smoother.FrameSteps",
+    "jaxevent.reconstruction.smoother.Sided": "jaxevent.reconstruction.smoother.CensoredPixels",
+    "jaxevent.reconstruction.smoother.compose_links": "jaxevent.reconstruction.smoother.compose_message_maps",
+    "jaxevent.reconstruction.smoother.counts_around": "jaxevent.reconstruction.smoother.adjacent_counts",
+    "jaxevent.reconstruction.smoother.information": "jaxevent.reconstruction.smoother.state_to_message",
+    "jaxevent.reconstruction.smoother.initial": "jaxevent.reconstruction.smoother.init",
+    "jaxevent.reconstruction.smoother.join": "jaxevent.reconstruction.smoother.combine",
+    "jaxevent.reconstruction.smoother.make_rows": "jaxevent.reconstruction.smoother.make_frame_steps",
+    "jaxevent.reconstruction.smoother.measure": "jaxevent.reconstruction.smoother.frame_update",
+    "jaxevent.reconstruction.smoother.one_pixel": "jaxevent.reconstruction.smoother.single_pixel_frame",
+    "jaxevent.reconstruction.smoother.share_events": "jaxevent.reconstruction.smoother.redistribute_images",
+    "jaxevent.reconstruction.smoother.shared": "jaxevent.reconstruction.smoother.redistribute_events",
+    "jaxevent.reconstruction.smoother.step_between": "jaxevent.reconstruction.smoother.change_between",
     "jaxevent.simulate.Motion": "jaxevent.simulate.TargetMotion",
     "jaxevent.simulate.blobs.Motion": "jaxevent.simulate.blobs.TargetMotion",
     "jaxevent.simulate.hybrid.response_of": "jaxevent.simulate.hybrid.sensor_response",
@@ -105,10 +154,12 @@ RENAMED: dict[str, str] = {
 }
 # Modules that have another name or are part of another one.
 MOVED_MODULES: dict[str, str] = {
+    "jaxevent.reconstruction.clock": "jaxevent.reconstruction.frames",
     "jaxevent.reconstruction.compensated.agreement": "jaxevent.reconstruction.compensated.robust_mean",
     "jaxevent.reconstruction.compensated.borders": "jaxevent.reconstruction.compensated.trajectories",
     "jaxevent.reconstruction.compensated.implicit": "jaxevent.reconstruction.compensated.normal_equations",
     "jaxevent.reconstruction.compensated.parameters": "jaxevent.reconstruction.compensated.params",
+    "jaxevent.reconstruction.prepared": "jaxevent.reconstruction.estimator",
     "jaxevent.sharing": "jaxevent.locks",
     "jaxevent.shown": "jaxevent.display",
 }
@@ -161,6 +212,65 @@ class RenamedAttribute:
     def __get__(self, instance: Any, owner: type) -> Any:
         warn_renamed(f"{owner.__name__}.{self.old}", f"{owner.__name__}.{self.new}")
         return getattr(owner if instance is None else instance, self.new)
+
+
+def renamed_fields(**names: str) -> Callable[[type[T]], type[T]]:
+    """Make a decorator that lets a dataclass take and give fields by their old names too.
+
+    Args:
+        names: The new name of each field by its old one.
+
+    Returns:
+        The decorator of the dataclass.
+    """
+
+    def decorate(cls: Any) -> Any:
+        init = cls.__init__
+
+        @functools.wraps(init)
+        def __init__(self: Any, *args: Any, **values: Any) -> None:
+            for old, new in names.items():
+                if old in values:
+                    warn_renamed(f"{cls.__name__}.{old}", f"{cls.__name__}.{new}")
+                    values[new] = values.pop(old)
+            init(self, *args, **values)
+
+        cls.__init__ = __init__
+        for old, new in names.items():
+            attribute = RenamedAttribute(new)
+            attribute.__set_name__(cls, old)
+            setattr(cls, old, attribute)
+        return cls
+
+    return decorate
+
+
+def renamed_methods(**names: str) -> Callable[[type[T]], type[T]]:
+    """Make a decorator that lets methods be called, and overridden in subclasses, by old names too.
+
+    Args:
+        names: The new name of each method or property by its old one.
+
+    Returns:
+        The decorator of the class.
+    """
+
+    def decorate(cls: Any) -> Any:
+        def __init_subclass__(sub: type, **options: Any) -> None:
+            super(cls, cast(Any, sub)).__init_subclass__(**options)
+            for old, new in names.items():
+                if old in vars(sub) and new not in vars(sub):
+                    warn_renamed(f"{sub.__name__}.{old}", f"{sub.__name__}.{new}")
+                    setattr(sub, new, vars(sub)[old])
+
+        cls.__init_subclass__ = classmethod(__init_subclass__)
+        for old, new in names.items():
+            attribute = RenamedAttribute(new)
+            attribute.__set_name__(cls, old)
+            setattr(cls, old, attribute)
+        return cls
+
+    return decorate
 
 
 class RenamedModules(importlib.abc.MetaPathFinder, importlib.abc.Loader):

@@ -4,10 +4,10 @@ import jax
 import numpy as np
 import pytest
 
-from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.compensated import thresholds
 from jaxevent.reconstruction.compensated.images import InstantSmoother
 from jaxevent.reconstruction.compensated.params import Params
+from jaxevent.reconstruction.frames import Timing
 from jaxevent.reconstruction.windows import prepare
 from jaxevent.recording import Events, Frames, Recording
 

@@ -25,7 +25,6 @@ from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.locks import synchronized
-from jaxevent.reconstruction.clock import Clock, Timing, time_span
 from jaxevent.reconstruction.compensated.exposures import (
     AdjacentExposures,
     AdjacentFrames,
@@ -100,7 +99,7 @@ from jaxevent.reconstruction.compensated.warp import (
 )
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.features import Features, Numeric, ReadOut
-from jaxevent.reconstruction.frames import FrameImages
+from jaxevent.reconstruction.frames import Clock, FrameImages, Timing, time_span
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.reconstruction.windows import WINDOW_EVENTS, prepare
 from jaxevent.recording import Recording, Times, microseconds
