@@ -28,7 +28,7 @@ from jaxevent.blob.smoother import (
 )
 from jaxevent.blob.track import TrackBuffer, TrackStates, is_alive, readout
 from jaxevent.blob.tracks import Tracks
-from jaxevent.codegen.expressions import Untranslatable
+from jaxevent.codegen.module import choose_backend, make_kernel
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator, OptionKind, of_class
 from jaxevent.recording import Recording, Times, microseconds
@@ -247,7 +247,7 @@ class Tracker(Estimator[P]):
         self.check_options(
             seeds=seeds, start=start, stop=stop, detect=detect, found=found, smooth=smooth
         )
-        self._check_compiler(compiler)
+        choose_backend(compiler, True)
         if smooth:
             self._check_smoothing()
         smooth = self.filter.transition is not None if smooth is None else smooth
@@ -292,7 +292,7 @@ class Tracker(Estimator[P]):
         Raises:
             InputError: A seed is outside the sensor, or numba is requested and has no kernel.
         """
-        self._check_compiler(compiler)
+        choose_backend(compiler, True)
         self.check_options(seeds=seeds, start=start, detect=detect)
         params = self.Params() if params is None else params
         detect = seeds is None if detect is None else detect
@@ -306,25 +306,14 @@ class Tracker(Estimator[P]):
                 "`transition`; leave out smooth"
             )
 
-    def _check_compiler(self, compiler: str | None) -> None:
-        if compiler not in (None, "numba", "xla"):
-            raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
-
     def _make_runner(
         self, params: P, compiler: str | None, detect: bool, found: TargetSearchResult | None = None
     ) -> KernelRunner | XlaRunner:
         """Make the runner of segments: by numba where it has a kernel, else by XLA."""
-        if compiler == "xla":
-            return XlaRunner(self.filter, params)
         overrides = tuple(found.per_target_values(params)) if found else ()
-        try:
-            return KernelRunner(
-                self.filter, params, detect=detect, overrides=overrides, has_owners=bool(found)
-            )
-        except Untranslatable as reason:
-            if compiler == "numba":
-                raise InputError(
-                    f"numba has no kernel for the method {self.name!r} ({reason}); leave out the "
-                    "compiler"
-                ) from reason
-            return XlaRunner(self.filter, params)
+        make = functools.partial(
+            KernelRunner, self.filter, params,
+            detect=detect, overrides=overrides, has_owners=bool(found),
+        )  # fmt: skip
+        kernel = make_kernel(self.name, compiler, True, make)
+        return XlaRunner(self.filter, params) if kernel is None else kernel

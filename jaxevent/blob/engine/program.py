@@ -29,31 +29,28 @@ from jaxevent.blob.track import (
     track_params,
     update_track,
 )
-from jaxevent.codegen.expressions import Graph, Untranslatable, value_of
-from jaxevent.codegen.host import HostProgram
-from jaxevent.codegen.loops import (
-    MARK,
-    Function,
-    Kernels,
-    Loop,
-    LoopWriter,
-    Program,
-    leaves_of,
-    numbers_of,
-    translate,
+from jaxevent.codegen.graph import Graph, ParameterProgram, TranslationError, constant_value
+from jaxevent.codegen.module import KernelCache
+from jaxevent.codegen.trace import (
+    ELEMENTS,
+    TracedFunction,
+    TracedProgram,
+    name_leaves,
+    name_numbers,
+    translate_function,
 )
-from jaxevent.codegen.text import Numbers, Place
+from jaxevent.codegen.write import Address, ElementLoop, ModuleText, Writer
 
 MAX_OPERATIONS = 4000  # of a module; beyond, numba compiles longer than XLA's scan takes
 
-FUNCTION = """@callback(types.void(CELLS, WHOLE, CELLS, WHOLE, NUMBERS, I, I, I, I), **HOW)
+FUNCTION = """@cfunc(types.void(CELLS, WHOLE, CELLS, WHOLE, NUMBERS, I, I, I, I), **OPTIONS)
 def {name}(reals, integers, work, owners, numbers, target, row, size, count):
     of_reals, of_integers = target * {n_reals}, target * {n_integers}
 {body}
 
 
 """
-ALONE = """@numba.njit(**LOOP)
+ALONE = """@numba.njit(**LOOP_OPTIONS)
 def alone_0(work, numbers, row, size, count):
     for i in range(count):
 {body}
@@ -61,8 +58,8 @@ def alone_0(work, numbers, row, size, count):
 
 """
 ARGUMENTS = ("work", "owners", "row", "size", "count")
-EVENTS, TRACKS_OF_EVENT = Loop("i", "count", ARGUMENTS), Loop("k", "count", ARGUMENTS)
-NO_LOOP = Loop("i", "count", ())
+EVENTS = ElementLoop("i", "count", ARGUMENTS)
+TRACKS_OF_EVENT = ElementLoop("k", "count", ARGUMENTS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +69,7 @@ class Layout:
     reals: dict[str, int]
     integers: dict[str, int]
 
-    def places(self) -> dict[str, Place]:
+    def places(self) -> dict[str, Address]:
         """Return the places from which the numbers are read."""
         places = {name: ("reals", "of_reals", at) for name, at in self.reals.items()}
         return places | {
@@ -97,7 +94,7 @@ class Layout:
 
 
 @dataclasses.dataclass(frozen=True)
-class TrackProgram(Program):
+class TrackProgram(TracedProgram):
     """The traced functions of a filter's track."""
 
     track: Any  # the shapes of one track
@@ -193,8 +190,8 @@ class _Shapes(NamedTuple):
         return jax.ShapeDtypeStruct(size, self.dtype if kind is None else kind)
 
 
-def _host_program(params: TrackerParams) -> HostProgram:
-    host = HostProgram()
+def _host_program(params: TrackerParams) -> ParameterProgram:
+    host = ParameterProgram()
     for leaf in jax.tree.leaves(params):
         host.add_input(np.asarray(leaf))
     return host
@@ -217,7 +214,7 @@ def trace_track(
         dtype: Type of real numbers.
 
     Raises:
-        Untranslatable: A function has no translation.
+        TranslationError: A function has no translation.
     """
     single = params.events_per_step == 1
     graph, steps, shape = Graph(), _TrackSteps(filter, single), _Shapes(dtype)
@@ -230,7 +227,7 @@ def trace_track(
 
     own = {name: shape() for name in overrides}
     track = jax.eval_shape(make_track, params, own, shape(2), shape(), time, flag)
-    M = 1 if single else MARK
+    M = 1 if single else ELEMENTS
     batch = jax.eval_shape(EventBatch, shape(M, 2), shape(M), shape(M))
     owner = shape(M, 2, kind=np.int32) if has_owners else None
     events = jax.eval_shape(StepEvents, time, batch, shape(M, kind=bool), owner)
@@ -240,7 +237,7 @@ def trace_track(
     predicted = jax.eval_shape(steps.measurement, params, **at_stop)["evidence.predicted"]
     evidence = jax.eval_shape(TrackEvidence, predicted, flag, flag)
     update = {"track": track, "events": events, "prediction": prediction, "weight": shape(M)}
-    weights = {"inside": shape(MARK, kind=bool), "log_likelihood": shape(MARK)}
+    weights = {"inside": shape(ELEMENTS, kind=bool), "log_likelihood": shape(ELEMENTS)}
     decide = {**at_stop, "frame": shape(2), "evidence": evidence}
     functions = {
         "init": (steps.init, {"track": track, "xi": shape(2), "size": shape()}, True),
@@ -254,7 +251,7 @@ def trace_track(
         "decide": (steps.decide_track, decide, True),
     }
     traced = {
-        name: translate(function, params, values, graph, host, alone)
+        name: translate_function(function, params, values, graph, host, alone)
         for name, (function, values, alone) in functions.items()
     }
     layout = _make_layout({"track": track, "prediction": prediction, "evidence": evidence})
@@ -266,11 +263,11 @@ def _make_layout(trees: Mapping[str, Any]) -> Layout:
     reals = {name: k for k, name in enumerate(loop.REALS)}
     integers = {name: k for k, name in enumerate(loop.INTEGERS)}
     for name, tree in trees.items():
-        for leaf_name, leaf in leaves_of(name, tree).items():
-            if MARK in leaf.shape:
+        for leaf_name, leaf in name_leaves(name, tree).items():
+            if ELEMENTS in leaf.shape:
                 continue
             columns = reals if leaf.dtype.kind == "f" else integers
-            for number in numbers_of(leaf_name, leaf):
+            for number in name_numbers(leaf_name, leaf):
                 columns.setdefault(number, len(columns))
     return Layout(reals, integers)
 
@@ -315,7 +312,7 @@ def _weight_texts(row: str, i: str) -> tuple[dict[str, str], dict[str, str]]:
 
 
 def _step_lines(
-    writer: LoopWriter, program: TrackProgram, function: Function, stores: dict[str, str]
+    writer: Writer, program: TrackProgram, function: TracedFunction, stores: dict[str, str]
 ) -> list[str]:
     """Write a step of one event, which updates the track or leaves it unchanged.
 
@@ -333,27 +330,27 @@ def _step_lines(
     return writer.branches(truth, cases, stores)
 
 
-def write_track(program: TrackProgram) -> tuple[str, Numbers]:
+def write_track(program: TrackProgram) -> ModuleText:
     """Write the module of a track's functions."""
     read, write = _event_texts(program.single)
     places, stores = program.layout.places() | read, program.layout.stores() | write
-    writer, texts = LoopWriter(places), []
+    writer, texts = Writer(program, places), []
     for name, function in program.functions.items():
         results = function.results
         if name == "weights_alone":
-            writer.places, to = _weight_texts("row", "i")
+            writer.addresses, to = _weight_texts("row", "i")
             lines = writer.lines([*results.values()], 8)
             lines += [f"        {to[k].format(writer.name(n))}" for k, n in results.items()]
             writer.loops.append(ALONE.format(body="\n".join(lines)))
             lines = ["    alone_0(work, numbers, row, size, count)"]
         elif name == "weights":
-            writer.places, to = _weight_texts(f"{TRACKS} + {ROWS_PER_TRACK} * k", "row")
+            writer.addresses, to = _weight_texts(f"{TRACKS} + {ROWS_PER_TRACK} * k", "row")
             lines = writer.body(name, function, to, TRACKS_OF_EVENT)
         elif name == "step" and program.single:
-            writer.places = places
+            writer.addresses = places
             lines = _step_lines(writer, program, function, stores)
         else:
-            writer.places = places
+            writer.addresses = places
             changed = {
                 key: text
                 for key, text in stores.items()
@@ -361,13 +358,13 @@ def write_track(program: TrackProgram) -> tuple[str, Numbers]:
             }
             lines = writer.body(name, function, changed, EVENTS)
         texts.append(program.layout.function(name, lines))
-    return writer.module("Functions of one track (`jaxevent.blob.engine`).", program, texts)
+    return writer.module("Functions of one track (`jaxevent.blob.engine`).", texts, program.layout)
 
 
 def trace_readout(
     filter: Filter, params: TrackerParams, track: Any, layout: Layout, dtype: np.dtype
-) -> Program:
-    """Trace the functions of the readout; raises `Untranslatable`."""
+) -> TracedProgram:
+    """Trace the functions of the readout; raises `TranslationError`."""
     host, graph, steps, shape = (
         _host_program(params),
         Graph(),
@@ -381,30 +378,30 @@ def trace_readout(
         "canonical": (steps.canonical, {"x": shape(8), "P": shape(8, 8)}),
     }
     traced = {
-        name: translate(function, params, given, graph, host, single=True)
+        name: translate_function(function, params, given, graph, host, single=True)
         for name, (function, given) in functions.items()
     }
-    return Program(traced, host, layout, dtype)
+    return TracedProgram(traced, host, layout, dtype)
 
 
-def write_readout(program: Program) -> tuple[str, Numbers]:
+def write_readout(program: TracedProgram) -> ModuleText:
     """Write the module of the readout's functions."""
     m = smoother_loop
     outputs = {"x": m.X, "P": m.P, "F": m.F, "mean": m.MEAN, "covariance": m.COVARIANCE}
     work = {"dt.0": ("work", "row", m.DT), "silence.0": ("work", "row", m.SILENCE)}
     for name, size in (("x", 8), ("P", 64)):
         work |= {f"{name}.{k}": ("work", "row", outputs[name] + k) for k in range(size)}
-    writer, texts = LoopWriter(program.layout.places() | work), []
+    writer, texts = Writer(program, program.layout.places() | work), []
     for name, function in program.functions.items():
         store = {}
         for key in function.results:
             what, number = key.split(".")
             store[key] = f"work[{outputs[what] + int(number)}] = {{}}"
-        texts.append(program.layout.function(name, writer.body(name, function, store, NO_LOOP)))
-    return writer.module("Readout of a track (`jaxevent.blob.engine`).", program, texts)
+        texts.append(program.layout.function(name, writer.body(name, function, store)))
+    return writer.module("Readout of a track (`jaxevent.blob.engine`).", texts, program.layout)
 
 
-def find_blocks(program: Program) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def find_blocks(program: TracedProgram) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Find blocks of the 8 components that neither correlate nor pass into each other.
 
     Returns:
@@ -414,7 +411,7 @@ def find_blocks(program: Program) -> tuple[NDArray[np.int64], NDArray[np.int64]]
     tied = np.eye(8, dtype=bool)
     for i, j in itertools.product(range(8), range(8)):
         entries = predict[f"P.{8 * i + j}"], transition.get(f"F.{8 * i + j}")
-        tied[i, j] |= any(node is not None and value_of(node) != 0 for node in entries)
+        tied[i, j] |= any(node is not None and constant_value(node) != 0 for node in entries)
     tied |= tied.T
     for k in range(8):
         tied |= tied[:, k, None] & tied[k]
@@ -424,8 +421,8 @@ def find_blocks(program: Program) -> tuple[NDArray[np.int64], NDArray[np.int64]]
     return order, np.append(begins, 8)
 
 
-_track_kernels = Kernels(TrackFunctions, write_track, most=MAX_OPERATIONS)
-_readout_kernels = Kernels(ReadoutFunctions, write_readout, most=MAX_OPERATIONS)
+_track_kernels = KernelCache(TrackFunctions, write_track, max_nodes=MAX_OPERATIONS)
+_readout_kernels = KernelCache(ReadoutFunctions, write_readout, max_nodes=MAX_OPERATIONS)
 
 
 class TrackCompiler:
@@ -439,7 +436,7 @@ class TrackCompiler:
         dtype: Type of real numbers.
 
     Raises:
-        Untranslatable: A function has no translation.
+        TranslationError: A function has no translation.
     """
 
     def __init__(
@@ -451,21 +448,22 @@ class TrackCompiler:
         dtype: np.dtype,
     ):
         if params.association == "authors":
-            raise Untranslatable('association = "authors"')
+            raise TranslationError('association = "authors"')
         self._filter, self._params, self._dtype = filter, params, dtype
         leaves, tree = jax.tree.flatten(params)
         shapes = tuple(np.shape(leaf) for leaf in leaves)
         self._key = filter, tree, shapes, overrides, has_owners, dtype
-        program, self.functions, self.numbers = _track_kernels.get(
+        compiled = _track_kernels.get(
             self._key, params, lambda: trace_track(filter, params, overrides, has_owners, dtype)
         )
-        self.layout, self.track = program.layout, program.track
+        self.functions, self.numbers = compiled.functions, compiled.numbers
+        self.layout, self.track = compiled.places, compiled.program.track
 
     def readout(self) -> smoother_loop.ReadoutKernel:
         """Compile the functions of the readout."""
         filter, params, dtype = self._filter, self._params, self._dtype
-        program, functions, numbers = _readout_kernels.get(
+        compiled = _readout_kernels.get(
             self._key, params, lambda: trace_readout(filter, params, self.track, self.layout, dtype)
         )
-        smallest = 4 * float(np.finfo(dtype).eps)
-        return smoother_loop.ReadoutKernel(functions, numbers, *find_blocks(program), smallest)
+        blocks, smallest = find_blocks(compiled.program), 4 * float(np.finfo(dtype).eps)
+        return smoother_loop.ReadoutKernel(compiled.functions, compiled.numbers, *blocks, smallest)

@@ -18,8 +18,8 @@ from jaxevent.blob.lifecycle import LifecycleLog, TrackerState, init_state
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Segment
 from jaxevent.blob.track import TrackBuffer
-from jaxevent.codegen.host import run as run_on_host
-from jaxevent.codegen.loops import leaves_of, numbers_of
+from jaxevent.codegen.graph import evaluate_jaxpr
+from jaxevent.codegen.trace import name_leaves, name_numbers
 
 
 @functools.lru_cache(maxsize=16)
@@ -41,7 +41,7 @@ class KernelRunner:
         has_owners: Whether only some tracks may own an event.
 
     Raises:
-        Untranslatable: A function has no translation.
+        TranslationError: A function has no translation.
     """
 
     events_per_segment = 262144  # so that the kernel seldom waits for a segment to be packed
@@ -68,10 +68,10 @@ class KernelRunner:
         self._kernel = loop.TrackKernel(compiler.functions, compiler.numbers, config)
         layout = compiler.layout
         self._columns: list[tuple[bool, NDArray[np.int64], tuple[int, ...], np.dtype]] = []
-        for name, leaf in leaves_of("track", compiler.track).items():
+        for name, leaf in name_leaves("track", compiler.track).items():
             real = leaf.dtype.kind == "f"
             places = layout.reals if real else layout.integers
-            columns = np.array([places[number] for number in numbers_of(name, leaf)], np.int64)
+            columns = np.array([places[number] for number in name_numbers(name, leaf)], np.int64)
             self._columns.append((real, columns, leaf.shape, leaf.dtype))
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -87,7 +87,7 @@ class KernelRunner:
         values = [np.asarray(leaf) for leaf in leaves]
         kinds = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in values)
         closed, structure = _trace_init(self._filter, tree, kinds)
-        return jax.tree.unflatten(structure, run_on_host(closed, values))
+        return jax.tree.unflatten(structure, evaluate_jaxpr(closed, values))
 
     def run(self, state: TrackerState, features: Features) -> tuple[TrackerState, LifecycleLog]:
         """Run a segment; return the state at its end, with births and deaths."""
