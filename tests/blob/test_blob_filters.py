@@ -35,12 +35,12 @@ def scanned(name, params, position, size, events, gate=None, report=None):
         dt, xi, age, polarity, weight = event
         state = steps.predict(params, state, dt)
         if gate:
-            ahead = steps.predicted_measurement(params, state)
-            e = xi - (ahead.p - ahead.v * age[:, None])
-            inverse = jnp.linalg.inv(ahead.spread + ahead.P_p)
+            prediction = steps.predicted_measurement(params, state)
+            e = xi - (prediction.p - prediction.v * age[:, None])
+            inverse = jnp.linalg.inv(prediction.spread + prediction.P_p)
             distance = jnp.einsum("mi,ij,mj->m", e, inverse, e)
             if params.gate_shape == "circle":
-                distance = (e**2).sum(1) / ahead.size.max() ** 2
+                distance = (e**2).sum(1) / prediction.size.max() ** 2
             weight = weight * (distance < gate**2)
         state = steps.update(params, state, EventBatch(xi, age, polarity), weight)
         return state, report(state)
@@ -291,11 +291,11 @@ def test_moving_moments_are_weighted_sums():
     center, when = w @ x, w @ t
     e, s = x - center, t - when
     spread = (w * e.T) @ e + w[0] * 144 * np.eye(2)
-    ahead = jax.jit(tracker_of(name).filter.predicted_measurement)(params, state)
-    np.testing.assert_allclose(ahead.p, center, rtol=1e-10)
-    np.testing.assert_allclose(ahead.v, (w * s) @ e / (w @ s**2), rtol=1e-9)
-    np.testing.assert_allclose(ahead.spread, spread, rtol=1e-10)
-    np.testing.assert_allclose(ahead.P_p, spread / mass, rtol=1e-9)
+    prediction = jax.jit(tracker_of(name).filter.predicted_measurement)(params, state)
+    np.testing.assert_allclose(prediction.p, center, rtol=1e-10)
+    np.testing.assert_allclose(prediction.v, (w * s) @ e / (w @ s**2), rtol=1e-9)
+    np.testing.assert_allclose(prediction.spread, spread, rtol=1e-10)
+    np.testing.assert_allclose(prediction.P_p, spread / mass, rtol=1e-9)
 
 
 def test_truncation_factors_are_integrals_over_the_gate():
@@ -423,10 +423,10 @@ def test_nothing_breaks_the_numbers(name, float32, optimised):
 
     def report(state):
         mean, P = steps.readout(params, state)
-        ahead = steps.predicted_measurement(params, state)
+        prediction = steps.predicted_measurement(params, state)
         scale = jnp.sqrt(jnp.diagonal(P))
         skew = (jnp.abs(P - P.T) / (scale * scale[:, None] + 1e-30)).max()
-        return mean, jnp.diagonal(P), skew, jnp.linalg.det(ahead.spread), ahead.P_p
+        return mean, jnp.diagonal(P), skew, jnp.linalg.det(prediction.spread), prediction.P_p
 
     state, (mean, variances, skew, det, P_p) = jax.jit(
         lambda e: scanned(name, params, [3.0, -2.0], 10.0, e, report=report)
@@ -460,9 +460,9 @@ def test_gradient_of_the_likelihood():
         def step(state, event):
             dt, xi, age, polarity, weight = event
             state = steps.predict(params, state, dt)
-            ahead = steps.predicted_measurement(params, state)
-            S = ahead.spread + ahead.P_p
-            e = xi[0] - ahead.p
+            prediction = steps.predicted_measurement(params, state)
+            S = prediction.spread + prediction.P_p
+            e = xi[0] - prediction.p
             nll = e @ jnp.linalg.inv(S) @ e / 2 + jnp.log(jnp.linalg.det(S)) / 2
             return steps.update(params, state, EventBatch(xi, age, polarity), weight), nll
 
@@ -471,11 +471,11 @@ def test_gradient_of_the_likelihood():
 
     params = params_of("moment")
     both = jax.jit(jax.value_and_grad(loss))
-    slopes = both(params)[1].raw
+    gradient = both(params)[1].raw
     for key in ("Q_p", "Q_v", "Q_lambda", "Q_theta", "Q_q"):
         h = 1e-5
         up, down = (float(both(params.with_raw({key: params.raw[key] + d}))[0]) for d in (h, -h))
-        np.testing.assert_allclose(slopes[key], (up - down) / (2 * h), rtol=1e-5, atol=2e-6)
+        np.testing.assert_allclose(gradient[key], (up - down) / (2 * h), rtol=1e-5, atol=2e-6)
 
 
 # ---- Statistics over seeds.

@@ -64,19 +64,19 @@ def test_kernel_equals_run(case):
     params = tracker.Params(**FEW, **values, max_targets=3)
     seeds = [(25.0, 22.0, 4.0), (70.0, 24.0, 4.0, 0.001)]
     rec = crossing(np.random.default_rng(7))
-    packing = ChunkPacker(rec, params, seeds, detect=True, steps=16, chunks=40)
-    state, cursor, kernel = None, packing.first, KernelRunner(tracker.filter, params, detect=True)
+    packer = ChunkPacker(rec, params, seeds, detect=True, steps=16, chunks=40)
+    state, cursor, kernel = None, packer.first, KernelRunner(tracker.filter, params, detect=True)
     number = 0
     while cursor is not None:
-        segment = packing.pack(cursor)
+        segment = packer.pack(cursor)
         cursor, number = segment.next, number + 1
         if state is None:
             state = init_state(tracker.filter, params, segment.features)
         end, log = kernel.run(state, segment.features)
         got = end, ChunkInfo(log, kernel.chunk_starts(kernel.record(state, segment.features)[1]))
         before = state
-        state, told = run_compiled(tracker.filter, params, state, segment.features)
-        expected = state, dataclasses.replace(told, association=None)
+        state, result = run_compiled(tracker.filter, params, state, segment.features)
+        expected = state, dataclasses.replace(result, association=None)
         paths = jax.tree_util.tree_flatten_with_path(expected)[0]
         for (path, one), other in zip(paths, jax.tree.leaves(got), strict=True):
             name = f"{jax.tree_util.keystr(path)} of segment {number}"
@@ -85,15 +85,15 @@ def test_kernel_equals_run(case):
     # Of the last segment also the readout, filtered, as the first chunk with a pause begins.
     _, updates = kernel.record(before, segment.features)
     ends = np.asarray(segment.features.t)[:, 0, -1]  # of the chunks' first steps
-    chunk = int(np.flatnonzero((ends > 1) & (np.asarray(told.tracks.id) >= 0).any(1))[0])
-    slots = jax.tree.map(lambda a: a[chunk], told.tracks)
+    chunk = int(np.flatnonzero((ends > 1) & (np.asarray(result.tracks.id) >= 0).any(1))[0])
+    tracks = jax.tree.map(lambda a: a[chunk], result.tracks)
     read = jax.jit(jax.vmap(functools.partial(readout, tracker.filter, params), (0, None)))
-    wanted, id = np.asarray(slots.id)[None] >= 0, np.asarray(slots.id, np.int64)
+    wanted, id = np.asarray(tracks.id)[None] >= 0, np.asarray(tracks.id, np.int64)
     times = segment.start[[chunk]] + ends[chunk] - 1
     got = kernel.readout(segment, updates, None, times, id, wanted)
-    for one, other in zip(got, read(slots, ends[chunk] - 1), strict=True):
+    for one, other in zip(got, read(tracks, ends[chunk] - 1), strict=True):
         np.testing.assert_allclose(one[wanted], other[wanted[0]], rtol=1e-9, atol=1e-9)
-    log = np.asarray(told.log.end_reason)
+    log = np.asarray(result.log.end_reason)
     assert log.shape == (40, 5) and (np.asarray(state.next_id) > 2)
 
 
@@ -109,9 +109,9 @@ def test_tracks_of_both_compilers():
     )
     np.testing.assert_array_equal([fused.birth, fused.death], [scanned.birth, scanned.death])
     times = np.arange(rec.start, rec.stop, 173)
-    told = fused(times)
-    assert told.valid.any(0).all() and not told.valid.all()
-    for one, other in zip(told, scanned(times), strict=True):
+    result = fused(times)
+    assert result.valid.any(0).all() and not result.valid.all()
+    for one, other in zip(result, scanned(times), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8)
     for one, other in zip(fused.events(), scanned.events(), strict=True):
         for x, y in zip(one, other, strict=True):
@@ -121,7 +121,7 @@ def test_tracks_of_both_compilers():
     fused._runner._readout_kernel = fused._runner._readout_kernel._replace(blocks=np.array([0, 8]))
     del fused._segment_infos
     fused._kept_infos.clear()
-    np.testing.assert_allclose(fused(times).mean, told.mean, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(fused(times).mean, result.mean, rtol=1e-9, atol=1e-9)
 
 
 def test_a_filter_without_kernel_is_scanned():

@@ -79,18 +79,18 @@ def test_three_cars_tell_their_times_to_contact():
         preset="ttc", lambda0=6.0, events_per_step=8, P0_p=1.0, P0_v=1e4
     )
     tracks = blob.constant_velocity.estimate(recording, params, seeds=seeds, progress=False)
-    whose = np.concatenate([one.id for one in tracks.events()])
+    target_of = np.concatenate([one.id for one in tracks.events()])
     t = np.concatenate([one.t for one in tracks.events()])
     for car, (_, distance, speed, acceleration) in enumerate(CARS):
         pair = 2 * car, 2 * car + 1
-        times = t[np.isin(whose, pair)]
+        times = t[np.isin(target_of, pair)]
         assert len(times) > 0.95 * 2 * 2e3 * truth.duration
         times = times[(times > 300_000) & (times < 1_700_000)][::20]
         states = tracks(times, pair)
         assert states.valid.all()
         parts = states.mean, states.covariance
-        told = (jnp.asarray(part[:, k]) for k in (0, 1) for part in parts)
-        value, variance = (np.asarray(part) for part in INVERSE_TTC(*told))
+        result = (jnp.asarray(part[:, k]) for k in (0, 1) for part in parts)
+        value, variance = (np.asarray(part) for part in INVERSE_TTC(*result))
         s = times * 1e-6
         true = (speed + acceleration * s) / (distance - speed * s - acceleration * s**2 / 2)
         assert np.abs(value - true).max() < 0.06
@@ -203,9 +203,9 @@ def test_growth_allows_for_errors_that_last():
     tracks, steps, dt, Q_lambda, noise = 300, 400, 0.005, 3.0, 0.54
     spread = noise  # the filter's variance, which settles
     for _ in range(300):
-        ahead = spread + Q_lambda * dt
-        gain = ahead / (ahead + noise)
-        spread = (1 - gain) * ahead
+        prediction = spread + Q_lambda * dt
+        gain = prediction / (prediction + noise)
+        spread = (1 - gain) * prediction
     size = np.full((tracks, steps + 200, 2), 10.0)
     for k in range(1, steps + 200):
         measured = 10 + np.sqrt(noise) * rng.normal(size=(tracks, 2))
@@ -512,8 +512,8 @@ def test_what_comes_nearer_grows_along_both_axes():
     valid[:, 5] = False
     sizes = np.concatenate([sizes, np.ones((50, 1, 2))], 1)
     few = np.zeros_like(sizes)
-    told = track_plots._scales(sizes, few, valid)
-    assert told.tolist() == [True, True, False, False, False, False]
+    result = track_plots._scales(sizes, few, valid)
+    assert result.tolist() == [True, True, False, False, False, False]
     flickers = np.exp(0.3 * np.sin(20 * t))[:, None, None] * 5 * np.ones((1, 1, 2))
     swells = np.exp(np.clip(4 - 20 * abs(t - 0.5), 0, 1))[:, None, None] * 5 * np.ones((1, 1, 2))
     tiny = sizes[:, :2] / 3

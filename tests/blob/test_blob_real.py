@@ -34,8 +34,8 @@ def dot(data):
 
 def follow(recording, params, steps, chunks):
     """`estimate` with chunks of a size that suits short slices."""
-    packing = ChunkPacker(recording, params, steps=steps, chunks=chunks)
-    return Tracks(XlaRunner(moment.filter, params), packing)
+    packer = ChunkPacker(recording, params, steps=steps, chunks=chunks)
+    return Tracks(XlaRunner(moment.filter, params), packer)
 
 
 def test_reference_finds_a_known_path(real):
@@ -80,10 +80,10 @@ def test_tail_of_the_dot_begins_no_track(real, dot, float32):
     begun = {}
     for surround in (1.0, 2.0):
         params = moment.Params(preset="fast", **real.DOT_FOUND, surround=surround)
-        packing = ChunkPacker(cut, params, steps=64, chunks=128)
-        cursor, state = packing.first, None
+        packer = ChunkPacker(cut, params, steps=64, chunks=128)
+        cursor, state = packer.first, None
         while cursor is not None:  # in the program of `follow`
-            segment = packing.pack(cursor)
+            segment = packer.pack(cursor)
             state, _ = run_compiled(moment.filter, params, state, segment.features)
             cursor = segment.next
         begun[surround] = int(state.next_id)

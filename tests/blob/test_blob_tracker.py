@@ -69,10 +69,10 @@ def pair():
 def follow(rec, params=None, seeds=None, detect=False, steps=64, chunks=32, tracker=blob.moment):
     """`estimate` with chunks of one size, so that few programs are compiled."""
     params = params or Params()
-    packing = ChunkPacker(
+    packer = ChunkPacker(
         rec, params, seeds, detect=detect or seeds is None, steps=steps, chunks=chunks
     )
-    return Tracks(XlaRunner(tracker.filter, params), packing)
+    return Tracks(XlaRunner(tracker.filter, params), packer)
 
 
 @functools.cache
@@ -97,7 +97,7 @@ def oracle(rec, params, seeds, tracker=blob.moment):
         for x, y, size in seeds
     ]
     paths = [[(first, state)] for state, *_ in targets]
-    whose, loss, rows = [], [], list(range(len(e)))
+    target_of, loss, rows = [], [], list(range(len(e)))
     while rows:
         cycle = (e.t[rows[0]] - first) // 10_000
         step = [r for r in rows[:M] if (e.t[r] - first) // 10_000 == cycle]
@@ -108,14 +108,14 @@ def oracle(rec, params, seeds, tracker=blob.moment):
         for k, (state, gate, last) in enumerate(targets):
             dt = (time - last) * 1e-6
             state = predict(params, state, jnp.asarray(dt))
-            told = expected(params, state)
-            size = float(told.size.max())
+            result = expected(params, state)
+            size = float(result.size.max())
             a = math.exp(-alpha * dt)
             radius = min(max(a * gate + (1 - a) * b * size, low), high)
             predictions.append((state, radius))
-            P, L2 = np.asarray(told.P_p), np.asarray(told.spread)
+            P, L2 = np.asarray(result.P_p), np.asarray(result.spread)
             for place, r in enumerate(step):
-                d = np.array([e.x[r], e.y[r]], float) - (told.p - ages[place] * told.v)
+                d = np.array([e.x[r], e.y[r]], float) - (result.p - ages[place] * result.v)
                 if params.gate_shape == "circle":
                     inside = d @ d <= radius**2 + g**2 * np.linalg.eigvalsh(P)[-1]
                 else:
@@ -133,7 +133,7 @@ def oracle(rec, params, seeds, tracker=blob.moment):
                 if params.association == "nearest":
                     weights[k, place] = (density, k) == max(found)
             best = int(np.argmax(weights[:, place]))
-            whose.append((best if found else -1, weights[best, place]))
+            target_of.append((best if found else -1, weights[best, place]))
         fill = M - len(step)
         batch = EventBatch(
             jnp.array([(e.x[r], e.y[r]) for r in step + step[-1:] * fill], float),
@@ -153,7 +153,12 @@ def oracle(rec, params, seeds, tracker=blob.moment):
             rows.append(canonical_ellipse(*moments(params, state)))
         return [np.stack(part) for part in zip(*rows, strict=True)]
 
-    return np.array([k for k, _ in whose]), np.array([w for _, w in whose]), np.mean(loss), at
+    return (
+        np.array([k for k, _ in target_of]),
+        np.array([w for _, w in target_of]),
+        np.mean(loss),
+        at,
+    )
 
 
 NEAREST = {"association": "nearest", "gate_shape": "circle", "events_per_step": 4}
@@ -170,10 +175,10 @@ def test_equals_a_plain_loop(pair, setting):
     ids, weights, _, at = oracle(rec, params, seeds)
     assert (ids == -1).sum() > 20
     tracks = follow(rec, params, seeds)
-    told = list(tracks.events())
-    assert np.array_equal(np.concatenate([e.id for e in told]), ids)
-    np.testing.assert_allclose(np.concatenate([e.weight for e in told]), weights, atol=1e-9)
-    assert np.array_equal(np.concatenate([e.row for e in told]), np.arange(len(rec.events)))
+    result = list(tracks.events())
+    assert np.array_equal(np.concatenate([e.id for e in result]), ids)
+    np.testing.assert_allclose(np.concatenate([e.weight for e in result]), weights, atol=1e-9)
+    assert np.array_equal(np.concatenate([e.row for e in result]), np.arange(len(rec.events)))
     part = np.concatenate([e.row for e in tracks.events(0.05, 0.052)])
     assert np.array_equal(part, np.arange(*map(rec.events.index, (50_000, 52_000))))
     times = np.array([rec.start, rec.start + 3001, 61_234, int(rec.events.t[200]), rec.stop])
@@ -358,10 +363,10 @@ def test_prefilter():
         kept.append(len(pixels) >= 2)
     kept = np.flatnonzero(kept)
     for steps, chunks in ((4, 3), (64, 100)):
-        packing = ChunkPacker(rec, params, [], steps=steps, chunks=chunks)
-        cursor, rows = packing.first, []
+        packer = ChunkPacker(rec, params, [], steps=steps, chunks=chunks)
+        cursor, rows = packer.first, []
         while cursor is not None:
-            segment = packing.pack(cursor)
+            segment = packer.pack(cursor)
             t = segment.start[:, None, None] + segment.features.t
             row = segment.row[segment.features.valid]
             assert np.array_equal(t[segment.features.valid], e.t[row])
@@ -379,10 +384,10 @@ def line_by_line(seed=0):
 
 def test_steps_hold_events_of_all_lines_of_one_time():
     rec = line_by_line()
-    packing = ChunkPacker(rec, Params(events_per_step=8), [(100.0, 90.0, 25.0)], steps=5, chunks=3)
-    cursor, rows, far = packing.first, [], []
+    packer = ChunkPacker(rec, Params(events_per_step=8), [(100.0, 90.0, 25.0)], steps=5, chunks=3)
+    cursor, rows, far = packer.first, [], []
     while cursor is not None:
-        segment = packing.pack(cursor)
+        segment = packer.pack(cursor)
         valid, row = segment.features.valid, segment.row
         assert np.array_equal((segment.start[:, None, None] + segment.features.t)[valid],
             rec.events.t[row[valid]])  # fmt: skip
@@ -426,7 +431,7 @@ def test_gradient_and_vmap(pair):
     for k, name in enumerate(names):
         steps[name][2 * k : 2 * k + 2] = h, -h
     # Compiling a gradient takes seconds: one program tells all.
-    held, (nll, slopes), (errors, along) = jax.tree.map(
+    held, (nll, gradient), (errors, along) = jax.tree.map(
         np.asarray, jax.jit(jax.vmap(losses))({name: raw[name] + steps[name] for name in names})
     )
     expected = float(oracle(rec, params, seeds, tracker)[2])
@@ -434,7 +439,7 @@ def test_gradient_and_vmap(pair):
     values = np.stack([nll, errors], 1)
     expected = (values[:12:2] - values[1:12:2]) / (2 * h)
     assert abs(expected[:, 0]).min() > 1e-7
-    np.testing.assert_allclose([slopes[name][12] for name in names], expected[:, 0], rtol=3e-4)
+    np.testing.assert_allclose([gradient[name][12] for name in names], expected[:, 0], rtol=3e-4)
     assert along[12] == pytest.approx(expected[:, 1].sum(), rel=3e-4)
 
     d2 = ((follow(rec, params, seeds, tracker=tracker)(times).mean[:, :, :2] - truth) ** 2).sum(-1)
