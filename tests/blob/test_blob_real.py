@@ -102,16 +102,3 @@ def test_cars_are_found_and_followed(real, data, float32):
     assert row["coverage"] == 1
     assert row["median"] < 4
     assert row["switches"] == row["strays"] == 0
-
-
-@pytest.mark.slow
-def test_dat_events(real, tmp_path):
-    events = np.array([[5, 1279 | 719 << 14 | 1 << 28], [7, 3 | 2 << 14]], "<u4")
-    path = tmp_path / "two.dat"
-    path.write_bytes(b"% Height 720\n% Width 1280\n" + bytes([12, 8]) + events.tobytes())
-    recording = real.read_dat(path)
-    assert (recording.width, recording.height) == (1280, 720)
-    assert recording.events.t.tolist() == [5, 7]
-    assert recording.events.x.tolist() == [1279, 3]
-    assert recording.events.y.tolist() == [719, 2]
-    assert recording.events.p.tolist() == [True, False]
