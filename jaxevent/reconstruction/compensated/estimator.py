@@ -618,7 +618,7 @@ class MotionCompensated(ImageEstimator[Params]):
         features, instants = prepare(recording, every, Timing.of(params), filtering=False)
         factors = follow.images.factors
         if factors is not None:
-            features, instants = features.weighted(factors), instants.weighted(factors)
+            features, instants = features.scale_counts(factors), instants.scale_counts(factors)
         shape = (len(chosen), *trajectories.nodes(recording.height, recording.width, 0), 4)
         rows, p = np.zeros((len(chosen), room), np.int32), np.zeros(shape, np.float32)
         places, taken, told, steady = [], [], [], []
