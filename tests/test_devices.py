@@ -26,7 +26,7 @@ from jaxevent.methods import METHODS
 from jaxevent.runs import egomotion
 from jaxevent.runs.evaluate import evaluate
 from jaxevent.runs.fit import fit
-from jaxevent.runs.reconstruction import Objective, Problem, parts
+from jaxevent.runs.reconstruction import Objective, Problem, cut_windows
 
 TWO = "--xla_force_host_platform_device_count=2"
 
@@ -80,7 +80,7 @@ def reconstructions(folder: Path) -> dict[str, Any]:
     method = METHODS["edi"]
     params = method.Params(c_on=0.02, c_off=0.013)
     objective = Objective(method)
-    batch = Problem(objective, parts(recording, "held-out"))(params)[0][0]
+    batch = Problem(objective, cut_windows(recording, "held-out"))(params)[0][0]
     batch = batch if devices.is_single_device() else batch.over(devices.local_devices())
     found["shared out"] = batch.truth.sharding.num_devices
 
@@ -321,7 +321,7 @@ for table in ("tcp", "tcp6"):
 def test_each_process_prepares_its_own_windows(monkeypatch):
     from texture import moving
 
-    windows = parts(moving(), "held-out", (1, 1, 0), 0.126)
+    windows = cut_windows(moving(), "held-out", (1, 1, 0), 0.126)
     edi = METHODS["edi"]
     monkeypatch.setattr(jax, "process_count", lambda: 3)
     owners: list[list[int]] = [[], []]

@@ -23,7 +23,7 @@ from jaxevent.progress import bar
 from jaxevent.recording import EventSource, Recording
 
 
-class Opened(threading.local):
+class RecordingCache(threading.local):
     """The recording last loaded: methods are run on it one after another."""
 
     def __init__(self):
@@ -64,7 +64,7 @@ def _stamp(file: Path) -> tuple[str, int, int]:
     return str(file), about.st_size, about.st_mtime_ns
 
 
-class Contents:
+class FileHashes:
     """Hashes of what files and folders hold, kept in a file as long as size and time agree."""
 
     # A file changed again within the clock's tick (s) after it was read would look unchanged.
@@ -198,7 +198,7 @@ def _feed(thing: Any, update: Callable[[Any], None]) -> None:
 
 
 def fingerprint(path: Path, update: Callable[[bytes], None]) -> None:
-    """Feed a hash the file's name, size and content; of a large file 64 pieces of 1 MiB."""
+    """Feed a hash with the file's name, size and content; of a large file 64 pieces of 1 MiB."""
     size, piece = path.stat().st_size, 1 << 20
     update(f"{path.name} {size}".encode())
     step = max(piece, size // 64)

@@ -61,20 +61,30 @@ from jaxevent.errors import InputError, InputWarning, MissingExtra
 from jaxevent.io import load, toml
 from jaxevent.progress import stage
 from jaxevent.recording import Recording
-from jaxevent.runs import findings
 from jaxevent.runs.calls import (
     CALLED,
     Forms,
     PathLike,
-    described,
     recordings_of,
     settings_of,
+    to_toml_table,
 )
-from jaxevent.runs.checkpoint import finished_rows, restore, save
 from jaxevent.runs.contents import digest
 from jaxevent.runs.family import Sources
 from jaxevent.runs.fit_config import Plan, Task, plan_of, read_plan
-from jaxevent.runs.results import Fits, alone, check_folder, results, write_rows
+from jaxevent.runs.results import (
+    Fits,
+    check_folder,
+    compute_gains,
+    find_intervals,
+    finished_rows,
+    format_findings,
+    lock_folder,
+    open_results,
+    restore_checkpoint,
+    save_checkpoint,
+    write_rows,
+)
 from jaxevent.show import plot_losses
 from jaxevent.splits import SPLITS
 from jaxevent.tuning import FitResult, Run, optimise
@@ -217,7 +227,7 @@ def _fit_objects(
             table[split] = recordings_of(settings[split])
     if resume and out is None:
         raise InputError("resume goes on from the checkpoint in out; give out")
-    text = CALLED + toml.dump(described(table))
+    text = CALLED + toml.dump(to_toml_table(table))
     plan = devices.on_all_processes(lambda: plan_of(table, Path(), None, text.encode()))
     if out is None:
         return _fit(plan, None, resume, progress, replace)
@@ -258,7 +268,7 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
             warnings.filterwarnings("ignore", ".*events contradict frames", InputWarning)
             rows = _score(plan, done, sources, progress)
         params = {t.label: one.params for t, one in zip(plan.tasks, done, strict=True)}
-        gained = findings.gains(plan.tasks, unseen(rows))
+        gained = compute_gains(plan.tasks, unseen(rows))
         fits = Fits(rows, params, found, gained, _text(plan.tasks, rows, found, gained))
         if out is None or not devices.is_process_zero():
             return fits
@@ -276,7 +286,7 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
 
 def _text(tasks: Sequence[Task], rows: Any, found: Any, gained: Any) -> str:
     """results.md: the scores that no fit saw, what was found, and the gain."""
-    return _results(tasks, unseen(rows)) + findings.text(found, gained)
+    return _results(tasks, unseen(rows)) + format_findings(found, gained)
 
 
 def _finished(rows: list[dict[str, Any]], out: Path, plan: Plan) -> Fits:
@@ -297,7 +307,7 @@ def _ended_before(
     A folder that exists is held until the stack is closed.
     """
     if out.is_dir():
-        held.enter_context(alone(out))
+        held.enter_context(lock_folder(out))
     checkpoint = out / CHECKPOINT
     if checkpoint.exists() and not resume:
         raise InputError(
@@ -338,9 +348,9 @@ def _fit_tasks(
             # `results` removes a folder that it made if the block raises. At the first checkpoint
             # the block ends: from then on the folder stays.
             missing = not out.exists()
-            write = new.enter_context(results(out))
+            write = new.enter_context(open_results(out))
             if missing:
-                held.enter_context(alone(out))
+                held.enter_context(lock_folder(out))
             checkpoint = out / CHECKPOINT
             content = checkpoint.read_bytes() if checkpoint.exists() else None
             for remains in out.glob(".*.part"):  # of a write during which the run was killed
@@ -350,14 +360,14 @@ def _fit_tasks(
         if out is not None:
             content = devices.on_process_zero(lambda: open_folder(out))
             if content is not None:
-                done, run = restore(content, out / CHECKPOINT, key, plan)
+                done, run = restore_checkpoint(content, out / CHECKPOINT, key, plan)
 
         def keep(run: Run | None, certain: bool) -> None:
             nonlocal saved
             if out is None:
                 return
             if devices.is_process_zero() and (certain or time.monotonic() - saved > PERIOD):
-                save(out / CHECKPOINT, key, done, run)
+                save_checkpoint(out / CHECKPOINT, key, done, run)
                 saved = time.monotonic()
             new.close()
 
@@ -376,7 +386,7 @@ def _fit_tasks(
             except InputError as error:
                 raise InputError(f"{plan.where()}{task.label}: {error}") from None
             with stage(f"{task.label}: intervals", progress):
-                found += findings.find(task, done[number], problem)
+                found += find_intervals(task, done[number], problem)
         new.close()
     return done, found, write
 
@@ -387,12 +397,12 @@ def _score(
     """Rows of all methods, before and after; several processes share them out."""
     scored: list[tuple[Task, str, Any, dict[str, str]]] = []
     for task, one in zip(plan.tasks, done, strict=True):
-        said = {"warning": DIVERGED.format(task.label)} if one.diverged else {}
+        warning = {"warning": DIVERGED.format(task.label)} if one.diverged else {}
         scored.append((task, f"{task.label}, before", task.params, {}))
-        scored.append((task, task.label, one.params, said))
+        scored.append((task, task.label, one.params, warning))
     mine = range(jax.process_index(), len(scored), jax.process_count())
     found = devices.on_all_processes(
-        lambda: {k: list(_rows(*scored[k], sources, plan, progress)) for k in mine}
+        lambda: {k: list(_rows(*scored[k], sources, plan, progress=progress)) for k in mine}
     )
     told = {k: some for each in devices.allgather(found) for k, some in each.items()}
     return [row for k in range(len(scored)) for row in told[k]]
@@ -402,13 +412,14 @@ def _rows(
     task: Task,
     label: str,
     params: Any,
-    said: dict[str, str],
+    warning: dict[str, str],
     sources: Sources,
     plan: Plan,
+    *,
     progress: bool | None,
 ) -> Iterator[dict[str, Any]]:
     for row in task.goal.score(sources, plan.split, plan.window, params, progress):
-        yield {**row, "method": label, **said}
+        yield {**row, "method": label, **warning}
 
 
 def _results(tasks: Sequence[Task], rows: Sequence[dict[str, Any]]) -> str:

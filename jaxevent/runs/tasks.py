@@ -77,14 +77,14 @@ class Outcome:
 
 
 @dataclasses.dataclass(frozen=True)
-class Place:
-    """Where tasks run: in this process; in `workers` processes; on a Dask cluster.
+class ComputeResources:
+    """Processes or machines that run tasks: this process, `workers` processes, or a Dask cluster.
 
-    Of several devices of this process each has a task at a time; of too few tasks for that, each
-    may use all. Processes take one device each, in turn.
+    With several devices in this process, each runs one task at a time; with too few tasks for that,
+    each task may use all. Worker processes take one device each, in turn.
 
     `cluster` is the address of its scheduler, a `distributed.Client` or a cluster object;
-    `scheduler_file` is the file that tells the address. Raises `InputError` if more than one is
+    `scheduler_file` is the file that holds the address. Raises `InputError` if more than one is
     given, for less than one worker and without the extra.
     """
 
@@ -112,7 +112,7 @@ class Place:
 
     @property
     def remote(self) -> bool:
-        """Whether tasks run on a cluster."""
+        """True if tasks run on a cluster."""
         return self.cluster is not None or self.scheduler_file is not None
 
 
@@ -120,7 +120,7 @@ def run(
     function: Callable[..., Any],
     tasks: Sequence[Task],
     folder: Path | None = None,
-    place: Place | None = None,
+    place: ComputeResources | None = None,
     *,
     retries: int = 2,
     progress: bool | None = None,
@@ -145,7 +145,7 @@ def run(
     """
     if retries < 0:
         raise InputError(f"{retries} retries are not possible; give 0 or more")
-    place = place or Place()
+    place = place or ComputeResources()
     folder = None if folder is None else folder.absolute()
     if folder is not None:
         try:
@@ -393,7 +393,7 @@ def _cores() -> int:
 
 
 def _serve(connection: multiprocessing.connection.Connection, threads: int, number: int) -> None:
-    """What a worker process does: answer tasks by (record, whether to try again)."""
+    """Run a worker process: answer tasks by (record, whether to try again)."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started it ends it
     os.environ["NPROC"] = str(threads)  # of XLA on the CPU, when it starts
     parent = multiprocessing.parent_process()
@@ -423,7 +423,7 @@ def _on_cluster(
     tasks: Sequence[Task],
     folder: Path | None,
     retries: int,
-    place: Place,
+    place: ComputeResources,
 ) -> Records:
     distributed = require("distributed", "cluster")
     given = place.cluster

@@ -16,7 +16,7 @@ from noise import small
 import jaxevent
 from jaxevent.methods import names
 from jaxevent.reconstruction import video
-from jaxevent.reconstruction.compensated import estimator as compensated
+from jaxevent.reconstruction.compensated.images import InstantImages
 from jaxevent.reconstruction.estimator import PixelEstimator
 from jaxevent.reconstruction.filtering import Event, Observation, PixelState
 from jaxevent.recording import Events, Frames, Recording
@@ -216,8 +216,8 @@ def test_windows_do_not_change_the_result_of_baselines(name):
 def test_windows_do_not_change_the_evidence_of_mc():
     recording, params = random_recording(4, 300, 6, exposure=500), jaxevent.mc.Params()
     times = np.linspace(recording.start, recording.stop, 7).astype(np.int64)
-    whole = compensated.Images(recording, params, 10**6)(times)
-    for a, b in zip(whole, compensated.Images(recording, params, 37)(times), strict=True):
+    whole = InstantImages(recording, params, 10**6)(times)
+    for a, b in zip(whole, InstantImages(recording, params, 37)(times), strict=True):
         np.testing.assert_allclose(b, a, rtol=2e-6, atol=1e-9)  # kept in single precision
 
 

@@ -5,9 +5,15 @@ import pytest
 
 from jaxevent import blob
 from jaxevent.blob.search.background import measure_background
-from jaxevent.blob.search.paths import Path
+from jaxevent.blob.search.merge import (
+    Turn,
+    _centre_of_turn,
+    _events_within,
+    _measure_turn,
+    _rate_of_pieces,
+)
+from jaxevent.blob.search.paths import TargetPath
 from jaxevent.blob.search.stream import Stream
-from jaxevent.blob.search.turning import Turn, _follow, _middle, _rate, _within
 from jaxevent.recording import Events, Recording
 
 FRAME, DURATION, HUB, RADIUS, OMEGA = (96, 80), 0.6, np.array([50.0, 38.0]), 22, -14.0
@@ -44,7 +50,7 @@ def test_a_textured_disc_that_turns_in_its_place_is_one():
     disc = turned(texture(np.random.default_rng(1)), 60, 0.3)
     found = blob.find(disc, progress=False)
     (path,) = found.paths
-    assert path.turn == pytest.approx(OMEGA, rel=0.01)
+    assert path.turn_rate == pytest.approx(OMEGA, rel=0.01)
     assert "1 turns in place at -14 rad/s" in found.summary()
     assert np.hypot(*(path.p - HUB).T).max() < 1
     assert path.end - path.begin > 0.95 * DURATION * 1e6
@@ -57,18 +63,18 @@ def test_blobs_that_circle_about_one_point_are_as_many_as_they_are():
     angle = 2 * np.pi * np.arange(5) / 5
     places = RADIUS * np.stack([np.cos(angle), np.sin(angle)], 1)
     found = blob.find(turned(places, 8e3, 2.0), progress=False)
-    assert len(found) == 5 and all(path.turn is None for path in found.paths)
+    assert len(found) == 5 and all(path.turn_rate is None for path in found.paths)
 
 
 def test_the_turn_of_events_is_what_it_was_made():
     disc = turned(texture(np.random.default_rng(2)), 60, 0.3, seed=1)
     stream = Stream(disc, 0, round(1e6 * DURATION))
     bright = measure_background(stream).rate
-    own = _within(stream, bright > 4 * np.median(bright))
-    centre = _middle(own)
+    own = _events_within(stream, bright > 4 * np.median(bright))
+    centre = _centre_of_turn(own)
     assert np.hypot(*(centre - HUB)) < 0.8
     # Told a rate that is a third too small.
-    scene = _follow(own, Turn(0.67 * OMEGA, centre), 0.006)
+    scene = _measure_turn(own, Turn(0.67 * OMEGA, centre), 0.006)
     angle = np.unwrap(np.arctan2(scene.maps[:, 1, 0], scene.maps[:, 0, 0]))
     np.testing.assert_allclose(angle, OMEGA * (scene.t - scene.t[0]), atol=0.05)
     np.testing.assert_allclose(
@@ -83,5 +89,5 @@ def test_velocities_of_pieces_tell_the_rate_as_their_median_by_distance():
     v = OMEGA * (p - HUB)[:, ::-1] * [-1, 1]
     v[:20] *= -3
     C = np.tile(np.eye(2), (101, 1, 1))
-    path = Path(np.arange(101), p, v, C, np.ones(101), 1000, 1.0)
-    assert np.isclose(_rate([path], HUB), OMEGA)
+    path = TargetPath(np.arange(101), p, v, C, np.ones(101), 1000, 1.0)
+    assert np.isclose(_rate_of_pieces([path], HUB), OMEGA)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from jaxevent import blob
-from jaxevent.blob.search.background import Background
-from jaxevent.blob.search.moving import (
-    _looks_like_one,
-    goes_own_way,
+from jaxevent.blob.search.background import Background, SceneMotion
+from jaxevent.blob.search.paths import TargetPath
+from jaxevent.blob.search.scene import (
+    _required_gain,
+    has_own_motion,
     measure_moving_background,
-    pauses,
+    measure_scene_motion,
+    split_at_pauses,
 )
-from jaxevent.blob.search.paths import Path
-from jaxevent.blob.search.scene import SceneMotion, measure_scene_motion
 from jaxevent.blob.search.stream import Stream
 from jaxevent.recording import Events, Recording
 from jaxevent.simulate.blobs import Circle, Line, Target, simulate_blobs
@@ -77,10 +77,10 @@ def test_the_scene_goes_as_it_was_made_to():
     true = maps(scene.t)
     moved = np.einsum("nij,kj->nki", true[:, :, :2], start) + true[:, None, :, 2]
     for k, corner in enumerate(corners):
-        x, y = scene.on_sensor(corner[0], corner[1], scene.t)
+        x, y = scene.to_sensor(corner[0], corner[1], scene.t)
         assert np.hypot(*(np.stack([x, y], 1) - moved[:, k]).T).max() < 2.5
         np.testing.assert_allclose(
-            np.stack(scene.in_scene(x, y, scene.t), 1),
+            np.stack(scene.to_scene(x, y, scene.t), 1),
             np.broadcast_to(corner, moved[:, k].shape),
             atol=1e-9,
         )
@@ -98,10 +98,10 @@ def test_a_moving_map_holds_the_rates_of_places():
     M[:, 0, 2] = 100 * t
     background = measure_moving_background(Stream(recording, 0, 800_000), SceneMotion(t, M))
     true = 4e5 / SIZE.prod()
-    assert background.mean == pytest.approx(true, rel=0.15)
+    assert background.mean_rate == pytest.approx(true, rel=0.15)
     x = np.arange(2, 126)
     for time in np.linspace(0, 0.79, 5):
-        assert background.at(x, 48, time, 12).mean() == pytest.approx(true, rel=0.1)
+        assert background.rate_at(x, 48, time, 12).mean() == pytest.approx(true, rel=0.1)
 
 
 def test_what_another_depth_does_is_no_own_way():
@@ -114,11 +114,11 @@ def test_what_another_depth_does_is_no_own_way():
     for v, own in (((100, 0), 0), ((250, 0), 0), ((20, 0), 0), ((100, 60), 1), ((-60, 0), 1)):
         p = np.array([60.0, 50]) + t[:, None] * v
         us = 5_000_000 + np.rint(t * 1e6).astype(np.int64)
-        path = Path(us, p, np.zeros_like(p), C, np.full(51, 30.0), 20_000, 1.0)
-        assert goes_own_way(path, scene, 5_000_000) == bool(own)
+        path = TargetPath(us, p, np.zeros_like(p), C, np.full(51, 30.0), 20_000, 1.0)
+        assert has_own_motion(path, scene, 5_000_000) == bool(own)
         # What leaves its way by its size in every window is none.
-        astray = dataclasses.replace(path, agility=3 * 9.0 / 0.02**3)
-        assert not goes_own_way(astray, scene, 5_000_000)
+        astray = dataclasses.replace(path, velocity_noise=3 * 9.0 / 0.02**3)
+        assert not has_own_motion(astray, scene, 5_000_000)
 
 
 @pytest.mark.slow
@@ -144,13 +144,13 @@ def test_of_a_camera_that_shakes_it_is_said_that_it_moves():
 def test_pauses_are_told_by_most_of_the_sensor():
     ones = np.ones((6, 8))
     background = Background(ones, ones[None] > 0, ones < 0, np.ones(64), 6.4)
-    assert pauses(background) == [(0.0, 6.4)]
+    assert split_at_pauses(background) == [(0.0, 6.4)]
     level = np.repeat([0.8, 0.05, 0.7], [20, 24, 20])
     level[[5, 30]], level[-7:] = (0.1, 0.7), 0.1  # what is short is none
-    told = pauses(dataclasses.replace(background, level=level))
+    told = split_at_pauses(dataclasses.replace(background, level=level))
     np.testing.assert_allclose(told, [(0, 2), (2, 4.4), (4.4, 6.4)])
     # Nor is there one where most of the sensor never sees much.
-    assert len(pauses(dataclasses.replace(background, level=level / 4))) == 1
+    assert len(split_at_pauses(dataclasses.replace(background, level=level / 4))) == 1
 
 
 def test_noise_of_few_events_is_no_scene():
@@ -162,7 +162,7 @@ def test_noise_of_few_events_is_no_scene():
             rate = rng.poisson(rate) / 16  # px, for 1 s
             seen = np.ones((1, 80, 45), bool)
             one = Background(rate, seen, seen[0], np.ones(1), 1.0)
-            assert (_looks_like_one(one) is not None) == scene
+            assert (_required_gain(one) is not None) == scene
 
 
 @pytest.mark.slow
@@ -183,8 +183,8 @@ def test_stars_side_by_side_are_no_edges():
     one = Background(rate, np.ones((1, 45, 80)) > 0, rate < 0, np.ones(1), 1.0)
     rate[10::20, 10::24] = rate[10::20, 12::24] = 200.0  # each of two cells, 8 px apart
     rate[10::20, 11::24] = 30.0  # and some of both between them
-    assert _looks_like_one(one) is None
+    assert _required_gain(one) is None
     rate[10::20, 10::24] = rate[10::20, 16::24] = 200.0  # 24 px long
     for k in range(12, 16):
         rate[10::20, k::24] = 200.0
-    assert _looks_like_one(one) is not None
+    assert _required_gain(one) is not None
