@@ -14,7 +14,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 # The full name until this release, and the one from now on.
-RENAMED: dict[str, str] = {}
+RENAMED: dict[str, str] = {
+    "jaxevent.register.Warped": "jaxevent.register.ResampledImages",
+    "jaxevent.register.by_triggers": "jaxevent.register.stamp_by_triggers",
+    "jaxevent.register.registered": "jaxevent.register.apply_registration",
+    "jaxevent.register.seen": "jaxevent.register.coverage",
+}
 # Modules that have another name or are part of another one.
 MOVED_MODULES: dict[str, str] = {}
 
