@@ -214,7 +214,7 @@ class _Alignment:
         return np.stack(out).astype(np.float64)
 
     def _event_intervals(self, offset: float) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return place and polarity of each pair's events, and when they count, from and to (us)."""
+        """Return place and polarity of each pair's events, and from when to when (us) they count."""
         if self._near is None or abs(offset - self._near[0]) * 1e6 > self.apart / 2:
             assert self.other.frames is not None and self.pairs is not None
             width, height = self.size
@@ -253,7 +253,7 @@ class _Alignment:
         return values
 
     def _smoothed_changes(self, sigma: float, scale: float) -> NDArray[np.float64]:
-        """Return D of each pair, its gradient and whether it is known, (other pixels, pairs * 4)."""
+        """Return D of each pair, its gradient and if it is known, (other pixels, pairs * 4)."""
         blur = sigma * scale
         if self._images[0] is None or abs(math.log(self._images[0] / blur)) > 0.1:
             assert self.pairs is not None
