@@ -214,7 +214,7 @@ class _Alignment:
         return np.stack(out).astype(np.float64)
 
     def _event_intervals(self, offset: float) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return place and polarity of each pair's events, and from when to when (us) they count."""
+        """Return place and polarity of each pair's events, and begin and end (us) of each."""
         if self._near is None or abs(offset - self._near[0]) * 1e6 > self.apart / 2:
             assert self.other.frames is not None and self.pairs is not None
             width, height = self.size
