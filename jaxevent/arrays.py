@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
@@ -39,7 +40,7 @@ _HELD_NOT_NUMBERS = {
 }
 
 
-def find(names: Sequence[str]) -> dict[str, str] | None:
+def find_fields(names: Sequence[str]) -> dict[str, str] | None:
     """The names of t, x, y and p among some; None unless each is there, once."""
     found = {}
     for field, aliases in NAMES.items():
@@ -120,7 +121,7 @@ def columns_of(events: Any) -> dict[str, Any]:
     if names is None and all(hasattr(events, name) for name in "txyp"):
         return {name: getattr(events, name) for name in "txyp"}
     try:
-        fields = None if names is None else find(list(names))
+        fields = None if names is None else find_fields(list(names))
     except TypeError:
         names = fields = None
     if fields is None:
@@ -389,12 +390,21 @@ def as_images(frames: Any, what: str = "frames") -> tuple[NDArray, NDArray[np.ui
     if images.ndim == 3:
         return plain_images(images), None
     differ = any((one != one[..., :1]).any() for one in images)
-    grey = np.stack([grey_of(one) for one in images]) if len(images) else images[..., 0]
+    grey = np.stack([to_grey(one) for one in images]) if len(images) else images[..., 0]
     return plain_images(grey), np.stack([_in_8_bits(one) for one in images]) if differ else None
 
 
-def grey_of(image: NDArray) -> NDArray:
-    """The luma (H, W) of an image (H, W, 3) in its own type, rounded as Pillow does."""
+def to_grey(image: NDArray) -> NDArray:
+    """Convert an image to grey of its own type, rounded as Pillow does.
+
+    Args:
+        image: (H, W), which stays as it is, or (H, W, 3), red first.
+
+    Returns:
+        (H, W) luma of ITU-R 601.
+    """
+    if image.ndim == 2:
+        return image
     if image.dtype.kind == "f":
         return image @ LUMA.astype(image.dtype)
     parts = (image[..., k].astype(np.uint32) * np.uint32(_LUMA_16[k]) for k in range(3))
@@ -438,3 +448,6 @@ def check_image_values(images: Any, what: str) -> None:
                 f"{what}: frame {row} holds NaN or values outside [0, 1]; scale float frames to "
                 "[0, 1], dividing by 255 if these are levels of 8 bits, and remove broken ones"
             )
+
+
+__getattr__ = renamed_names(__name__)

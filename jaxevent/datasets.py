@@ -15,7 +15,7 @@ Nothing is downloaded. A recording is found in any folder below, where `LAYOUTS`
     m3ed     *_data.h5                              poses, `depth`
     hdr      *.mat of the AKF's authors             `HDR_mat`, where it is there
     ahdr     the same                               `HDR_mat`
-    evimo2   folders with dataset_events_t.npy      none: see `jaxevent.io.evimo`
+    evimo2   folders with dataset_events_t.npy      none: see `jaxevent.io.folders`
 
 `depth`, `disparity` and `flow` are in `Recording.extra`, as `jaxevent.io.truth` describes, with the
 layouts' sources; the readers of `jaxevent.io` describe the recordings' own. In configurations of
@@ -28,7 +28,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from jaxevent.errors import InputError
-from jaxevent.io import load, reading, truth
+from jaxevent.io import load, truth
+from jaxevent.io.checks import reading
 from jaxevent.parameters import nearest
 from jaxevent.recording import Recording
 

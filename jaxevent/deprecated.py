@@ -14,9 +14,68 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 # The full name until this release, and the one from now on.
-RENAMED: dict[str, str] = {}
+RENAMED: dict[str, str] = {
+    "jaxevent.arrays.find": "jaxevent.arrays.find_fields",
+    "jaxevent.arrays.grey_of": "jaxevent.arrays.to_grey",
+    "jaxevent.confidence.Finding": "jaxevent.confidence.ParameterInterval",
+    "jaxevent.confidence.Findings": "jaxevent.confidence.FitIntervals",
+    "jaxevent.confidence.Parted": "jaxevent.confidence.PartwiseLoss",
+    "jaxevent.confidence.examine": "jaxevent.confidence.confidence_intervals",
+    "jaxevent.devices.ELSEWHERE": "jaxevent.devices.REMOTE",
+    "jaxevent.devices.Elsewhere": "jaxevent.devices.RemoteBatch",
+    "jaxevent.devices.accelerated": "jaxevent.devices.has_accelerator",
+    "jaxevent.devices.along": "jaxevent.devices.shard",
+    "jaxevent.devices.local": "jaxevent.devices.local_devices",
+    "jaxevent.devices.mesh": "jaxevent.devices.make_mesh",
+    "jaxevent.estimator.Described": "jaxevent.estimator.ShortRepr",
+    "jaxevent.io.aedat2.read": "jaxevent.io.aedat.read_aedat2",
+    "jaxevent.io.aedat4.read": "jaxevent.io.aedat.read_aedat4",
+    "jaxevent.io.calibrated": "jaxevent.io.checks.make_supported_camera",
+    "jaxevent.io.check_unfolded": "jaxevent.io.checks.check_unfolded",
+    "jaxevent.io.columns.find": "jaxevent.io.columns.find_fields",
+    "jaxevent.io.columns.read_npy": "jaxevent.io.tables.read_npy",
+    "jaxevent.io.columns.read_text": "jaxevent.io.tables.read_text",
+    "jaxevent.io.ecf.MOST": "jaxevent.io.ecf.MAX_EVENTS",
+    "jaxevent.io.event_stream.read": "jaxevent.io.atis.read_event_stream",
+    "jaxevent.io.evimo.read": "jaxevent.io.folders.read_evimo",
+    "jaxevent.io.evreal.read": "jaxevent.io.folders.read_evreal",
+    "jaxevent.io.find_event_texts": "jaxevent.io.text.find_event_texts",
+    "jaxevent.io.most_unfolded": "jaxevent.io.checks.max_unfolded",
+    "jaxevent.io.n_caltech.read": "jaxevent.io.atis.read_n_caltech",
+    "jaxevent.io.naming": "jaxevent.io.checks.naming",
+    "jaxevent.io.npz.read": "jaxevent.io.tables.read_npz",
+    "jaxevent.io.open_archive": "jaxevent.io.checks.open_archive",
+    "jaxevent.io.parquet.read": "jaxevent.io.tables.read_parquet",
+    "jaxevent.io.pinhole": "jaxevent.io.checks.make_camera",
+    "jaxevent.io.reading": "jaxevent.io.checks.reading",
+    "jaxevent.io.ros_events.event_topic": "jaxevent.io.ros.open_event_topic",
+    "jaxevent.io.timelens.read": "jaxevent.io.folders.read_timelens",
+    "jaxevent.io.whole_number": "jaxevent.io.checks.whole_number",
+    "jaxevent.parameters.Share": "jaxevent.parameters.UnitInterval",
+    "jaxevent.parameters.nearest": "jaxevent.parameters.suggest_name",
+    "jaxevent.parameters.shown": "jaxevent.parameters.format_value",
+    "jaxevent.tuning.Believed": "jaxevent.tuning.LossWithPrior",
+    "jaxevent.tuning.Fitted": "jaxevent.tuning.FitResult",
+    "jaxevent.tuning.Weighted": "jaxevent.tuning.WeightedBatch",
+    "jaxevent.tuning.loss_of": "jaxevent.tuning.evaluate_loss",
+    "jaxevent.tuning.slopes": "jaxevent.tuning.loss_and_grad",
+}
 # Modules that have another name or are part of another one.
-MOVED_MODULES: dict[str, str] = {}
+MOVED_MODULES: dict[str, str] = {
+    "jaxevent.io.aedat2": "jaxevent.io.aedat",
+    "jaxevent.io.aedat4": "jaxevent.io.aedat",
+    "jaxevent.io.event_stream": "jaxevent.io.atis",
+    "jaxevent.io.evimo": "jaxevent.io.folders",
+    "jaxevent.io.evreal": "jaxevent.io.folders",
+    "jaxevent.io.exposures": "jaxevent.io.images",
+    "jaxevent.io.n_caltech": "jaxevent.io.atis",
+    "jaxevent.io.npz": "jaxevent.io.tables",
+    "jaxevent.io.parquet": "jaxevent.io.tables",
+    "jaxevent.io.ros_events": "jaxevent.io.ros",
+    "jaxevent.io.timelens": "jaxevent.io.folders",
+    "jaxevent.sharing": "jaxevent.locks",
+    "jaxevent.shown": "jaxevent.display",
+}
 
 
 def warn_renamed(old: str, new: str) -> None:
@@ -83,7 +142,14 @@ class RenamedModules(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         new = MOVED_MODULES[spec.name]
         warn_renamed(spec.name, new)
         module = types.ModuleType(spec.name, f"The old name of `{new}`.")
-        vars(module)["__getattr__"] = lambda name: getattr(importlib.import_module(new), name)
+        renamed = renamed_names(spec.name)
+
+        def __getattr__(name: str) -> Any:
+            if f"{spec.name}.{name}" in RENAMED:
+                return renamed(name)
+            return getattr(importlib.import_module(new), name)
+
+        vars(module)["__getattr__"] = __getattr__
         return module
 
     def exec_module(self, module: types.ModuleType) -> None:

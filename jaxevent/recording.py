@@ -98,8 +98,16 @@ class EventColumns(NamedTuple):
 class ColumnSource(EventSource, Protocol):
     """Events that can be read without being checked."""
 
-    def columns(self, rows: slice, room: EventColumns | None = None) -> EventColumns | None:
-        """A range of rows, written over those of `room` if they fit; None where types differ."""
+    def columns(self, rows: slice, out: EventColumns | None = None) -> EventColumns | None:
+        """Read a range of rows as they are stored.
+
+        Args:
+            rows: The rows, step 1.
+            out: Columns to write to, if they are long enough.
+
+        Returns:
+            The columns; None if they are stored as other types.
+        """
         ...
 
 
@@ -485,6 +493,8 @@ class Triggers:
 
     def __post_init__(self):
         _set_rows(self, "trigger", edge=((), np.int8), channel=((), np.uint8))
+        if not np.isin(self.edge, (-1, 0, 1)).all():
+            raise InputError("triggers need an edge, -1, 0 or 1, for each time; correct them")
 
     def __len__(self) -> int:
         return len(self.t)

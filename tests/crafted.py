@@ -289,7 +289,7 @@ FILES = {  # what the refusal says
     text_images_named_many_times: "images.txt: .* over 100 times",
     npz_of_zeros: "over 100 times",
     npz_of_no_array: "frames is not a NumPy array",
-    npz_of_columns_for_polarity: r"p is bool of shape \(400, 1\)",
+    npz_of_columns_for_polarity: r"p has shape \(400, 1\)",
     mat_of_zeros: "over 100 times",
     mat_of_an_empty_array_with_a_size: "events is said to be empty but has a size",
     bag_with_a_chunk_of_bz2: "over 100 times",

@@ -25,7 +25,7 @@ mends both. Of numbers of the same kind as the event times, the unit of these co
 
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from jaxevent.arrays import SCALES, to_microseconds
 from jaxevent.errors import InputError, InputWarning
-from jaxevent.io.options import ReadOptions
+from jaxevent.io.checks import ReadOptions
 
 NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 FEWEST_EVENTS = 300
@@ -79,7 +79,7 @@ class InferredUnit(NamedTuple):
 
     Attributes:
         name: "s", "ms", "us" or "ns".
-        notes: What `Recording.notes` says of it.
+        notes: Sentences for `Recording.notes` on how it was found.
     """
 
     name: str
@@ -146,7 +146,7 @@ def infer_unit(
         size: (width, height) of the sensor in pixels.
         source: Name of the file for messages.
         options: Their `time_unit`, where given, is taken.
-        stated: Unit that the file states, and the words for how ("the name 't_ns'").
+        stated: Unit that the file states, and the words for how it does ("the name 't_ns'").
         usual: Unit of the layout; None has microseconds for whole numbers, seconds for others.
 
     Returns:
@@ -157,9 +157,9 @@ def infer_unit(
             than 11.6 days.
     """
     t = sample["t"]
-    if t.ndim != 1 or t.dtype.kind not in "iuf" or not len(t):
+    if t.dtype.kind not in "iuf" or not len(t):
         return InferredUnit(options.time_unit or (stated[0] if stated else usual or "us"))
-    numbers = _Numbers.of(sample, count, size)
+    numbers = _Numbers.from_sample(sample, count, size)
     expected = usual or _convention(numbers)
     scores = {unit: numbers.score(unit, usual) for unit in SCALES}
     best = max(scores, key=lambda unit: scores[unit])
@@ -233,7 +233,9 @@ class _Numbers(NamedTuple):
     rounding: float  # distance between neighbouring numbers of the type
 
     @classmethod
-    def of(cls, sample: Mapping[str, NDArray], count: int, size: tuple[int, int]) -> "_Numbers":
+    def from_sample(
+        cls, sample: Mapping[str, NDArray], count: int, size: tuple[int, int]
+    ) -> "_Numbers":
         pixels = max(size[0] * size[1], 1)
         kept = np.isfinite(sample["t"])
         stored = sample["t"][kept]
@@ -270,6 +272,7 @@ class _Numbers(NamedTuple):
 
     @property
     def has_decimals(self) -> bool:
+        """True if some time is not a whole number."""
         return self.is_float and (self.digits is None or self.digits > 0)
 
     def rate(self, unit: str) -> float:
@@ -277,6 +280,7 @@ class _Numbers(NamedTuple):
         return self.count / (self.pixels * self.span * SCALES[unit] * 1e-6)
 
     def describe(self, unit: str) -> str:
+        """Describe the recording as it would be under a unit."""
         seconds = self.span * SCALES[unit] * 1e-6
         rate = f", {self.rate(unit):.2g} events per pixel and second" if seconds else ""
         return f"they last {seconds:.3g} s{rate}"
@@ -456,7 +460,7 @@ class Clock(NamedTuple):
             values: (n,) times as stored.
             source: Name of the file for messages.
             what: "image", "pose" or the like.
-            notes: A note is appended where the unit is not the usual one.
+            notes: Notes of the recording, to which one on an unusual unit is added.
             usual: Unit of the layout; None has us for integers, s for floats.
             stated: Unit that the file states.
 
@@ -464,19 +468,19 @@ class Clock(NamedTuple):
             (n,) int64 us.
         """
         unit = stated or usual or ("s" if values.dtype.kind == "f" else "us")
-        as_usual = to_microseconds(values, unit, source, what)
-        if stated is not None or self.last <= self.first or len(as_usual) < 2:
-            return as_usual
+        in_usual = to_microseconds(values, unit, source, what)
+        if stated is not None or self.last <= self.first or len(in_usual) < 2:
+            return in_usual
         is_alike = self.unit != unit and self.is_float == (values.dtype.kind == "f")
         if is_alike and self._fits(values, self.unit):
             return to_microseconds(values, self.unit, source, what)
         if self._fits(values, unit):
-            return as_usual
+            return in_usual
         others = {other: self._overlap(values, other) for other in SCALES if other != unit}
         # The unit of the events first, where several would do.
         best = max(others, key=lambda u: (others[u] > _MUCH / 2, u == self.unit, others[u]))
         if others[best] <= _MUCH / 2 or not self._has_plausible_intervals(values, best):
-            return as_usual
+            return in_usual
         note = f"{what} times are taken as {NAMES[best]}, on the clock of the events"
         is_new = note not in notes
         notes += [note] * is_new
@@ -511,9 +515,3 @@ class Clock(NamedTuple):
 
 def _ends(values: NDArray, unit: str) -> tuple[float, float]:
     return float(values.min()) * SCALES[unit], float(values.max()) * SCALES[unit]
-
-
-def clock_of(unit: InferredUnit, stored: NDArray, t: Sequence[int] | NDArray) -> Clock:
-    """Return the clock of events with the times `t` (us), which are `stored` in a unit."""
-    first, last = (int(t[0]), int(t[-1])) if len(t) else (0, 0)
-    return Clock(unit.name, first, last, stored.dtype.kind == "f")

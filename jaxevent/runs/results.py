@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxevent.errors import InputError
-from jaxevent.io.output import complete
-from jaxevent.io.places import check, locked
+from jaxevent.io.output import check_outputs, complete, locked
 from jaxevent.parameters import Parameters
 from jaxevent.show.report import flatten, markdown_table, means
 
@@ -101,10 +100,10 @@ def check_folder(
     """Raise `InputError` if writing files of these names into a folder would cost something.
 
     Inputs are never written over, existing files only if they are to be replaced or the folder is
-    of a run that goes on: the caller's own. See `jaxevent.io.places.check`.
+    of a run that goes on: the caller's own. See `jaxevent.io.output.check_outputs`.
     """
     files = [folder / name for name in names]
-    check(files, inputs, force=replace, inside=files if own else ())
+    check_outputs(files, inputs, force=replace, inside=files if own else ())
 
 
 def write_rows(

@@ -328,7 +328,7 @@ def test_two_columns_that_are_no_exposures(tmp_path, text):
 
 
 def test_exposures_of_a_stack(tmp_path):
-    from jaxevent.io.exposures import read_stack
+    from jaxevent.io.images import read_stack
 
     folder = pictures(tmp_path / "stack")
     (folder / "timestamps.txt").write_text(EXPOSED)
