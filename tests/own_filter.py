@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxevent.parameters import Positive, Share
+from jaxevent.parameters import Positive, UnitInterval
 from jaxevent.reconstruction.augment import FrameParams, Held, event_change
 from jaxevent.reconstruction.filtering import Event, Filter, Observation, Observer
 
@@ -16,7 +16,7 @@ class Params(FrameParams):
     """Parameters of the trend filter."""
 
     alpha = Positive(10.0, "rad/s", "rate at which the last frame pulls")
-    gain = Share(0.1, "1", "part of an event's slope that the slope takes over")
+    gain = UnitInterval(0.1, "1", "part of an event's slope that the slope takes over")
     tau = Positive(0.02, "s", "time constant in which a slope fades")
 
 

@@ -23,7 +23,7 @@ from jaxevent.blob.search.paths import NOBODY, candidates, join
 from jaxevent.blob.seeds import read_seeds, span_of
 from jaxevent.codegen import njit_noalloc
 from jaxevent.errors import InputError
-from jaxevent.estimator import Described
+from jaxevent.estimator import ShortRepr
 from jaxevent.events.filters import supported
 from jaxevent.recording import Recording, Times, check_times
 
@@ -39,7 +39,7 @@ NEVER = np.iinfo(np.int64).max  # us
 Numeric = Array | np.ndarray
 
 
-class Features(Described):
+class Features(ShortRepr):
     """Chunks of events. An event that only fills up is not valid and has its step's time."""
 
     t: Int[Numeric, "chunks steps M"]  # us since the chunk's start
@@ -59,7 +59,7 @@ class Features(Described):
     cells: tuple[int, int] = eqx.field(static=True)  # rows and columns of the grid of births
 
 
-class ReadOut(Described):
+class ReadOut(ShortRepr):
     """Where times are in the chunks of `Features`."""
 
     chunk: Int[Numeric, " times"]

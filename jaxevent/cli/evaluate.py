@@ -60,6 +60,7 @@ def add(commands: Any) -> None:
 
 
 def run(
+    *,
     config: Path,
     out: Path | None,
     metrics: list[str],

@@ -61,6 +61,7 @@ def add(commands: Any) -> None:
 
 
 def run(
+    *,
     source: Path,
     target: Path,
     reading: dict[str, Any],

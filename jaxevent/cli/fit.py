@@ -53,6 +53,7 @@ def add(commands: Any) -> None:
 
 
 def run(
+    *,
     config: Path,
     out: Path,
     recordings: list[str] | None,
@@ -77,7 +78,7 @@ def run(
     from jaxevent.runs.fit import FILES, fit
 
     rows = fit(config, out, recordings, resume, show_progress(), replace=force)
-    if not devices.first():
+    if not devices.is_process_zero():
         return
     print((out / "results.md").read_text(encoding="utf-8"), end="")
     files = [name for name in FILES if (out / name).exists()]

@@ -114,6 +114,7 @@ def _add_known(one: Any) -> None:
 
 
 def run(
+    *,
     path: Path,
     model: str,
     method: str | None,

@@ -95,6 +95,7 @@ def _usual(has_frames: bool, pixels: int, missing: str = "") -> str:
 
 
 def run(
+    *,
     path: Path,
     method: str | None,
     rate: float | int | None,

@@ -129,6 +129,7 @@ def _check(given: set[str]) -> None:
 
 
 def run(
+    *,
     path: Path,
     frames: Path | None,
     reference: Path | None,

@@ -107,6 +107,7 @@ def _add_settings(one: Any) -> None:
 
 
 def run(
+    *,
     video: Path | None,
     scene: str | None,
     objects: bool,
@@ -124,7 +125,7 @@ def run(
     cut: float | int | None,
     max_size: int | None,
 ) -> None:
-    from jaxevent.parameters import nearest
+    from jaxevent.parameters import suggest_name
     from jaxevent.simulate import SENSORS
 
     if seed < 0:
@@ -134,7 +135,7 @@ def run(
     if size is not None and min(size) < 1:
         raise InputError(f"--size {size[0]},{size[1]} is not possible; give it in pixels")
     if sensor is not None and sensor not in SENSORS:
-        raise InputError(f"there is no sensor {sensor!r}; {nearest(sensor, SENSORS)}")
+        raise InputError(f"there is no sensor {sensor!r}; {suggest_name(sensor, SENSORS)}")
     of_video = {"start": start, "cut": cut, "max-size": max_size}
     if blobs is not None:
         own = {"sensor": sensor, "speed": speed, "size": size, "change": change}

@@ -7,8 +7,8 @@ from typing import Any
 
 from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command, show_progress
+from jaxevent.display import plural
 from jaxevent.errors import InputError
-from jaxevent.shown import plural
 
 
 def add(commands: Any) -> None:
@@ -111,6 +111,7 @@ def _add_quantities(one: Any) -> None:
 
 
 def run(
+    *,
     path: Path,
     method: str,
     params: Path | None,

@@ -43,6 +43,7 @@ def add(commands: Any) -> None:
 
 
 def run(
+    *,
     path: Path,
     results: list[Path],
     start: float | int | None,

@@ -38,7 +38,7 @@ from jaxevent.devices import full_precision
 from jaxevent.egomotion.geometry import A, rotation_basis, rotation_exp, unit
 from jaxevent.errors import InputError
 from jaxevent.estimator import imported
-from jaxevent.parameters import nearest
+from jaxevent.parameters import suggest_name
 
 if TYPE_CHECKING:
     from jaxevent.egomotion.twists import Twists
@@ -445,7 +445,7 @@ def find_model(model: str | type[Model]) -> type[Model]:
     if ":" in model:
         return _load(model)
     if model not in MODELS:
-        raise InputError(f"there is no motion model {model!r}; {nearest(model, MODELS)}")
+        raise InputError(f"there is no motion model {model!r}; {suggest_name(model, MODELS)}")
     return MODELS[model]
 
 

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
+from jaxevent.display import HtmlRepr
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.estimator import Estimate
 from jaxevent.recording import Recording, Times, check_times, microseconds
-from jaxevent.shown import Shown
 
 if TYPE_CHECKING:
     import pandas
@@ -67,8 +67,8 @@ class Calibration(NamedTuple):
     factor C + share^2 |m|^2 + speed^2 m m' + change^2 (d d' + b b'),
 
     d the change of the motion within what an estimate sees and b by how much it bends there.
-    Chosen on simulated scenes: `experiments/egomotion_sigmas.py`. `behind` adds what a real lens
-    makes.
+    See `experiments/studies/predicted_errors.md` for their choice. `behind` adds what a real
+    lens makes.
     """
 
     factor: float = 1.0
@@ -82,7 +82,7 @@ class Calibration(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Motion(Shown):
+class Motion(HtmlRepr):
     """An estimated motion: `mean, covariance, valid = motion(times)`.
 
     The components are those of its `model`: of planar motion the image velocity (px/s), of a

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from jaxevent.errors import InputError, OrderError
 from jaxevent.io import disorder
 from jaxevent.io.checks import ReadOptions, check_events, reading
+from jaxevent.locks import TurnLock, synchronized
 from jaxevent.progress import bar
 from jaxevent.recording import Events, EventSource, Recording, Triggers
-from jaxevent.sharing import Turns, in_turn
 
 BLOCK = 1 << 20  # events decoded together: 13 MB
 
@@ -335,12 +335,12 @@ class DecodedEvents(EventsInFile):
         self._stream: Iterator[tuple[Any, Columns]] = iter(())
         self._next = -1
         self.checked_size, self._source, self._origin = size, source, origin
-        self._turns, self._process = Turns(source), os.getpid()
+        self._turns, self._process = TurnLock(source), os.getpid()
 
     def __len__(self) -> int:
         return int(self._rows[-1])
 
-    @in_turn
+    @synchronized
     def __getitem__(self, rows: slice) -> Events:
         """Decode the events of a range of rows; the file must not have changed since."""
         start, stop = row_range(rows, len(self))
@@ -354,7 +354,7 @@ class DecodedEvents(EventsInFile):
             block += 1
         return _joined(pieces)
 
-    @in_turn
+    @synchronized
     def index(self, time: int) -> int:
         """Count the events earlier than `time` (us): at most one block is decoded."""
         block = int(np.searchsorted(self._first, time)) - 1
@@ -444,7 +444,7 @@ class _ImageStream:
 
     def __init__(self, images: Callable[[int], Iterable[NDArray]], source: str):
         self._images, self.source = images, source
-        self.turns, self._process = Turns(source), os.getpid()
+        self.turns, self._process = TurnLock(source), os.getpid()
         self._stream: Iterator[NDArray] = iter(())
         self._next = -1
 

@@ -22,9 +22,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
-from jaxevent.devices import AXIS, along
-from jaxevent.devices import mesh as devices_mesh
-from jaxevent.estimator import Described
+from jaxevent.devices import AXIS, make_mesh, shard
+from jaxevent.estimator import ShortRepr
 from jaxevent.reconstruction.layout import LANES
 
 # Prepared on the host, where they stay until a jitted function takes them.
@@ -88,7 +87,7 @@ class ImagePoints(Points):
         return values.at[self.piece].get(mode="clip")[:, None]
 
 
-class Tiles(Described):
+class Tiles(ShortRepr):
     """The events of a window; slots without an event have polarity 0 and change nothing.
 
     Shared out over a mesh, the arrays' last axis is cut into blocks of `LANES`, which become the
@@ -163,7 +162,7 @@ class Segments(eqx.Module):
     off: Float[Numeric, " segments"]
 
 
-class FrameFeatures(Described):
+class FrameFeatures(ShortRepr):
     """Frames of a window and the event counts that tie them together; spare rows repeat the last.
 
     Counts are [frames, pixels]: `head` from the left edge to mid-exposure, `tail` from there to the
@@ -199,7 +198,7 @@ class Growth(eqx.Module):
     rho_ref: Float[Numeric, ""]  # s, for which the counts were made
 
 
-class Features(Described):
+class Features(ShortRepr):
     """All that `run` needs to know about a window of a recording; a pytree of arrays."""
 
     frames: FrameFeatures
@@ -252,7 +251,7 @@ class Features(Described):
         return Features(frames, tiles, start, last, growth)
 
 
-class ReadOut(Described):
+class ReadOut(ShortRepr):
     """Images to be read: one time each, and for every pixel its last event before it."""
 
     points: ImagePoints
@@ -290,14 +289,14 @@ class ReadOut(Described):
 
 def pixel_mesh(devices: Sequence[Any]) -> Mesh | None:
     """The mesh that pixels are shared out over; None where there is but one device."""
-    return devices_mesh(devices, LANES)
+    return make_mesh(devices, LANES)
 
 
 def over_pixels(tree: Any, mesh: Mesh, pixels: int) -> Any:
     """Arrays [..., pixels] shared out along pixels, all others whole on every device."""
 
     def put(leaf: Any) -> Any:
-        return along(mesh, leaf, -1 if np.shape(leaf)[-1:] == (pixels,) else None)
+        return shard(mesh, leaf, -1 if np.shape(leaf)[-1:] == (pixels,) else None)
 
     return jax.tree.map(put, tree)
 

@@ -18,8 +18,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxevent.devices import at_once
-from jaxevent.estimator import Described, Estimate
+from jaxevent.devices import loop_unroll
+from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.engine.images import DividedEvents, prepared_by_kernel
 from jaxevent.reconstruction.engine.video import FusedVideo, video_by_kernel
@@ -92,7 +92,7 @@ class Observer(eqx.Module):
         return self(points).level
 
 
-class Trajectory(Described):
+class Trajectory(ShortRepr):
     """A filtered window: enough to read an image at any time inside it."""
 
     observer: Observer
@@ -274,7 +274,7 @@ def _over_tiles(step: Callable, lanes: Any, place: Place, slots: Any) -> Any:
     def use(ranks: int, width: int, lanes: Any, tile: Any) -> tuple[Any, Any]:
         tile = jax.tree.map(lambda v: v.reshape(ranks, width), tile)
         mine = jax.tree.map(lambda s: s[:width], lanes)
-        end, out = lax.scan(step, mine, tile, unroll=at_once(UNROLLED))
+        end, out = lax.scan(step, mine, tile, unroll=loop_unroll(UNROLLED))
         lanes = jax.tree.map(lambda s, e: jnp.concatenate([e, s[width:]]), lanes, end)
         return lanes, jax.tree.map(jnp.ravel, out)
 

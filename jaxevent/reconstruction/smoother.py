@@ -31,7 +31,7 @@ from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.estimator import Described, Estimate
+from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.parameters import Choice, Positive
 from jaxevent.reconstruction.augment import (
     CertaintyParams,
@@ -177,7 +177,7 @@ class Sided(Protocol):
     def bound(self) -> Any: ...
 
 
-class Passage(Described):
+class Passage(ShortRepr):
     """A smoothed window: enough to read an image at any time inside it."""
 
     past: Gaussian  # [frames, pixels], after the frame

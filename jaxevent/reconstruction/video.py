@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent import dispatch
-from jaxevent.devices import accelerated
+from jaxevent.devices import has_accelerator
+from jaxevent.display import HtmlRepr
 from jaxevent.errors import InputError, InputWarning, require
 from jaxevent.estimator import Estimate
+from jaxevent.locks import TurnLock, refuse_to_pickle
 from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.clock import Timing
@@ -25,8 +27,6 @@ from jaxevent.reconstruction.reading import ImageReader
 from jaxevent.reconstruction.stream import StreamState
 from jaxevent.reconstruction.windows import WINDOW_EVENTS, EventWindow, WindowedRecording
 from jaxevent.recording import Recording, Times, microseconds
-from jaxevent.sharing import Turns, refuse_to_pickle
-from jaxevent.shown import Shown
 
 P = TypeVar("P", bound=FrameParams)
 S = TypeVar("S", bound="ImageSequence")
@@ -112,7 +112,7 @@ class FilteredWindow(NamedTuple):
         return (start is None or start <= time) and (stop is None or time < stop)
 
 
-class ImageSequence(Shown, abc.ABC, Generic[P]):
+class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
     """Images of a reconstruction: `image, variance, valid = sequence(times)`.
 
     A subclass reads images in `_read`. Images do not depend on which others were asked for. Threads
@@ -142,7 +142,7 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
         self.estimator, self.recording, self.params = estimator, recording, params
         self.progress = progress
         self._compared = not estimator.fuses
-        self._turns = Turns(f"images of {recording.name}")
+        self._turns = TurnLock(f"images of {recording.name}")
 
     def __reduce__(self) -> tuple[Any, ...]:
         given, options = self._made_of
@@ -236,7 +236,7 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
                 warnings.warn(contradiction, InputWarning, stacklevel=2)
         start, stop = self.recording.start, self.recording.stop
         with bar(total=len(times), desc="images", unit="image", progress=self.progress) as shown:
-            for batch, images in self._turns.each(self._read(times)):
+            for batch, images in self._turns.iterate(self._read(times)):
                 shape = (len(batch), self.recording.height, self.recording.width)
                 image, variance, valid = (
                     np.asarray(v)[: len(batch)].reshape(shape) for v in images
@@ -252,7 +252,7 @@ def _windows_of(
     recording: Recording, timing: Timing, devices: int, **options: Any
 ) -> WindowedRecording:
     """A recording in windows: prepared on a GPU where images are made on one, else on the host."""
-    if accelerated() and devices < 2:
+    if has_accelerator() and devices < 2:
         from jaxevent.reconstruction.on_device import DeviceWindows  # others need not load it
 
         if DeviceWindows.serves(timing):
@@ -287,7 +287,7 @@ class Video(ImageSequence[P]):
         super().__init__(estimator, recording, params, progress=progress)
         self._devices, self._factors = devices, factors
         self._mesh = pixel_mesh(devices)
-        self._batch = DEVICE_BATCH if accelerated() else BATCH
+        self._batch = DEVICE_BATCH if has_accelerator() else BATCH
         self._windows = _windows_of(
             recording,
             Timing.of(params),

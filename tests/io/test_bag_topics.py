@@ -334,7 +334,7 @@ def test_other_encodings(tmp_path):
             continue
         colours = deep if encoding.endswith("16") else rgb
         grey = colours @ [0.299, 0.587, 0.114]
-        np.testing.assert_allclose(got.frames.images, grey, rtol=0, atol=1)
+        np.testing.assert_allclose(np.asarray(got.frames.images), grey, rtol=0, atol=1)
         assert ("rgb" in got.extra) == (not encoding.endswith("16"))
 
 

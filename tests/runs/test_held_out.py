@@ -16,7 +16,7 @@ from jaxevent.reconstruction.filtering import Filter
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.evaluate import evaluate
 from jaxevent.runs.protocols import held_out
-from jaxevent.runs.reconstruction import parts
+from jaxevent.runs.reconstruction import cut_windows
 from jaxevent.runs.scores import score, subset
 
 I0, VARIANCE = 0.5, 0.04
@@ -118,7 +118,7 @@ def test_a_gap_is_given_and_hidden_wholly():
     assert hidden.t.tolist() == recording.frames.t[[1, 2, 3, 5, 6, 7, 9]].tolist()
     usual, default = held_out(recording, 2), held_out(recording)
     assert usual[0].frames.t.tolist() == default[0].frames.t.tolist()
-    (part,) = parts(recording, "held-out", gap=4)
+    (part,) = cut_windows(recording, "held-out", gap=4)
     assert part.truth.t.tolist() == hidden.t.tolist()
 
 

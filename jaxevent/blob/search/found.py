@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.search.paths import STILL, Path
 from jaxevent.blob.search.scale import Choice
+from jaxevent.display import plural
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording
-from jaxevent.shown import plural
 
 P = TypeVar("P", bound=TrackerParams)
 

@@ -48,7 +48,7 @@ from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import Calibration, Motion
 from jaxevent.egomotion.patches import Speed
 from jaxevent.egomotion.warped import blur, splat
-from jaxevent.parameters import Choice, Count, Parameters, Positive, Share
+from jaxevent.parameters import Choice, Count, Parameters, Positive, UnitInterval
 from jaxevent.progress import bar
 from jaxevent.recording import Recording
 
@@ -86,7 +86,7 @@ class Params(Parameters):
     margin = Count(16, "px", "of the image around the sensor")
 
     duration = Positive(0.1, "s", "length of a window; motion is taken to be constant in it")
-    overlap = Share(0.5, "", "share of a window that the next one has too")
+    overlap = UnitInterval(0.5, "", "share of a window that the next one has too")
     speed_max = Positive(4000.0, "px/s", "planar: motions of the search are in +- this")
     omega_max = Positive(30.0, "rad/s", "rotation: motions of the search are in +- this")
     contrast = Positive(1.2, "", "lost where J's square is less than this, in chance's")

@@ -23,7 +23,7 @@ from jaxevent.egomotion.models import General, Model
 from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.patches import Speed
 from jaxevent.errors import InputError, require
-from jaxevent.parameters import Count, Parameters, Positive, Share
+from jaxevent.parameters import Count, Parameters, Positive, UnitInterval
 from jaxevent.progress import bar
 from jaxevent.recording import Frames, Recording
 
@@ -40,7 +40,7 @@ class Params(Parameters):
     iterations = Count(30, "", "most of a level")
     fewest = Count(5, "", "points that an estimate needs")
 
-    quality = Share(0.01, "", "a corner's strength, in shares of the best one's")
+    quality = UnitInterval(0.01, "", "a corner's strength, in shares of the best one's")
     spacing = Positive(5.0, "px", "least distance of two corners")
     returns = Positive(0.5, "px", "points that come back farther off do not count")
     span = Positive(0.4, "s", "general motion: time between the two frames that tell it, at least")

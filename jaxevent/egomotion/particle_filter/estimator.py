@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jaxevent import dispatch
 from jaxevent.camera import PinholeCamera
 from jaxevent.codegen.expressions import Untranslatable
-from jaxevent.devices import along, mesh
+from jaxevent.devices import make_mesh, shard
 from jaxevent.egomotion.candidates import Candidates, Expected, Gatherer
 from jaxevent.egomotion.estimator import COMMON, Batch, MotionEstimator, Stretch, truth_of
 from jaxevent.egomotion.geometry import length
@@ -352,19 +352,19 @@ class Followed(Batch):
     def over(self, devices: Sequence[Any]) -> "Followed":
         """Runs shared out, or particles if runs are too few."""
         runs, particles = self.noise.normal.shape[0], self.start.shape[0]
-        chosen = mesh(devices, runs)
+        chosen = make_mesh(devices, runs)
         by_run = chosen is not None and chosen.size == len(devices)
         if not by_run:
-            chosen = mesh(devices, particles)
+            chosen = make_mesh(devices, particles)
         if chosen is None:
             return jax.device_put(self, devices[0])
         noise = self.noise
         axes = (0, 0, 0, None) if by_run else (2, None, 1, 0)
         arrays = (noise.normal, noise.uniform, noise.cloud, self.start)
-        placed = [along(chosen, v, axis) for v, axis in zip(arrays, axes, strict=True)]
+        placed = [shard(chosen, v, axis) for v, axis in zip(arrays, axes, strict=True)]
         return eqx.tree_at(
             lambda b: (b.noise.normal, b.noise.uniform, b.noise.cloud, b.start),
-            along(chosen, self),
+            shard(chosen, self),
             placed,
         )
 

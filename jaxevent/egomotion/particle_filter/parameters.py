@@ -1,6 +1,6 @@
 """Parameters of motion by voting."""
 
-from jaxevent.parameters import Choice, Count, Number, Parameters, Positive, Share
+from jaxevent.parameters import Choice, Count, Number, Parameters, Positive, UnitInterval
 
 
 class Params(Parameters):
@@ -56,7 +56,7 @@ class Params(Parameters):
     baseline = Positive(
         6.5, "px", "b: how far a point moves in the ages that are looked at", gradient=False
     )
-    youngest = Share(
+    youngest = UnitInterval(
         0.7, "", "youngest candidates that are looked at, in oldest ones' ages", gradient=False
     )
     tau_max = Positive(0.1, "s", "oldest candidates; 2 b / (expected speed)", gradient=False)
@@ -92,7 +92,7 @@ class Params(Parameters):
     contrast = Positive(
         1.1, "", "search anew when votes are fewer than this, in chance's votes", gradient=False
     )
-    drop = Share(0.25, "", "or fewer than this share of what they were", gradient=False)
+    drop = UnitInterval(0.25, "", "or fewer than this share of what they were", gradient=False)
     off = Positive(
         0.03,
         "",

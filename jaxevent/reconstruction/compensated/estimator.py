@@ -22,7 +22,8 @@ from scipy.ndimage import map_coordinates
 
 from jaxevent import dispatch
 from jaxevent.errors import InputError
-from jaxevent.estimator import Described, Estimate
+from jaxevent.estimator import Estimate, ShortRepr
+from jaxevent.locks import synchronized
 from jaxevent.reconstruction.clock import Clock, Timing, time_span
 from jaxevent.reconstruction.compensated import borders, trajectories
 from jaxevent.reconstruction.compensated.agreement import Agreement, Place, agree, place_of, shown
@@ -75,7 +76,6 @@ from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.reconstruction.windows import WINDOW_EVENTS, prepare
 from jaxevent.recording import Recording, Times, microseconds
-from jaxevent.sharing import in_turn
 
 PROBES = 6  # instants at which the speed of the image is measured
 KEPT = 96  # images of instants that a video remembers
@@ -90,7 +90,7 @@ INFLATE = 3.0  # of the variance of an image that motion is refined with
 evidence = Evidence("evidence", Params, fuses=False)  # reads images at single instants
 
 
-class Targets(Described):
+class Targets(ShortRepr):
     """Images to be read: where their instants lie, and how their points move."""
 
     instants: ReadOut  # all instants of all targets, sorted
@@ -486,7 +486,7 @@ class CompensatedVideo(ImageSequence[Params]):
         return np.dtype(jnp.result_type(float))
 
     @property
-    @in_turn
+    @synchronized
     def follow(self) -> Follower:
         """What estimates the motion of targets; made when first asked for."""
         if self._follower is None:
@@ -494,7 +494,7 @@ class CompensatedVideo(ImageSequence[Params]):
             self._follower = follower_of(*given, self._start)
         return self._follower
 
-    @in_turn
+    @synchronized
     def _target(self, t: int) -> tuple[Followed, Fused]:
         if self._latest is None or self._latest[0] != t:
             dispatch.check_threads()
@@ -537,7 +537,7 @@ class CompensatedVideo(ImageSequence[Params]):
         for t in wanted.tolist():
             yield self._target(t)
 
-    @in_turn
+    @synchronized
     def carry(
         self, images: NDArray[np.floating], at: NDArray[np.int64], to: int
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
@@ -553,7 +553,7 @@ class CompensatedVideo(ImageSequence[Params]):
         seen = _carry(np.asarray(images, np.float32), s, target.paths)
         return np.asarray(seen), np.asarray(_shown(self.params, M, along))
 
-    @in_turn
+    @synchronized
     def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.float32]:
         """Optical flow (T, H, W, 2) at `times`, of x and y in px/s, of the points visible then.
 
@@ -565,7 +565,7 @@ class CompensatedVideo(ImageSequence[Params]):
         ]
         return np.stack(found)
 
-    @in_turn
+    @synchronized
     def sources(self, times: Times, extrapolate: bool = False) -> dict[str, NDArray[np.float32]]:
         """Where each pixel of the images comes from: shares (T, H, W) whose sum is 1.
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxevent.devices import full_precision
-from jaxevent.estimator import Described
+from jaxevent.estimator import ShortRepr
 from jaxevent.reconstruction.compensated.agreement import (
     Agreement,
     Place,
@@ -92,7 +92,7 @@ def weight_after(place: Place) -> Numeric:
     return jnp.where(a == b, 0, jnp.clip(-place.s[a] / apart, 0, jnp.float32(1)))
 
 
-class Fused(Described):
+class Fused(ShortRepr):
     """An image of log intensity and what is told of it, each (h, w)."""
 
     L: Float[Array, "h w"]
@@ -101,7 +101,7 @@ class Fused(Described):
     visible: Float[Array, "2 h w"]  # how far the frames before and after see the point, 0..1
 
 
-class Comparison(Described):
+class Comparison(ShortRepr):
     """What the choice is between, and what it looks at."""
 
     ingredients: Float[Array, "3 h w"]  # log intensity along trajectories, smoothed, blended

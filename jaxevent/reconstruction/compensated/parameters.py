@@ -1,6 +1,6 @@
 """Parameters of the motion-compensated reconstruction."""
 
-from jaxevent.parameters import Choice, Number, Positive, Share
+from jaxevent.parameters import Choice, Number, Positive, UnitInterval
 from jaxevent.reconstruction import smoother
 
 # What the choice between the ingredients looks at; `fusion.compare` computes them.
@@ -65,7 +65,9 @@ class Params(smoother.Params):
 
     sigma_pixel = Positive(0.004, "intensity", "noise of a frame's pixel, along trajectories")
     floor = Positive(2e-4, "(ln I)^2", "variance of any image at a point between pixels")
-    information = Share(0.15, "1", "of an instant without frame; the errors of instants are akin")
+    information = UnitInterval(
+        0.15, "1", "of an instant without frame, whose errors resemble others'"
+    )
     sigma_place = Positive(0.1, "px", "error of trajectories where images are fused")
     sigma_between = Positive(0.003, "ln I", "error of interpolation between pixels")
     tolerance = Positive(3.0, "1", "standardised squared difference by which a point is hidden")
