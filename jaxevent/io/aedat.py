@@ -69,10 +69,11 @@ from jaxevent.io.checks import (
     ReadOptions,
     check_unfolded,
     check_whole_records,
+    damaged,
     reading,
     sensor_size,
 )
-from jaxevent.io.decoded import Columns, DecodedImages, FirstPassTriggers, read_events
+from jaxevent.io.decoded import Columns, DecodedImages, FirstPass, gather_pieces, read_events
 from jaxevent.io.images import gather_frames
 from jaxevent.recording import Frames, Imu, Recording
 
@@ -140,7 +141,7 @@ def read_aedat2(path: Path, options: ReadOptions) -> Recording:
         return _read_dvs128(path, header, options)
     width, height = header.size
     counts: Counter[str] = Counter()
-    triggers = FirstPassTriggers()
+    first_pass = FirstPass()
     readouts = _Readouts(width, height)
     samples = _ImuSamples(counts)
     seen: set = set()
@@ -154,7 +155,7 @@ def read_aedat2(path: Path, options: ReadOptions) -> Recording:
                 for level in (_RESET, _SIGNAL):
                     readouts.add(first, a, t, kind == level, level)
                 samples.add(a[kind == _IMU], t[kind == _IMU])
-                triggers.add(first, t[is_event & (a >> 10 & 1 == 1)], -1, 0)
+                first_pass.add_triggers(first, t[is_event & (a >> 10 & 1 == 1)], -1, 0)
                 if unknown := int(np.count_nonzero(kind == 2)):
                     counts["samples_of_unknown_kind"] += unknown
             chosen = is_event & (a >> 10 & 1 == 0)
@@ -172,12 +173,18 @@ def read_aedat2(path: Path, options: ReadOptions) -> Recording:
         frames = dataclasses.replace(frames, images=np.asarray(frames.images))
     extra = {name: np.array(number) for name, number in sorted(counts.items())}
     return Recording(
-        path.stem, *header.size, events, frames, imu=imu, extra=extra, triggers=triggers.sorted()
+        path.stem,
+        *header.size,
+        events,
+        frames,
+        imu=imu,
+        extra=extra,
+        triggers=first_pass.triggers(),
     )
 
 
 def _read_dvs128(path: Path, header: _Header, options: ReadOptions) -> Recording:
-    triggers = FirstPassTriggers()
+    first_pass = FirstPass()
 
     def decode(state: Any) -> Iterator[tuple[Any, Columns]]:
         for here, first, a, t in _records(path, header.start, state):
@@ -188,12 +195,12 @@ def _read_dvs128(path: Path, header: _Header, options: ReadOptions) -> Recording
                     "DVS128 lacks; the file is damaged or of another chip"
                 )
             special = a & 0x80008000 != 0
-            triggers.add(first, t[special], -1, 0)
+            first_pass.add_triggers(first, t[special], -1, 0)
             a, t = a[~special], t[~special]
             yield here, (t, 127 - (a >> 1 & 0x7F), 127 - (a >> 8 & 0x7F), a & 1 == 0)
 
     events = read_events(decode, header.size, str(path), options)
-    return Recording(path.stem, *header.size, events, triggers=triggers.sorted())
+    return Recording(path.stem, *header.size, events, triggers=first_pass.triggers())
 
 
 def _read_header(path: Path, size: tuple[int, int] | None) -> _Header:
@@ -220,7 +227,7 @@ def _read_header(path: Path, size: tuple[int, int] | None) -> _Header:
             f"{path}: its times count ticks of {tick[1]} {tick[2]}; only ticks of 1 us can be "
             "read, so convert it with jAER"
         )
-    size = sensor_size(f"{path}: the header does not tell the chip", size, known)
+    size = sensor_size(f"{path}: the header does not name the chip", size, known)
 
     def preference(key: str, otherwise: str) -> str:
         match = re.search(rf'key="{key}" value="([^"]*)"', text)
@@ -427,7 +434,7 @@ def read_aedat4(path: Path, options: ReadOptions) -> Recording:
             f"{path}: holds no events, and frames in the streams {', '.join(frames_in)}; choose "
             "one with frames="
         )
-    frames, imu, triggers, extra = _read_others(path, chosen, options.in_memory)
+    frames, imu, first_pass, extra = _read_others(path, chosen, options.in_memory)
     unread = [
         f"{other} {stream['type']}"
         for other, stream in streams.items()
@@ -439,22 +446,17 @@ def read_aedat4(path: Path, options: ReadOptions) -> Recording:
     size = options.size or (int(stated["width"]), int(stated["height"]))
 
     def decode(state: int | None) -> Iterator[tuple[int, Columns]]:
-        held: list[NDArray] = []
-        first = 0
-        for packet, content in enumerate(_packets(path)):
-            if packet < (state or 0) or content["stream_id"] != number:
-                continue
-            first = first if held else packet
-            held.append(content["events"])
-            if sum(map(len, held)) >= decoded.BLOCK:
-                yield first, _event_columns(held)
-                held = []
-        if held:
-            yield first, _event_columns(held)
+        pieces = (
+            (packet, len(content["events"]), content["events"])
+            for packet, content in enumerate(_packets(path))
+            if packet >= (state or 0) and content["stream_id"] == number
+        )
+        for first, packets in gather_pieces(pieces):
+            yield first, _event_columns(packets)
 
     events = read_events(decode, size, source, options)
     return Recording(
-        path.stem, *size, events, frames, imu=imu, extra=extra, triggers=triggers.sorted(),
+        path.stem, *size, events, frames, imu=imu, extra=extra, triggers=first_pass.triggers(),
         left_out=left_out,
     )  # fmt: skip
 
@@ -474,7 +476,7 @@ def _choose_streams(
     }
     several = of_kind["events"]
     described = [f"{n} ({streams[n]['width']}x{streams[n]['height']})" for n in several]
-    name = options.choose_stream(path, "stream", [str(n) for n in several], described)
+    name = options.choose_stream(path, "stream of events", [str(n) for n in several], described)
     if (name is None or options.without_events) and not of_kind["frame"]:
         raise InputError(f"{path}: holds no stream of events and none of frames")
     number = None if name is None or options.without_events else int(name)
@@ -516,14 +518,14 @@ def _event_columns(packets: list[NDArray]) -> Columns:
 
 def _read_others(
     path: Path, chosen: Mapping[str, int], in_memory: bool
-) -> tuple[Frames | None, Imu | None, FirstPassTriggers, dict[str, Any]]:
+) -> tuple[Frames | None, Imu | None, FirstPass, dict[str, Any]]:
     """Read frames, inertial samples and triggers in one pass, and the entry of `extra`."""
     stamps, exposures, samples = [], [], []
-    triggers = FirstPassTriggers()
+    first_pass = FirstPass()
     if not chosen.keys() & {"frame", "imus", "triggers"}:
-        return None, None, triggers, {}
+        return None, None, first_pass, {}
 
-    def first_pass() -> Iterator[NDArray]:
+    def frames_of_first_pass() -> Iterator[NDArray]:
         for number, packet in enumerate(_packets(path, strict=True)):
             if packet["stream_id"] == chosen.get("frame", -1):
                 frame = packet["frame"]
@@ -538,7 +540,7 @@ def _read_others(
                 signals = packet["triggers"]
                 kind = signals["source"]
                 edge = np.select([np.isin(kind, (1, 4)), np.isin(kind, (2, 5))], [1, 0], -1)
-                triggers.add(number, signals["t"].astype(np.int64), edge, kind)
+                first_pass.add_triggers(number, signals["t"].astype(np.int64), edge, kind)
 
     def decode(row: int) -> Iterator[NDArray]:
         for packet in _packets(path, strict=True):
@@ -549,7 +551,7 @@ def _read_others(
                 row -= 1
 
     images, extra = gather_frames(
-        first_pass(), decode, lambda n: f"{path}: frame {n}", str(path), in_memory
+        frames_of_first_pass(), decode, lambda n: f"{path}: frame {n}", str(path), in_memory
     )
     frames = imu = None
     if images is not None:
@@ -564,7 +566,7 @@ def _read_others(
             for name in ("gyroscope", "accelerometer")
         )
         imu = Imu(rows["t"].astype(np.int64), np.deg2rad(gyro), acc * GRAVITY)
-    return frames, imu, triggers, extra
+    return frames, imu, first_pass, extra
 
 
 def _packets(path: Path, *, strict: bool = False) -> Iterator[dict[str, Any]]:
@@ -590,10 +592,8 @@ def _decoding(path: Path) -> Iterator[None]:
     except BaseException as error:
         if type(error).__name__ != "PanicException":
             raise
-        raise InputError(
-            f"{path}: a packet is damaged ({' '.join(str(error).split())[:120]}); fetch the file "
-            "again"
-        ) from None
+        reason = " ".join(str(error).split())[:120]
+        raise damaged(f"{path}: a packet cannot be read ({reason})") from None
 
 
 def _max_unfolded_packet(file: Any, at: int, size: int) -> int:
@@ -646,53 +646,50 @@ def _check_packets(path: Path) -> None:
     third an XML text that names the streams.
     """
     length = path.stat().st_size
-    damaged = InputError(f"{path}: its header is damaged; fetch the file again")
+    wrong = damaged(f"{path}: its header is not valid")
     with path.open("rb") as file:
         head = file.read(18)
         (size,) = struct.unpack_from("<I", head, 14)
         if not 8 <= size <= length - 18:
-            raise InputError(f"{path}: its header is cut off; fetch the file again")
+            raise damaged(f"{path}: its header ends early")
         header = file.read(size)
         try:
             (root,) = struct.unpack_from("<I", header)
             (back,) = struct.unpack_from("<i", header, root)
             if root < back:
-                raise damaged
+                raise wrong
             fields, _, _, for_table, for_text = struct.unpack_from("<5H", header, root - back)
             if header[4:8] != b"IOHE" or fields < 10 or not for_text:
-                raise damaged
+                raise wrong
             stop = struct.unpack_from("<q", header, root + for_table)[0] if for_table else -1
             start = root + for_text
             start += struct.unpack_from("<I", header, start)[0]
             (count,) = struct.unpack_from("<I", header, start)
             text = header[start + 4 : start + 4 + count]
             if b"<!" in text:  # entities of XML grow without end
-                raise damaged
+                raise wrong
             streams = {
                 int(node.get("name", ""))
                 for node in ElementTree.fromstring(text.decode()).iterfind("node/node")
             }
         except (struct.error, ValueError, ElementTree.ParseError) as error:
-            raise damaged from error
+            raise wrong from error
         if len(text) != count:
-            raise damaged
+            raise wrong
         at = 18 + size
         if stop < 0:
             stop = length
         elif not at <= stop <= length or not _is_packet_table(file, stop, length):
-            raise InputError(
+            raise damaged(
                 f"{path}: its header puts the table of packets at byte {stop} of {length}, where "
-                "there is none; the file was cut off or its header is damaged, so fetch it again"
+                "there is none"
             )
         while at < stop:
             file.seek(at)
             packet = file.read(8)
             number, size = struct.unpack("<ii", packet) if len(packet) == 8 else (-1, -1)
             if number not in streams or size < 0 or at + 8 + size > stop:
-                raise InputError(
-                    f"{path}: the packet at byte {at} does not fit into the file; the recording "
-                    "was cut off or is damaged, so fetch it again"
-                )
+                raise damaged(f"{path}: the packet at byte {at} does not fit into the file")
             check_unfolded(
                 _max_unfolded_packet(file, at + 8, size), length, f"{path}: the packet at byte {at}"
             )

@@ -34,7 +34,7 @@ from jaxevent.codegen import njit
 from jaxevent.errors import InputError
 from jaxevent.io import decoded
 from jaxevent.io.checks import ReadOptions, check_whole_records, reading, sensor_size
-from jaxevent.io.decoded import Columns, FirstPassCounts, read_events
+from jaxevent.io.decoded import Columns, FirstPass, read_events
 from jaxevent.recording import Recording
 
 _HEADER = 20  # bytes
@@ -67,7 +67,7 @@ def read_n_caltech(path: Path, options: ReadOptions) -> Recording:
     """
     otherwise = (
         f"{path}: has no header, but could be a .bin of N-Caltech101 or N-MNIST, of which it does "
-        "not tell the sensor's size"
+        "not state the sensor's size"
     )
     size = sensor_size(otherwise, options.size)
     decode = functools.partial(_decode_bin, path)
@@ -120,7 +120,7 @@ def read_event_stream(path: Path, options: ReadOptions) -> Recording:
         raise InputError(f"{path}: ends inside its header; fetch the file again")
     width, height = (int(n) for n in np.frombuffer(head, "<u2", 2, 16))
     size = options.size or (width, height)
-    counts = FirstPassCounts()
+    first_pass = FirstPass()
 
     def decode(state: tuple[int, int] | None) -> Iterator[tuple[Any, Columns]]:
         offset, t = state or (_HEADER, 0)
@@ -131,7 +131,7 @@ def read_event_stream(path: Path, options: ReadOptions) -> Recording:
                 state = (offset, t)
                 data = np.frombuffer(rest + piece, np.uint8)
                 columns, count, crossings, used, t = _decode_stream(data, t, kind == 2)
-                counts.add("intensity_events", crossings, offset)
+                first_pass.count("intensity_events", crossings, offset)
                 offset += used
                 rest = data[used:].tobytes()
                 ts, xs, ys, ps = (column[:count] for column in columns)
@@ -139,7 +139,7 @@ def read_event_stream(path: Path, options: ReadOptions) -> Recording:
         check_whole_records(path, len(rest), 5, "an event")
 
     events = read_events(decode, size, str(path), options)
-    return Recording(path.stem, *size, events, extra=counts.arrays())
+    return Recording(path.stem, *size, events, extra=first_pass.counts())
 
 
 @njit

@@ -74,7 +74,7 @@ class ReadOptions:
 
         Args:
             path: The file.
-            what: Word of the format for a camera, as "topic", for messages.
+            what: Words of the format for a camera, as "topic of events", for messages.
             names: Names of the cameras in the file.
             described: Longer names for the message, (n,) as `names`.
 
@@ -85,8 +85,9 @@ class ReadOptions:
             InputError: There are several cameras and none is named, or none of that name.
         """
         if self.stream is not None and self.stream not in names:
+            noun, _, rest = what.partition(" ")
             raise InputError(
-                f"{path}: has no {what} of events {self.stream!r}; its {what}s of events are "
+                f"{path}: has no {what} {self.stream!r}; its {f'{noun}s {rest}'.strip()} are "
                 f"{', '.join(names) or 'none'}"
             )
         if self.stream is None and len(names) > 1 and not self.without_events:
@@ -126,6 +127,11 @@ def reading(source: object) -> Iterator[None]:
             f"{source}: cannot be read ({reason}); the file is damaged, incomplete or not "
             "permitted, so fetch it again or check its permissions"
         ) from error
+
+
+def damaged(what: str) -> InputError:
+    """Return the error to raise for a fault of a file, which `what` describes with its place."""
+    return InputError(f"{what}; the file was cut off or is damaged, so fetch it again")
 
 
 def max_unfolded(stored: int) -> int:
@@ -314,7 +320,7 @@ def sensor_size(otherwise: str, *sizes: tuple[int, int] | None) -> tuple[int, in
     """Return the first size that is known.
 
     Args:
-        otherwise: First part of the error, as "FILE: no image tells the sensor's size".
+        otherwise: First part of the error, as "FILE: no image shows the sensor's size".
         *sizes: (width, height) in px each, or None.
 
     Returns:

@@ -9,7 +9,7 @@ These are the names of tonic (x y t p), expelliarmus and OpenEB (t x y p), dv-pr
 x y polarity), faery and aedat (t x y on) and event_utils (ts xs ys ps). The order of the columns
 does not count, as it differs from one program to the next.
 
-Four columns without names are told apart by their values (`order_of`): t x y p, x y p t, x y t p
+Four columns without names are distinguished by their values (`order_of`): t x y p, x y p t, x y t p
 or p t x y. A table that fits more than one of these orders is refused.
 
 The unit of the times is that of the name, or inferred (`time_units`): usually us where all are
@@ -77,7 +77,15 @@ def as_rows(array: Any) -> Any:
 
 
 def split_rows(rows: NDArray, order: str) -> dict[str, NDArray]:
-    """Return the columns t, x, y and p of rows (n, 4) whose columns are in some order."""
+    """Return the columns t, x, y and p of rows of numbers.
+
+    Args:
+        rows: (n, 4) rows.
+        order: Order of the columns, as "txyp".
+
+    Returns:
+        Columns (n,) by name.
+    """
     return {name: rows[:, order.index(name)] for name in "txyp"}
 
 
@@ -130,7 +138,18 @@ def order_of(rows: NDArray, size: tuple[int, int] | None, source: str) -> str:
 
 
 def record_fields(records: NDArray, source: str) -> dict[str, str]:
-    """Find the names of t, x, y and p in a structured array of events, or raise `InputError`."""
+    """Find the names of t, x, y and p in a structured array of events.
+
+    Args:
+        records: (n,) structured array.
+        source: Name of the file for messages.
+
+    Returns:
+        Names of the array's fields by "t", "x", "y" and "p".
+
+    Raises:
+        InputError: The array has other fields, or another shape.
+    """
     fields = find_fields(records.dtype.names or ())
     if records.ndim != 1 or fields is None:
         held = ", ".join(records.dtype.names or ()) or str(records.dtype)
@@ -193,7 +212,15 @@ class ColumnFormat(NamedTuple):
         return np.where(values == self.off, -1.0, values)
 
     def clock(self, first: int, last: int) -> Clock:
-        """Return the clock of events whose first and last times are given in us."""
+        """Return the clock of events, for the times of images, poses and samples beside them.
+
+        Args:
+            first: Time of the first event in us.
+            last: Time of the last event in us.
+
+        Returns:
+            The clock.
+        """
         return Clock(self.unit.name, first, last, self.is_float)
 
 

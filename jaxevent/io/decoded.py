@@ -14,7 +14,7 @@ them: a copy opens the file again.
 import functools
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple, ParamSpec, Self
+from typing import Any, NamedTuple, ParamSpec, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ BLOCK = 1 << 20  # events decoded together: 13 MB
 Columns = disorder.Columns
 Decoder = disorder.Decoder
 P = ParamSpec("P")
+T = TypeVar("T")
 
 
 class LoadCall:
@@ -252,62 +253,84 @@ def _joined(pieces: list[Events]) -> Events:
     return Events.of_checked(*columns)
 
 
-class FirstPassCounts:
-    """Counts of things in a file that a decoder meets on its first pass, by name."""
+class FirstPass:
+    """Counts and external triggers that a decoder meets on its first pass over a file.
+
+    A place in the file rises from block to block; a place that was met before adds nothing.
+    """
 
     def __init__(self):
         self._counts: dict[str, int] = {}
-        self._places: dict[str, int] = {}
+        self._last_places: dict[str, int] = {}
+        self._triggers: list[tuple[NDArray, NDArray, NDArray]] = []
 
-    def add(self, name: str, number: int, place: int) -> None:
+    def _is_new(self, name: str, place: int) -> bool:
+        is_new = place > self._last_places.get(name, -1)
+        self._last_places[name] = max(place, self._last_places.get(name, -1))
+        return is_new
+
+    def count(self, name: str, number: int, place: int) -> None:
         """Add to a count.
 
         Args:
             name: Name of the count.
             number: Number to add.
-            place: Place of the block in the file, which rises from block to block; a place that
-                was counted before adds nothing.
+            place: Place of the block in the file.
         """
-        if number and place > self._places.get(name, -1):
-            self._places[name] = place
+        if number and self._is_new(name, place):
             self._counts[name] = self._counts.get(name, 0) + number
 
-    def arrays(self) -> dict[str, NDArray]:
-        """Return the counts that are not 0, by name."""
+    def counts(self) -> dict[str, NDArray]:
+        """Return the counts that are not 0, by name, as `Recording.extra` keeps them."""
         return {name: np.array(number) for name, number in sorted(self._counts.items())}
 
-
-class FirstPassTriggers:
-    """External triggers that a decoder meets on its first pass."""
-
-    def __init__(self):
-        self._pieces: list[tuple[NDArray, NDArray, NDArray]] = []
-        self._place = -1
-
-    def add(self, place: int, t: NDArray, edge: NDArray | int, channel: NDArray | int) -> None:
+    def add_triggers(
+        self, place: int, t: NDArray, edge: NDArray | int, channel: NDArray | int
+    ) -> None:
         """Keep the triggers of a block.
 
         Args:
-            place: Place of the block in the file, which rises from block to block; a place that
-                was met before adds nothing.
+            place: Place of the block in the file.
             t: (n,) times in us.
             edge: 1 rising, 0 falling, -1 unknown, one for all or (n,).
             channel: Number of the input, one for all or (n,).
         """
-        if place > self._place:
-            self._place = place
-            if len(t):
-                edge, channel = np.broadcast_to(edge, len(t)), np.broadcast_to(channel, len(t))
-                self._pieces.append((t, edge, channel))
+        if self._is_new("triggers", place) and len(t):
+            edge, channel = np.broadcast_to(edge, len(t)), np.broadcast_to(channel, len(t))
+            self._triggers.append((t, edge, channel))
 
-    def sorted(self) -> Triggers | None:
+    def triggers(self) -> Triggers | None:
         """Return all triggers in the order of their times; None if there are none."""
-        if not self._pieces:
+        if not self._triggers:
             return None
-        t, edge, channel = (np.concatenate(values) for values in zip(*self._pieces, strict=True))
+        t, edge, channel = (np.concatenate(one) for one in zip(*self._triggers, strict=True))
         order = np.argsort(t, kind="stable")
         found = Triggers(t.astype(np.int64), edge.astype(np.int8), channel.astype(np.uint8))
         return found[order]
+
+
+def gather_pieces(
+    pieces: Iterable[tuple[Any, int, T]], count: int | None = None
+) -> Iterator[tuple[Any, list[T]]]:
+    """Gather small pieces of a file, as packets, into blocks.
+
+    Args:
+        pieces: State of the decoder before each piece, size of the piece, and the piece.
+        count: Size of a block; None takes `BLOCK`.
+
+    Yields:
+        The state before each block, and its pieces.
+    """
+    first, held, size = None, [], 0
+    for state, number, piece in pieces:
+        first = first if held else state
+        held.append(piece)
+        size += number
+        if size >= (count or BLOCK):
+            yield first, held
+            held, size = [], 0
+    if held:
+        yield first, held
 
 
 class DecodedEvents(EventsInFile):

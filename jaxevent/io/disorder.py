@@ -1,6 +1,6 @@
 """Event times that go back: what kind of fault it is, and how each kind is mended.
 
-Four faults are told apart, in times of int64 us:
+Four faults are distinguished, in times of int64 us:
 
     jitter    events that come late by at most a bound: they are sorted
     outliers  a few events far before or after their neighbours, to whose times the stream
@@ -43,7 +43,7 @@ Decoder = Callable[[Any], Iterator[tuple[Any, Columns]]]
 
 @dataclasses.dataclass(frozen=True)
 class Repair:
-    """The repairs that a user asked for.
+    """The repairs that a user named.
 
     Attributes:
         sort: Whether to sort late events.
@@ -143,7 +143,9 @@ class Disorder:
                 f"event {self.first.row} is at {self.first.after} us, earlier than the one before "
                 f"it at {self.first.before} us: "
             )
-        if self.events <= 2 * _MAX_EDGE and (self.resets or self.outliers):  # too few to tell apart
+        if self.events <= 2 * _MAX_EDGE and (
+            self.resets or self.outliers
+        ):  # too few to distinguish
             return OrderError(f"{where.rstrip(': ')}; sort the events by time (stable)")
         return OrderError(
             f"{where}{'; '.join(faults)}; mend this with repair={repairs!r} or jaxevent convert "

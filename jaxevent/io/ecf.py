@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import njit, njit_inlined
 from jaxevent.deprecated import renamed_names
-from jaxevent.errors import InputError
+from jaxevent.io.checks import damaged
 
 FILTER = 36559
 MAX_EVENTS = 65535  # of a chunk
@@ -40,9 +40,9 @@ class Records:
 
     def __init__(self, stored: h5py.Dataset, source: str):
         if stored.dtype != RECORD or len(stored.shape) != 1:
-            raise InputError(
+            raise damaged(
                 f"{source} is compressed with Prophesee's ECF but holds {stored.dtype}, not "
-                "records x, y, p and t; fetch the file again"
+                "records x, y, p and t"
             )
         self._stored, self._source = stored, source
         self._size: int = (stored.chunks or (1,))[0]
@@ -75,9 +75,7 @@ class Records:
         else:
             records = decode(np.frombuffer(data, np.uint8))
         if records is None or len(records) < count:
-            raise InputError(
-                f"{self._source}: the chunk of row {first} is damaged; fetch the file again"
-            )
+            raise damaged(f"{self._source}: the chunk of row {first} cannot be decoded")
         return records[:count]
 
 

@@ -52,7 +52,7 @@ Times are whole microseconds in BS-ERGB; other units are inferred (`time_units`)
 HS-ERGB and BS-ERGB were remapped onto the images' pixels, and are stored in 1/32 pixel. Coordinates
 are taken so where most events would lie outside the images otherwise. They are rounded to whole
 pixels, as are coordinates with decimals, and events outside the images are left out; a note counts
-them. Images beyond the last time are left out too, as the README of TimeLens says.
+them. Images beyond the last time are left out too, as the README of TimeLens requires.
 
 Exposures are unknown: 0. Colours become grey (ITU-R 601 luma), and `extra["rgb"]` keeps them.
 
@@ -74,6 +74,7 @@ from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
 from jaxevent.io.checks import (
     ReadOptions,
+    damaged,
     image_size,
     make_supported_camera,
     open_archive,
@@ -157,7 +158,7 @@ def _read_member(archive: zipfile.ZipFile, name: str, source: str) -> NDArray:
         if shape is None or dtype is None:
             raise InputError(f"{source}: {name} is pickled, which is not read; store numbers")
         if int(np.prod(shape, dtype=object)) * dtype.itemsize > archive.getinfo(name).file_size:
-            raise InputError(f"{source}: {name} is cut off; fetch the file again")
+            raise damaged(f"{source}: {name} holds too few bytes")
     with archive.open(name) as stream:
         return np.lib.format.read_array(stream, allow_pickle=False)
 
@@ -219,7 +220,7 @@ def read_evimo(
             elif len(t):
                 extra |= {name: images, f"{name}_t": t}
     sizes = [part.shape[::-1] for part in parts.values() if part.shape is not None]
-    size = sensor_size(f"{path}: no image tells the sensor's size", options.size, stated, *sizes)
+    size = sensor_size(f"{path}: no image shows the sensor's size", options.size, stated, *sizes)
     held = _open_events(path, "dataset_events", "t")
     unit = "s" if held.is_float else "us"
     found = read_columns(held.fields, held.count, size, source, options, unit=unit)
@@ -351,7 +352,7 @@ def read_evreal(path: Path, options: ReadOptions) -> Recording:
     source = str(path)
     held = _open_events(path, "events", "ts")
     images, left_out = _open_images(path)
-    otherwise = f"{path}: neither metadata.json nor an image tells the sensor's size"
+    otherwise = f"{path}: neither metadata.json nor an image shows the sensor's size"
     size = sensor_size(otherwise, options.size, _stated_size(path), image_size(images))
     usual = "s" if held.is_float else "us"
     found = read_columns(held.fields, held.count, size, source, options, usual=usual)
@@ -393,7 +394,7 @@ def _stated_size(path: Path) -> tuple[int, int] | None:
 
 
 def _open_images(path: Path) -> tuple[NDArray | None, dict[str, str]]:
-    """Open the images, left in their file, or say why they are left out."""
+    """Open the images, left in their file, or explain why they are left out."""
     file = path / "images.npy"
     if not file.is_file():
         return None, {}
@@ -454,7 +455,7 @@ def read_timelens(path: Path, options: ReadOptions) -> Recording:
     images, extra = None, {}
     if pictures:
         images, extra = read_files(pictures, str(folder), options.in_memory)
-    otherwise = f"{path}: no image in {names[1]} tells the sensor's size"
+    otherwise = f"{path}: no image in {names[1]} shows the sensor's size"
     size = sensor_size(otherwise, options.size, image_size(images))
     first, last = _first_and_last(files)
     grid = _PixelGrid(size, first[1], first[2])

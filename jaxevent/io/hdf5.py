@@ -19,14 +19,14 @@
 
 All times but events/t are on the recording's clock. Only /events is required to read a file, so
 files of DSEC and VECtor (t uint32, no attributes) can be read too, and RVT's (events/width and
-height). DSEC's rectify_map.h5, where it lies beside the file, tells the sensor's size and is kept
+height). DSEC's rectify_map.h5, where it lies beside the file, shows the sensor's size and is kept
 in `extra["rectify_map"]`; otherwise files of this layout compressed by Blosc, as DSEC and VECtor
 publish theirs, have 640x480 pixels, and of others the size must be given. Other
 layouts: `hdf5_layouts`.
 
 Data compressed by a filter that HDF5 itself lacks (DSEC: Blosc) need the package hdf5plugin, which
 is imported when first needed. A file that claims many more events than its bytes can hold is
-refused before any memory is asked for.
+refused before any memory is taken.
 """
 
 import dataclasses
@@ -38,7 +38,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.arrays import times, to_microseconds
+from jaxevent.arrays import UNITS, times, to_microseconds
 from jaxevent.errors import InputError, OrderError
 from jaxevent.io import companions
 from jaxevent.io.checks import (
@@ -63,7 +63,7 @@ from jaxevent.io.hdf5_files import (
     open_file,
 )
 from jaxevent.io.output import CLOCK_UNIT, complete_hdf5
-from jaxevent.io.time_units import NAMES, Clock, unit_of_words
+from jaxevent.io.time_units import Clock, unit_of_words
 from jaxevent.progress import bar
 from jaxevent.recording import (
     EventColumns,
@@ -260,7 +260,7 @@ class StoredEvents(EventsInFile):
             yield start, self._read(start, min(start + _BLOCK, len(self)))
 
     def repaired(self, options: ReadOptions) -> EventSource:
-        """Return these events, with their times repaired as the options say."""
+        """Return these events, with their times repaired by the options."""
         if options.repair is None:
             return self
         return read_events(self.decode, self.checked_size, self._source, options)
@@ -274,7 +274,15 @@ class StoredEvents(EventsInFile):
         return self._format.clock(int(first) + self._offset, int(last) + self._offset)
 
     def columns(self, rows: slice, out: EventColumns | None = None) -> EventColumns | None:
-        """See `recording.ColumnSource`."""
+        """Read a range of rows as they are stored; see `recording.ColumnSource`.
+
+        Args:
+            rows: The rows, step 1.
+            out: Columns to write to, if they are long enough.
+
+        Returns:
+            The columns; None if they are stored as other types.
+        """
         stored: list[Any] = [self._t, self._x, self._y, self._p]
         if not all(isinstance(column, h5py.Dataset) for column in stored):
             return None
@@ -435,7 +443,7 @@ def _read_open(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
         found = infer_column_format(columns, size, source, options)
     if found.unit.name != "us" and offset:
         raise InputError(
-            f"{source}: events/t is in {NAMES[found.unit.name]} and t_offset in microseconds; "
+            f"{source}: events/t is in {UNITS[found.unit.name]} and t_offset in microseconds; "
             "store all times in integer microseconds"
         )
     notes = list(found.unit.notes)

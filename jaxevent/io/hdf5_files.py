@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, require
-from jaxevent.io.checks import check_unfolded, max_unfolded, reading
+from jaxevent.io.checks import check_unfolded, damaged, max_unfolded, reading
 
 _MAX_COMPRESSION = 4096  # times smaller than in memory that any filter makes real events
 _HEAP_BYTES = 1 << 24  # at either end of a file that are searched for heaps
@@ -104,7 +104,7 @@ def check_heaps(path: Path) -> None:
 @functools.lru_cache(maxsize=16)
 def search_heaps(path: Path, state: tuple[int, ...]) -> None:
     """Check the heaps of a file, once for each state of it."""
-    damaged = InputError(f"{path}: a string or its heap is damaged; fetch the file again")
+    wrong = damaged(f"{path}: a string or its heap is not valid")
     with path.open("rb", buffering=0) as file:
         length = file.seek(0, 2)
         strings = set[bytes]()
@@ -117,13 +117,13 @@ def search_heaps(path: Path, state: tuple[int, ...]) -> None:
                 strings |= {match[1] for match in _STRING.finditer(block)}
                 heaps += [place + match.start() for match in _HEAP.finditer(block)]
             if not _all_heaps_end(file, heaps, end):
-                raise damaged
+                raise wrong
         base = _find_start(file, length)
         for count, heap, _ in (struct.unpack("<IQI", string) for string in strings):
             if count and (
                 heap >= length or count > length or _read_at(file, heap + base, 4) != b"GCOL"
             ):
-                raise damaged
+                raise wrong
 
 
 def _blocks(file: io.FileIO, begin: int, end: int) -> Iterator[tuple[int, memoryview]]:
@@ -229,10 +229,7 @@ def dataset(file: h5py.File, name: str, source: str, undone: Sequence[int] = ())
                 _check_deflated(found, f"{source}: {name}")
         held = stored * (_MAX_COMPRESSION if filters else 1)
         if count * found.dtype.itemsize > held:
-            raise InputError(
-                f"{source}: {name} claims {count} values but holds {stored} bytes; the file is "
-                "damaged or incomplete, so fetch it again"
-            )
+            raise damaged(f"{source}: {name} claims {count} values but holds {stored} bytes")
     return found
 
 
@@ -248,7 +245,7 @@ def find_images(file: h5py.File) -> list[str]:
         nonlocal seen
         seen += 1
         if isinstance(item, h5py.Dataset) and not name.startswith("extra/"):
-            # Of a virtual dataset the shape cannot be asked for without following it.
+            # Of a virtual dataset the shape cannot be read without following it.
             is_virtual = item.id.get_create_plist().get_layout() == h5py.h5d.VIRTUAL
             if not is_virtual and item.dtype in (np.uint8, np.uint16) and item.ndim in (3, 4):
                 found.append(name)
@@ -290,10 +287,7 @@ def _check_deflated(stored: h5py.Dataset, source: str) -> None:
     for place in large:
         _, data = stored.id.read_direct_chunk(place)
         if len(zlib.decompressobj().decompress(data, whole + 1)) > whole:
-            raise InputError(
-                f"{source}: the chunk at {place} unfolds to more than a chunk; the file is "
-                "damaged, so fetch it again"
-            )
+            raise damaged(f"{source}: the chunk at {place} unfolds to more than a chunk")
 
 
 def _load_filter(code: int, source: str) -> None:

@@ -1,4 +1,4 @@
-"""Recordings as HDF5 in other layouts than jaxevent's own, told by the names inside.
+"""Recordings as HDF5 in other layouts than jaxevent's own, recognised by the names inside.
 
     event_utils (ECD as HDF5)   /events/{ts, xs, ys, ps}: ts in s; /images/image000000000 and on,
                                 each with its time, attribute timestamp; sensor_resolution (H, W)
@@ -10,7 +10,7 @@
     Metavision                  /CD/events, records with fields t, x, y, p, also compressed by ECF
                                 (`ecf`); attribute geometry; /EXT_TRIGGER/events, records t, p, id
     v2e                         /events, or the only dataset, (N, 4) or (4, N): t in us, x, y, p;
-                                the order is told by the content; 4294967295 is a polarity of -1;
+                                the order is inferred; 4294967295 is a polarity of -1;
                                 /frame (frames, H, W) uint8, /frame_ts in us, /frame_idx, the
                                 number of events before each frame, which is not needed
     others                      /events or the file itself with t, x, y and p, whole lists or
@@ -103,7 +103,7 @@ def _read_open(file: Any, path: Path, options: ReadOptions) -> Recording:
         stamps, images = _open_numbered_images(file, source)
     if isinstance(file.get("frame"), h5py.Dataset):
         stamps, images = _open_images_of_v2e(file, source)
-    otherwise = f"{path}: neither an attribute nor an image tells the sensor's size"
+    otherwise = f"{path}: neither an attribute nor an image shows the sensor's size"
     stated = _stated_size(file, source) if options.size is None else None
     size = sensor_size(otherwise, options.size, stated, image_size(images))
     columns = columns if plain is None else _split_plain_columns(file, plain, size, source)
@@ -150,7 +150,7 @@ def _name_of_plain_columns(file: Any) -> str | None:
     found = file.get(names[0]) if len(names) == 1 else None
     if not isinstance(found, h5py.Dataset) or file.userblock_size or found.dtype.kind not in "iuf":
         return None
-    # Of a virtual dataset the shape cannot be asked for without following it.
+    # Of a virtual dataset the shape cannot be read without following it.
     is_virtual = found.id.get_create_plist().get_layout() == h5py.h5d.VIRTUAL
     return names[0] if is_virtual or found.ndim == 2 and 4 in found.shape else None
 
@@ -228,7 +228,7 @@ def _read_mvsec(file: Any, path: Path, options: ReadOptions, group: str) -> Reco
         if images.ndim != 3:
             raise InputError(f"{source}: {group}/image_raw has shape {images.shape}; store 3 axes")
         images = StoredImages(images, source) if len(images) else None
-    otherwise = f"{path}: has no {group}/image_raw to tell the sensor's size"
+    otherwise = f"{path}: has no {group}/image_raw to show the sensor's size"
     size = sensor_size(otherwise, options.size, image_size(images))
     found = infer_column_format(columns, size, source, options, usual="s")
     events = StoredEvents(columns, size, source, found)

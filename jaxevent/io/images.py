@@ -31,13 +31,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.arrays import LUMA, SCALES, to_grey
+from jaxevent.arrays import LUMA, SCALES, UNITS, to_grey
 from jaxevent.camera import TableResponse
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.io.checks import check_unfolded, reading
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.output import complete
-from jaxevent.io.time_units import NAMES, unit_of_name
+from jaxevent.io.time_units import unit_of_name
 from jaxevent.recording import microseconds
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
@@ -540,7 +540,7 @@ def _inside(
         return times
     unit, t = next(iter(fitting.items()))
     warnings.warn(
-        f"{path}: the times are taken as {NAMES[unit]}, since they lie in the recording then; name "
+        f"{path}: the times are taken as {UNITS[unit]}, since they lie in the recording then; name "
         f"the column t_{unit} to be sure",
         InputWarning,
         stacklevel=3,
@@ -650,8 +650,8 @@ def _exif_exposure(file: Path) -> float:
         value = image.getexif().get_ifd(_EXIF).get(_EXPOSURE_TIME)
     if value is None:
         raise InputError(
-            f"{file}: does not tell its exposure time; give --exposures, or {STACK_TIMES} of lines "
-            "'s name' beside the images"
+            f"{file}: does not state its exposure time; give --exposures, or {STACK_TIMES} of "
+            "lines 's name' beside the images"
         )
     return float(value)
 

@@ -15,7 +15,7 @@ unless there are three frames. MATLAB's rows and columns (1 x N) become vectors.
 
 In place of `events` there may be four vectors with the names of `columns` (ASL-DVS: ts, x, y, pol),
 as variables or as fields of a struct, or one other array (N, 4) or (4, N), in an order that
-`columns.order_of` tells. Their x and y count from 0 where a 0 occurs, otherwise from 1. The fields
+`columns.order_of` infers. Their x and y count from 0 where a 0 occurs, otherwise from 1. The fields
 of other structs are kept as "struct.field".
 """
 
@@ -32,7 +32,14 @@ from numpy.typing import NDArray
 
 from jaxevent.arrays import times
 from jaxevent.errors import InputError
-from jaxevent.io.checks import ReadOptions, check_unfolded, image_size, reading, sensor_size
+from jaxevent.io.checks import (
+    ReadOptions,
+    check_unfolded,
+    damaged,
+    image_size,
+    reading,
+    sensor_size,
+)
 from jaxevent.io.columns import (
     ColumnEvents,
     as_rows,
@@ -88,19 +95,17 @@ def _unpacked(path: Path) -> BytesIO:
     while at < len(data):
         kind, size = struct.unpack_from(order + "2I", data, at)
         body = data[at + 8 : at + 8 + size]
+        wrong = damaged(f"{path}: the variable at byte {at} is not valid")
         if len(body) != size or kind not in (_COMPRESSED, _MATRIX):
-            raise InputError(
-                f"{path}: the variable at byte {at} is damaged or cut off; fetch the file again"
-            )
+            raise wrong
         if kind == _COMPRESSED:
             unpacking = zlib.decompressobj()
             (kind, size) = struct.unpack(order + "2I", unpacking.decompress(body, 8))
             check_unfolded(out.tell() + size, len(data), str(path))
             body = unpacking.decompress(unpacking.unconsumed_tail, size + 1)
         if kind != _MATRIX or len(body) != size:
-            raise InputError(f"{path}: the variable at byte {at} is damaged; fetch it again")
-        source = f"{path}: the variable at byte {at}"
-        for part in _numeric_parts(memoryview(body), order, source):
+            raise wrong
+        for part in _numeric_parts(memoryview(body), order, wrong):
             out.write(struct.pack(order + "2I", kind, len(part)))
             out.write(part)
         at += 8 + int(struct.unpack_from(order + "2I", data, at)[1])
@@ -116,56 +121,55 @@ class _Element(NamedTuple):
     stop: int
 
 
-def _elements(body: memoryview, order: str, damaged: InputError) -> Iterator[_Element]:
+def _elements(body: memoryview, order: str, wrong: InputError) -> Iterator[_Element]:
     at = 0
     while at < len(body):
         if len(body) - at < 8:
-            raise damaged
+            raise wrong
         kind, size = struct.unpack_from(order + "2I", body, at)
         start, stop = at + 8, at + 8 + size + -size % 8
         if kind >> 16:  # up to 4 bytes, beside the type
             kind, size, start, stop = kind & 0xFFFF, kind >> 16, at + 4, at + 8
         if start + size > len(body) or (stop == at + 8 and start == at + 4 and size > 4):
-            raise damaged
+            raise wrong
         yield _Element(kind, body[start : start + size], stop)
         at = stop
 
 
 def _numeric_parts(
-    body: memoryview, order: str, source: str, *, is_field: bool = False
+    body: memoryview, order: str, wrong: InputError, *, is_field: bool = False
 ) -> list[bytes]:
-    """Return the arrays of numbers in a variable: itself, or the fields of a struct of one element.
+    """Return the arrays of numbers in a variable: itself, or the fields of a lone struct.
 
-    They are the flags, whose lowest byte is the class and whose bit 11 says complex, the sizes, the
-    name, the real and for complex the imaginary numbers; of a struct, in place of numbers, the
+    They are the flags, whose lowest byte is the class and whose bit 11 marks complex, the sizes,
+    the name, the real and for complex the imaginary numbers; of a struct, in place of numbers, the
     length of its fields' names, these, and the fields. Fields become variables of their own, named
-    "struct.field"; structs that are fields themselves are left out. Raises `InputError` where the
-    elements do not fill the variable.
+    "struct.field"; structs that are fields themselves are left out. Raises `wrong` if the elements
+    do not fill the variable.
     """
-    damaged = InputError(f"{source} is damaged; fetch the file again")
-    elements = _elements(body, order, damaged)
+    elements = _elements(body, order, wrong)
     flags = next(elements, None)
     if flags is None or flags.kind != _FLAGS or len(flags.data) != 8:
-        raise damaged
+        raise wrong
     (bits,) = struct.unpack_from(order + "I", flags.data)
     is_struct = bits & 0xFF == _STRUCT
     if bits & 0xFF not in _CLASSES and (is_field or not is_struct):
         return []
     kept = [flags, *elements]
     if [element.kind for element in kept[1:3]] != [_SIZES, _NAME]:
-        raise damaged
+        raise wrong
     numbers = kept[3:]
     if not is_struct:
         is_right = {element.kind for element in numbers} <= _NUMBERS
         if len(numbers) != 1 + bool(bits & 0x800) or not is_right:
-            raise damaged
+            raise wrong
         return [bytes(body)]
     if len(numbers) < 2 or len(numbers[0].data) != 4:
-        raise damaged
+        raise wrong
     (length,) = struct.unpack(order + "I", numbers[0].data)
     joined, fields = bytes(numbers[1].data), numbers[2:]
     if not length or len(joined) % length or any(field.kind != _MATRIX for field in fields):
-        raise damaged
+        raise wrong
     names = [joined[at : at + length].split(b"\0")[0] for at in range(0, len(joined), length)]
     if len(fields) != len(names):  # an array of structs
         return []
@@ -173,14 +177,14 @@ def _numeric_parts(
     for name, field in zip(names, fields, strict=True):
         whole = bytes(kept[2].data) + b"." + name
         if len(field.data):
-            held = _numeric_parts(field.data, order, source, is_field=True)
+            held = _numeric_parts(field.data, order, wrong, is_field=True)
             parts += [_renamed(part, whole, order) for part in held]
     return parts
 
 
 def _renamed(body: bytes, name: bytes, order: str) -> bytes:
     """Replace the name of an array of numbers, its third element."""
-    elements = [*_elements(memoryview(body), order, InputError("damaged"))]
+    elements = [*_elements(memoryview(body), order, damaged("it"))]
     held = struct.pack(order + "2I", 1, len(name)) + name + bytes(-len(name) % 8)
     return body[: elements[1].stop] + held + body[elements[2].stop :]
 
@@ -217,7 +221,7 @@ def read_v73(path: Path, options: ReadOptions) -> Recording:
                     empty = hdf5_files.attribute(dataset, "MATLAB_empty")
                     stored = hdf5_files.array(file, name, str(path))
                     if empty and stored.all():
-                        raise InputError(f"{path}: {name} is said to be empty but has a size")
+                        raise InputError(f"{path}: {name} is marked as empty but has a size")
                     value = np.zeros(stored.astype(int)) if empty else stored.T
                     variables[name.replace("/", ".")] = value
                     held = sum(value.nbytes for value in variables.values())
@@ -240,7 +244,7 @@ def _make_recording(path: Path, options: ReadOptions, variables: dict) -> Record
     images = arrays.pop("image") if "image" in arrays else None
     if images is not None:
         images = _checked_images(path, images)
-    otherwise = f"{path}: has no image to tell the sensor's size"
+    otherwise = f"{path}: has no image to show the sensor's size"
     size = sensor_size(otherwise, options.size, image_size(images))
     events, clock, notes = _read_events(path, found, size, options)
     frames = None
@@ -256,7 +260,7 @@ def _make_recording(path: Path, options: ReadOptions, variables: dict) -> Record
 class _StoredEvents(NamedTuple):
     """Events as stored: columns by name, or in one array whose order may be known.
 
-    `is_layout` says that it is the array of the layout: t x y p, where times are sorted so.
+    `is_layout` marks the array of the layout: t x y p, where times are sorted so.
     """
 
     columns: dict[str, NDArray]

@@ -203,7 +203,7 @@ class Command:
         """The inputs as TOML, one line each: `"name" = { bytes = 7, sha256 = "..." }`.
 
         Of a folder it is the sha256 of its files' names and sizes: "name\\tbytes\\n" for each, by
-        rising name. Files above 2 GB have their size alone, and a note that says so.
+        rising name. Files above 2 GB have their size alone, and a note on it.
         """
         prints = {_printable(str(path)): _fingerprint(path) for path in self.inputs}
         return "\n".join(f"{toml.key(n)} = {toml.text(about)}" for n, about in prints.items())

@@ -40,14 +40,8 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, require
 from jaxevent.io import companions, decoded
-from jaxevent.io.checks import ReadOptions, check_whole_records, reading, sensor_size
-from jaxevent.io.decoded import (
-    Columns,
-    Decoder,
-    FirstPassCounts,
-    FirstPassTriggers,
-    read_events,
-)
+from jaxevent.io.checks import ReadOptions, check_whole_records, damaged, reading, sensor_size
+from jaxevent.io.decoded import Columns, Decoder, FirstPass, read_events
 from jaxevent.recording import Recording
 
 _MAX_HEADER = 1 << 16  # bytes
@@ -55,7 +49,7 @@ _TRIGGER_RECORDS = 14  # the type of a DAT file's records
 _EVT2_TYPES = (0, 1, 8, 10, 14, 15)
 _EVT3_TYPES = (0, 2, 3, 4, 5, 6, 7, 8, 10, 14, 15)
 _MAX_RESERVED = 16  # different values of words of other types in a block
-_SIZES = (  # of sensors whose files may not tell their size, by the name of Metavision's plugin
+_SIZES = (  # of sensors whose files may not state their size, by the name of Metavision's plugin
     ("gen31", (640, 480)),
     ("gen3", (640, 480)),
     ("gen41", (1280, 720)),
@@ -84,20 +78,20 @@ def read(path: Path, options: ReadOptions) -> Recording:
         version = stated or {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}.get(
             header.get("evt", ""), ""
         )
-        counts, triggers = FirstPassCounts(), FirstPassTriggers()
+        first_pass = FirstPass()
         decode: Decoder
         if version in ("EVT2", "EVT21"):
             width = 4 if version == "EVT2" else 8
             is_swapped = width == 8 and _has_swapped_halves(path, start, header.get("format", ""))
             words = functools.partial(_evt2_words, path, start, width, is_swapped)
-            decode = functools.partial(_decode_evt2, path, words, counts, triggers)
+            decode = functools.partial(_decode_evt2, path, words, first_pass)
         elif version == "EVT3":
             width = 2
             words_from = functools.partial(_evt3_words, path, start)
-            decode = functools.partial(decode_evt3, str(path), words_from, counts, triggers)
+            decode = functools.partial(decode_evt3, str(path), words_from, first_pass)
         elif not version and "version" in header:
             width = 8
-            decode, start = _open_dat(path, start, header, triggers)
+            decode, start = _open_dat(path, start, header, first_pass)
         else:
             raise InputError(
                 f"{path}: has a header like a Prophesee recording's, but its format "
@@ -105,10 +99,16 @@ def read(path: Path, options: ReadOptions) -> Recording:
                 "convert it with Metavision's tools"
             )
         check_whole_records(path, path.stat().st_size - start, width, "a word")
-    otherwise = f"{path}: the header does not tell the sensor's size"
+    otherwise = f"{path}: the header does not state the sensor's size"
     size = sensor_size(otherwise, options.size, _stated_size(header))
     events = read_events(decode, size, str(path), options)
-    return Recording(path.stem, *size, events, extra=counts.arrays(), triggers=triggers.sorted())
+    return Recording(
+        path.stem,
+        *size,
+        events,
+        extra=first_pass.counts(),
+        triggers=first_pass.triggers(),
+    )
 
 
 def _read_header(path: Path) -> tuple[dict[str, str], int]:
@@ -171,7 +171,7 @@ def _count_reserved(
     kind: NDArray[np.uint8],
     defined: tuple[int, ...],
     offset: int,
-    counts: FirstPassCounts,
+    first_pass: FirstPass,
 ) -> None:
     """Count words of types that a format reserves, which decoders skip.
 
@@ -183,7 +183,7 @@ def _count_reserved(
         kind: (n,) their types.
         defined: Types that the format defines.
         offset: Offset of the block in bytes.
-        counts: Counts of the file.
+        first_pass: Counts of the file.
 
     Raises:
         InputError: Reserved words have more than `_MAX_RESERVED` values.
@@ -195,12 +195,12 @@ def _count_reserved(
         return
     if len(np.unique(words[reserved])) > _MAX_RESERVED:
         row = int(np.argmax(reserved))
-        raise InputError(
+        raise damaged(
             f"{source}: the word at byte {offset + row * words.itemsize} has the type "
             f"{int(kind[row]):#x}, which the format reserves, and so have many others of different "
-            "values; the file is damaged, so fetch it again"
+            "values"
         )
-    counts.add("reserved_words", int(np.count_nonzero(reserved)), offset)
+    first_pass.count("reserved_words", int(np.count_nonzero(reserved)), offset)
 
 
 def _continued(values: NDArray[np.int64], before: int | None, bits: int) -> NDArray[np.int64]:
@@ -267,28 +267,27 @@ def _evt2_words(
 def _decode_evt2(
     path: Path,
     words_from: Callable[[int | None], Iterator[_Evt2Words]],
-    counts: FirstPassCounts,
-    triggers: FirstPassTriggers,
+    first_pass: FirstPass,
     state: Any,
 ) -> Iterator[tuple[Any, Columns]]:
     begin, before = state or (None, None)
     for offset, words, heads, masks in words_from(begin):
         state = (offset, before)
         kind = (heads >> 28).astype(np.uint8)
-        _count_reserved(path, words, kind, _EVT2_TYPES, offset, counts)
+        _count_reserved(path, words, kind, _EVT2_TYPES, offset, first_pass)
         is_high = kind == 8
         high = _continued((heads[is_high] & 0xFFFFFFF).astype(np.int64), before, 28)
         at = np.flatnonzero(kind == 10)
         when, early = _timed(is_high, high, at, before)
-        counts.add("triggers_without_time", early, offset)
+        first_pass.count("triggers_without_time", early, offset)
         signals = heads[at[early:]]
         when = when[early:] << 6 | (signals >> 22 & 0x3F).astype(np.int64)
-        triggers.add(offset, when, signals & 1, signals >> 8 & 0x1F)
+        first_pass.add_triggers(offset, when, signals & 1, signals >> 8 & 0x1F)
         chosen = np.flatnonzero(kind <= 1)
         t, untimed = _timed(is_high, high, chosen, before)
         before = int(high[-1]) if len(high) else before
         lost = untimed if masks is None else np.bitwise_count(masks[chosen[:untimed]]).sum()
-        counts.add("events_without_time", int(lost), offset)
+        first_pass.count("events_without_time", int(lost), offset)
         chosen, t = chosen[untimed:], t[untimed:]
         is_on, heads = kind[chosen] == 1, heads[chosen]
         t = t << 6 | (heads >> 22 & 0x3F)
@@ -313,14 +312,14 @@ def _has_swapped_halves(path: Path, start: int, stated: str) -> bool:
         fits.append(8 in kinds and kinds <= set(_EVT2_TYPES))
     if fits[0] == fits[1]:
         raise InputError(
-            f"{path}: the order of the halves of its EVT2.1 words cannot be told; add "
+            f"{path}: the order of the halves of its EVT2.1 words is not known; add "
             "';endianness=little' or ';endianness=legacy' to the line '% format EVT21'"
         )
     return fits[1]
 
 
 def _open_dat(
-    path: Path, start: int, header: dict[str, str], triggers: FirstPassTriggers
+    path: Path, start: int, header: dict[str, str], first_pass: FirstPass
 ) -> tuple[Decoder, int]:
     with path.open("rb") as file:
         file.seek(start)
@@ -339,7 +338,7 @@ def _open_dat(
     fields = (14, 14) if header["version"] != "1" else (9, 8)
     beside = companions.triggers(path)
     if beside is not None:
-        _read_dat_triggers(beside, triggers)
+        _read_dat_triggers(beside, first_pass)
     return functools.partial(_decode_dat, path, start + 2, fields), start + 2
 
 
@@ -360,7 +359,7 @@ def _decode_dat(
         yield state, (t, x, y, p.astype(np.uint8))
 
 
-def _read_dat_triggers(path: Path, triggers: FirstPassTriggers) -> None:
+def _read_dat_triggers(path: Path, first_pass: FirstPass) -> None:
     """Keep the triggers of a DAT file of triggers, or raise `InputError` if it is none."""
     with reading(path):
         _, start = _read_header(path)
@@ -374,11 +373,11 @@ def _read_dat_triggers(path: Path, triggers: FirstPassTriggers) -> None:
     for offset, words in _words(path, start + 2, "<u4", 2 * decoded.BLOCK):
         t, signal = _continued(words[0::2].astype(np.int64), before, 32), words[1::2]
         before = int(t[-1])
-        triggers.add(offset, t, signal & 0xF, signal >> 26)
+        first_pass.add_triggers(offset, t, signal & 0xF, signal >> 26)
 
 
 def _add_evt3_triggers(
-    triggers: FirstPassTriggers,
+    first_pass: FirstPass,
     offset: int,
     words: NDArray,
     kind: NDArray,
@@ -388,7 +387,7 @@ def _add_evt3_triggers(
     """Keep the triggers of a block of EVT3 words.
 
     Args:
-        triggers: Triggers of the file.
+        first_pass: Triggers of the file.
         offset: Offset of the block in bytes.
         words: (n,) words.
         kind: (n,) their types.
@@ -412,7 +411,7 @@ def _add_evt3_triggers(
     low = np.concatenate([[last.get(6, 0) & 0xFFF], low])[np.searchsorted(clock, at)]
     when = (when << 12 | low)[early:]
     signals = words[at[early:]]
-    triggers.add(offset, when, signals & 1, signals >> 8 & 0xF)
+    first_pass.add_triggers(offset, when, signals & 1, signals >> 8 & 0xF)
     return int(values[-1]) if len(values) else high
 
 
@@ -427,8 +426,7 @@ def _moved_base(base: int, kind: NDArray) -> int:
 def decode_evt3(
     source: str,
     words_from: Callable[[Any], Iterator[tuple[int, Any, NDArray]]],
-    counts: FirstPassCounts,
-    triggers: FirstPassTriggers,
+    first_pass: FirstPass,
     state: Any,
 ) -> Iterator[tuple[Any, Columns]]:
     """Decode EVT3 of any container: a `Decoder` but for its first arguments.
@@ -437,8 +435,7 @@ def decode_evt3(
         source: Name of the file for messages.
         words_from: Function from a place, None at the start, to an iterator over blocks of words:
             offset in bytes, place, and words (n,) uint16 of each block.
-        counts: Counts of events and triggers without a time.
-        triggers: Triggers of the file.
+        first_pass: Triggers, and counts of events and triggers without a time.
         state: State before the first block; None at the start.
 
     Yields:
@@ -460,7 +457,7 @@ def decode_evt3(
     for offset, place, words in words_from(begin):
         known = dict(last)
         kind = (words >> 12).astype(np.uint8)
-        _count_reserved(source, words, kind, _EVT3_TYPES, offset, counts)
+        _count_reserved(source, words, kind, _EVT3_TYPES, offset, first_pass)
         data = words & 0xFFF
         data[kind == 5] &= 0xFF
         numbers = np.where(kind == 2, 1, 0).astype(np.uint8)
@@ -482,11 +479,11 @@ def decode_evt3(
         if 3 in last:
             last[3] = _moved_base(last[3], kind)
         if unplaced.any():
-            counts.add("events_without_time", int(numbers[unplaced].sum()), offset)
+            first_pass.count("events_without_time", int(numbers[unplaced].sum()), offset)
             numbers[unplaced] = 0
             words = np.where(unplaced, np.uint16(0xE000), words)
         if state is None:
-            clock_high = _add_evt3_triggers(triggers, offset, words, kind, known, clock_high)
+            clock_high = _add_evt3_triggers(first_pass, offset, words, kind, known, clock_high)
         highs = np.flatnonzero(kind == 8)
         if len(highs):
             times = words[highs].astype(np.int64) & 0xFFF
@@ -501,10 +498,9 @@ def decode_evt3(
             words = np.concatenate([np.array(kept, "<u2"), words])
         events = decoder.feed(words.tobytes())
         if len(events.t) != int(numbers.sum(dtype=np.int64)):
-            raise InputError(
+            raise damaged(
                 f"{source}: {int(numbers.sum(dtype=np.int64)):,} events stand in the words from "
-                f"byte {offset} on but {len(events.t):,} were decoded; the file is damaged, so "
-                "fetch it again"
+                f"byte {offset} on but {len(events.t):,} were decoded"
             )
         t = events.t.astype(np.int64)
         if len(t) and first_t is not None:

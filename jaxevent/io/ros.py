@@ -60,18 +60,13 @@ from jaxevent.io.bags import Bag, MessageLayout, Place
 from jaxevent.io.checks import (
     ReadOptions,
     check_unfolded,
+    damaged,
     image_size,
     make_supported_camera,
     reading,
     sensor_size,
 )
-from jaxevent.io.decoded import (
-    Columns,
-    Decoder,
-    FirstPassCounts,
-    FirstPassTriggers,
-    read_events,
-)
+from jaxevent.io.decoded import Columns, Decoder, FirstPass, gather_pieces, read_events
 from jaxevent.io.images import BAYER_PATTERNS, demosaic, drop_alpha, gather_frames, read_image
 from jaxevent.io.prophesee import decode_evt3
 from jaxevent.recording import Events, Frames, Imu, Poses, Recording, Triggers
@@ -152,7 +147,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
         imu = _read_imu(bag, chosen[_IMU])
         poses = _read_poses(bag, chosen[_POSE])
         camera, left_out_camera = _read_camera(bag, chosen[_CAMERA_INFO])
-    otherwise = f"{path}: the events of {topic} do not tell the sensor's size"
+    otherwise = f"{path}: the events of {topic} do not state the sensor's size"
     size = sensor_size(
         otherwise, options.size, stated, image_size(None if frames is None else frames.images)
     )
@@ -161,7 +156,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
     unread -= {image, *chosen.values()}
     names = [*sorted(unread), *(other for other in several if other != topic)]
     extra |= {"topics_left_out": np.array(names)} if names else {}
-    extra |= held.untimed.arrays() if held else {}
+    extra |= held.first_pass.counts() if held else {}
     triggers = held.triggers() if held else None
     left_out |= left_out_camera
     return Recording(
@@ -175,7 +170,7 @@ def _choose_events(
     """Choose the topic of the events; None in a bag of images alone."""
     if options.without_events and has_images:
         return None
-    topic = options.choose_stream(bag.path, "topic", topics)
+    topic = options.choose_stream(bag.path, "topic of events", topics)
     if topic is None:
         held = ", ".join(f"{name} ({kind})" for name, kind in sorted(bag.kinds().items()))
         if not has_images or options.without_frames:
@@ -456,13 +451,13 @@ class EventTopic:
     Attributes:
         decode: Their decoder.
         size: (width, height) of the sensor in px, if messages state it.
-        untimed: Numbers of events and triggers before any time, after the decoder's first pass.
+        first_pass: Counts of events and triggers before any time.
         triggers: Function that returns the triggers of the decoder's first pass.
     """
 
     decode: Decoder
     size: tuple[int, int] | None
-    untimed: FirstPassCounts
+    first_pass: FirstPass
     triggers: Callable[[], Triggers | None]
 
 
@@ -479,7 +474,7 @@ def open_event_topic(bag: Bag, topic: str) -> EventTopic:
     Raises:
         InputError: A message is damaged, or its encoding is not known.
     """
-    found, layout = FirstPassCounts(), _layout(bag, bag.kind(topic))
+    found, layout = FirstPass(), _layout(bag, bag.kind(topic))
     names = _find_event_fields(layout)
     messages = (message for _, message in _messages(bag, topic, layout))
     if names is not None:
@@ -513,10 +508,7 @@ def _messages(
         try:
             yield here, layout.read(data)
         except ValueError as error:
-            raise InputError(
-                f"{bag.path}: a message of {topic} has {error}; the bag is damaged, so fetch it "
-                "again"
-            ) from None
+            raise damaged(f"{bag.path}: a message of {topic} has {error}") from None
 
 
 def _size(message: Mapping[str, Any]) -> tuple[int, int] | None:
@@ -527,18 +519,12 @@ def _size(message: Mapping[str, Any]) -> tuple[int, int] | None:
 def _decode_arrays(
     bag: Bag, topic: str, layout: MessageLayout, names: _EventFields, state: Place | None
 ) -> Iterator[tuple[Place, Columns]]:
-    held: list[NDArray] = []
-    first, count = None, 0
-    for place, message in _messages(bag, topic, layout, state):
-        first = first or place
-        pieces = message[names.array]
-        held += pieces
-        count += sum(map(len, pieces))
-        if count >= decoded.BLOCK:
-            yield first, _columns(bag, topic, names, held)
-            held, first, count = [], None, 0
-    if first is not None:
-        yield first, _columns(bag, topic, names, held)
+    messages = (
+        (place, sum(map(len, message[names.array])), message[names.array])
+        for place, message in _messages(bag, topic, layout, state)
+    )
+    for first, arrays in gather_pieces(messages):
+        yield first, _columns(bag, topic, names, [piece for array in arrays for piece in array])
 
 
 def _columns(bag: Bag, topic: str, names: _EventFields, pieces: list[NDArray]) -> Columns:
@@ -547,10 +533,7 @@ def _columns(bag: Bag, topic: str, names: _EventFields, pieces: list[NDArray]) -
         for name in (names.sec, names.nanosec, names.x, names.y, names.p)
     )
     if len(ns) and ns.max() >= 10**9:
-        raise InputError(
-            f"{bag.path}: an event of {topic} has more than 10^9 nanoseconds; the bag is damaged, "
-            "so fetch it again"
-        )
+        raise damaged(f"{bag.path}: an event of {topic} has more than 10^9 nanoseconds")
     # Seconds are unsigned in ROS 1, and in ROS 2 not below 0; rosbags declares both as int32.
     s = s.view(np.uint32) if s.dtype == np.int32 else s
     return s * np.int64(1_000_000) + ns // 1000, x, y, p
@@ -570,9 +553,9 @@ def _packets(
             )
         content = np.concatenate([piece["value"] for piece in packet["events"]])
         if len(content) % width:
-            raise InputError(
-                f"{bag.path}: a packet of {topic} has {len(content)} bytes, which are not "
-                f"whole words of {width}; the bag is damaged, so fetch it again"
+            raise damaged(
+                f"{bag.path}: a packet of {topic} has {len(content)} bytes, which are not whole "
+                f"words of {width}"
             )
         yield here, packet, content
 
@@ -584,55 +567,41 @@ def _decode_mono(
     packets: Packets, shift: int, state: Place | None
 ) -> Iterator[tuple[Place, Columns]]:
     """Decode packets of words; `shift` (ns) leads from time bases to the clock of headers."""
-    held: list[tuple[NDArray, NDArray]] = []
-    first = None
-    for place, packet, content in packets("mono", 8, state):
-        first = first or place
-        words = content.view("<u8")
-        held.append((words, (words & 0xFFFFFFFF).astype(np.int64) + (packet["time_base"] + shift)))
-        if sum(len(words) for words, _ in held) >= decoded.BLOCK:
-            yield first, _mono_columns(held)
-            held, first = [], None
-    if first is not None:
-        yield first, _mono_columns(held)
-
-
-def _mono_columns(held: list[tuple[NDArray, NDArray]]) -> Columns:
-    words, t = (np.concatenate(column) for column in zip(*held, strict=True))
-    x, y = words >> 32 & 0xFFFF, words >> 48 & 0x7FFF
-    return t // 1000, x.astype(np.uint16), y.astype(np.uint16), words >> 63 == 1
+    pieces = (
+        (place, len(content) // 8, (content.view("<u8"), packet["time_base"] + shift))
+        for place, packet, content in packets("mono", 8, state)
+    )
+    for first, held in gather_pieces(pieces):
+        words = np.concatenate([one for one, _ in held])
+        t = np.concatenate([(one & 0xFFFFFFFF).astype(np.int64) + base for one, base in held])
+        x, y = (words >> 32 & 0xFFFF).astype(np.uint16), (words >> 48 & 0x7FFF).astype(np.uint16)
+        yield first, (t // 1000, x, y, words >> 63 == 1)
 
 
 class _Evt3Packets:
     """The words of evt3 packets, one after the other, on the clock of the first header (us)."""
 
-    def __init__(self, source: str, packets: Packets, stamp: int, found: FirstPassCounts):
+    def __init__(self, source: str, packets: Packets, stamp: int, found: FirstPass):
         self._source, self._packets, self._stamp, self._found = source, packets, stamp, found
-        self._list = FirstPassTriggers()
         self._shift: int | None = None
 
     def decode(self, state: Any) -> Iterator[tuple[Any, Columns]]:
-        blocks = decode_evt3(self._source, self._words, self._found, self._list, state)
+        blocks = decode_evt3(self._source, self._words, self._found, state)
         for here, (t, x, y, p) in blocks:
             if self._shift is None and len(t):
                 self._shift = self._stamp - int(t[0])
             yield here, (t + (self._shift or 0), x, y, p)
 
     def triggers(self) -> Triggers | None:
-        held = self._list.sorted()
+        held = self._found.triggers()
         return held and dataclasses.replace(held, t=held.t + (self._shift or 0))
 
     def _words(self, place: tuple[int, Place] | None) -> Iterator[tuple[int, Any, NDArray]]:
         offset, at = place or (0, None)
-        held: list[NDArray] = []
-        first, count = None, 0
-        for here, _, content in self._packets("evt3", 2, at):
-            first = first or here
-            held.append(content)
-            count += len(content)
-            if count >= 2 * decoded.BLOCK:
-                yield offset, (offset, first), np.concatenate(held).view("<u2")
-                offset += count
-                held, first, count = [], None, 0
-        if count:
-            yield offset, (offset, first), np.concatenate(held).view("<u2")
+        pieces = (
+            (here, len(content), content) for here, _, content in self._packets("evt3", 2, at)
+        )
+        for first, held in gather_pieces(pieces, 2 * decoded.BLOCK):
+            words = np.concatenate(held).view("<u2")
+            yield offset, (offset, first), words
+            offset += words.nbytes

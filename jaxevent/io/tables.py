@@ -75,7 +75,7 @@ _TEXT_BYTES = 1 << 24  # of text parsed together: about a million events
 _MAX_LINE_BYTES = 1 << 12
 _TEXT_SAMPLE = 16 * SAMPLE  # bytes of text from which order, unit and signs are inferred
 _OTHER_TIMES = ("frame_t", "exp_start", "exp_end", "imu_t")  # of an archive, beside the events
-_NO_SIZE = "the table does not tell the sensor's size"
+_NO_SIZE = "the table does not state the sensor's size"
 
 
 def read_npy(path: Path, options: ReadOptions) -> Recording:

@@ -88,7 +88,7 @@ def _read(
         root / name, source, "t x y p", header="width height", progress=options.progress
     )
     otherwise = (
-        f"{source}: neither a first line 'width height' nor an image tells the sensor's size"
+        f"{source}: neither a first line 'width height' nor an image shows the sensor's size"
     )
     size = sensor_size(otherwise, options.size, header, image_size(images))
     fields = find_fields(names) or {name: name for name in "txyp"}

@@ -38,9 +38,9 @@ def from_dataset(dataset: Any, size: tuple[int, ...] | None = None) -> Iterator[
     Raises:
         InputError: The size is not known, or an item is not valid.
     """
-    told = size or getattr(dataset, "sensor_size", None)
+    size = size or getattr(dataset, "sensor_size", None)
     for number in range(len(dataset)):
-        yield from_item(dataset[number], told, f"{type(dataset).__name__} {number}")
+        yield from_item(dataset[number], size, f"{type(dataset).__name__} {number}")
 
 
 def from_item(item: Any, size: tuple[int, ...] | None, name: str = "tonic") -> Recording:

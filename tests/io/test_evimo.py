@@ -174,6 +174,6 @@ def test_damaged_files_are_refused_or_read(name, place, how, value, tmp_path_fac
 
 def test_the_size_must_be_known(tmp_path):
     folder = formats.evimo(tmp_path / "a", EVENTS, META)
-    with pytest.raises(InputError, match="no image tells the sensor's size"):
+    with pytest.raises(InputError, match="no image shows the sensor's size"):
         io.load(folder)
     check_events(io.load(folder, SIZE).events)

@@ -428,7 +428,7 @@ def changed(row, column, value):
         (dict(events=changed(1, 0, np.nan)), "event 1 has the time nan"),
         (dict(events=changed(1, 0, 5)), "event 1 is at 5 us, earlier"),
         (dict(events=changed(1, 3, 7)), "event 1 has the polarity 7"),
-        (dict(image=None, time_image=None), "no image to tell the sensor's size; give size="),
+        (dict(image=None, time_image=None), "no image to show the sensor's size; give size="),
         (dict(time_image=None), "image has no times; add time_image"),
         (dict(time_image=np.array([5.0])), r"frames have shape \(2, 3, 4\)"),
         (dict(time_image=np.array([5.0, np.nan])), "time_image: image 1 has the time nan"),

@@ -343,8 +343,8 @@ def test_headers_of_prophesee(tmp_path):
         ("% evt 4.0\n% end\n", "its format '4.0' is not EVT2"),
         ("% format AER;width=9\n", "its format 'AER' is not EVT2"),
         ("% something else\n", "its format '.' is not EVT2"),
-        ("% evt 2.0\n", "does not tell the sensor's size"),
-        ("% format EVT21\n% geometry 9x9\n", "order of the halves .* cannot be told"),
+        ("% evt 2.0\n", "does not state the sensor's size"),
+        ("% format EVT21\n% geometry 9x9\n", "order of the halves .* is not known"),
     ):
         path.write_bytes(header.encode() + words)
         with pytest.raises(InputError, match=message):
@@ -444,7 +444,7 @@ def test_damage_that_the_decoder_does_not_survive(tmp_path):
     pytest.importorskip("aedat")
     content = formats.aedat4(formats.events_of(0, 9, SIZE), SIZE)
     (tmp_path / "a.aedat4").write_bytes(content.replace(b"sizeX", b"size\xca"))
-    with pytest.raises(InputError, match="its header is damaged"):
+    with pytest.raises(InputError, match="its header is not valid"):
         load(tmp_path / "a.aedat4")
 
 
