@@ -25,9 +25,9 @@ from jaxevent.reconstruction.engine.loop import (
 )
 from jaxevent.reconstruction.engine.pixel import Directions
 from jaxevent.reconstruction.engine.timeline import NEVER, make_line
-from jaxevent.reconstruction.features import aligned
+from jaxevent.reconstruction.features import allocate_aligned
 from jaxevent.reconstruction.frames import FrameImages, Timing
-from jaxevent.reconstruction.stream import Stream, StreamState, weigh
+from jaxevent.reconstruction.stream import Stream, StreamState, event_weights
 from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import ColumnSource, EventColumns, Recording
 
@@ -145,7 +145,7 @@ class DividedRecording:
         """
         windows, source = self.windows, self.recording.events
         weight = np.empty(0, self.dtype)
-        plain = state.last_then is None and self._factors is None
+        plain = state.context_last is None and self._factors is None
         if plain and isinstance(source, ColumnSource):
             stored = source.columns(slice(context, finish), self._stored)
             self._stored = stored
@@ -153,11 +153,13 @@ class DividedRecording:
             if bands is not None:
                 return bands, state
         around = source[context:finish]  # raises `InputError` for what is not valid
-        if state.last_then is not None:
+        if state.context_last is not None:
             state = windows.move_context(state, context)
-            assert state.last_then is not None
+            assert state.context_last is not None
             stream = Stream.of(around, self.recording.width)
-            weight = weigh(stream, state.last_then.copy(), windows.dead).astype(self.dtype)
+            weight = event_weights(stream, state.context_last.copy(), windows.dead).astype(
+                self.dtype
+            )
         if self._factors is not None:
             pixel = around.y.astype(np.int64) * self.recording.width + around.x
             factors = self._factors[np.where(around.p, 0, 1), pixel]
@@ -211,7 +213,7 @@ class Passes:
         self.kernel, self.layout, self.dtype = kernel, layout, dtype
         places, stride = fields.places, layout.stride
         self._memory = Memory(
-            aligned((bands, fields.size), dtype),
+            allocate_aligned((bands, fields.size), dtype),
             np.zeros((bands, max(len(fields.whole), 1) * stride), np.int64),
             np.zeros((bands, stride)),
             np.zeros((bands, 2), np.int64),
