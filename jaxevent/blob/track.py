@@ -297,14 +297,14 @@ def update_track(
     touched = (weight > 0).any()
     number = lax.stop_gradient(weight).sum()
     updated = filter.update(params, prediction.state, events.batch, weight)
-    return TrackBuffer(
-        where_tree(touched, updated, track.state),
-        jnp.where(touched, prediction.radius, track.gate),
-        track.hits + number,
-        jnp.where(touched, events.time, track.last_update),
-        jnp.where(number >= 0.5, events.time, track.last_hit),
-        track.birth, track.last_apart, track.id, track.confirmed, track.overrides, track.reference,
-    )  # fmt: skip
+    return dataclasses.replace(
+        track,
+        state=where_tree(touched, updated, track.state),
+        gate=jnp.where(touched, prediction.radius, track.gate),
+        hits=track.hits + number,
+        last_update=jnp.where(touched, events.time, track.last_update),
+        last_hit=jnp.where(number >= 0.5, events.time, track.last_hit),
+    )
 
 
 def _update_nearest_track(
@@ -324,13 +324,15 @@ def _update_nearest_track(
     own = track_params(params, track.overrides)
     event = ReferenceEvent(batch, time, since)
     result = reference_step(filter, own, track.state, track.gate, track.reference, event)
-    new = TrackBuffer(
-        result.state, result.radius, track.hits + result.accepted,
-        jnp.where(result.updated, time, track.last_update),
-        jnp.where(result.accepted, time, track.last_hit),
-        track.birth, track.last_apart, track.id, track.confirmed, track.overrides,
-        result.reference,
-    )  # fmt: skip
+    new = dataclasses.replace(
+        track,
+        state=result.state,
+        gate=result.radius,
+        hits=track.hits + result.accepted,
+        last_update=jnp.where(result.updated, time, track.last_update),
+        last_hit=jnp.where(result.accepted, time, track.last_hit),
+        reference=result.reference,
+    )
     hit = (jnp.arange(len(tracks.id)) == k) & prediction.alive & valid[0]
     after = jax.vmap(where_tree, (0, None, 0))(hit, new, tracks)
 

@@ -12,6 +12,7 @@ squared (beta would not hold), the shape stays.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -66,38 +67,19 @@ class Params(WindowParams):
         # As printed, but for the errors that docs/theory/tracking.md lists. Of the gate the paper
         # gives no numbers; its shape and that it follows the size are the paper's.
         "paper": {
-            "target": "2n",
-            "current_in_jacobian": True,
-            "association": "nearest",
-            "gate_shape": "circle",
-            "gate_position": 0.0,
+            "target": "2n", "current_in_jacobian": True, "association": "nearest",
+            "gate_shape": "circle", "gate_position": 0.0,
         },
         # Published settings of the authors' program, for cars.
         "authors": {
-            "formulation": "authors",
-            "association": "authors",
-            "target": "2n",
-            "beta": 0.0,
+            "formulation": "authors", "association": "authors", "target": "2n", "beta": 0.0,
             "polarity_offset": True,
-            "Q_p": 200.0,
-            "Q_v": 1e3,
-            "Q_lambda": 1.0,
-            "Q_theta": 0.005,
-            "Q_q": 0.01,
-            "P0_p": 10.0,
-            "P0_v": 500.0,
-            "P0_lambda": 5.0,
-            "P0_theta": 0.5,
-            "P0_q": 2.0,
-            "lambda0": 30.0,
-            "gate_shape": "circle",
-            "gate": 2.5,
-            "gate_decay": 1.4,
-            "gate_min": 10.0,
-            "gate_max": 1e6,
-            "t_coast": 1e3,
+            "Q_p": 200.0, "Q_v": 1e3, "Q_lambda": 1.0, "Q_theta": 0.005, "Q_q": 0.01,
+            "P0_p": 10.0, "P0_v": 500.0, "P0_lambda": 5.0, "P0_theta": 0.5, "P0_q": 2.0,
+            "lambda0": 30.0, "gate_shape": "circle", "gate": 2.5, "gate_decay": 1.4,
+            "gate_min": 10.0, "gate_max": 1e6, "t_coast": 1e3,
         },
-    }
+    }  # fmt: skip
 
 
 class ResidualWindow(eqx.Module):
@@ -211,6 +193,17 @@ class _Measurement(NamedTuple):
     weight: Array
 
 
+class _WindowStep(NamedTuple):
+    """Residuals of a step and the window of those before."""
+
+    residuals: _Residuals
+    trusted: Array  # whether the position is certain enough for the shape
+    shape: Array  # 1 where the shape is updated, else 0
+    past: Array  # (2,), px^2, sums of squares without this step
+    W: Array  # weight of the window
+    filled: Array  # steps in it
+
+
 def _rotate_residuals(
     params: WindowParams, state: Chi2State, batch: EventBatch, weight: Array
 ) -> _Residuals:
@@ -300,12 +293,33 @@ def _update_scalars(x: Array, P: Array, measurements: list[_Measurement]) -> tup
     return x + step, (P + P.T) / 2 + jnp.diag(rounding)
 
 
-def _clip_state(params: WindowParams, x: Array, logarithmic: bool) -> Array:
-    """Clip sizes to their limits, and wrap the angle to [-pi, pi]."""
-    low, high = params.lambda_min, params.lambda_max
-    if logarithmic:
-        low, high = jnp.log(low), jnp.log(high)
+def _clip_state(params: WindowParams, x: Array) -> Array:
+    """Clip log sizes to their limits, and wrap the angle to [-pi, pi]."""
+    low, high = jnp.log(params.lambda_min), jnp.log(params.lambda_max)
     return jnp.concatenate([x[:4], jnp.clip(x[4:6], low, high), wrap_angle(x[6])[None], x[7:]])
+
+
+def _update(
+    params: Any,
+    state: Chi2State,
+    batch: EventBatch,
+    weight: Array,
+    measure: Callable[[Any, Chi2State, _WindowStep], list[_Measurement]],
+) -> Chi2State:
+    """Update by a step's mean residual and the window's sums, which `measure` compares."""
+    authors = not state.logarithmic
+    residuals = _rotate_residuals(params, state, batch, weight)
+    P, trusted = (state.P, jnp.bool(True)) if authors else _limit_variances(params, state)
+    push = jnp.concatenate([residuals.energy, residuals.m[None]])
+    window = state.window.push(push)
+    shape = (trusted & ((window.filled >= params.n) | authors)).astype(P.dtype)
+    W = jnp.where(residuals.m > 0, window.sums[2], 1)
+    step = _WindowStep(residuals, trusted, shape, (window.sums - push)[:2], W, window.filled)
+    x, P = _update_scalars(state.x, P, measure(params, state, step))
+    if not authors:
+        x = _clip_state(params, x)
+    window = where_tree(trusted, window, state.window)
+    return where_tree(residuals.m > 0, Chi2State(x, P, window, state.logarithmic), state)
 
 
 # ---- chi2: one sum.
@@ -320,21 +334,17 @@ def predict(params: Params, state: Chi2State, dt: Array) -> Chi2State:
 
 
 def update(params: Params, state: Chi2State, batch: EventBatch, weight: Array) -> Chi2State:
-    authors = params.formulation == "authors"
-    residuals = _rotate_residuals(params, state, batch, weight)
-    P, trusted = (state.P, jnp.bool(True)) if authors else _limit_variances(params, state)
-    push = jnp.concatenate([residuals.energy, residuals.m[None]])
-    window = state.window.push(push)
-    full = window.filled >= params.n
-    shape = (trusted & (full | authors)).astype(P.dtype)
-    measurements = _measure_mean(params, state, residuals, trusted, shape)
+    return _update(params, state, batch, weight, _measure_sum)
 
-    unit = jnp.eye(len(state.x), dtype=P.dtype)
+
+def _measure_sum(params: Params, state: Chi2State, step: _WindowStep) -> list[_Measurement]:
+    """Return the measurements of the mean and of the window's one sum."""
+    authors, residuals = params.formulation == "authors", step.residuals
+    measurements = _measure_mean(params, state, residuals, step.trusted, step.shape)
+    unit = jnp.eye(len(state.x), dtype=state.P.dtype)
     over = 1 / residuals.size
-    past = window.sums - push
     scale = 1.0 if authors else 1 / (1 + params.beta)
-    W = jnp.where(residuals.m > 0, window.sums[2], 1)
-    inside = past[:2] * scale + (0 if authors else residuals.energy)
+    inside = step.past * scale + (0 if authors else residuals.energy)
     found = (inside * over**2).sum()
     pull = -2 * inside * over**3 * _size_derivative(state)
     row = pull[0] * unit[4] + pull[1] * unit[5]
@@ -342,15 +352,9 @@ def update(params: Params, state: Chi2State, batch: EventBatch, weight: Array) -
         for i in range(2):
             other = measurements[i].row * (1 - unit[4] - unit[5])
             row = row + 2 * residuals.m * residuals.mean[i] * over[i] * other
-    goal = 2 * W + (4 if params.target == "2n+4" else 0)
-    on = jnp.where(window.filled > 1, 1.0, 0.0) if authors else shape
-    measurements.append(_Measurement(row, goal - found, 4 * W, on))
-
-    x, P = _update_scalars(state.x, P, measurements)
-    if not authors:
-        x = _clip_state(params, x, state.logarithmic)
-    window = where_tree(trusted, window, state.window)
-    return where_tree(residuals.m > 0, Chi2State(x, P, window, state.logarithmic), state)
+    goal = 2 * step.W + (4 if params.target == "2n+4" else 0)
+    on = jnp.where(step.filled > 1, 1.0, 0.0) if authors else step.shape
+    return [*measurements, _Measurement(row, goal - found, 4 * step.W, on)]
 
 
 def predicted_measurement(params: WindowParams, state: Chi2State) -> PredictedMeasurement:
@@ -384,34 +388,21 @@ def readout(params: WindowParams, state: Chi2State) -> tuple[Array, Array]:
 # ---- chi2_split: one sum per axis.
 
 
-def _update_split(
-    params: WindowParams, state: Chi2State, batch: EventBatch, weight: Array
-) -> Chi2State:
-    residuals = _rotate_residuals(params, state, batch, weight)
-    P, trusted = _limit_variances(params, state)
-    push = jnp.concatenate([residuals.energy, residuals.m[None]])
-    window = state.window.push(push)
-    full = window.filled >= params.n
-    shape = (trusted & full).astype(P.dtype)
-    measurements = _measure_mean(params, state, residuals, trusted, None)
-
-    unit = jnp.eye(len(state.x), dtype=P.dtype)
+def _measure_axes(params: WindowParams, state: Chi2State, step: _WindowStep) -> list[_Measurement]:
+    """Return the measurements of the mean and of the window's sums along both axes."""
+    residuals = step.residuals
+    measurements = _measure_mean(params, state, residuals, step.trusted, None)
+    unit = jnp.eye(len(state.x), dtype=state.P.dtype)
     over = 1 / residuals.size
-    past = window.sums - push
     scale = 1 / (1 + params.beta)
-    W = jnp.where(residuals.m > 0, window.sums[2], 1)
     kappa, fourth = gated_moments(params)
     variance = 3 * fourth / kappa**2 - 1
     for i in range(2):
-        found = (residuals.energy[i] + scale * past[i]) * over[i] ** 2 / kappa
-        derivative = -kappa * variance * W
-        noise = variance * W * params.n
-        measurements.append(_Measurement(derivative * unit[4 + i], W - found, noise, shape))
-
-    x, P = _update_scalars(state.x, P, measurements)
-    x = _clip_state(params, x, True)
-    window = where_tree(trusted, window, state.window)
-    return where_tree(residuals.m > 0, Chi2State(x, P, window, True), state)
+        found = (residuals.energy[i] + scale * step.past[i]) * over[i] ** 2 / kappa
+        row = -kappa * variance * step.W * unit[4 + i]
+        noise = variance * step.W * params.n
+        measurements.append(_Measurement(row, step.W - found, noise, step.shape))
+    return measurements
 
 
 chi2 = Tracker(
@@ -426,7 +417,7 @@ chi2_split = Tracker(
     Filter(
         functools.partial(_init, logarithmic=True),
         functools.partial(_predict, authors=False),
-        _update_split,
+        functools.partial(_update, measure=_measure_axes),
         predicted_measurement,
         readout,
         zero_velocity,
