@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 import jaxevent
 from jaxevent.cli.motion import estimated
-from jaxevent.egomotion import Motion
-from jaxevent.egomotion.choice import choose
+from jaxevent.egomotion import MotionEstimate
+from jaxevent.egomotion.model_selection import select_model
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.runs.egomotion import find_estimator
@@ -114,11 +114,11 @@ def changes() -> Iterator[Change]:
     yield "without its end", shortened, SAME, 1.0
 
 
-def told(recording: Recording) -> Motion | None:
+def told(recording: Recording) -> MotionEstimate | None:
     """As by the command, with all its choices; None where nothing is seen to move."""
     with contextlib.redirect_stdout(None):
         try:
-            kind = choose(recording).model
+            kind = select_model(recording).model
         except InputError:
             return None
         settings = {"model": kind, "seed": 0}
@@ -126,7 +126,9 @@ def told(recording: Recording) -> Motion | None:
         return estimated(method, recording, None, settings, no_gyro, True)[1]
 
 
-def usual(motion: Motion, signs: tuple[NDArray, NDArray], faster: float) -> tuple[NDArray, NDArray]:
+def usual(
+    motion: MotionEstimate, signs: tuple[NDArray, NDArray], faster: float
+) -> tuple[NDArray, NDArray]:
     """The mean motion and its usual sigmas, changed back."""
     told = motion.valid
     by = np.concatenate(signs) if motion.mean.shape[1] == 6 else signs[1]

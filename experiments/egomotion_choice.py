@@ -21,7 +21,7 @@ import pandas as pd
 
 import jaxevent
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion.choice import choose
+from jaxevent.egomotion.model_selection import select_model
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording
 from jaxevent.simulate import motion_scene
@@ -53,7 +53,7 @@ REAL: tuple[tuple[str, str, float | None, tuple[float | None, float | None]], ..
 def row(name: str, right: str, recording: Recording, camera: PinholeCamera | None) -> dict:
     clock = time.process_time()
     try:
-        found = choose(recording, camera)
+        found = select_model(recording, camera)
     except InputError as error:
         return {"scene": name, "right": right, "chosen": f"none: {error}"}
     z = {f"z {one}, {other}": value for (one, other), value in found.z.items()}

@@ -22,8 +22,8 @@ from egomotion_voting import LITERAL_FRAMES, STEP
 from numpy.typing import NDArray
 
 from jaxevent.egomotion import voting
-from jaxevent.egomotion.particle_filter.likelihood import score
-from jaxevent.egomotion.particle_filter.parameters import Params
+from jaxevent.egomotion.particle_filter.likelihood import score_batch
+from jaxevent.egomotion.particle_filter.params import Params
 from jaxevent.simulate.motion import frame_events
 
 TRUTHS = ((0.8, 0.0), (0.8, 0.6))
@@ -39,8 +39,8 @@ WAYS: dict[str, dict[str, Any]] = {
 def objective(params: Params, flow: tuple[float, float], seed: int) -> NDArray[np.float64]:
     """Over velocities, (v, u): px of the literal likelihood; of the soft vote, of log weight."""
     recording, _ = frame_events(np.tile(flow, (FRAMES, 1)), seed=seed)
-    model, gatherer = voting.gatherer(recording, params, "planar")
-    made = gatherer.whole(0.0, float(params.tau_max)).candidates
+    model, sampler = voting.sampler(recording, params, "planar")
+    made = sampler.sample_all(0.0, float(params.tau_max)).candidates
     grid = np.stack(np.meshgrid(ALONG, ALONG), -1).reshape(-1, 2) / STEP
     true = np.asarray(flow) / STEP
     # Of the soft vote, ages are those of the motion that the cloud is about: the true one.
@@ -50,7 +50,9 @@ def objective(params: Params, flow: tuple[float, float], seed: int) -> NDArray[n
 
     @jax.jit
     def add(batch):
-        return score(params, model, batch, jnp.asarray(grid), weights, False).log_likelihood.sum(0)
+        return score_batch(
+            params, model, batch, jnp.asarray(grid), weights, False
+        ).log_likelihood.sum(0)
 
     for k in range(len(made.elapsed)):
         batch = jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf[k]), made)

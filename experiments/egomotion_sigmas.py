@@ -27,7 +27,7 @@ import jaxevent
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import contrast, planes, voting
 from jaxevent.egomotion.estimator import MotionEstimator
-from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.show.motion import fitted_velocity
 from jaxevent.simulate import motion_scene
 
@@ -40,13 +40,15 @@ METHODS: dict[str, MotionEstimator[Any]] = {
 }
 
 
-def shown(motion: Motion, first: int, last: int) -> np.ndarray:
+def shown(motion: MotionEstimate, first: int, last: int) -> np.ndarray:
     """Times (us) within bounds that the estimates show."""
     t = motion.t - np.rint(1e6 * motion.lag).astype(np.int64)
     return t[(t >= first) & (t <= last)]
 
 
-def standardised(name: str, motion: Motion, t: np.ndarray, true: np.ndarray) -> dict[str, Any]:
+def standardised(
+    name: str, motion: MotionEstimate, t: np.ndarray, true: np.ndarray
+) -> dict[str, Any]:
     mean, covariance, valid = motion(t, centred=True, extrapolate=True)
     valid &= np.isfinite(true).all(1)
     row: dict[str, Any] = {"scene": name, "lost %": 100 * (~valid).mean()}
@@ -76,7 +78,7 @@ def real(data: Path, methods: Sequence[str]) -> Iterator[dict[str, Any]]:
     t = np.arange(recording.start + 400_000, 3_100_000, 20_000)
     for name in methods:
         method = METHODS[name]
-        motion, _ = method.estimate(recording, model="planar").with_layers(recording)
+        motion, _ = method.estimate(recording, model="planar").with_flow_consistency(recording)
         true = fitted_velocity(recording, motion)
         yield {"method": name, **standardised("slider_depth, planar", motion, t, true(t))}
     disk = jaxevent.load(data / "rotating_disk_imu.npz")
@@ -115,7 +117,9 @@ def main() -> None:
                 if name == "contrast":
                     parts.append((f"{scene}, one window", recording[slice(*CUT)], 240_000, 260_000))
                 for title, part, first, last in parts:
-                    motion, _ = METHODS[name].estimate(part, model=model).with_layers(part)
+                    motion, _ = (
+                        METHODS[name].estimate(part, model=model).with_flow_consistency(part)
+                    )
                     t = shown(motion, first, last)
                     true = source.velocity(t) if model == "planar" else source.twist(t)[1]
                     rows.append({"method": name, **standardised(title, motion, t, true)})

@@ -42,10 +42,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxevent.egomotion.comparison import by_part
-from jaxevent.egomotion.estimator import RATE, Batch, MotionEstimator, Stretch
+from jaxevent.egomotion.estimator import (
+    SCORE_RATE_HZ,
+    MotionEstimator,
+    TrainingRuns,
+    TrainingSegment,
+)
 from jaxevent.egomotion.models import Model, find_model
-from jaxevent.egomotion.truth import Known
+from jaxevent.egomotion.scores import errors_by_part
+from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.errors import InputError
 from jaxevent.io.output import finite, values_of
 from jaxevent.methods import find
@@ -66,12 +71,12 @@ class Loss:
 
     centred: bool = False
 
-    def __call__(self, params: Any, batch: Batch) -> Float[Array, ""]:
+    def __call__(self, params: Any, batch: TrainingRuns) -> Float[Array, ""]:
         means, lags = batch.estimates(params)
         return jnp.mean(jax.vmap(lambda mean, lag: self.one(batch, mean, lag))(means, lags))
 
     def one(
-        self, batch: Batch, mean: Float[Array, "T d"], lag: Float[Array, " T"]
+        self, batch: TrainingRuns, mean: Float[Array, "T d"], lag: Float[Array, " T"]
     ) -> Float[Array, ""]:
         """Of one run."""
         at = jnp.asarray(batch.time) - (jax.lax.stop_gradient(lag) if self.centred else 0)
@@ -119,7 +124,7 @@ class Goal(FamilyGoal):
             return {name: float(getattr(params, name)) for name in acts}
 
         def make(params: Any) -> Batches:
-            made = self.method.follow(found, params, self.kind, self.runs, self.settle)
+            made = self.method.training_runs(found, params, self.kind, self.runs, self.settle)
             return share_out(found, made)
 
         return LastBatches(acting, make)
@@ -141,8 +146,8 @@ class Goal(FamilyGoal):
                 continue
             known = mine[0].known
             motion = self.method.estimate(recording, params, model=self.kind, progress=progress)
-            t = np.arange(mine[0].start, mine[-1].stop, round(1e6 / RATE))
-            t = t[known.within(t)]
+            t = np.arange(mine[0].start, mine[-1].stop, round(1e6 / SCORE_RATE_HZ))
+            t = t[known.covers(t)]
             told = motion(t, centred=self.loss.centred) if self.loss.centred else motion(t)
             mean, _, valid = told
             truth = known(t)
@@ -156,7 +161,7 @@ class Goal(FamilyGoal):
                 usable = inside & valid
                 row: dict[str, Any] = {"recording": given, "split": name, "error": None}
                 if usable.any():
-                    each = by_part(self.kind, mean[usable], truth[usable])
+                    each = errors_by_part(self.kind, mean[usable], truth[usable])
                     row |= {name: finite(float(values.mean())) for name, values in each.items()}
                 row["lost"] = float((~valid[inside]).mean())
                 row["windows"] = len(chosen)
@@ -169,14 +174,14 @@ class Goal(FamilyGoal):
                 columns.insert(1, (f"{part.name} deg", part.name, 1, 2))
         return aligned(rows, columns) + legend(columns)
 
-    def known(self, recording: Recording) -> Known:
+    def known(self, recording: Recording) -> KnownMotion:
         """What is true of the motion of a recording, whose name is its path."""
         settings = {"model": self.model, "truth": self.truth, **self.of_truth}
         return scores.true_motion(recording, settings)
 
     def _stretches(
         self, sources: Sources, split: Shares, window: float | int | None
-    ) -> list[Stretch]:
+    ) -> list[TrainingSegment]:
         """The windows of all recordings whose truth is known and that hold events."""
         found = []
         for place, (_, recording) in (
@@ -194,7 +199,7 @@ class Goal(FamilyGoal):
                 )
             for begin, end, s in windows(first, stop, window, split, place):
                 if events.index(begin) < events.index(end):
-                    found.append(Stretch(recording, begin, end, truth, s))
+                    found.append(TrainingSegment(recording, begin, end, truth, s))
         return found
 
 

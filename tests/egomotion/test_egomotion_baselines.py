@@ -11,8 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import contrast, frames, planes
-from jaxevent.egomotion.baselines import contrast_maximisation, local_planes, tracked_points
-from jaxevent.egomotion.baselines.five_points import relative_motion
+from jaxevent.egomotion.baselines import contrast as maximisation
+from jaxevent.egomotion.baselines import fits, points
+from jaxevent.egomotion.baselines import planes as plane_fits
+from jaxevent.egomotion.baselines.points import fit_general
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate import motion_scene
@@ -93,7 +95,7 @@ def test_a_plane_of_times_gives_its_normal_flow():
     speeds = np.array([150.0, 300.0, 220.0, 180.0, 400.0, 260.0])
     recording = swept(normals, speeds)
     params = planes.Params.of(dict(radius=2, fewest=8, apart=1e-5))
-    flow = local_planes.normal_flow(recording, params)
+    flow = plane_fits.normal_flow(recording, params)
     e = recording.events
     tile = (e.x // 24 + 4 * (e.y // 24)).astype(int) % len(normals)
     # Inside a tile: elsewhere neighbours belong to other edges.
@@ -118,7 +120,7 @@ def test_neighbours_off_the_plane_are_left_out():
     flow = {}
     for tolerance in (1.5, 100.0):
         params = planes.Params.of(dict(radius=3, tolerance=tolerance, rough=1.0, oldest=0.1))
-        made = local_planes.normal_flow(recording, params)
+        made = plane_fits.normal_flow(recording, params)
         e = recording.events
         flow[tolerance] = made.flow[(e.x == 7) & (e.y == 5)][0]
     assert np.linalg.norm(flow[1.5] - [200, 0]) < 1e-6
@@ -133,7 +135,7 @@ def test_bursts_count_once(rounds):
     t = np.concatenate([first + 700 * k * (1 + (x + y) % 3) for k in range(rounds)])
     x, y = np.tile(x, rounds), np.tile(y, rounds)
     recording = recorded(t, x, y, np.ones(len(x)), shape=(9, 9))
-    made = local_planes.normal_flow(recording, planes.Params.of(dict(apart=0.02)))
+    made = plane_fits.normal_flow(recording, planes.Params.of(dict(apart=0.02)))
     assert made.valid.sum() > 20
     np.testing.assert_allclose(made.flow[made.valid], [[200.0, 0]] * made.valid.sum(), atol=1e-6)
 
@@ -147,14 +149,14 @@ def test_the_fit_is_robust_and_knows_its_error():
         rows = np.stack([np.cos(angle), np.sin(angle)], 1)
         values = rows @ truth + 5 * np.repeat(rng.normal(size=100), 2)  # pairs err together
         values[:10] += 400
-        fit = local_planes.robust_fit(rows, values, np.arange(200) // 2, np.ones(2))
+        fit = fits.robust_fit(rows, values, np.arange(200) // 2, np.ones(2))
         off = fit.mean - truth
         errors.append(off @ np.linalg.solve(fit.covariance, off))
     assert 1.4 < np.mean(errors) < 3.2  # 2 expected
     upright = rows * [1, 1e-3]
-    assert local_planes.robust_fit(upright, values, np.arange(200), np.ones(2)) is None
+    assert fits.robust_fit(upright, values, np.arange(200), np.ones(2)) is None
     # Where components have other units it is not the aperture.
-    assert local_planes.robust_fit(upright, values, np.arange(200), np.array([1, 1e-3])) is not None
+    assert fits.robust_fit(upright, values, np.arange(200), np.array([1, 1e-3])) is not None
 
 
 def test_without_outliers_the_fit_is_least_squares():
@@ -162,7 +164,7 @@ def test_without_outliers_the_fit_is_least_squares():
     rows = rng.normal(size=(50, 3))
     noise = np.sign(rng.normal(size=50))  # none is far off the others
     values = rows @ [1.0, 2.0, 3.0] + 0.01 * noise
-    fit = local_planes.robust_fit(rows, values, np.arange(50), np.ones(3))
+    fit = fits.robust_fit(rows, values, np.arange(50), np.ones(3))
     np.testing.assert_allclose(fit.mean, np.linalg.lstsq(rows, values)[0], rtol=1e-9)
 
 
@@ -303,7 +305,7 @@ def test_five_points_tell_heading_and_turn(noise):
         if noise:
             wrong = rng.choice(n, n // 5, replace=False)
             end[wrong] += rng.uniform(-30, 30, (len(wrong), 2))
-        fit = relative_motion(cv2, begin, end, np.arange(n), f, dt)
+        fit = fit_general(cv2, begin, end, np.arange(n), f, dt)
         off = fit.mean - np.concatenate([np.array(T) / np.linalg.norm(T), Omega])
         if not noise:
             assert np.abs(off).max() < 1e-4  # the pose's steps
@@ -315,14 +317,14 @@ def test_five_points_tell_heading_and_turn(noise):
 def test_five_points_without_a_motion_are_lost():
     cv2 = pytest.importorskip("cv2", reason="needs the extra 'vision'")
     few = np.random.default_rng(0).uniform(-50, 50, (7, 2))
-    assert relative_motion(cv2, few, few + 1, np.arange(7), 100.0, 0.1) is None
+    assert fit_general(cv2, few, few + 1, np.arange(7), 100.0, 0.1) is None
 
 
 def test_frames_of_a_span_are_paired():
     kept = filmed([texture()] * 6).frames
-    assert tracked_points._pairs(kept, 0.0) == [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
-    assert tracked_points._pairs(kept, 0.1) == [(0, 3), (1, 4), (2, 5)]
-    assert tracked_points._pairs(kept, 9.0) == [(0, 5)]
+    assert points.pair_frames(kept, 0.0) == [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
+    assert points.pair_frames(kept, 0.1) == [(0, 3), (1, 4), (2, 5)]
+    assert points.pair_frames(kept, 9.0) == [(0, 5)]
 
 
 def windowed(model, number=150, seed=0, **settings):
@@ -332,9 +334,9 @@ def windowed(model, number=150, seed=0, **settings):
     x, y = rng.integers(8, WIDTH - 8, number), rng.integers(8, HEIGHT - 8, number)
     recording = recorded(t, x, y, rng.random(number) < 0.5, CAMERA)
     params = contrast.Params.of(dict(events=200, duration=0.03, **settings))
-    windows = contrast_maximisation.Windows(recording, params, model)
+    windows = maximisation.WindowSequence(recording, params, model)
     motion = {"planar": [90.0, -40.0], "rotation": [0.7, -0.4, 0.9]}[model]
-    return params, windows.cut(*next(iter(windows))), np.array(motion)
+    return params, windows.crop(next(iter(windows))), np.array(motion)
 
 
 @pytest.mark.slow
@@ -364,10 +366,10 @@ def test_the_objective_and_its_gradient(model, polarity, measure):
     if measure == "variance":
         J = J - J.mean()
     expected = (J**2).sum() / (window.weight**2).sum()
-    value = jax.jit(lambda m: contrast_maximisation.objective(params, window, m))
+    value = jax.jit(lambda m: maximisation.objective(params, window, m))
     np.testing.assert_allclose(value(motion), expected, rtol=1e-12)
     # As many blurs when their number is traced.
-    traced = jax.jit(lambda k: contrast_maximisation.objective(params, window, motion, k))
+    traced = jax.jit(lambda k: maximisation.objective(params, window, motion, k))
     np.testing.assert_allclose(traced(jnp.asarray(1)), expected, rtol=1e-12)
     gradient, h = jax.jit(jax.grad(value))(motion), 1e-7
     for k, step in enumerate(h * np.eye(len(motion))):
@@ -377,14 +379,14 @@ def test_the_objective_and_its_gradient(model, polarity, measure):
 
 def test_in_view_is_what_the_sensor_sees_all_the_time():
     _, window, _ = windowed("planar")
-    seen = np.asarray(contrast_maximisation.in_view(window, np.array([400.0, 0.0])).mask)
+    seen = np.asarray(maximisation.mask_visible(window, np.array([400.0, 0.0])).mask)
     x = np.arange(window.shape[1]) + window.offset[0]
     y = np.arange(window.shape[0]) + window.offset[1]
     way = 400 * 0.015
     expected = (abs(x) <= (WIDTH - 1) / 2 - way) & (abs(y) <= (HEIGHT - 1) / 2)[:, None]
     # Half a us of the window's length may lie on a pixel's centre.
     assert (seen != expected).sum() <= HEIGHT
-    fast = contrast_maximisation.in_view(window, np.array([1e4, 0.0]))
+    fast = maximisation.mask_visible(window, np.array([1e4, 0.0]))
     assert np.asarray(fast.mask).all()
 
 
@@ -407,8 +409,8 @@ def test_a_search_finds_fast_rotations(omega):
     """Some ten times as fast as the window, at once, could be searched."""
     recording = moved(turned(np.array(omega)), 0.024, 800, camera=CAMERA)
     params = contrast.Params.of(dict(events=4000, duration=0.02, margin=8, starts=5))
-    windows = contrast_maximisation.Windows(recording, params, "rotation")
-    found = windows.search(*next(iter(windows)))
+    windows = maximisation.WindowSequence(recording, params, "rotation")
+    found = windows.search(next(iter(windows)))
     assert np.linalg.norm(found - omega) < 0.15 * np.linalg.norm(omega)
 
 

@@ -19,7 +19,7 @@ from jaxevent.egomotion.bundle.frames import DARK, look_at, offset
 from jaxevent.egomotion.bundle.path import ROWS, Path, advanced, normalised, warp
 from jaxevent.egomotion.bundle.photometric import Report, compute_covariance
 from jaxevent.egomotion.bundle.tracks import Scene, misfits, placed
-from jaxevent.egomotion.twists import Twists
+from jaxevent.egomotion.truth import Twists
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Recording
 

@@ -8,10 +8,9 @@ import pytest
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import flow as module
-from jaxevent.egomotion.field import RigidFlow
-from jaxevent.egomotion.flow import Params, flow, iterate
+from jaxevent.egomotion.flow import Params, RigidFlow, flow, iterate_flow
 from jaxevent.egomotion.models import find_model
-from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
 from jaxevent.simulate import motion_scene
@@ -32,7 +31,7 @@ def textured():
 def known(model, mean, t=(0, 300_000), valid=None):
     n = len(find_model(model).components)
     mean = np.broadcast_to(np.asarray(mean, float), (len(t), n))
-    return Motion.of(model, np.array(t), mean, np.zeros((len(t), n, n)), valid)
+    return MotionEstimate.from_arrays(model, np.array(t), mean, np.zeros((len(t), n, n)), valid)
 
 
 def true_motion(source, sign=1):
@@ -186,7 +185,7 @@ def test_pieces_are_the_whole(monkeypatch):
     whole = flow(recording, motion)
     assert len(whole.valid) == len(recording.events)
     monkeypatch.setattr(module, "BATCHES", 3)
-    parts = list(iterate(recording, motion))
+    parts = list(iterate_flow(recording, motion))
     assert len(parts) == -(-len(recording.events) // (3 * module.BATCH))
     for name in ("flow", "valid", "residual"):
         joined = np.concatenate([getattr(part, name) for part in parts])
@@ -204,8 +203,8 @@ def test_where_the_motion_is_lost_there_is_no_flow():
     late = known("planar", [[0.0, 0.0], [60.0, 0.0]], t=(20_000, 80_000))
     told = flow(recording, dataclasses.replace(late, lag=np.full(2, 0.02)))
     np.testing.assert_allclose(told.flow[:, 0], recording.events.t * 1e-3, atol=1e-3)
-    nothing = flow(recording, Motion.nothing("planar"))
-    assert not nothing.valid.any() and nothing.outliers() == 0
+    nothing = flow(recording, MotionEstimate.empty("planar"))
+    assert not nothing.valid.any() and nothing.outlier_percentage() == 0
 
 
 def test_noise_is_an_outlier(optimised):

@@ -6,16 +6,18 @@ import numpy as np
 import pytest
 
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion import batch, contrast, find_model, truth, twists, voting
+from jaxevent.egomotion import batch, contrast, find_model, truth, voting
 from jaxevent.egomotion.bundle.translation import Told, together
-from jaxevent.egomotion.candidates import coordinates
-from jaxevent.egomotion.choice import choose, decide
+from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.geometry import A, B, rotation_basis
-from jaxevent.egomotion.layers import layers
-from jaxevent.egomotion.motion import LENS, Calibration, Motion, decided
-from jaxevent.egomotion.patch_fits import standard
-from jaxevent.egomotion.patches import usual_speed
-from jaxevent.egomotion.still import edges_with_events
+from jaxevent.egomotion.model_selection import flow_consistency, select_by_z, select_model, z_score
+from jaxevent.egomotion.motion import (
+    LENS_ERROR,
+    CovarianceCalibration,
+    MotionEstimate,
+    is_observable,
+)
+from jaxevent.egomotion.patches import edge_event_fraction, measure_image_speed
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Imu, Poses, Recording
 from jaxevent.show.motion import Written
@@ -50,17 +52,19 @@ def moving(flow, seconds: float, number: int = 700, every: float = 0.7, camera=C
 @pytest.mark.parametrize(("speed", "seconds"), [(12.0, 2.0), (90.0, 0.6), (900.0, 0.1)])
 def test_a_speed_is_told(speed, seconds):
     recording = moving(lambda x: np.tile([0.8 * speed, -0.6 * speed], (len(x), 1)), seconds)
-    found = usual_speed(recording)
-    assert found is not None and abs(found.usual / speed - 1) < 0.2
-    assert usual_speed(recording) is found and usual_speed(recording, CAMERA) is found
-    suited = contrast.suit(recording, contrast.Params())
+    found = measure_image_speed(recording)
+    assert found is not None and abs(found.median / speed - 1) < 0.2
+    assert (
+        measure_image_speed(recording) is found and measure_image_speed(recording, CAMERA) is found
+    )
+    suited = contrast.adapt_params(recording, contrast.Params())
     way = float(suited.params.duration) * speed
-    assert 4 < way < 61 and "px/s" in suited.moves and suited.speed == found
-    given = contrast.suit(recording, contrast.Params(duration=0.07), given=["duration"])
+    assert 4 < way < 61 and "px/s" in suited.speed_message and suited.speed == found
+    given = contrast.adapt_params(recording, contrast.Params(duration=0.07), given=["duration"])
     assert float(given.params.duration) == pytest.approx(0.07)  # a number that is given wins
-    params = voting.suit(recording, voting.Params(), speed=found).params
+    params = voting.adapt_params(recording, voting.Params(), speed=found).params
     assert float(params.tau_max) * speed > float(params.baseline)
-    half = float(batch.suit(recording, batch.Params(), speed=found).params.half_window)
+    half = float(batch.adapt_params(recording, batch.Params(), speed=found).params.half_window)
     assert 20 < 2 * half * speed < 151
 
 
@@ -69,18 +73,18 @@ def test_noise_has_no_speed():
     t = np.sort(rng.integers(0, 300_000, n))
     x, y = (rng.integers(0, size, n).astype(np.uint16) for size in (WIDTH, HEIGHT))
     noise = Recording("noise", WIDTH, HEIGHT, Events(t, x, y, rng.random(n) < 0.5), camera=CAMERA)
-    assert usual_speed(noise) is None
-    suited = voting.suit(noise, voting.Params())
+    assert measure_image_speed(noise) is None
+    suited = voting.adapt_params(noise, voting.Params())
     # Of the lengths 1.6 ms 2^k the longest below the recording's 0.3 s is named.
     assert suited.speed is None and "nothing was seen to move in windows of 1.6 ms to 0.2 s" in (
-        suited.line
+        suited.message
     )
     assert suited.params.values() == voting.Params().values()
     hasty = dataclasses.replace(noise, events=Events(t // 300, x, y, x % 2 == 0))
     said = "in windows of 1.6 ms", "in so few events", "in so short a recording"
     for recording, words in zip((noise[:0.003], noise[:0.001], hasty), said, strict=True):
         with pytest.raises(InputError, match=f"nothing is seen to move {words};"):
-            choose(recording)
+            select_model(recording)
 
 
 def rates(x, T, Omega, rho):
@@ -109,32 +113,50 @@ def test_models_are_told_apart():
         return rates(x, np.array([-0.9, 0.0, 0.2]), np.zeros(3), rho)
 
     sliding = moving(deep, 0.6, 900)
-    turns, slides = choose(moving(turn, 0.4, 400)), choose(sliding)
+    turns, slides = select_model(moving(turn, 0.4, 400)), select_model(sliding)
     assert turns.model.name == "rotation" and slides.model.name == "general"
     assert turns.z["rotation", "planar"] > 3 and "better than" in " ".join(turns.lines)
     assert "not sure" in turns.lines[-1] and "not sure" not in " ".join(slides.lines)
-    flat, several, rolling = layers(plane), layers(sliding), layers(turning)
-    assert usual_speed(turning) != usual_speed(sliding) != usual_speed(plane)
-    assert rolling is not None and rolling.several and rolling.spread > 0.5 and rolling.both
-    assert flat is None or not flat.several
+    flat, several, rolling = (
+        flow_consistency(plane),
+        flow_consistency(sliding),
+        flow_consistency(turning),
+    )
     assert (
-        several is not None and several.several and not several.both and 0.2 < several.spread < 0.9
+        measure_image_speed(turning) != measure_image_speed(sliding) != measure_image_speed(plane)
+    )
+    assert (
+        rolling is not None
+        and rolling.is_inconsistent
+        and rolling.spread > 0.5
+        and rolling.both_directions
+    )
+    assert flat is None or not flat.is_inconsistent
+    assert (
+        several is not None
+        and several.is_inconsistent
+        and not several.both_directions
+        and 0.2 < several.spread < 0.9
     )
     assert several.slow < 50 and several.fast > 75  # 45 and 90 px/s
     bare = moving(lambda x: np.tile(one, (len(x), 1)), 0.6, camera=None)
-    assert choose(bare).model.name == "planar"
+    assert select_model(bare).model.name == "planar"
 
     t = np.array([100_000, 500_000])
-    motion = Motion.of("planar", t, np.tile(one, (2, 1)), np.tile(np.eye(2), (2, 1, 1)))
-    wider, line = motion.with_layers(dataclasses.replace(sliding, camera=None))
+    motion = MotionEstimate.from_arrays(
+        "planar", t, np.tile(one, (2, 1)), np.tile(np.eye(2), (2, 1, 1))
+    )
+    wider, line = motion.with_flow_consistency(dataclasses.replace(sliding, camera=None))
     along = several.spread**2 * (1 + 0.1**2) * (one @ one)
     unit = one / np.linalg.norm(one)
     assert unit @ wider.covariance[0] @ unit == pytest.approx(1 + along)
     assert "depths" in line and "--model general --focal PX may explain it" in line
-    turn = Motion.of("rotation", t, np.tile([0.0, 2, 0], (2, 1)), np.tile(np.eye(3), (2, 1, 1)))
-    same, line = turn.with_layers(turning)
+    turn = MotionEstimate.from_arrays(
+        "rotation", t, np.tile([0.0, 2, 0], (2, 1)), np.tile(np.eye(3), (2, 1, 1))
+    )
+    same, line = turn.with_flow_consistency(turning)
     assert same is turn and not line
-    wider, line = turn.with_layers(sliding)  # translation may have made all of it
+    wider, line = turn.with_flow_consistency(sliding)  # translation may have made all of it
     assert wider.covariance[0, 1, 1] == pytest.approx(1 + 4 * 1.01)
     assert "rotation" in line and "--model general may explain it" in line
 
@@ -153,7 +175,7 @@ def test_models_are_told_apart():
 )
 def test_the_simplest_model_that_is_not_beaten_is_chosen(patches, windows, model, sure):
     pairs = ("rotation", "planar"), ("general", "planar"), ("general", "rotation")
-    found = decide(dict(zip(pairs, patches, strict=True)), lambda: windows)
+    found = select_by_z(dict(zip(pairs, patches, strict=True)), lambda: windows)
     assert found.model.name == model
     assert ("not sure" in found.lines[-1]) is not sure
     # No line says of a general motion that is not chosen that it explains more.
@@ -178,7 +200,9 @@ def test_a_heading_that_nothing_tells_is_said():
     covariance = np.tile(np.diag([1.2, 1.2, 0, 1e-4, 1e-4, 1e-4]), (2, 1, 1))
     for sigma2, said in ((1.2, True), (1e-4, False)):
         covariance[:, [0, 1], [0, 1]] = sigma2
-        motion = dataclasses.replace(Motion.of("general", t, mean, covariance), held=1)
+        motion = dataclasses.replace(
+            MotionEstimate.from_arrays("general", t, mean, covariance), n_extended=1
+        )
         lines = Written([], t, motion(t), motion, None, None, None).summary()
         assert lines[0].startswith("1 estimate, found")  # the other one holds it
         assert ("not observable" in " ".join(lines)) == ("not told" in lines[2]) == said
@@ -200,33 +224,35 @@ def test_a_camera_that_stands_still_while_things_move():
     light = np.random.default_rng(0).uniform(0.2, 1, (HEIGHT // 8, WIDTH // 8)).repeat(8, 0)
     image, shares = np.full((HEIGHT, WIDTH), 0.5, np.float32), []
     mean, covariance = np.tile([70.0, 20.0], (2, 1)), np.tile(np.eye(2), (2, 1, 1))
-    motion = Motion.of("planar", np.array([100_000, 500_000]), mean, covariance)
+    motion = MotionEstimate.from_arrays("planar", np.array([100_000, 500_000]), mean, covariance)
     for columns in (slice(0, 56), slice(64, WIDTH)):
         image[:], image[:, columns] = 0.5, light.repeat(8, 1)[:, columns]
         frames = Frames(t, np.tile(image, (len(t), 1, 1)), np.zeros(len(t), np.int64))
         shown = dataclasses.replace(recording, events=events, frames=frames)
-        shares.append(edges_with_events(shown))
-        told, line = motion.with_layers(shown)
+        shares.append(edge_event_fraction(shown))
+        told, line = motion.with_flow_consistency(shown)
         still = "stand still" in line
         assert still == (told.covariance[0, 0, 0] > 70**2) == (columns.start == 0)
     assert shares[0] < 0.1 and shares[1] > 0.5
-    assert edges_with_events(recording) is None
+    assert edge_event_fraction(recording) is None
     heading = np.tile([0.0, 0, 1, 0.1, 0, 0], (2, 1))
-    general = Motion.of("general", motion.t, heading, np.zeros((2, 6, 6)))
-    unsure = general._of_things().covariance
-    assert not decided("general", unsure)[:, :3].any() and unsure[0, 3, 3] > 0.1**2
+    general = MotionEstimate.from_arrays("general", motion.t, heading, np.zeros((2, 6, 6)))
+    unsure = general._with_full_uncertainty().covariance
+    assert not is_observable("general", unsure)[:, :3].any() and unsure[0, 3, 3] > 0.1**2
 
 
 def test_standard():
-    assert standard(np.array([1.0, 1, 1, 1])) == pytest.approx(2)
-    assert standard(np.zeros(3)) == 0
+    assert z_score(np.array([1.0, 1, 1, 1])) == pytest.approx(2)
+    assert z_score(np.zeros(3)) == 0
 
 
 def test_what_errors_are_made_of():
     t = np.array([0, 100_000, 200_000])
     mean = np.array([[1.0, 0], [2, 0], [3, 0]])
-    motion = Motion.of("planar", t, mean, np.tile(np.eye(2), (3, 1, 1)))
-    told = motion.calibrated(Calibration(factor=4, share=0.5, change=0.2), 0.1)
+    motion = MotionEstimate.from_arrays("planar", t, mean, np.tile(np.eye(2), (3, 1, 1)))
+    told = motion.with_calibrated_covariance(
+        CovarianceCalibration(factor=4, share=0.5, change=0.2), 0.1
+    )
     expected = 4 + 0.25 * 4 + 0.04 * 1.0**2  # the motion changes by 1 in 0.1 s, and is straight
     np.testing.assert_allclose(told.covariance[1], np.diag([expected, 5]))
     # At the ends it is taken to change as it comes, and later it is known less and less.
@@ -236,29 +262,34 @@ def test_what_errors_are_made_of():
     later = told(np.array([200_000, 250_000, 300_000]), extrapolate=True)
     grown = later.covariance - told.covariance[2]
     np.testing.assert_allclose(grown, [[[v, 0], [0, 0]] for v in (0, 0.25, 1)], atol=1e-12)
-    fast = Motion.of("planar", t, mean + [0, 1], np.tile(np.eye(2), (3, 1, 1)))
-    told = fast.calibrated(Calibration(speed=0.5))
+    fast = MotionEstimate.from_arrays("planar", t, mean + [0, 1], np.tile(np.eye(2), (3, 1, 1)))
+    told = fast.with_calibrated_covariance(CovarianceCalibration(speed=0.5))
     np.testing.assert_allclose(told.covariance[1] - np.eye(2), [[1.0, 0.5], [0.5, 0.25]])
-    lost = Motion.of("planar", t, mean, np.full((3, 2, 2), np.nan))
+    lost = MotionEstimate.from_arrays("planar", t, mean, np.full((3, 2, 2), np.nan))
     assert not lost(t).valid.any()  # without a sigma
 
 
 def test_a_lone_estimate_and_what_it_reaches():
     t, mean = np.array([100_000]), np.array([[3.0, 0]])
-    motion = Motion.of("planar", t, mean, np.eye(2)[None])
-    assert (motion.calibrated(Calibration(change=0.5), 0.2).covariance == np.eye(2)).all()
-    told = motion.calibrated(Calibration(change=0.5), 0.2, np.array([0.0, 4.0]))
+    motion = MotionEstimate.from_arrays("planar", t, mean, np.eye(2)[None])
+    assert (
+        motion.with_calibrated_covariance(CovarianceCalibration(change=0.5), 0.2).covariance
+        == np.eye(2)
+    ).all()
+    told = motion.with_calibrated_covariance(
+        CovarianceCalibration(change=0.5), 0.2, np.array([0.0, 4.0])
+    )
     np.testing.assert_allclose(told.covariance[0], np.diag([1, 1 + 0.25 * 16]))
     rate = np.diag([0, 4.0**2]) / 2e5**2
-    assert (told.held, told.reaching(0, 200_000).held) == (0, 2)
-    whole = told.reaching(0, 200_000, rate).within(moving(lambda x: x, 0.2))
+    assert (told.n_extended, told.extended_to(0, 200_000).n_extended) == (0, 2)
+    whole = told.extended_to(0, 200_000, rate).with_recording(moving(lambda x: x, 0.2))
     assert list(whole.t) == [0, 100_000, 200_000] and whole.valid.all()
     np.testing.assert_allclose(whole.mean, np.tile(mean, (3, 1)))
     # In half a window it changes by half as much.
     np.testing.assert_allclose(whole.covariance[:, 1, 1], [9, 5, 9])
     assert whole(np.arange(5000, 195_000, 1000)).valid.all()
-    lost = Motion.of("planar", t, mean, np.eye(2)[None], np.array([False]))
-    assert len(lost.reaching(0, 200_000)) == 1
+    lost = MotionEstimate.from_arrays("planar", t, mean, np.eye(2)[None], np.array([False]))
+    assert len(lost.extended_to(0, 200_000)) == 1
 
 
 def test_what_the_calibration_of_a_lens_leaves():
@@ -276,7 +307,7 @@ def test_what_the_calibration_of_a_lens_leaves():
         return PinholeCamera(fx, fy, cx, cy, (k1, k2, 0.0, 0.0, 0.0))
 
     def places(values):
-        xi, f = coordinates(60, 45, camera(values))
+        xi, f = pixel_coordinates(60, 45, camera(values))
         slope = np.stack([np.gradient(xi, axis=axis) for axis in (1, 0)], -1)
         return slope.reshape(-1, 2, 2), rotation_basis(xi.reshape(-1, 2), f)
 
@@ -287,34 +318,34 @@ def test_what_the_calibration_of_a_lens_leaves():
         slope, flow = places(lens + off)
         found = np.linalg.lstsq(flow.reshape(-1, 3), (slope @ seen).reshape(-1, 50))[0]
         square += np.square(found - axes).mean()
-    assert LENS / 1.3 < np.sqrt(square) < 1.3 * LENS
-    ideal = Calibration(share=0.02)
-    assert ideal.behind(None) == ideal.behind(CAMERA) == ideal
-    assert ideal.behind(camera(lens)).share == pytest.approx(np.hypot(0.02, LENS))
+    assert LENS_ERROR / 1.3 < np.sqrt(square) < 1.3 * LENS_ERROR
+    ideal = CovarianceCalibration(share=0.02)
+    assert ideal.with_lens(None) == ideal.with_lens(CAMERA) == ideal
+    assert ideal.with_lens(camera(lens)).share == pytest.approx(np.hypot(0.02, LENS_ERROR))
 
 
 def test_a_gyro_in_other_axes_and_with_a_bias():
     t = np.linspace(0, 1, 50)
     Omega = np.stack([0.3 * np.sin(7 * t), 0.2 * np.cos(5 * t), 0.5 + 0.2 * np.sin(9 * t)], 1)
     bias = np.array([0.05, -0.06, 0.02])
-    np.testing.assert_allclose(twists.constant_between(Omega, Omega + bias), bias)
-    for name, R in twists.AXES.items():
+    np.testing.assert_allclose(truth.fit_gyro_bias(Omega, Omega + bias), bias)
+    for name, R in truth.AXES.items():
         assert np.linalg.det(R) == pytest.approx(1)
         measured = (Omega + bias) @ R  # R takes the gyro's axes to the camera's
-        found = twists.nearest_axes(Omega, measured)
+        found = truth.find_imu_axes(Omega, measured)
         assert found == (None if name == "camera" else name)
         imu = Imu(np.rint(1e6 * t).astype(np.int64), measured, np.zeros_like(measured))
-        np.testing.assert_allclose(twists.from_gyro(imu, rotation=R).Omega, Omega + bias)
+        np.testing.assert_allclose(truth.from_gyro(imu, rotation=R).Omega, Omega + bias)
     # Axes without a name are told as `imu_rotation` reads them.
     R = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
-    found = twists.nearest_axes(Omega, (Omega + bias) @ R)
+    found = truth.find_imu_axes(Omega, (Omega + bias) @ R)
     assert found is not None
-    np.testing.assert_array_equal(twists.imu_rotation(found), R)
-    np.testing.assert_array_equal(twists.imu_rotation("y-up"), np.diag([1.0, -1, -1]))
-    np.testing.assert_array_equal(twists.imu_rotation("0,1,0,0,0,1,1,0,0")[0], [0, 1, 0])
+    np.testing.assert_array_equal(truth.imu_rotation(found), R)
+    np.testing.assert_array_equal(truth.imu_rotation("y-up"), np.diag([1.0, -1, -1]))
+    np.testing.assert_array_equal(truth.imu_rotation("0,1,0,0,0,1,1,0,0")[0], [0, 1, 0])
     for wrong in ("y_up", "1,2", "1,0,0,0,1,0,0,0,-1"):
         with pytest.raises(InputError, match="imu-rotation"):
-            twists.imu_rotation(wrong)
+            truth.imu_rotation(wrong)
 
 
 def test_poses_and_a_depth_tell_an_image_velocity():
@@ -324,9 +355,9 @@ def test_poses_and_a_depth_tell_an_image_velocity():
     recording = Recording(
         "r", WIDTH, HEIGHT, Events.empty(), camera=CAMERA, poses=Poses(t, position, quaternion)
     )
-    known = truth.known(recording, "planar", depth=2.0)
+    known = truth.known_motion(recording, "planar", depth=2.0)
     np.testing.assert_allclose(known.values, np.tile([-F * 0.2, F * 0.05], (len(known.t), 1)))
     with pytest.raises(InputError, match="depth"):
-        truth.known(recording, "rotation", depth=2.0)
+        truth.known_motion(recording, "rotation", depth=2.0)
     with pytest.raises(InputError, match="depth 0"):
-        truth.known(recording, find_model("planar"), depth=0.0)
+        truth.known_motion(recording, find_model("planar"), depth=0.0)

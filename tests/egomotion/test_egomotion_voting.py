@@ -12,10 +12,10 @@ from points import HEIGHT, WIDTH, moved, recorded, turning
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import candidates, voting
 from jaxevent.egomotion.models import MODELS, General, Planar
-from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.particle_filter import filtering
-from jaxevent.egomotion.particle_filter.likelihood import along_edge, score
-from jaxevent.egomotion.particle_filter.smoothing import smoothed
+from jaxevent.egomotion.particle_filter.filtering import smooth
+from jaxevent.egomotion.particle_filter.likelihood import is_along_edge, score_batch
 from jaxevent.errors import InputError
 from jaxevent.recording import Events
 
@@ -51,12 +51,12 @@ def slow(recording, row, radius, per_pixel, youngest, oldest):
 @pytest.mark.parametrize("every, batch, pieces, per_pixel", [(1, 7, 3, 3), (3, 16, 64, 8)])
 def test_candidates_are_the_recent_neighbours(every, batch, pieces, per_pixel):
     recording = scattered()
-    gatherer = candidates.Gatherer(
+    sampler = candidates.CandidateSampler(
         recording, radius=2, per_pixel=per_pixel, most=200, every=every, batch=batch, longest=1e9
     )
     rows, ends = [], []
-    while not gatherer.done:
-        made = gatherer.gather(pieces, 40e-6, 2000e-6)
+    while not sampler.is_exhausted:
+        made = sampler.sample(pieces, 40e-6, 2000e-6)
         c = made.candidates
         for b, k in zip(*np.nonzero(made.row >= 0), strict=True):
             rows.append(made.row[b, k])
@@ -81,9 +81,11 @@ def test_candidates_are_the_recent_neighbours(every, batch, pieces, per_pixel):
 
 def test_too_many_candidates_are_thinned_evenly():
     recording = scattered(number=3000)
-    some = candidates.Gatherer(recording, radius=2, per_pixel=4, most=10, every=1, batch=50)
-    every = candidates.Gatherer(recording, radius=2, per_pixel=4, most=200, every=1, batch=50)
-    few, all_ = (g.whole(1e-6, 1e-2).candidates for g in (some, every))
+    some = candidates.CandidateSampler(recording, radius=2, per_pixel=4, most=10, every=1, batch=50)
+    every = candidates.CandidateSampler(
+        recording, radius=2, per_pixel=4, most=200, every=1, batch=50
+    )
+    few, all_ = (g.sample_all(1e-6, 1e-2).candidates for g in (some, every))
     number = all_.mask.sum(-1)
     np.testing.assert_allclose(few.scale, np.maximum(number / 10, 1))
     np.testing.assert_array_equal(few.mask.sum(-1), np.minimum(number, 10))
@@ -98,11 +100,13 @@ def test_candidates_about_an_expected_flow():
     recording = scattered(number=1500)
     rng = np.random.default_rng(0)
     youngest, oldest = rng.uniform([[100]], 500, (7, 9)), rng.uniform(1000, 3000, (7, 9))
-    gate = candidates.Expected(
+    gate = candidates.ExpectedFlow(
         rng.uniform(-1000, 1000, (2, 7, 9)), rng.uniform(0, 300, (7, 9)), 1.5
     )
-    gatherer = candidates.Gatherer(recording, radius=2, per_pixel=4, most=200, every=3, batch=50)
-    made = gatherer.gather(20, 1e-6 * youngest, 1e-6 * oldest, expected=gate)
+    sampler = candidates.CandidateSampler(
+        recording, radius=2, per_pixel=4, most=200, every=3, batch=50
+    )
+    made = sampler.sample(20, 1e-6 * youngest, 1e-6 * oldest, expected=gate)
     c, e, some = made.candidates, recording.events, 0
     for b, k in zip(*np.nonzero(made.row >= 0), strict=True):
         x, y = int(e.x[made.row[b, k]]), int(e.y[made.row[b, k]])
@@ -130,24 +134,26 @@ def listed(c, b, k):
 
 def test_chunks_end_in_time_and_lose_nothing():
     recording = scattered()
-    rows, gatherer = [], candidates.Gatherer(recording, radius=2, every=3, batch=7)
-    while not gatherer.done:
-        made = gatherer.gather(40, 0.0, 1.0, span=5e-4)
+    rows, sampler = [], candidates.CandidateSampler(recording, radius=2, every=3, batch=7)
+    while not sampler.is_exhausted:
+        made = sampler.sample(40, 0.0, 1.0, span=5e-4)
         t = recording.events.t[made.row[made.row >= 0]]
         assert t[-1] - t[0] <= 500
         rows.append(made.row[made.row >= 0])
     assert len(rows) == 8
     np.testing.assert_array_equal(np.concatenate(rows), np.arange(0, 400, 3))
     # A search needs candidates of all ages.
-    short = candidates.Gatherer(recording, radius=2, every=3).gather(9, 0.0, 1e-3).candidates
+    short = (
+        candidates.CandidateSampler(recording, radius=2, every=3).sample(9, 0.0, 1e-3).candidates
+    )
     assert np.max(short.history) == 1e-3
 
 
 def test_a_batch_ends_in_time_and_times_add_up():
     recording = recorded([0, 100, 5000, 30000, 30001, 30001], [1] * 6, [1] * 6, [1] * 6)
-    made = candidates.Gatherer(recording, every=1, batch=4, longest=0.004, silence=0.02).whole(
-        0.0, 1.0
-    )
+    made = candidates.CandidateSampler(
+        recording, every=1, batch=4, longest=0.004, silence=0.02
+    ).sample_all(0.0, 1.0)
     assert made.t.tolist() == [100, 5000, 30001]
     np.testing.assert_allclose(made.candidates.elapsed, [1e-4, 4.9e-3, 25.001e-3])
     np.testing.assert_allclose(made.candidates.history, [1e-4, 5e-3, 1e-6])
@@ -156,13 +162,13 @@ def test_a_batch_ends_in_time_and_times_add_up():
 def test_displacements_are_undistorted():
     camera = PinholeCamera(80.0, 80.0, 60.0, 45.0, (-0.3, 0.1, 0.001, -0.002, 0.0))
     recording = recorded([0, 1000], [110, 113], [80, 78], [1, 1])
-    c = candidates.Gatherer(recording, camera, every=1).whole(0.0, 1.0).candidates
+    c = candidates.CandidateSampler(recording, camera, every=1).sample_all(0.0, 1.0).candidates
     xi: np.ndarray = np.asarray(c.xi)[0, :2]
     np.testing.assert_allclose(c.d[0, 1, 0], xi[1] - xi[0])
     x, y = np.transpose(xi) / 80
     r2 = x**2 + y**2
-    rooms = np.asarray(c.room)[0, 0]  # from the first column to the last, at its row
-    edge, _ = candidates.coordinates(WIDTH, HEIGHT, camera)
+    rooms = np.asarray(c.bounds)[0, 0]  # from the first column to the last, at its row
+    edge, _ = candidates.pixel_coordinates(WIDTH, HEIGHT, camera)
     here = np.asarray(c.xi)[0, 0]
     np.testing.assert_allclose(rooms[:, 0], here[0] - edge[80, [WIDTH - 1, 0], 0])
     np.testing.assert_allclose(rooms[:, 1], here[1] - edge[[HEIGHT - 1, 0], 110, 1])
@@ -181,8 +187,8 @@ def prepared(likelihood="soft", model="planar", number=500, **settings):
     t = np.sort(rng.integers(0, 100_000, number))
     x, y, p = rng.integers(0, 14, number), rng.integers(0, 11, number), rng.random(number) < 0.5
     recording = recorded(t, x, y, p, 14, 11, PinholeCamera(20.0, 20.0, 6.0, 5.0))
-    kind, gatherer = voting.gatherer(recording, params, model)
-    return params, kind, gatherer.whole(1e-3, 0.1).candidates
+    kind, sampler = voting.sampler(recording, params, model)
+    return params, kind, sampler.sample_all(1e-3, 0.1).candidates
 
 
 def by_hand(params, model, batch, particles, weights, searching):
@@ -197,7 +203,7 @@ def by_hand(params, model, batch, particles, weights, searching):
     sigma = float(params.sigma_x) * (2 if searching else 1)
     for k in np.flatnonzero(batch.valid):
         x, y = batch.xi[k]
-        least_d, most_d = batch.room[k]
+        least_d, most_d = batch.bounds[k]
         f, general = model.f, model.name == "general"
         rows = np.array([[x * y / f, -(f + x * x / f), y], [f + y * y / f, -x * y / f, -x]])
         flows = [q if model.name == "planar" else rows @ q[-3:] for q in particles]
@@ -258,9 +264,9 @@ def by_hand(params, model, batch, particles, weights, searching):
         # votes, a disc's and a strip's of the window's half width.
         area = 2 * np.pi * sigma**2
         if general:
-            area = area / 2 + np.sqrt(2 * np.pi) * sigma * batch.reach
+            area = area / 2 + np.sqrt(2 * np.pi) * sigma * batch.radius
         usual = batch.rate[k] * (1 - share) * tau
-        chance += max(usual * area / (2 * batch.reach + 1) ** 2, 0.2)
+        chance += max(usual * area / (2 * batch.radius + 1) ** 2, 0.2)
     return total, votes, chance, np.mean(taus)
 
 
@@ -298,11 +304,12 @@ def test_a_step_is_the_slow_one(searching):
         jax.tree.map(lambda a: jnp.asarray(a[25]), c), history=jnp.array(1.0)
     )
     particles, weights = cloud_of(kind)
-    carry = filtering.State(
+    carry = filtering.ParticleState(
         *map(jnp.asarray, (particles, np.log(weights), searching, 0.0, 0.0, 0.0, 0.0))
     )
-    cloud, zero = jnp.zeros_like(carry.particles), jnp.zeros(())
-    after, told = STEP(params, kind, carry, jax.tree.map(jnp.asarray, batch), cloud, zero, cloud)
+    cloud = jnp.zeros_like(carry.particles)
+    noise = filtering.BatchNoise(cloud, jnp.zeros(()), cloud)
+    after, told = STEP(params, kind, carry, jax.tree.map(jnp.asarray, batch), noise)
     gain, *_ = by_hand(params, kind, batch, particles, weights, searching)
     gain = gain * (min(1, 0.5 / gain.std()) if searching else 1)
     w = weights * np.exp(gain)
@@ -318,7 +325,7 @@ def test_a_step_is_the_slow_one(searching):
 
 
 STEP = eqx.filter_jit(filtering.step)
-SCORE = eqx.filter_jit(score)
+SCORE = eqx.filter_jit(score_batch)
 
 
 def test_systematic_resampling_is_unbiased():
@@ -344,7 +351,7 @@ def test_resampling_carries_the_score():
 def test_gradient_without_resampling(likelihood, optimised):
     params, kind, c = prepared(likelihood, number=300, resample_below=0.0, r_t=50.0, memory=1e9)
     noise = filtering.draw(jax.random.key(3), len(c.elapsed), params, kind)
-    carry = filtering.begin(params, kind, noise)
+    carry = filtering.init(params, kind, noise)
     carry = dataclasses.replace(carry, particles=carry.particles / 6, searching=jnp.asarray(False))
     names = ["noise"] + (["r_t", "alpha_literal"] if likelihood == "literal" else
                          ["sigma_x", "s0", "alpha"])  # fmt: skip
@@ -425,7 +432,7 @@ def test_seeds_and_parameters_in_one_call():
     def final(key, alpha):
         tuned = eqx.tree_at(lambda p: p.raw["alpha"], params, alpha)
         noise = filtering.draw(key, len(c.elapsed), params, kind)
-        return RUN(tuned, kind, c, noise, filtering.begin(params, kind, noise))[1].mean[-1]
+        return RUN(tuned, kind, c, noise, filtering.init(params, kind, noise))[1].mean[-1]
 
     alphas = jnp.log(jnp.array([1.0, 2.0, 3.0]))
     together = jax.jit(jax.vmap(final))(keys, alphas)
@@ -472,7 +479,7 @@ def test_particles_that_all_die_begin_anew(model):
     params, kind, c = prepared(model=model)
     c = jax.tree.map(lambda a: a[:4], c)
     noise = filtering.draw(jax.random.key(0), len(c.elapsed), params, kind)
-    carry = filtering.begin(params, kind, noise)
+    carry = filtering.init(params, kind, noise)
     dead = dataclasses.replace(carry, log_weights=jnp.full_like(carry.log_weights, -jnp.inf))
     after, told = RUN(params, kind, c, noise, dead)
     assert told.searching[0] and after.searching
@@ -482,7 +489,7 @@ def test_particles_that_all_die_begin_anew(model):
 
 
 def test_states_between_batches():
-    motion = Motion(
+    motion = MotionEstimate(
         Planar, np.array([1000, 3000]), np.array([[1.0, 0], [3, 4]]),
         np.stack([np.eye(2), 3 * np.eye(2)]), np.array([False, True]),
         np.full(2, 5e-4), np.ones(2), np.zeros(2),
@@ -496,7 +503,11 @@ def test_states_between_batches():
 
 def test_smoothed_is_the_dense_posterior():
     """Of a random walk seen with noise: a Kalman filter, then the joint Gaussian of all times."""
-    params, rng, n = voting.Params.of({"noise_rotation": 2.0}), np.random.default_rng(0), 40
+    params, rng, n = (
+        voting.Params.of({"noise_rotation": 2.0}),
+        np.random.default_rng(0),
+        40,
+    )
     dt = rng.uniform(1e-3, 1e-2, n)
     dt[0], R, P0 = 0.0, np.diag([0.1, 0.2, 0.4]), np.eye(3)
     z = np.cumsum(2 * np.sqrt(dt)[:, None] * rng.normal(size=(n, 3)), 0)
@@ -510,21 +521,25 @@ def test_smoothed_is_the_dense_posterior():
     t = np.rint(1e6 * np.cumsum(dt)).astype(np.int64)
     lag = np.linspace(0.02, 0.03, n)
     means, covariances = (np.array(part) for part in zip(*told, strict=True))
-    motion = dataclasses.replace(Motion.of("rotation", t, means, covariances), lag=lag)
-    smooth = smoothed(motion, params)
+    motion = dataclasses.replace(
+        MotionEstimate.from_arrays("rotation", t, means, covariances), lag=lag
+    )
+    smoothed = smooth(motion, params)
     # cov(x_i, x_j) = P0 + 4 min(t_i, t_j), each component alone.
     joint = 1 + 4 * np.cumsum(dt)[np.minimum.outer(np.arange(n), np.arange(n))]
     for i in range(3):
         gain = joint @ np.linalg.inv(joint + R[i, i] * np.eye(n))
-        np.testing.assert_allclose(smooth.mean[:, i], gain @ z[:, i], rtol=1e-2, atol=2e-3)
+        np.testing.assert_allclose(smoothed.mean[:, i], gain @ z[:, i], rtol=1e-2, atol=2e-3)
         posterior = joint - gain @ joint
-        np.testing.assert_allclose(smooth.covariance[:, i, i], np.diag(posterior), rtol=1e-3)
-    np.testing.assert_allclose(smooth.t, t - 1e6 * lag, atol=1)
-    assert not smooth.lag.any()
+        np.testing.assert_allclose(smoothed.covariance[:, i, i], np.diag(posterior), rtol=1e-3)
+    np.testing.assert_allclose(smoothed.t, t - 1e6 * lag, atol=1)
+    assert not smoothed.lag.any()
     # Nothing passes a stretch in which the motion is lost.
     valid = np.arange(n) != 20
-    cut = smoothed(dataclasses.replace(motion, valid=valid), params)
-    first = smoothed(Motion.of("rotation", t[:20], means[:20], covariances[:20]), params)
+    cut = smooth(dataclasses.replace(motion, valid=valid), params)
+    first = smooth(
+        MotionEstimate.from_arrays("rotation", t[:20], means[:20], covariances[:20]), params
+    )
     np.testing.assert_allclose(cut.mean[:20], first.mean)
     np.testing.assert_allclose(cut.mean[20], means[20])
 
@@ -545,13 +560,13 @@ def test_general_particles():
     params = voting.Params.of({"preset": "general"})
     kind = General(100.0)
     noise = filtering.draw(jax.random.key(0), 1, params, kind)
-    particles = jax.jit(filtering.begin, static_argnums=1)(params, kind, noise).particles
+    particles = jax.jit(filtering.init, static_argnums=1)(params, kind, noise).particles
     particles = np.asarray(particles)
     np.testing.assert_allclose(np.linalg.norm(particles[:, :3], axis=1), 1)
     # All over the sphere: second moments of directions are 1 / 3.
     T = particles[:, :3]
     np.testing.assert_allclose(T.T @ T / 500, np.eye(3) / 3, atol=0.06)
-    steps, moved = 0.01 * np.asarray(noise.normal[0]), jax.jit(jax.vmap(kind.moved))
+    steps, moved = 0.01 * np.asarray(noise.normal[0]), jax.jit(jax.vmap(kind.retract))
     after = np.asarray(moved(particles, steps))
     np.testing.assert_allclose(np.linalg.norm(after[:, :3], axis=1), 1)
     across = steps[:, :3] - particles[:, :3] * (steps[:, :3] * particles[:, :3]).sum(1)[:, None]
@@ -560,7 +575,7 @@ def test_general_particles():
     cloud = moved(around, 5 * steps)
     mean = np.asarray(jax.jit(kind.mean)(cloud, np.full(500, 1 / 500)))
     np.testing.assert_allclose(mean[:3], [0.6, 0, 0.8], atol=0.02)
-    apart = np.asarray(jax.jit(jax.vmap(kind.apart, (0, None)))(cloud, mean))
+    apart = np.asarray(jax.jit(jax.vmap(kind.deviation, (0, None)))(cloud, mean))
     np.testing.assert_allclose(apart[:, :3] @ mean[:3], 0, atol=1e-12)
     covariance = apart.T @ apart / 500
     np.testing.assert_allclose(np.linalg.eigvalsh(covariance[:3, :3])[1:], 0.05**2, rtol=0.2)
@@ -589,5 +604,5 @@ def test_candidates_along_an_edge_against_a_loop():
         near = bool(earlier) and abs(min(earlier) - last) <= edge
         expected.append(0 < age[c] <= edge and near)
     params = voting.Params(edge=edge)
-    found = along_edge(params, jnp.asarray(d), jnp.asarray(age), jnp.asarray(last))
+    found = is_along_edge(params, jnp.asarray(d), jnp.asarray(age), jnp.asarray(last))
     assert np.array_equal(found, expected) and 0 < sum(expected) < (age > 0).sum()

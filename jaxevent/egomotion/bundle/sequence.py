@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from jaxevent.egomotion.bundle.path import Path, advanced
 from jaxevent.egomotion.bundle.windows import Fit, Params, Rival, Windows, near_to
-from jaxevent.egomotion.estimator import COMMON, Given, OnHost
+from jaxevent.egomotion.estimator import COMMON_OPTIONS, HostEstimator, HostInputs
 from jaxevent.egomotion.models import General
-from jaxevent.egomotion.motion import Motion
-from jaxevent.egomotion.patches import Speed
+from jaxevent.egomotion.motion import MotionEstimate
+from jaxevent.egomotion.patches import ImageSpeed
 from jaxevent.progress import bar
 
 WAYS = 24.0, 150.0  # px in a window, with which the default length is kept
@@ -27,17 +27,17 @@ DOUBTED = 1.0
 LOST = 4  # times the least cost of the windows before: the path is not followed
 
 
-def solve(params: Params, given: Given) -> Motion:
+def solve(params: Params, given: HostInputs) -> MotionEstimate:
     """The general motion of a camera, from windows that overlap.
 
     The motion at a time is the mean of what the windows around it tell, of those nearer the more
     (a raised cosine). Estimates are a fifth of a `step` apart. The seed chooses events where a
     window has more than `events`. The option `gyro` (`twists.from_gyro`) settles Omega.
     """
-    recording, camera, gyro = given.recording, given.camera, given.more.get("gyro")
+    recording, camera, gyro = given.recording, given.camera, given.options.get("gyro")
     assert camera is not None
     if not len(recording.events):
-        return Motion.nothing(given.model)
+        return MotionEstimate.empty(given.model)
     windows = Windows(recording, params, camera, gyro, given.seed)
     first, last = int(recording.events[:1].t[0]), int(recording.events[-1:].t[0])
     half, step = (round(1e6 * float(value)) for value in (params.half_window, params.step))
@@ -127,7 +127,7 @@ def _revise(
 
 def _blended(
     centres: NDArray, fits: list[Fit | None], half: int, step: int, first: int, last: int
-) -> Motion:
+) -> MotionEstimate:
     """The motion of overlapping windows; lost where none tells it.
 
     Of a window the middle two thirds count, those beyond `reach` where no other tells more. How far
@@ -163,7 +163,7 @@ def _blended(
     size = np.linalg.norm(heading, axis=1, keepdims=True)
     heading = np.where(size > 0, heading / np.where(size > 0, size, 1), np.array([0.0, 0, 1]))
     mean = np.concatenate([heading, Omega / safe[:, None]], 1)
-    told = Motion.of(General, t, mean, covariance / safe[:, None, None], ~lost)
+    told = MotionEstimate.from_arrays(General, t, mean, covariance / safe[:, None, None], ~lost)
     return dataclasses.replace(told, agreement=agreement / safe)
 
 
@@ -209,21 +209,21 @@ def _disagreements(
     return [np.mean(squares, 0) if squares else np.zeros((6, 6)) for squares in found]
 
 
-def lengths(params: Params, speed: Speed) -> dict[str, float]:
+def lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
     """Windows in which the image moves by some pixels."""
-    way = 2 * float(params.half_window) * speed.usual
+    way = 2 * float(params.half_window) * speed.median
     if WAYS[0] <= way <= WAYS[1]:
         return {}
-    half = min(max((WAYS[0] if way < WAYS[0] else WAYS[1]) / speed.usual / 2, SHORTEST), LONGEST)
+    half = min(max((WAYS[0] if way < WAYS[0] else WAYS[1]) / speed.median / 2, SHORTEST), LONGEST)
     return {"half_window": half, "step": half * float(params.step) / float(params.half_window)}
 
 
-batch = OnHost(
+batch = HostEstimator(
     "batch",
     Params,
     solve,
     models=(General.name,),
-    options=COMMON | {"gyro"},
+    options=COMMON_OPTIONS | {"gyro"},
     lengths=lengths,
     about="General motion by fitting a whole window of events: the camera's path and the scene's "
     "depth. Estimates of overlapping windows are blended, a fifth of a `step` apart.",

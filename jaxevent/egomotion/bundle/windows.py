@@ -39,9 +39,9 @@ from jaxevent.egomotion.bundle.starts import (
     start,
 )
 from jaxevent.egomotion.bundle.tracks import Scene, Tracks
-from jaxevent.egomotion.candidates import coordinates
-from jaxevent.egomotion.motion import left_by_lens
-from jaxevent.egomotion.twists import Twists
+from jaxevent.egomotion.candidates import pixel_coordinates
+from jaxevent.egomotion.motion import lens_error
+from jaxevent.egomotion.truth import Twists
 from jaxevent.parameters import Choice, Count, Number, Parameters, Positive
 from jaxevent.recording import Recording
 
@@ -178,12 +178,12 @@ class Windows:
         seed: int = 0,
     ):
         self.recording, self.params, self.gyro, self.seed = recording, params, gyro, seed
-        self.lens = left_by_lens(camera)
+        self.lens = lens_error(camera)
         self.least: dict[int, float] = {}  # C, sigma at least, by windows
         # Stages look at the same window one after another.
         self.look_at = functools.lru_cache(2)(self._look_at)
         self.real = np.dtype(jax.dtypes.canonicalize_dtype(float))
-        self.xi, self.f = coordinates(recording.width, recording.height, camera)
+        self.xi, self.f = pixel_coordinates(recording.width, recording.height, camera)
         flat = self.xi.reshape(-1, 2)
         lower, upper = np.floor(flat.min(0)) - MARGIN, np.ceil(flat.max(0)) + MARGIN
         cells = np.ceil((upper - lower + 1) / params.cell).astype(int)
