@@ -3,8 +3,9 @@
     python experiments/blob_accuracy.py [--seeds 2]
 
 A simulated target of (5, 4) px circles at 500 px/s with 40,000 events/s. Events per step are chosen
-by `Found.settings(accuracy)`; standard deviation and rms error of the filtered position, at times
-all over the steps, are divided by those of event by event, in one process. The bound is for both.
+by `TargetSearchResult.settings(accuracy)`; standard deviation and rms error of the filtered
+position, at times all over the steps, are divided by those of event by event, in one process. The
+bound is for both.
 """
 
 import argparse
@@ -13,9 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob import Found, moment
-from jaxevent.blob.search.agility import fit_agility
-from jaxevent.blob.search.paths import Path
+from jaxevent.blob import TargetSearchResult, moment
+from jaxevent.blob.search.paths import TargetPath, fit_velocity_noise
 from jaxevent.recording import Recording
 from jaxevent.simulate.blobs import Circle, Target, simulate_blobs
 
@@ -23,17 +23,19 @@ WINDOW = 5000  # us
 ACCURACIES = (0.02, 0.1, 0.5)
 
 
-def known(recording: Recording, truth: Any) -> Found:
+def known(recording: Recording, truth: Any) -> TargetSearchResult:
     """The target as a search in windows would find it, from its true path."""
     t = np.arange(WINDOW // 2, 1e6 * truth.duration, WINDOW).astype(np.int64)
     p, v = truth(t)[:, 0, :2], truth(t)[:, 0, 2:4]
     C = np.broadcast_to(np.diag([25.0, 16.0]), (len(t), 2, 2))
-    agility = fit_agility(t * 1e-6, p, np.full(len(t), 25 / 200), 25 / (WINDOW * 1e-6) ** 3)
-    path = Path(t, p, v, C, np.full(len(t), 200.0), WINDOW, agility)
-    return Found((path,), (), 0, 0.0, recording)
+    noise = fit_velocity_noise(t * 1e-6, p, np.full(len(t), 25 / 200), 25 / (WINDOW * 1e-6) ** 3)
+    path = TargetPath(t, p, v, C, np.full(len(t), 200.0), WINDOW, noise)
+    return TargetSearchResult((path,), (), 0, 0.0, recording)
 
 
-def told(found: Found, truth: Any, M: int, times: NDArray[np.int64]) -> NDArray[np.float64]:
+def told(
+    found: TargetSearchResult, truth: Any, M: int, times: NDArray[np.int64]
+) -> NDArray[np.float64]:
     """Standard deviation (px) and rms error (px)."""
     settings: dict[str, Any] = found.settings() | {"events_per_step": M}
     params = moment.Params(**settings)

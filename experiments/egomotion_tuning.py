@@ -24,22 +24,22 @@ from typing import Any
 import numpy as np
 from bench import machine
 
-from jaxevent.confidence import examine
+from jaxevent.confidence import confidence_intervals
 from jaxevent.egomotion import voting
 from jaxevent.egomotion.models import Planar, Rotation
 from jaxevent.egomotion.particle_filter.params import Params
 from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.recording import Events, Recording
-from jaxevent.runs.egomotion import Goal, Loss
+from jaxevent.runs.egomotion import MotionGoal, MotionLoss
 from jaxevent.simulate import motion_scene
-from jaxevent.tuning import Settings, loss_of, optimise
+from jaxevent.tuning import Settings, evaluate_loss, optimise
 
 GRID = 10.0 ** np.arange(1, 6.1, 0.5)  # px/s
 RUNS, SETTLE, ITERATIONS = 2, 0.05, 20
 
 
 @dataclasses.dataclass(frozen=True)
-class Simulated(Goal):
+class Simulated(MotionGoal):
     """The goal of recordings whose truth is here instead of in a file."""
 
     truths: tuple[KnownMotion, ...] = ()
@@ -130,9 +130,9 @@ class Problem:
             "test": [],
         }
 
-    def __call__(self, params: Params) -> tuple[Loss, Sequence[Any], Sequence[Any]]:
+    def __call__(self, params: Params) -> tuple[MotionLoss, Sequence[Any], Sequence[Any]]:
         """The loss, and windows to fit to and unseen ones."""
-        goal = Simulated(voting, Loss(), self.model, "", RUNS, SETTLE, {}, self.truths)
+        goal = Simulated(voting, MotionLoss(), self.model, "", RUNS, SETTLE, {}, self.truths)
         return goal.loss, *goal.problem(self.sources, None, None)(params)
 
 
@@ -148,9 +148,9 @@ WAYS: dict[str, tuple[Callable, str, dict[str, Any]]] = {
 }
 
 
-def percent(loss: Loss, params: Params, batches: Sequence[Any]) -> float:
+def percent(loss: MotionLoss, params: Params, batches: Sequence[Any]) -> float:
     """The root of the loss over all windows, in %."""
-    return 100 * float(np.sqrt(np.mean([float(loss_of(loss, params, b)) for b in batches])))
+    return 100 * float(np.sqrt(np.mean([float(evaluate_loss(loss, params, b)) for b in batches])))
 
 
 def fitted(problem: Problem, label: str, given: dict[str, Any], names: list[str]) -> None:
@@ -161,7 +161,7 @@ def fitted(problem: Problem, label: str, given: dict[str, Any], names: list[str]
         iterations=ITERATIONS, learning_rate=0.3, rounds=1, every=5, patience=1000, forward=True
     )
     found = optimise(loss, params, names, mine, (), settings)
-    told = examine(loss, params, found.params, names, mine, None, True)
+    told = confidence_intervals(loss, params, found.params, names, mine, None, True)
     before, after = (percent(loss, p, unseen) for p in (params, found.params))
     for name in names:
         one = told[name]

@@ -75,8 +75,8 @@ class Contrast:
             if seen is None:
                 continue
             energy = seen.energy.mean(0).reshape(len(seen.xi), -1)
-            at, n = energy.argmax(1), len(seen.ways)
-            way = np.stack([seen.ways[at % n], seen.ways[at // n]], -1)
+            at, n = energy.argmax(1), len(seen.displacements)
+            way = np.stack([seen.displacements[at % n], seen.displacements[at // n]], -1)
             sharp = energy.max(1) / np.maximum(np.median(energy, 1), 1e-9)
             for k, place in enumerate(map(tuple, seen.xi.tolist())):
                 inside = np.abs(way[k]).max() < MAX_DISPLACEMENT_PX - 0.5

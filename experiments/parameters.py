@@ -1,22 +1,25 @@
-"""Print docs/parameters.md, all parameters of all methods: python experiments/parameters.py"""
+"""The page of all parameters of all methods, made from the code when the site is built.
+
+`python experiments/parameters.py` prints it; `on_files` is a hook of MkDocs (`mkdocs.yml`).
+"""
 
 from typing import Any
 
 import jaxevent
 from jaxevent.estimator import Estimator
 from jaxevent.methods import HOMES
-from jaxevent.parameters import Choice, Parameters, Share, shown
+from jaxevent.parameters import Choice, Parameters, UnitInterval, format_value
 
 TITLES = {"reconstruction": "Reconstruction", "blob": "Tracking", "egomotion": "Egomotion"}
 
 
 def cell(value: Any) -> str:
-    """A value as TOML has it."""
-    return str(value).lower() if isinstance(value, bool) else shown(value).replace("'", '"')
+    """Format a value as TOML."""
+    return str(value).lower() if isinstance(value, bool) else format_value(value).replace("'", '"')
 
 
 def rows(method: Estimator) -> list[str]:
-    """A row for each setting of a method: name, default, unit, gradient, meaning."""
+    """Return a row for each setting of a method: name, default, unit, gradient, meaning."""
     kind = method.Params
     lines = ["| parameter | default | unit | gradient | |", "|---|---|---|---|---|"]
     fixed = {**kind.choices, **kind().without_gradient()}
@@ -24,7 +27,7 @@ def rows(method: Estimator) -> list[str]:
         fixed = kind.settings()
     for name, setting in kind.settings().items():
         meaning = setting.meaning
-        if isinstance(setting, Share):
+        if isinstance(setting, UnitInterval):
             meaning += "; in [0, 1)"
         if isinstance(setting, Choice):
             meaning += f"; one of {', '.join(map(cell, setting.options))}"
@@ -35,7 +38,7 @@ def rows(method: Estimator) -> list[str]:
 
 
 def presets(kind: type[Parameters]) -> list[str]:
-    """A line for each preset: what it sets."""
+    """Return a line for each preset and its values."""
     lines = []
     for name, values in kind.presets.items():
         parts = ", ".join(f"{key} = {cell(value)}" for key, value in values.items())
@@ -44,9 +47,10 @@ def presets(kind: type[Parameters]) -> list[str]:
 
 
 def page() -> str:
+    """Return the page as Markdown."""
     parts = [
         "# Parameters",
-        "Made by `python experiments/parameters.py`. Numbers with a gradient can be named under "
+        "Numbers with a gradient can be named under "
         "`fit` in a fit's configuration, other numbers under `search`. A method without any "
         "gradient computes on the host: its numbers are searched. A positive number that is 0 "
         "stays 0: give it a value first. The column of gradients holds as the other parameters "
@@ -61,6 +65,14 @@ def page() -> str:
             if kind.presets:
                 parts.append("\n".join(presets(kind)))
     return "\n\n".join(parts) + "\n"
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the page to the files that MkDocs builds."""
+    from mkdocs.structure.files import File
+
+    files.append(File.generated(config, "parameters.md", content=page()))
+    return files
 
 
 if __name__ == "__main__":

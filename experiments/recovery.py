@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 
 import jaxevent
-from jaxevent.confidence import Findings, examine
+from jaxevent.confidence import FitIntervals, confidence_intervals
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.runs.blob import FAMILY as BLOBS
-from jaxevent.runs.egomotion import Loss
-from jaxevent.runs.reconstruction import Objective, Part, Problem, parts
+from jaxevent.runs.egomotion import MotionLoss
+from jaxevent.runs.reconstruction import Objective, Problem, RecordingWindow, cut_windows
 from jaxevent.simulate import Pan, Sensor, blob_scene, scene, simulate
 from jaxevent.tuning import Settings, optimise
 
@@ -84,22 +84,22 @@ def from_model(
 
 def found_by(
     loss: Any, start: Any, names: list[str], batches: Any, settings: Settings, search: Any = None
-) -> Findings:
+) -> FitIntervals:
     """What a fit finds, with its intervals."""
     fit = optimise(loss, start, names, batches, settings=settings, search=search)
-    return examine(loss, start, fit.params, names, batches, search, settings.forward)
+    return confidence_intervals(loss, start, fit.params, names, batches, search, settings.forward)
 
 
 def by_frames(recording: Recording, start: Any, names: list[str], search: Any, iterations: int):
     """By the likelihood of the frames."""
     assert recording.frames is not None
-    part = Part(recording, recording.frames, np.arange(0), np.arange(0))
+    part = RecordingWindow(recording, recording.frames, np.arange(0), np.arange(0))
     problem = Problem(Objective(jaxevent.aks, None), [part])
     settings = Settings(iterations=iterations, learning_rate=0.1, rounds=2)
     return found_by(problem.objective, start, names, problem, settings, search)
 
 
-Recovered = tuple[dict[str, float], Findings]
+Recovered = tuple[dict[str, float], FitIntervals]
 
 
 def model_recovery(
@@ -162,7 +162,7 @@ def akf_recovery(seed: int) -> Recovered:
         c_on=0.2, c_off=0.2, sigma_proc=0.1, sigma_iso=0.2, sigma_ref=0.1, rho=RHO, I0=I0, P0=P0,
         kappa=1e-9, calibrate=False, deblur=False,
     )  # fmt: skip
-    drawn = parts(from_akf(seed), "reference")
+    drawn = cut_windows(from_akf(seed), "reference")
     problem = Problem(Objective(jaxevent.akf, "nll", False), drawn)
     settings = Settings(iterations=80, learning_rate=0.1, rounds=2)
     return AKF, found_by(problem.objective, start, list(AKF), problem, settings)
@@ -211,7 +211,7 @@ def voting_recovery(seed: int, names: tuple[str, ...] = ("noise", "alpha")) -> R
     settings = Settings(
         iterations=30, learning_rate=0.2, rounds=1, every=10, patience=1000, forward=True
     )
-    return NOISE, found_by(Loss(), start, list(names), batches, settings)
+    return NOISE, found_by(MotionLoss(), start, list(names), batches, settings)
 
 
 def sensor_recovery(seed: int) -> Recovered:

@@ -11,7 +11,7 @@ programs are kept in the user's cache folder: `jaxevent.cache` says how to chang
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from jaxevent import cache, deprecated, dispatch, shown
+from jaxevent import cache, deprecated, dispatch, display
 
 if TYPE_CHECKING:
     from jaxevent import (
@@ -115,14 +115,14 @@ __all__ = [
 
 cache.keep_compiled()
 deprecated.install()
-dispatch.run_in_turn()
+dispatch.use_synchronous_dispatch()
 
 
 def _as_html(thing: Any) -> str:
     return importlib.import_module("jaxevent.show.notebook").as_html(thing)
 
 
-shown.as_html = _as_html  # whose module loads when something is shown
+display.as_html = _as_html  # whose module loads when something is shown
 
 
 def __getattr__(name: str) -> Any:

@@ -1,22 +1,22 @@
-"""What a fit found: the interval of every number, and which ran to a bound or away.
+"""Confidence intervals of fitted parameters, and parameters that ran to a bound or away.
 
     fitted = jaxevent.optimise(loss, params, names, batches)
-    for finding in examine(loss, params, fitted.params, names, batches).findings:
-        print(finding)
+    for interval in confidence_intervals(loss, params, fitted.params, names, batches).intervals:
+        print(interval)
 
-A loss is a mean over parts: batches, or smaller ones that the loss tells apart (`Parted`). With H
-the curvature of the loss where the fit ended and g_k the slope of part k, which has the share w_k,
-fits to other such parts would spread by the covariance (White 1982)
+A loss is a mean over parts: batches, or the smaller ones of a `PartwiseLoss`. With H the curvature
+of the loss at the fitted parameters, g_k the gradient of part k and w_k its share, fits to other
+such parts would spread by the covariance (White 1982)
 
     H^-1 J H^-1,  J = K / (K - p) sum_k w_k^2 (g_k - g)(g_k - g)^T,  g = sum_k w_k g_k,
 
-for K parts and p numbers. It holds for any smooth loss and takes the parts as independent. With
-fewer than p + 2 parts that of a likelihood of n measurements, H^-1 / n, takes its place; of other
-losses there is no interval then. H is found by differences of gradients, in the unconstrained
-numbers, so that an interval of a positive number is positive.
+for K parts and p numbers. The formula holds for any smooth loss and assumes independent parts. With
+fewer than p + 2 parts, the covariance of a likelihood of n measurements, H^-1 / n, takes its place;
+other losses then have no interval. H is found by differences of gradients with respect to the
+unconstrained numbers, so that an interval of a positive number is positive.
 
-The curvature says nothing where it is not positive, where the interval would be wide, and where the
-fit stopped away from the least loss. There the loss itself is followed in both directions, the
+The curvature is not used where it is not positive, where the interval would be wide, and where the
+fit stopped away from the minimum. There the loss itself is followed in both directions, with the
 other numbers held, until its rise is as large as at the ends of an interval by curvature: t / 2
 standard errors of the rise's mean over parts. An end that is not found is open.
 """
@@ -34,13 +34,23 @@ import scipy.special
 from jaxtyping import Array
 from numpy.typing import NDArray
 
-from jaxevent.parameters import LARGEST, Number, Parameters, Positive, Share
-from jaxevent.tuning import FORWARD, Batches, Interval, Loss, Prepared, each_of, loss_of, slopes
+from jaxevent.deprecated import RenamedAttribute, renamed_names
+from jaxevent.parameters import LARGEST, Number, Parameters, Positive, UnitInterval
+from jaxevent.tuning import (
+    FORWARD,
+    Batches,
+    Interval,
+    Loss,
+    PreparedBatches,
+    evaluate_loss,
+    loss_and_grad,
+    map_batches,
+)
 
 LEVEL = 0.95
 STEP = 0.02  # of differences, in logarithms, or in shares of a number that has none
 WIDE = 2.0  # half widths in logarithms from which the curvature at one place does not tell them
-FIRST, DOUBLINGS, HALVINGS = 0.1, 6, 5  # of the steps that look for an end
+FIRST, DOUBLINGS, HALVINGS = 0.1, 6, 5  # of the steps of the search for an end
 AWAY = math.log(10.0)  # how far a number has run that ran away
 NEAR = 0.25  # of a bound, in the same measure
 
@@ -52,11 +62,12 @@ UNSETTLED = "had not come to rest"
 
 
 @dataclasses.dataclass(frozen=True)
-class Finding:
-    """A number that was fitted or searched, in its unit, and its interval of 95 %.
+class ParameterInterval:
+    """Confidence interval (95 %) of a number that was fitted or searched, in its unit.
 
-    An end that is None is open: the loss does not rise as far as was looked. Without an interval
-    both are NaN. `remark` says what is to be known of it, and is mostly empty.
+    An end that is None is open: the loss does not rise enough within the range of the search.
+    Without an interval both ends are NaN. `remark` says why an interval may not be trusted; it is
+    mostly empty.
     """
 
     name: str
@@ -78,32 +89,47 @@ class Finding:
         return f"above {low}" if high is None else f"{low} to {high}"
 
     def holds(self, value: float) -> bool:
-        """Whether a value is inside the interval."""
+        """Return true if a value is inside the interval."""
         above = self.low is None or self.low <= value
         return bool(above and (self.high is None or value <= self.high))
 
 
 @dataclasses.dataclass(frozen=True)
-class Findings:
-    """All numbers of a fit, and of how many parts their intervals are; 0: of measurements."""
+class FitIntervals:
+    """Intervals of all numbers of a fit.
 
-    findings: list[Finding]
+    Attributes:
+        intervals: One interval for each number.
+        parts: Number of parts that the intervals rest on; 0 where they rest on measurements.
+    """
+
+    intervals: list[ParameterInterval]
     parts: int
 
-    def __getitem__(self, name: str) -> Finding:
-        return next(one for one in self.findings if one.name == name)
+    findings = RenamedAttribute("intervals")
+
+    def __getitem__(self, name: str) -> ParameterInterval:
+        return next(one for one in self.intervals if one.name == name)
 
 
 @runtime_checkable
-class Parted(Protocol):
-    """A loss that tells parts of a batch apart which are about independent."""
+class PartwiseLoss(Protocol):
+    """A loss that can be split into about independent parts of a batch."""
 
     def parts(self, params: Any, batch: Any) -> tuple[Array, Array]:
-        """The mean of each part, (parts,), and its weight; their weighted mean is the loss."""
+        """Compute the loss of each part; their weighted mean is the loss of the batch.
+
+        Args:
+            params: Parameters of an estimator.
+            batch: One batch, as the loss takes it.
+
+        Returns:
+            The mean of each part, (parts,), and its weight, (parts,).
+        """
         ...
 
 
-def examine(
+def confidence_intervals(
     loss: Loss,
     start: Parameters,
     found: Parameters,
@@ -111,25 +137,28 @@ def examine(
     batches: Sequence[Any] | Callable[[Any], Batches],
     search: Mapping[str, Interval] | None = None,
     forward: bool | None = None,
-) -> Findings:
-    """Tell how well each number of a fit is known from what it was fitted to.
+) -> FitIntervals:
+    """Estimate how precisely the data determine each number of a fit.
 
     Args:
-        loss: As `optimise` was given it. Its attribute `likelihood`, if it has one, says whether it
-            is the mean of -ln p over as many measurements as the batches' `weight` says.
+        loss: The loss that `optimise` minimised. An attribute `likelihood` that is true marks it as
+            the mean of -ln p over as many measurements as the batches' `weight` counts.
         start: The parameters that the fit began with.
-        found: Those that it ended with.
-        names: What was fitted by gradient.
-        batches: As `optimise` was given them.
-        search: What was searched.
-        forward: Mode of the derivatives, as in `tuning.Settings`.
+        found: The parameters that the fit ended with.
+        names: Numbers that were fitted by gradient.
+        batches: The batches that `optimise` was given.
+        search: The searches that `optimise` was given.
+        forward: Mode of differentiation, see `tuning.Settings`.
+
+    Returns:
+        One interval for each number that was fitted or searched.
     """
-    prepared = Prepared.of(batches, (), None)
+    prepared = PreparedBatches.of(batches, (), None)
     given = _Sample(loss, found, names, forward, prepared(found)[0])
-    findings = _fitted(given, start)
+    findings = _intervals_of_fitted(given, start)
     for name, interval in (search or {}).items():
-        findings.append(_searched(loss, start, found, name, interval, prepared))
-    return Findings(findings, 0 if given.by_measurements else given.count)
+        findings.append(_interval_of_searched(loss, start, found, name, interval, prepared))
+    return FitIntervals(findings, 0 if given.by_measurements else given.count)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -138,8 +167,10 @@ def _parts(loss: Any, params: Any, batch: Any) -> tuple[Array, Array]:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _along(loss: Any, params: Any, raw: dict[str, Array], way: dict[str, Array], batch: Any):
-    """The slope of every part along a direction, (parts,)."""
+def _directional_derivatives(
+    loss: Any, params: Any, raw: dict[str, Array], way: dict[str, Array], batch: Any
+):
+    """Compute the derivative of every part along a direction, (parts,)."""
 
     def value(one: dict[str, Array]) -> Array:
         return loss.parts(params.with_raw(one), batch)[0]
@@ -148,7 +179,7 @@ def _along(loss: Any, params: Any, raw: dict[str, Array], way: dict[str, Array],
 
 
 class _Sample:
-    """The loss of the parts that it is a mean of, near where a fit ended."""
+    """The loss of all parts near the parameters where a fit ended."""
 
     def __init__(
         self,
@@ -171,17 +202,17 @@ class _Sample:
 
     @property
     def robust(self) -> bool:
-        """Whether there are parts enough to tell from how they differ."""
+        """True if there are enough parts to estimate the covariance from their scatter."""
         return self.count >= len(self.at) + 2
 
     @property
     def by_measurements(self) -> bool:
-        """Whether it is told by the number of measurements instead."""
+        """True if the covariance is that of a likelihood of n measurements."""
         return self.likelihood and not self.robust
 
     @property
     def quantile(self) -> float:
-        """Of the interval, in standard deviations."""
+        """Half width of the interval in standard deviations."""
         tail = 0.5 + LEVEL / 2
         degrees = self.count - max(len(self.at), 1)
         return float(
@@ -189,54 +220,59 @@ class _Sample:
         )
 
     def raw(self, at: NDArray[np.float64]) -> dict[str, Array]:
-        """What is stored of all fitted numbers."""
+        """Return the unconstrained numbers at a point, by name."""
         leaves = {name: np.array(self.found.raw[name], np.float64) for name in self.names}
         for (name, index), value in zip(self.places, at, strict=True):
             leaves[name][index] = value
         return {name: jnp.asarray(v, self.found.raw[name].dtype) for name, v in leaves.items()}
 
     def losses(self, params: Parameters, batches: Sequence[Any] | None = None):
-        """The loss of every part and its weight."""
+        """Compute the loss of every part and its weight, both (parts,)."""
         batches = self.batches if batches is None else batches
-        if not isinstance(self.loss, Parted):
-            found = each_of(lambda batch: loss_of(self.loss, params, batch), batches)
+        if not isinstance(self.loss, PartwiseLoss):
+            found = map_batches(lambda batch: evaluate_loss(self.loss, params, batch), batches)
             pairs = [(np.atleast_1d(value), np.atleast_1d(weight)) for weight, value in found]
         else:
-            found = each_of(lambda batch: _parts(self.loss, params, batch), batches)
-            pairs = [(np.asarray(v), _filled(np.asarray(w), whole)) for whole, (v, w) in found]
+            found = map_batches(lambda batch: _parts(self.loss, params, batch), batches)
+            pairs = [
+                (np.asarray(v), _rescale_weights(np.asarray(w), whole)) for whole, (v, w) in found
+            ]
         values, weights = (
             np.concatenate(column).astype(np.float64) for column in zip(*pairs, strict=True)
         )
         return np.where(weights > 0, values, 0.0), weights
 
     def slope(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The gradient of every batch, (batches, numbers)."""
+        """Compute the gradient of every batch, (batches, numbers)."""
         raw = {name: leaf[None] for name, leaf in self.raw(at).items()}
-        function = functools.partial(slopes, self.loss, self.forward, self.found, raw)
-        found = each_of(lambda batch: function(batch)[1], self.batches)
+        function = functools.partial(loss_and_grad, self.loss, self.forward, self.found, raw)
+        found = map_batches(lambda batch: function(batch)[1], self.batches)
         rows = [[np.asarray(s[name][0])[index] for name, index in self.places] for _, s in found]
         return np.array(rows, np.float64)
 
     def mean_slope(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
-        weights = [weight for weight, _ in each_of(lambda _: 0, self.batches)]
+        weights = [weight for weight, _ in map_batches(lambda _: 0, self.batches)]
         return np.average(self.slope(at), axis=0, weights=weights)
 
     def slopes_of_parts(self) -> NDArray[np.float64]:
-        """(parts, numbers)"""
-        if not isinstance(self.loss, Parted):
+        """Compute the gradient of every part, (parts, numbers)."""
+        if not isinstance(self.loss, PartwiseLoss):
             return self.slope(self.at)
         raw, columns = self.raw(self.at), []
         for name, index in self.places:
             way = {key: jnp.zeros_like(leaf) for key, leaf in raw.items()}
             way[name] = way[name].at[index].set(1.0)
-            function = functools.partial(_along, self.loss, self.found, raw, way)
-            found = each_of(lambda batch, function=function: function(batch), self.batches)
+            function = functools.partial(_directional_derivatives, self.loss, self.found, raw, way)
+            found = map_batches(lambda batch, function=function: function(batch), self.batches)
             columns.append(np.concatenate([np.asarray(part) for _, part in found]))
         table = np.stack(columns, 1).astype(np.float64)
         return np.where(self.weights[:, None] > 0, table, 0.0)
 
     def rises(self, values: NDArray[np.float64]) -> bool | None:
-        """Whether the loss is larger than here by what an interval's end asks; None: no telling."""
+        """Return true if the loss has risen as much as at an interval's end.
+
+        None if undetermined.
+        """
         if not np.isfinite(values).all():
             return True
         rise = values - self.values
@@ -249,8 +285,8 @@ class _Sample:
         return mean > max(self.quantile / 2 * math.sqrt(spread), 1e-12)
 
 
-def _filled(weights: NDArray, whole: float) -> NDArray:
-    """Weights of parts, so that their sum is that of the batch."""
+def _rescale_weights(weights: NDArray, whole: float) -> NDArray:
+    """Scale the weights of parts so that their sum is the weight of the batch."""
     return weights * (whole / max(float(weights.sum()), 1e-300))
 
 
@@ -258,18 +294,18 @@ def _physical(number: Number, raw: float) -> float:
     return float(number.physical(jnp.asarray(raw)))
 
 
-def _scale(number: Number, value: float, start: float) -> float:
-    """What a step of 1 is: a factor of e of what is stored as a logarithm, else all of it."""
-    if isinstance(number, Positive | Share):
+def _unit_step(number: Number, value: float, start: float) -> float:
+    """Return a unit step: 1 for numbers stored as logarithms, else the size of the number."""
+    if isinstance(number, Positive | UnitInterval):
         return 1.0
     return max(abs(value), abs(start)) or 1.0
 
 
-def _fitted(sample: _Sample, start: Parameters) -> list[Finding]:
-    """Of all numbers that were fitted by gradient."""
+def _intervals_of_fitted(sample: _Sample, start: Parameters) -> list[ParameterInterval]:
+    """Find the intervals of all numbers that were fitted by gradient."""
     numbers = [sample.found.numbers[name] for name, _ in sample.places]
     begun = np.array([float(np.asarray(start.raw[name])[i]) for name, i in sample.places])
-    scales = np.array(list(map(_scale, numbers, sample.at, begun)))
+    scales = np.array(list(map(_unit_step, numbers, sample.at, begun)))
     widths, newton = _widths(sample, scales) if len(numbers) else (scales, scales)
     findings = []
     for k, ((name, index), number) in enumerate(zip(sample.places, numbers, strict=True)):
@@ -278,8 +314,8 @@ def _fitted(sample: _Sample, start: Parameters) -> list[Finding]:
         if trusted:
             ends = [-widths[k], widths[k]]
         else:
-            look = functools.partial(_moved, sample, k, scales[k])
-            ends = [_end(sample, look, sign) for sign in (-1.0, 1.0)]
+            objective = functools.partial(_losses_at_step, sample, k, scales[k])
+            ends = [_find_interval_end(sample, objective, sign) for sign in (-1.0, 1.0)]
         low, high = (None if end is None else sample.at[k] + end * scales[k] for end in ends)
         remark = _remark(sample, k, (sample.at[k] - begun[k]) / scales[k], ends, scales[k])
         if not remark and not settled and np.isfinite(newton[k]):
@@ -287,14 +323,17 @@ def _fitted(sample: _Sample, start: Parameters) -> list[Finding]:
         label = name if not index else f"{name}[{index[0] + 1}]"
         began, value = (_physical(number, raw) for raw in (begun[k], sample.at[k]))
         low, high = (None if raw is None else _physical(number, raw) for raw in (low, high))
-        findings.append(Finding(label, number.unit, began, value, low, high, remark))
+        findings.append(ParameterInterval(label, number.unit, began, value, low, high, remark))
     return findings
 
 
 def _widths(
     sample: _Sample, scales: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Half widths by curvature and steps to the least loss, in scales; infinite: not told."""
+    """Compute half widths by curvature and Newton steps, both in unit steps.
+
+    Infinite if undetermined.
+    """
     p = len(scales)
     rows = []
     for k in range(p):
@@ -327,8 +366,10 @@ def _widths(
     return widths, newton
 
 
-def _moved(sample: _Sample, k: int, scale: float, step: float) -> NDArray[np.float64] | None:
-    """The losses of all parts where a number is moved by a step; None: outside its bounds."""
+def _losses_at_step(
+    sample: _Sample, k: int, scale: float, step: float
+) -> NDArray[np.float64] | None:
+    """Compute the losses of all parts with one number moved; None outside its bounds."""
     at = sample.at.copy()
     at[k] += step * scale
     params = sample.found.with_raw(sample.raw(at))
@@ -338,13 +379,16 @@ def _moved(sample: _Sample, k: int, scale: float, step: float) -> NDArray[np.flo
     return sample.losses(params)[0]
 
 
-def _end(
-    sample: _Sample, look: Callable[[float], NDArray[np.float64] | None], sign: float
+def _find_interval_end(
+    sample: _Sample, objective: Callable[[float], NDArray[np.float64] | None], sign: float
 ) -> float | None:
-    """How far off the loss has risen enough; None: not found; NaN: no telling."""
+    """Find the distance at which the loss has risen enough.
+
+    None if not found, NaN if undetermined.
+    """
     inside, step = 0.0, FIRST
     for _ in range(DOUBLINGS + 1):
-        values = look(sign * step)
+        values = objective(sign * step)
         if values is None:
             return None
         risen = sample.rises(values)
@@ -357,7 +401,7 @@ def _end(
         return None
     for _ in range(HALVINGS):
         middle = (inside + step) / 2
-        values = look(sign * middle)
+        values = objective(sign * middle)
         if values is None or sample.rises(values):
             step = middle
         else:
@@ -368,14 +412,14 @@ def _end(
 def _remark(
     sample: _Sample, k: int, moved: float, ends: Sequence[float | None], scale: float
 ) -> str:
-    """What is to be said of a number that moved so far, in scales."""
+    """Describe a number that ran to a bound or away, given its move in unit steps."""
     number = sample.found.numbers[sample.places[k][0]]
     for bound in (number.least, number.most):
         if abs(bound) >= LARGEST or (bound == 0 and isinstance(number, Positive)):
             continue
         away = (float(number.unconstrained(jnp.asarray(bound))) - sample.at[k]) / scale
         if abs(away) < NEAR:
-            values = _moved(sample, k, scale, away * (1 - 1e-3))
+            values = _losses_at_step(sample, k, scale, away * (1 - 1e-3))
             if values is not None and sample.shares @ (values - sample.values) <= 0:
                 return AT_BOUND.format(bound)
     low, high = ends
@@ -384,20 +428,20 @@ def _remark(
     return UNKNOWN if low is None and high is None else ""
 
 
-def _searched(
+def _interval_of_searched(
     loss: Any,
     start: Parameters,
     found: Parameters,
     name: str,
     interval: Interval,
     prepared: Callable[[Any], Batches],
-) -> Finding:
-    """Of a number that was searched, which prepares every batch anew."""
+) -> ParameterInterval:
+    """Find the interval of a number that was searched, for which every batch is prepared again."""
     low, high, count = interval
     value, scale = float(getattr(found, name)), (high - low) / (count - 1)
     number = found.numbers[name]
 
-    def look(step: float) -> NDArray[np.float64] | None:
+    def objective(step: float) -> NDArray[np.float64] | None:
         place = value + step * scale
         if not low <= place <= high:
             return None
@@ -406,7 +450,7 @@ def _searched(
         return sample.losses(params, prepared(params)[0])[0]
 
     sample = _Sample(loss, found, (), None, prepared(found)[0])
-    ends = [_end(sample, look, sign) for sign in (-1.0, 1.0)]
+    ends = [_find_interval_end(sample, objective, sign) for sign in (-1.0, 1.0)]
     below, above = (None if end is None else value + end * scale for end in ends)
     remark = ""
     for bound in (low, high):
@@ -415,4 +459,7 @@ def _searched(
     if not remark and ends == [None, None]:
         remark = UNKNOWN
     began = float(getattr(start, name))
-    return Finding(name, number.unit, began, value, below, above, remark)
+    return ParameterInterval(name, number.unit, began, value, below, above, remark)
+
+
+__getattr__ = renamed_names(__name__)

@@ -29,7 +29,7 @@ from pathlib import Path
 
 from jaxevent.errors import InputError
 from jaxevent.io import load, reading, truth
-from jaxevent.parameters import nearest
+from jaxevent.parameters import suggest_name
 from jaxevent.recording import Recording
 
 
@@ -94,7 +94,7 @@ class Dataset:
         if isinstance(which, int):
             which = self.names[which]
         if which not in self.paths:
-            raise InputError(f"there is no recording {which!r}; {nearest(which, self.paths)}")
+            raise InputError(f"there is no recording {which!r}; {suggest_name(which, self.paths)}")
         path, stream = self.paths[which], self.side if self.has_sides else None
         recording = load(path, self.size, self.in_memory, stream=stream)
         extra = {**recording.extra, **truth.read_images(path, self.side)}
@@ -122,7 +122,7 @@ def open(
     """
     folder = Path(folder)
     if name not in LAYOUTS:
-        raise InputError(f"there is no data set {name!r}; {nearest(name, LAYOUTS)}")
+        raise InputError(f"there is no data set {name!r}; {suggest_name(name, LAYOUTS)}")
     if side not in ("left", "right"):
         raise InputError(f"side is {side!r}; give left or right")
     found: dict[str, Path] = {}

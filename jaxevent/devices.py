@@ -1,11 +1,11 @@
-"""Several devices and processes: what is shared out among them, and how results come together.
+"""Several devices and processes: partition of the work, and combination of the results.
 
-On several devices of a process `jaxevent fit` and `jaxevent evaluate` need no option: what they
-compute on lies along the one axis of a `jax.sharding.Mesh` of all local devices. Where there are as
-many windows (of a fit) or recordings (of an evaluation) as devices, each device has its own; where
-there are fewer, the pixels of every window are shared out, or, of egomotion, runs or particles.
-Pixels do not touch each other, so images are the same to the bit; sums over pixels are added in
-another order. To try it without a GPU: XLA_FLAGS=--xla_force_host_platform_device_count=4.
+On several devices of a process `jaxevent fit` and `jaxevent evaluate` need no option: they compute
+along the one axis of a `jax.sharding.Mesh` of all local devices. With at least as many windows (of
+a fit) or recordings (of an evaluation) as devices, each device has its own. With fewer, the pixels
+of every window are partitioned, or for egomotion the runs or particles. Pixels are independent, so
+images are bit-equal; sums over pixels are added in another order. To try it without a GPU:
+XLA_FLAGS=--xla_force_host_platform_device_count=4.
 
 Several processes, on one machine or many, fit together if each is started with the same arguments
 and its number:
@@ -21,10 +21,10 @@ windows are exchanged and added in the order of the windows by every process: th
 those of one process, to the bit where the devices are alike. Process 0 writes.
 
 The channel between processes protects nothing: no password, no encryption. Whoever reaches its
-ports can read what is said, say something else, or end the fit, so use it in a network that you
-trust. What comes is read as JSON and arrays, never run. The coordinator listens at the HOST that is
-given, no other address of the machine (--distributed: where JAX has it listen, on all). On CPUs
-each process listens at the address of its host's name, too, for the exchange itself.
+ports can read, replace or end the exchange, so use it in a network that you trust. Messages are
+read as JSON and arrays, never run. The coordinator listens at the HOST that is given, no other
+address of the machine (--distributed: where JAX has it listen, on all). On CPUs each process also
+listens at the address of its host's name, for the exchange itself.
 """
 
 import contextlib
@@ -39,6 +39,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jaxevent.deprecated import renamed_names
 from jaxevent.dispatch import check_platform
 from jaxevent.errors import InputError
 
@@ -49,15 +50,15 @@ Q = ParamSpec("Q")
 T = TypeVar("T")
 
 
-class Elsewhere:
-    """Stands in a list of batches for one that another process has."""
+class RemoteBatch:
+    """Placeholder in a list of batches for one that another process holds."""
 
 
-ELSEWHERE = Elsewhere()
+REMOTE = RemoteBatch()
 
 
 def full_precision(function: Callable[Q, T]) -> Callable[Q, T]:
-    """Have a function multiply matrices in full precision, where GPUs round factors to 11 bits."""
+    """Make a function multiply matrices in full precision, where GPUs round factors to 11 bits."""
 
     @functools.wraps(function)
     def precise(*args: Q.args, **kwargs: Q.kwargs) -> T:
@@ -76,21 +77,24 @@ def double_precision(enabled: bool) -> contextlib.AbstractContextManager[Any]:
     return enable_x64(enabled)
 
 
-def accelerated() -> bool:
-    """Whether JAX computes on a GPU, or another device than the CPU, unless told otherwise."""
+def has_accelerator() -> bool:
+    """Return true if JAX computes on a GPU, or another device than the CPU, by default."""
     check_platform()
     return jax.default_backend() != "cpu"
 
 
-def at_once(steps: int) -> int:
-    """How many steps of a loop to compile into one: a GPU starts programs anew for each step."""
-    return steps if accelerated() else 1
+def loop_unroll(steps: int) -> int:
+    """Return how many steps of a loop to compile into one.
+
+    GPUs launch programs anew for each step.
+    """
+    return steps if has_accelerator() else 1
 
 
-def local() -> list[Any]:
-    """The devices to compute on: JAX's default device where one is set, else all of this process.
+def local_devices() -> list[Any]:
+    """Return the devices to compute on: JAX's default device if set, else all of this process.
 
-    `jax.default_device` so confines what runs under it to one.
+    `jax.default_device` thereby confines computations to one device.
     """
     check_platform()
     chosen = jax.config.jax_default_device  # ty: ignore[missing-attribute]
@@ -99,19 +103,19 @@ def local() -> list[Any]:
     return jax.local_devices(backend=chosen)[:1] if isinstance(chosen, str) else [chosen]
 
 
-def first() -> bool:
-    """Whether this process is number 0, the one that writes."""
+def is_process_zero() -> bool:
+    """Return true in process number 0, the one that writes."""
     return jax.process_index() == 0
 
 
-def alone() -> bool:
-    """Whether one process computes on one device."""
-    return jax.process_count() == 1 and len(local()) == 1
+def is_single_device() -> bool:
+    """Return true if one process computes on one device."""
+    return jax.process_count() == 1 and len(local_devices()) == 1
 
 
 def on_host() -> contextlib.AbstractContextManager[Any]:
-    """Under it what is prepared stays in the host's memory, where several devices share it out."""
-    if len(local()) == 1:
+    """Return a context that keeps prepared data on the host if several devices share them."""
+    if len(local_devices()) == 1:
         return contextlib.nullcontext()
     try:
         return jax.default_device(jax.local_devices(backend="cpu")[0])
@@ -119,14 +123,32 @@ def on_host() -> contextlib.AbstractContextManager[Any]:
         return contextlib.nullcontext()
 
 
-def mesh(devices: Sequence[Any], divisor: int) -> Mesh | None:
-    """A mesh of as many of the devices as divide `divisor`; None if that is one."""
+def make_mesh(devices: Sequence[Any], divisor: int) -> Mesh | None:
+    """Make a mesh of as many devices as divide `divisor`.
+
+    Args:
+        devices: Devices to take, the first ones first.
+        divisor: Length of the axis that the mesh partitions.
+
+    Returns:
+        A mesh with the axis `AXIS`, or None if it would hold one device.
+    """
     count = max((n for n in range(1, len(devices) + 1) if divisor % n == 0), default=1)
     return Mesh(np.array(devices[:count]), (AXIS,)) if count > 1 else None
 
 
-def along(mesh: Mesh, tree: Any, axis: int | None = None) -> Any:
-    """Arrays shared out along an axis; without one, and where it does not divide, whole on all."""
+def shard(mesh: Mesh, tree: Any, axis: int | None = None) -> Any:
+    """Partition arrays along an axis over a mesh.
+
+    Args:
+        mesh: Mesh with the axis `AXIS`.
+        tree: Pytree of arrays.
+        axis: Axis to partition; None, or an axis that the mesh does not divide, puts whole arrays
+            on every device.
+
+    Returns:
+        The pytree, on the devices.
+    """
 
     def put(leaf: Any) -> Any:
         spec: list[str | None] = [None] * np.ndim(leaf)
@@ -142,8 +164,13 @@ def join(
 ) -> None:
     """Make this process number `process` of `processes`, before JAX has computed anything.
 
-    `coordinator` is HOST:PORT, a free port of process 0's machine. With none of the three JAX looks
-    for them itself (SLURM, Open MPI, Kubernetes, cloud TPUs). On CPUs they talk by gloo.
+    Without any argument JAX finds them itself (SLURM, Open MPI, Kubernetes, cloud TPUs). On CPUs
+    the processes exchange data by gloo.
+
+    Args:
+        coordinator: HOST:PORT, a free port of process 0's machine.
+        processes: Number of processes.
+        process: Number of this process, from 0.
 
     Raises:
         InputError: Some are missing or make no sense, or the processes do not find each other.
@@ -177,33 +204,33 @@ def join(
         ) from error
 
 
-def shared_out(batches: Sequence[T]) -> list[T | Elsewhere]:
-    """Every how many-th batch is of this process; the others are elsewhere."""
+def partition_batches(batches: Sequence[T]) -> list[T | RemoteBatch]:
+    """Return the batches of this process, every N-th of N processes; the others are remote."""
     mine, processes = jax.process_index(), jax.process_count()
-    return [b if k % processes == mine else ELSEWHERE for k, b in enumerate(batches)]
+    return [b if k % processes == mine else REMOTE for k, b in enumerate(batches)]
 
 
-def gathered(said: Any) -> list[Any]:
-    """What every process says, in their order; all of them must ask. Arrays are kept to the bit.
+def allgather(message: Any) -> list[Any]:
+    """Gather one message from each process, in process order; every process must call it.
 
-    Raises `InputError` if one says what none of ours would; see `packed` for what can be said.
+    Arrays are exact. Raises `InputError` for a message that `serialise` would not make.
     """
     if jax.process_count() == 1:
-        return [said]
+        return [message]
     from jax.experimental.multihost_utils import process_allgather
 
-    text = np.frombuffer(packed(said), np.uint8)
+    text = np.frombuffer(serialise(message), np.uint8)
     lengths = np.asarray(process_allgather(np.array([len(text)], np.int32))).ravel()
     # A ladder of sizes: each one is compiled.
     room = 1 << max(10, (int(lengths.max()) - 1).bit_length())
     texts = np.asarray(process_allgather(np.pad(text, (0, room - len(text)))))
-    return [unpacked(row[:n].tobytes()) for row, n in zip(texts, lengths, strict=True)]
+    return [deserialise(row[:n].tobytes()) for row, n in zip(texts, lengths, strict=True)]
 
 
-def packed(said: Any) -> bytes:
-    """Numbers, text, bytes, arrays, None, and lists, tuples and dictionaries of them, as bytes.
+def serialise(message: Any) -> bytes:
+    """Convert numbers, text, bytes, arrays, None, and lists, tuples and dicts of them to bytes.
 
-    A line of JSON, then the arrays as .npy. Reading it runs nothing, as unpickling would.
+    The format is a line of JSON, then the arrays as .npy. Reading it runs no code.
     """
     arrays = io.BytesIO()
 
@@ -221,11 +248,14 @@ def packed(said: Any) -> bytes:
             return {kind: [node(one) for one in value]}
         return value
 
-    return json.dumps(node(said)).encode() + b"\n" + arrays.getvalue()
+    return json.dumps(node(message)).encode() + b"\n" + arrays.getvalue()
 
 
-def unpacked(text: bytes) -> Any:
-    """What `packed` was given; raises `InputError` for bytes that it would not make."""
+def deserialise(text: bytes) -> Any:
+    """Convert bytes back to the message.
+
+    Raise `InputError` for bytes that `serialise` would not make.
+    """
     arrays = io.BytesIO(text)
     made: dict[str, Callable[[Any], Any]] = {
         "bytes": lambda _: np.load(arrays, allow_pickle=False).tobytes(),
@@ -250,24 +280,27 @@ def unpacked(text: bytes) -> Any:
         ) from error
 
 
-def by_first(compute: Callable[[], T]) -> T:
-    """What process 0 computes, told to all; an `InputError` there is one of all processes."""
+def on_process_zero(compute: Callable[[], T]) -> T:
+    """Compute on process 0 and broadcast to all.
+
+    An `InputError` there is raised on all processes.
+    """
     if jax.process_count() == 1:
         return compute()
-    said: tuple[str, Any] = ("", None)
-    if first():
+    message: tuple[str, Any] = ("", None)
+    if is_process_zero():
         try:
-            said = ("value", compute())
+            message = ("value", compute())
         except InputError as error:
-            said = ("error", str(error))
-    kind, value = gathered(said)[0]
+            message = ("error", str(error))
+    kind, value = allgather(message)[0]
     if kind == "error":
         raise InputError(value)
     return value
 
 
-def in_step(compute: Callable[[], T]) -> T:
-    """What each process computes for itself; an `InputError` of one is one of all."""
+def on_all_processes(compute: Callable[[], T]) -> T:
+    """Compute on each process; an `InputError` on one is raised on all."""
     if jax.process_count() == 1:
         return compute()
     value: Any = None
@@ -276,17 +309,17 @@ def in_step(compute: Callable[[], T]) -> T:
         value = compute()
     except InputError as raised:
         error = str(raised)
-    for other in gathered(error):
+    for other in allgather(error):
         if other is not None:
             raise InputError(other)
     return value
 
 
-class Places:
-    """Where the batches of a fit are computed: placed once, as they are asked for.
+class BatchPlacement:
+    """Placement of the batches of a fit on devices, made once, when they are first used.
 
     With at least as many batches per step as devices, batch k is on device k mod n of n; with
-    fewer, every batch that can be (by its method `over(devices)`) is spread over all devices.
+    fewer, every batch that can be (by its method `over(devices)`) is partitioned over all devices.
     """
 
     def __init__(self, per_step: int | None):
@@ -295,18 +328,18 @@ class Places:
         self._placed: list[Any] = []
 
     def __call__(self, batches: Sequence[Any]) -> Sequence[Any]:
-        """The same batches where they belong; those that are elsewhere as they are."""
-        devices = local()
+        """Return the batches on their devices; remote ones stay as they are."""
+        devices = local_devices()
         if len(devices) == 1:
             return batches
         if self._given is not batches:
             self._given, self._placed = None, []  # so that two are never held at once
-            mine = [b for b in batches if b is not ELSEWHERE]
+            mine = [b for b in batches if b is not REMOTE]
             share = len(mine) / max(len(batches), 1)
             step = len(mine) if self.per_step is None else math.ceil(self.per_step * share)
             apart, number = min(step, len(mine)) >= len(devices), 0
             for batch in batches:
-                if batch is not ELSEWHERE:
+                if batch is not REMOTE:
                     batch = _put(batch, devices, number, apart)
                     number += 1
                 self._placed.append(batch)
@@ -318,3 +351,6 @@ def _put(batch: Any, devices: Sequence[Any], number: int, apart: bool) -> Any:
     if not apart and hasattr(batch, "over"):
         return batch.over(devices)
     return jax.device_put(batch, devices[number % len(devices)])
+
+
+__getattr__ = renamed_names(__name__)

@@ -1,12 +1,11 @@
-"""How JAX runs programs: on a platform that there is, and on CPUs one after another.
+"""Settings of JAX's dispatch: synchronous programs on CPUs, and checks of platform and threads.
 
 Kernels with derivatives are called from within JAX's programs, and use JAX for what depends on
-parameters alone. While a program runs in the background and its caller begins another, such a call
-waits for both, for ever: 2 of 2 runs of 60 gradients with other work between them did not end, and
-2 of 2 ended when programs were run in turn.
+parameters alone. If a program runs in the background while its caller begins another, such a call
+can wait for both forever. So JAX finishes each program before it begins the next.
 
-A forked process has none of the threads that JAX computes with, and would wait for them for ever.
-There JAX's programs are refused; kernels go on.
+A forked process has none of the threads that JAX computes with, and would wait for them forever.
+There JAX's programs are refused; kernels work.
 """
 
 import functools
@@ -16,13 +15,13 @@ from typing import Any, NoReturn
 
 from jaxevent.errors import InputError
 
-_left_behind = False  # whether the threads of JAX stayed in the parent of this process
+_lacks_threads = False  # whether the threads of JAX stayed in the parent of this process
 
 
-def run_in_turn() -> bool:
-    """Have JAX finish each program before it begins the next, once JAX is imported.
+def use_synchronous_dispatch() -> bool:
+    """Make JAX finish each program before it begins the next, once JAX is imported.
 
-    Returns False if JAX has begun to compute otherwise, or does not say.
+    Returns false if JAX has already begun to compute otherwise, or does not tell.
     """
     jax = sys.modules.get("jax")
     if jax is None:
@@ -42,17 +41,17 @@ def run_in_turn() -> bool:
 def check_platform() -> None:
     """Raise `InputError` if JAX has no device of the platform that JAX_PLATFORMS names.
 
-    JAX says so by errors of several kinds, where an array is made first. Starts JAX's platform.
+    JAX raises errors of several kinds, where an array is made first. This starts JAX's platform.
     """
     import jax
 
     try:
         jax.default_backend()
     except (RuntimeError, AssertionError) as error:
-        asked = jax.config.jax_platforms  # ty: ignore[missing-attribute]
+        requested = jax.config.jax_platforms  # ty: ignore[missing-attribute]
         reason = " ".join(str(error).split()).partition(" (set JAX_PLATFORMS")[0].rstrip(".")[:200]
         raise InputError(
-            f"JAX_PLATFORMS is {asked!r}, and JAX finds no such device here"
+            f"JAX_PLATFORMS is {requested!r}, and JAX finds no such device here"
             f"{f' ({reason})' if reason else ''}; unset it, or set JAX_PLATFORMS=cpu, or for an "
             "NVIDIA GPU look at what nvidia-smi says and install the extra gpu of jaxevent"
         ) from None
@@ -60,7 +59,7 @@ def check_platform() -> None:
 
 def check_threads() -> None:
     """Raise `InputError` in a forked process whose parent has computed with JAX."""
-    if _left_behind:
+    if _lacks_threads:
         _refuse()
 
 
@@ -72,11 +71,11 @@ def _refuse(*_: Any, **__: Any) -> NoReturn:
 
 
 def _in_child() -> None:
-    global _left_behind
+    global _lacks_threads
     bridge: Any = sys.modules.get("jax._src.xla_bridge")
     compiler: Any = sys.modules.get("jax._src.compiler")
     if bridge is not None and bridge.backends_are_initialized():
-        _left_behind = True
+        _lacks_threads = True
         if compiler is not None:  # of programs that nobody checks for
             compiler.compile_or_get_cached = _refuse
 

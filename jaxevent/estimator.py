@@ -28,17 +28,18 @@ from jax.core import Tracer
 
 from jaxevent.arrays import brief
 from jaxevent.camera import PinholeCamera
+from jaxevent.deprecated import renamed_names
+from jaxevent.display import with_article
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters, phrase
 from jaxevent.recording import Events, Recording, Times, microseconds
-from jaxevent.shown import with_article
 
 P = TypeVar("P", bound=Parameters)
 T = TypeVar("T")
 
 
-class Described(eqx.Module):
-    """A pytree whose `repr` says in a line what it holds: names, types and shapes."""
+class ShortRepr(eqx.Module):
+    """A pytree with a `repr` of one line: names, types and shapes of its fields."""
 
     def __repr__(self) -> str:
         fields = [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self)]
@@ -54,13 +55,13 @@ def _kind_of(value: Any) -> str:
     return type(value).__name__ if leaves else str(value)[:20]
 
 
-class Estimate(Described):
-    """What an estimator tells of some times: `mean, covariance, valid = result(times)`.
+class Estimate(ShortRepr):
+    """An estimate at some times: `mean, covariance, valid = result(times)`.
 
     It unpacks, has a length and is indexed as the tuple of its fields: `result(times)[0]` is the
-    mean. Arrays begin with an axis of times. `valid` says where the mean rests on data: of a pixel
-    at a time inside the recording, of a target that is alive, of a motion that is not lost.
-    Elsewhere the mean is NaN or the last one known.
+    mean. Arrays begin with an axis of times. `valid` is true where the mean rests on data: for a
+    pixel at a time inside the recording, for a target that is alive, for a motion that is not lost.
+    Elsewhere the mean is NaN or the last known one.
 
     | family | mean | covariance | valid |
     |---|---|---|---|
@@ -68,7 +69,7 @@ class Estimate(Described):
     | blob | states (T, targets, 8) | (T, targets, 8, 8) | (T, targets) |
     | egomotion | components (T, d) | (T, d, d) | (T,) |
 
-    A covariance is NaN where the estimator tells none (`Estimator.has_covariance`).
+    The covariance is NaN if the estimator has none (`Estimator.has_covariance`).
     """
 
     mean: Any
@@ -88,29 +89,37 @@ class Estimate(Described):
 class Result(Protocol):
     """A function of time, as `Estimator.estimate` returns it; reading it never changes it.
 
-    Threads may share it, and it can be pickled and copied, or says in a sentence why not.
+    Threads may share it. It can be pickled and copied, or an error names the reason why not.
     """
 
     def __call__(self, times: Times) -> Estimate:
-        """The estimate at `times`: integers are microseconds, floats seconds."""
+        """Return the estimate at `times`: integers are microseconds, floats seconds."""
         ...
 
 
 class OptionKind(NamedTuple):
-    """Values that an option takes, and words for them."""
+    """Domain of an option: a test of values, and its description."""
 
     fits: Callable[[Any], bool]
     text: str
 
 
 def of_class(kind: type, optional: bool = True) -> OptionKind:
-    """Objects of a class, and None where the option is `optional`."""
+    """Make the domain of objects of a class.
+
+    Args:
+        kind: The class.
+        optional: Whether None belongs to the domain.
+
+    Returns:
+        The domain.
+    """
     text = f"{kind.__module__}.{kind.__name__}{' or None' if optional else ''}"
     return OptionKind(lambda v: isinstance(v, kind) or (optional and v is None), text)
 
 
 def whole(least: int) -> OptionKind:
-    """Whole numbers from `least` to what int64 holds."""
+    """Make the domain of whole numbers from `least` to the largest of int64."""
 
     def fits(value: Any) -> bool:
         is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
@@ -139,19 +148,19 @@ DEVICES = OptionKind(
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Estimator(abc.ABC, Generic[P]):
-    """One estimator: a name, its `Params`, and the steps from a recording to a result.
+    """An estimator: a name, its `Params`, and the steps from a recording to a result.
 
     Attributes:
-        name: How configurations and the command line call it.
-        Params: The class of its parameters.
-        family: "reconstruction", "blob" or "egomotion": what kind of result it gives.
-        needs_frames: Whether it cannot do without frames.
-        differentiable: Whether `run` and `read` are pure functions of `params` that jit and
+        name: Name in configurations and at the command line.
+        Params: Class of its parameters.
+        family: Kind of result: "reconstruction", "blob" or "egomotion".
+        needs_frames: True if it requires frames.
+        differentiable: True if `run` and `read` are pure functions of `params` that jit and
             differentiate; if not, `run` computes on the host.
-        has_covariance: Whether it tells how certain it is.
-        models: Of egomotion: the names of the motion models that it knows; empty: all.
-        options: Names of what `estimate` takes beyond `progress`.
-        about: What it is, in a sentence or more; `help` shows it.
+        has_covariance: True if it estimates its uncertainty.
+        models: For egomotion: names of the motion models that it supports; empty: all.
+        options: Names of the options of `estimate` beyond `progress`.
+        about: Description in a sentence or more; `help` shows it.
     """
 
     name: str
@@ -226,35 +235,73 @@ class Estimator(abc.ABC, Generic[P]):
     def prepare(
         self, recording: Recording, times: Times, params: P | None = None, **options: Any
     ) -> tuple[Any, Any]:
-        """What `run` needs of a whole recording, and what `read` needs of sorted `times`.
+        """Compute what depends on the recording alone, once for all values of most parameters.
 
-        Depends on data, and on those numbers of `params` that act when data are prepared
-        (`Parameters.without_gradient` names them).
+        Numbers of `params` that act on data matter here; `Parameters.without_gradient` names them.
+
+        Args:
+            recording: Events, and frames if the estimator uses them.
+            times: Sorted times to estimate at: integers are microseconds, floats seconds.
+            params: Parameters; by default `Params()`.
+            **options: Options of the estimator.
+
+        Returns:
+            The features that `run` takes, and the data that `read` takes for `times`.
+
+        Raises:
+            InputError: The recording lacks something that the estimator needs.
         """
 
     @abc.abstractmethod
     def run(self, params: P, features: Any, state: Any = None) -> tuple[Any, Any]:
-        """Estimate: the trajectory, to be read, and the state at the end; pure.
+        """Run the estimator over prepared features; a pure function.
 
-        `state` is what the run before returned; omitted, the recording starts here.
+        Args:
+            params: Parameters.
+            features: Features that `prepare` made.
+            state: State that a previous run returned; None starts the recording.
+
+        Returns:
+            The trajectory, which `read` takes, and the state at the end.
         """
 
     @abc.abstractmethod
     def read(self, params: P, trajectory: Any, out: Any) -> Estimate:
-        """The estimate at the times that were prepared; pure, as `run`."""
+        """Evaluate a trajectory at the prepared times; a pure function.
+
+        Args:
+            params: Parameters.
+            trajectory: Trajectory that `run` returned.
+            out: The second value of `prepare`.
+
+        Returns:
+            Mean, covariance and validity at the prepared times.
+        """
 
     @abc.abstractmethod
     def estimate(self, recording: Recording, params: P | None = None, **options: Any) -> Any:
-        """The `Result` of a recording; see the family's own for its options."""
+        """Estimate over a whole recording, in constant memory.
+
+        Args:
+            recording: Events, and frames if the estimator uses them.
+            params: Parameters; by default `Params()`.
+            **options: Options of the estimator, see `options`.
+
+        Returns:
+            A `Result`, a function of time.
+
+        Raises:
+            InputError: The recording lacks something that the estimator needs.
+        """
 
     @property
     def spelled(self) -> str:
-        """Its name as Python spells it, for messages."""
+        """Name as a Python identifier, for messages."""
         return self.name.replace("-", "_")
 
     @property
     def by_parameters(self) -> str:
-        """The way to differentiate it by parameters, for messages."""
+        """Advice on how to differentiate by parameters, for messages."""
         if not self.differentiable:
             return "choose another method, this one is no function of parameters to JAX"
         return (
@@ -263,7 +310,12 @@ class Estimator(abc.ABC, Generic[P]):
         )
 
     def check_recording(self, recording: Any, call: str) -> None:
-        """Raise `InputError` unless it is a `Recording`, naming what makes one of it."""
+        """Raise `InputError` unless an argument is a `Recording`, naming the remedy.
+
+        Args:
+            recording: The argument.
+            call: Name of the called function in the message.
+        """
         if isinstance(recording, Recording):
             return
         if isinstance(recording, str | Path):
@@ -277,7 +329,12 @@ class Estimator(abc.ABC, Generic[P]):
         )
 
     def check_params(self, params: Any, call: str) -> None:
-        """Raise `InputError` unless they are parameters of this method, naming what makes them."""
+        """Raise `InputError` unless an argument holds parameters of this method, naming the remedy.
+
+        Args:
+            params: The argument; None is allowed.
+            call: Name of the called function in the message.
+        """
         if params is None:
             return
         if not isinstance(params, self.Params) or params.is_gradient:
@@ -294,7 +351,12 @@ class Estimator(abc.ABC, Generic[P]):
             )
 
     def refuse_traced(self, params: Any, call: str) -> None:
-        """Raise `InputError` for parameters that JAX traces or maps, naming what takes these."""
+        """Raise `InputError` for parameters that JAX traces or maps, naming the remedy.
+
+        Args:
+            params: Parameters, or None.
+            call: Name of the called function in the message.
+        """
         if params is None:
             return
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(params)):
@@ -320,7 +382,7 @@ class Estimator(abc.ABC, Generic[P]):
                 )
 
     def check_options(self, **options: Any) -> None:
-        """Raise `InputError` for an option of another kind than `option_kinds` says."""
+        """Raise `InputError` for an option outside its domain in `option_kinds`."""
         for name, value in options.items():
             kind = self.option_kinds.get(name)
             if kind is not None and not kind.fits(value):
@@ -333,7 +395,7 @@ CHECKED = frozenset({"prepare", "prepare_images", "estimate", "live", "run"})
 
 
 def _checked(step: str, method: Callable[..., Any]) -> Callable[..., Any]:
-    """A step of an estimator that refuses other kinds of arguments in a sentence."""
+    """Wrap a step of an estimator so that wrong arguments are refused in a sentence."""
     signature = inspect.signature(method)
     kinds = signature.parameters.items()
     rest = next((name for name, one in kinds if one.kind is one.VAR_KEYWORD), "")
@@ -362,10 +424,9 @@ def _checked(step: str, method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _place_of(estimator: Estimator) -> str:
-    """The "package.module:object" that `imported` finds it by; raises `InputError` if none is.
+    """Return the "package.module:object" that holds an estimator; raise `InputError` if none does.
 
-    That where its parameters are, which is where it was made, comes before modules that have it
-    from elsewhere.
+    The modules of its parameters and its class come before modules that import it from there.
     """
     first = [estimator.Params.__module__, type(estimator).__module__]
     own, main = "jaxevent.", ("__main__", "__mp_main__")
@@ -381,7 +442,19 @@ def _place_of(estimator: Estimator) -> str:
 
 
 def imported(path: str, kind: type[T], what: str) -> T:
-    """The object that "package.module:object" names; raises `InputError` if it is not of `kind`."""
+    """Import an object by "package.module:object".
+
+    Args:
+        path: Module and name of the object.
+        kind: Class that it must be an instance of.
+        what: Noun for it in messages.
+
+    Returns:
+        The object.
+
+    Raises:
+        InputError: It cannot be imported or is of another class.
+    """
     module, _, name = path.partition(":")
     try:
         found = importlib.import_module(module)
@@ -395,3 +468,6 @@ def imported(path: str, kind: type[T], what: str) -> T:
     if not isinstance(found, kind):
         raise InputError(f"{path!r} is {phrase(found)}, not {with_article(kind.__name__)}")
     return found
+
+
+__getattr__ = renamed_names(__name__)

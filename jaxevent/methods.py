@@ -1,6 +1,6 @@
-"""Every estimator by name, loaded when it is first asked for.
+"""Registry of every estimator by name, loaded at its first use.
 
-To add one: a line here, or from outside "package.module:object" wherever a name is asked for.
+To add one: a line here, or from outside "package.module:object" wherever a name is expected.
 """
 
 import functools
@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator, imported
-from jaxevent.parameters import nearest
+from jaxevent.parameters import suggest_name
 
 HOMES = {
     "reconstruction": {
@@ -42,7 +42,7 @@ HOMES = {
 
 
 class UnknownMethod(InputError, KeyError):
-    """A name that no method has."""
+    """Error for a name that no method has."""
 
     __str__ = Exception.__str__  # that of KeyError is the message's repr
 
@@ -53,44 +53,58 @@ def _load(path: str) -> Estimator:
 
 
 def names(family: str | None = None) -> list[str]:
-    """The names of the estimators of a family, or of all."""
+    """Return the names of the estimators of a family, or of all."""
     return [name for key, homes in HOMES.items() if family in (None, key) for name in homes]
 
 
 def find(name: str, family: str | None = None) -> Estimator:
-    """The estimator of that name, or of "package.module:object".
+    """Find an estimator by its name, or by "package.module:object".
 
-    Raises `InputError` for an unknown name, naming the nearest, and for another family's.
+    Args:
+        name: Name of a method, or the place of an `Estimator`.
+        family: "reconstruction", "blob" or "egomotion"; None allows all.
+
+    Returns:
+        The estimator.
+
+    Raises:
+        InputError: The name is unknown, or the method is of another family.
     """
     if ":" in name:
         found = _load(name)
     else:
         known = {one: path for homes in HOMES.values() for one, path in homes.items()}
         if name not in known:
-            raise UnknownMethod(f"there is no method {name!r}; {nearest(name, names(family))}")
+            raise UnknownMethod(f"there is no method {name!r}; {suggest_name(name, names(family))}")
         found = _load(known[name])
     check_family(found, family, name)
     return found
 
 
 def check_family(found: Estimator, family: str | None, name: str) -> None:
-    """Raise `InputError` for a method of another family than `family`; None allows all."""
+    """Raise `InputError` for a method of another family than `family`.
+
+    Args:
+        found: The estimator.
+        family: "reconstruction", "blob" or "egomotion"; None allows all.
+        name: Name of the estimator in the message.
+    """
     if family is not None and found.family != family:
         raise InputError(
             f"the method {name!r} is of {found.family}, not of {family}; "
-            f"{nearest(name, names(family))}"
+            f"{suggest_name(name, names(family))}"
         )
 
 
 class _Methods(Mapping[str, Estimator]):
-    """All estimators by name, each loaded when it is first asked for.
+    """All estimators by name, each loaded at its first use.
 
     A name that does not exist raises `UnknownMethod`, a `KeyError` that names the nearest.
     """
 
     def __getitem__(self, name: str) -> Estimator:
         if name not in names():
-            raise UnknownMethod(f"there is no method {name!r}; {nearest(str(name), names())}")
+            raise UnknownMethod(f"there is no method {name!r}; {suggest_name(str(name), names())}")
         return find(name)
 
     def __iter__(self) -> Iterator[str]:

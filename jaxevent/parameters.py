@@ -1,4 +1,4 @@
-"""Parameters of estimators: numbers that are read in physical units and tuned without bounds."""
+"""Parameters of estimators: numbers in physical units that an optimiser steps without bounds."""
 
 import difflib
 import inspect
@@ -14,9 +14,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from jaxevent.deprecated import renamed_names
 from jaxevent.dispatch import check_platform
+from jaxevent.display import with_article
 from jaxevent.errors import InputError
-from jaxevent.shown import with_article
 
 T = TypeVar("T", bound="Parameters")
 S = TypeVar("S", bound="Setting")
@@ -26,9 +27,9 @@ NO_GRADIENT = "acts when data are prepared or by comparisons, and has no gradien
 
 
 class Setting:
-    """What `Parameters` classes are made of: a name, a default, a unit and a meaning.
+    """A member of a `Parameters` class: a name, a default, a unit and a meaning.
 
-    Reading it from the class gives this description, reading it from an instance its value.
+    Read from the class it is this description, read from an instance its value.
     """
 
     name: str
@@ -42,7 +43,7 @@ class Setting:
 
     def __repr__(self) -> str:
         unit = f" {self.unit}" if self.unit not in ("", "1") else ""
-        return f"{self.name} = {shown(self.default)}{unit}: {self.meaning}"
+        return f"{self.name} = {format_value(self.default)}{unit}: {self.meaning}"
 
     def check(self, value: Any) -> None:
         """Raise `InputError` for a value outside the domain."""
@@ -50,13 +51,12 @@ class Setting:
 
 
 class Number(Setting):
-    """A number: the instance stores `raw`, on which an optimiser may step anywhere.
+    """A real parameter: the instance stores `raw`, on which an optimiser may step anywhere.
 
-    A default of several numbers makes it an array, given as a list of as many; a default of one in
-    a tuple, a list of any length. With `gradient=False` it acts
-    when data are prepared, or by comparisons: no derivative goes through it, so that no step can
-    lead it away from what was prepared, and `optimise` takes it for searches only. Values are from
-    `least` to `most`, and below `LARGEST` in size.
+    A default of several numbers makes an array, given as a list of as many; a default of one number
+    in a tuple allows a list of any length. With `gradient=False` the number acts when data are
+    prepared, or by comparisons: no derivative passes through it, and `optimise` takes it for
+    searches only. Values are from `least` to `most`, and below `LARGEST` in size.
     """
 
     lower: float = -LARGEST  # of the kind, where the number has no `least` of its own
@@ -95,14 +95,15 @@ class Number(Setting):
         return self.physical(raw if follows else jax.lax.stop_gradient(raw))
 
     def physical(self, raw: Array) -> Array:
-        """The value of what is stored."""
+        """Convert the stored number to the value."""
         return raw
 
     def unconstrained(self, value: Array) -> Array:
-        """What is stored of a value."""
+        """Convert a value to the number that is stored."""
         return value
 
     def check(self, value: Any) -> None:
+        """Raise `InputError` for a value outside the domain, or of another shape."""
         if not isinstance(self.default, tuple):
             if isinstance(value, list | tuple):
                 raise InputError(
@@ -124,7 +125,7 @@ class Number(Setting):
             self.check_one(one)
 
     def check_one(self, value: Any) -> None:
-        """Raise `InputError` for one of the numbers outside the domain."""
+        """Raise `InputError` for a single number outside the domain."""
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not number or not abs(value) < LARGEST:
             raise InputError(
@@ -140,13 +141,13 @@ class Number(Setting):
         return f"be from {self.least:g} to {self.most:g}"
 
     def allows(self, value: Array) -> Array:
-        """Whether `check` would take all of an array, which may be traced."""
+        """Return whether `check` would accept all of an array, which may be traced."""
         inside = (value >= self.least) & (value <= self.most) & (jnp.abs(value) < LARGEST)
         return inside.all()
 
 
 class Positive(Number):
-    """A number that stays positive; stored as its logarithm, so 0 is stored as -inf and stays 0."""
+    """A positive number, stored as its logarithm, so that 0 is stored as -inf and stays 0."""
 
     lower = 0.0
 
@@ -157,8 +158,8 @@ class Positive(Number):
         return _elementwise("log", value)
 
 
-class Share(Number):
-    """A share in [0, 1), stored as ln(p / (1 - p)), so 0 is stored as -inf and stays 0."""
+class UnitInterval(Number):
+    """A number in [0, 1), stored as ln(p / (1 - p)), so that 0 is stored as -inf and stays 0."""
 
     def physical(self, raw: Array) -> Array:
         return _elementwise("sigmoid", raw)
@@ -194,7 +195,7 @@ class Choice(Setting):
         return self if instance is None else dict(instance.chosen)[self.name]
 
     def __repr__(self) -> str:
-        return f"{super().__repr__()} (one of {', '.join(map(shown, self.options))})"
+        return f"{super().__repr__()} (one of {', '.join(map(format_value, self.options))})"
 
     def check(self, value: Any) -> None:
         if not any(value is option or value == option for option in self.options) or (
@@ -235,7 +236,7 @@ else:
 
 
 def _inherited(base: Any, owner: str) -> Any:
-    """An `__init__` of a class's own that does what its base's does."""
+    """Make an `__init__` of a class's own that calls its base's."""
 
     def init(self, *, preset: str | None = None, **values: Any):
         base.__init__(self, preset=preset, **values)
@@ -290,14 +291,16 @@ class Parameters(_Module):
             ]
         )
         about = (cls.__doc__ or "").partition("\n\nArguments:\n")[0]
-        cls.__doc__ = "\n".join([about, "", "Arguments:", *_described(cls)])
+        cls.__doc__ = "\n".join([about, "", "Arguments:", *_describe_settings(cls)])
 
     def __init__(self, *, preset: str | None = None, **values: Any):
         check_platform()  # the first arrays that JAX makes
         _refuse_unknown(values, {**self.numbers, **self.choices, "preset": None})
         if preset is not None:
             if preset not in self.presets:
-                raise InputError(f"there is no preset {preset!r}; {nearest(preset, self.presets)}")
+                raise InputError(
+                    f"there is no preset {preset!r}; {suggest_name(preset, self.presets)}"
+                )
             values = {**self.presets[preset], **values}
         self.raw = {
             name: _stored(number, values.get(name, number.default))
@@ -312,12 +315,12 @@ class Parameters(_Module):
 
     @classmethod
     def settings(cls) -> dict[str, Setting]:
-        """All that it is made of, by name."""
+        """Return all members by name."""
         return {**cls.numbers, **cls.choices}
 
     @property
     def is_gradient(self) -> bool:
-        """True where it holds derivatives by parameters, or a step; false where it is traced."""
+        """True if it holds derivatives by parameters, or a step; false while JAX traces it."""
         return isinstance(self.point, Array | np.ndarray) and not (
             isinstance(self.point, Tracer) or np.any(np.asarray(self.point))
         )
@@ -362,7 +365,9 @@ class Parameters(_Module):
         if not all(isinstance(leaf, Array | np.ndarray) for leaf in self.raw.values()):
             return eqx.tree_pformat(self)
         if self.is_gradient:
-            parts = {name: _leaf_shown(self.raw[name], self.numbers[name]) for name in self.numbers}
+            parts = {
+                name: _format_leaf(self.raw[name], self.numbers[name]) for name in self.numbers
+            }
             zeros = [name for name, text in parts.items() if text == "0"]
             some = ", ".join(f"{name}={text}" for name, text in parts.items() if text != "0")
             rest = f"0: {', '.join(zeros)}" if zeros else ""
@@ -373,19 +378,19 @@ class Parameters(_Module):
         defaults = type(self)()
         changed, same = [], []
         for name in self.settings():
-            text = _value_shown(self, name)
-            where = same if text == _value_shown(defaults, name) else changed
+            text = _format_setting(self, name)
+            where = same if text == _format_setting(defaults, name) else changed
             where.append(f"{name}={text}")
         rest = f"defaults: {', '.join(same)}" if same else ""
         return f"{type(self).__qualname__}({'; '.join(filter(None, [', '.join(changed), rest]))})"
 
     def values(self) -> dict[str, Any]:
-        """The physical values and the choices by name, as `Params(**values)` takes them."""
+        """Return the physical values and the choices by name, as `Params(**values)` takes them."""
         numbers = {name: np.asarray(getattr(self, name)).tolist() for name in self.numbers}
         return {**numbers, **dict(self.chosen)}
 
     def replace(self: T, **values: Any) -> T:
-        """The same with some other values; raises `InputError` as the class does."""
+        """Return a copy with some other values; raises `InputError` as the class does."""
         _refuse_unknown(values, self.settings())
         if self.is_gradient:
             raise InputError("a gradient has no values to replace; replace those of its parameters")
@@ -400,14 +405,13 @@ class Parameters(_Module):
         return self._with({**self.raw, **raw}, tuple(chosen.items()), self.followed)
 
     def with_raw(self: T, raw: Mapping[str, Array]) -> T:
-        """The same with some of the unconstrained numbers replaced."""
+        """Return a copy with some of the unconstrained numbers replaced."""
         return self._with({**self.raw, **raw}, self.chosen, self.followed)
 
     def with_derivatives(self: T, *names: str) -> T:
-        """The same with derivatives by numbers that act when data are prepared.
+        """Return a copy with derivatives by numbers that act when data are prepared.
 
-        They hold next to the prepared value only, so they are for looking at, not for stepping
-        along.
+        They hold next to the prepared value only, so they serve inspection, not descent.
         """
         _refuse_unknown(dict.fromkeys(names), self.numbers)
         return self._with(self.raw, self.chosen, self.followed | set(names))
@@ -425,14 +429,22 @@ class Parameters(_Module):
         return new
 
     def without_gradient(self) -> dict[str, str]:
-        """The numbers that have no gradient as the others stand, and why."""
+        """Return the numbers that have no gradient, each with the reason."""
         return {name: NO_GRADIENT for name, number in self.numbers.items() if not number.gradient}
 
     @classmethod
     def of(cls: type[T], table: Mapping[str, Any], rest: Mapping[str, Any] | None = None) -> T:
-        """Params from `name = value` settings; raises `InputError` naming the setting.
+        """Make parameters from `name = value` settings.
 
-        `rest` are values of numbers that neither the table nor its preset sets.
+        Args:
+            table: Values by name; "preset" names a preset.
+            rest: Values of numbers that neither the table nor its preset sets.
+
+        Returns:
+            The parameters.
+
+        Raises:
+            InputError: A name does not exist or a value is outside its domain.
         """
         preset = table.get("preset")
         if preset is not None and not isinstance(preset, str):
@@ -446,11 +458,22 @@ class Parameters(_Module):
         method: str | None = None,
         rest: Mapping[str, Any] | None = None,
     ) -> T:
-        """Params from a TOML file; raises `InputError` naming file and key.
+        """Read parameters from a TOML file.
 
-        The file holds `name = value` settings, or one table of them for each of several methods
-        (as `jaxevent fit` writes); then `method` is the name of the table to take.
-        `rest` are values of numbers that the file does not set; omitted, the defaults.
+        The file holds `name = value` settings, or one table of them for each of several methods, as
+        `jaxevent fit` writes.
+
+        Args:
+            path: The file.
+            method: Name of the table to take from a file of several methods.
+            rest: Values of numbers that the file does not set; omitted, the defaults.
+
+        Returns:
+            The parameters.
+
+        Raises:
+            InputError: The file cannot be read or holds another setting; the message names file and
+                key.
         """
         table = read_toml(path)
         try:
@@ -476,7 +499,7 @@ _FUNCTIONS: Mapping[str, tuple[Callable, Callable]] = {
 
 
 def _elementwise(name: str, values: Array) -> Array:
-    """A function of numbers, by NumPy where they are known: XLA compiles 60 ms for each shape."""
+    """Apply a function by NumPy where values are known: XLA compiles 60 ms for each shape."""
     known_by, traced_by = _FUNCTIONS[name]
     if isinstance(values, Tracer):
         return traced_by(values)
@@ -489,7 +512,7 @@ def _elementwise(name: str, values: Array) -> Array:
 
 
 def _plain(value: Any) -> Any:
-    """Arrays of NumPy, JAX and others as Python's numbers and lists; other values as they are."""
+    """Convert arrays of NumPy, JAX and others to numbers and lists of Python."""
     if isinstance(value, list | tuple):
         return [_plain(one) for one in value]
     if isinstance(value, Tracer):
@@ -502,7 +525,7 @@ def _plain(value: Any) -> Any:
 
 
 def _stored(number: Number, value: Any, dtype: Any = None) -> Array:
-    """Return what is stored of a value, which is checked unless it is traced."""
+    """Convert a value to the number that is stored; check it unless it is traced."""
     dtype = jnp.result_type(float) if dtype is None else dtype
     if isinstance(value, Tracer):
         if not (
@@ -522,14 +545,14 @@ def _stored(number: Number, value: Any, dtype: Any = None) -> Array:
 
 
 def _chosen(setting: Choice | Count, value: Any) -> Any:
-    """A choice or count as it is kept, checked."""
+    """Return a choice or count as it is stored, checked."""
     value = _plain(value)
     setting.check(value)
     return value
 
 
 def phrase(value: Any) -> str:
-    """A value's type in words, for messages: "a dict", "the class Params", "a gradient"."""
+    """Return a value's type in words, for messages: "a dict", "the class Params", "a gradient"."""
     if value is None:
         return "None"
     if isinstance(value, Parameters) and value.is_gradient:
@@ -541,41 +564,43 @@ def phrase(value: Any) -> str:
     return with_article(type(value).__qualname__)
 
 
-def _leaf_shown(value: Array | np.ndarray, number: Number) -> str:
-    """A number or its stored one, of traced and mapped ones the type or shape."""
+def _format_leaf(value: Array | np.ndarray, number: Number) -> str:
+    """Format a number or its stored one; a traced or mapped one by type or shape."""
     if isinstance(value, Tracer):
         return value.aval.str_short()
     ndim = isinstance(number.default, tuple)
-    return shown(np.asarray(value).tolist()) if value.ndim <= ndim else f"array{value.shape}"
+    return format_value(np.asarray(value).tolist()) if value.ndim <= ndim else f"array{value.shape}"
 
 
-def _value_shown(params: Parameters, name: str) -> str:
-    """One value, of a traced or mapped one the type and shape."""
+def _format_setting(params: Parameters, name: str) -> str:
+    """Format one value; a traced or mapped one by type and shape."""
     value = getattr(params, name)
-    return _leaf_shown(value, params.numbers[name]) if name in params.numbers else shown(value)
+    return (
+        _format_leaf(value, params.numbers[name]) if name in params.numbers else format_value(value)
+    )
 
 
-def shown(value: Any) -> str:
-    """A value as descriptions show it: numbers to four digits."""
+def format_value(value: Any) -> str:
+    """Format a value for descriptions: numbers to four digits."""
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, tuple | list):
-        return f"[{', '.join(map(shown, value))}]"
+        return f"[{', '.join(map(format_value, value))}]"
     return repr(value)
 
 
-def _described(kind: type[Parameters]) -> list[str]:
-    """Lines about every setting, for the docstring."""
+def _describe_settings(kind: type[Parameters]) -> list[str]:
+    """Return lines about every setting, for the docstring."""
     lines = []
     for name, setting in kind.settings().items():
         unit = f" {setting.unit}" if setting.unit not in ("", "1") else ""
         more = ""
         if isinstance(setting, Choice):
-            more = f" One of {', '.join(map(shown, setting.options))}."
+            more = f" One of {', '.join(map(format_value, setting.options))}."
         if isinstance(setting, Number) and not setting.gradient:
             more = " No gradient."
         lines.append(
-            f"    {name}: default {shown(setting.default)}{unit}; {setting.meaning}.{more}"
+            f"    {name}: default {format_value(setting.default)}{unit}; {setting.meaning}.{more}"
         )
     if kind.presets:
         lines.append(f"    preset: a named set of values: {', '.join(kind.presets)}.")
@@ -585,20 +610,31 @@ def _described(kind: type[Parameters]) -> list[str]:
 def _refuse_unknown(values: Mapping[str, Any], known: Mapping[str, Any]) -> None:
     for name in values:
         if name not in known:
-            raise InputError(f"there is no parameter {name!r}; {nearest(name, known)}")
+            raise InputError(f"there is no parameter {name!r}; {suggest_name(name, known)}")
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """The end of a sentence that says what an unknown name may have meant."""
+def suggest_name(name: str, known: Iterable[str]) -> str:
+    """Return the end of a sentence about an unknown name: the nearest known one, or all.
+
+    Args:
+        name: The unknown name.
+        known: All names that exist.
+
+    Returns:
+        "did you mean 'x'?", or "known: x, y".
+    """
     close = difflib.get_close_matches(name, list(known), 1)
     return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """The tables of a TOML file; raises `InputError` if it is missing or not TOML."""
+    """Read the tables of a TOML file; raise `InputError` if it is missing or not TOML."""
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
     except ValueError as error:  # not TOML, not UTF-8, or an integer without end
         raise InputError(f"{path}: is not TOML ({error}); mend that line") from None
+
+
+__getattr__ = renamed_names(__name__)

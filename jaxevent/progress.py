@@ -1,8 +1,7 @@
-"""What is being done, shown where somebody looks on: in a terminal or a notebook.
+"""Progress on stderr, in a terminal or a notebook.
 
-`bar` counts what is done of something, `stage` says what is done that cannot be counted. Whatever
-was begun last and is not over has the line; from 2 s on a thread keeps its time moving while no
-step ends.
+`bar` counts steps; `stage` shows an activity that cannot be counted. The activity that began last
+and is not over has the line. From 2 s on a thread keeps its time moving while no step ends.
 """
 
 import os
@@ -27,7 +26,7 @@ _over = threading.Event()
 
 
 def _begin_anew() -> None:
-    """Leave to the parent of a forked process what it shows, and the lock."""
+    """Leave the open bars and the lock to the parent of a forked process."""
     tqdm.set_lock(threading.RLock())
     _open.clear()
 
@@ -37,13 +36,13 @@ if hasattr(os, "register_at_fork"):
 
 
 class Bar(tqdm):  # ty: ignore[unsupported-base]
-    """A bar of tqdm on a line that all share, and a rate that holds from its first step on.
+    """A bar of tqdm on a line that all bars share, with a rate that holds from its first step on.
 
     The first step often compiles what all others use; a rate with it would promise too long a time.
     """
 
     _first: tuple[float, float] | None = None  # what was done, and when (s), after the first step
-    _told = False  # whether it is on the line
+    _displayed = False  # whether it is on the line
 
     def __init__(self, *arguments: Any, **options: Any):
         super().__init__(*arguments, **options)
@@ -65,21 +64,21 @@ class Bar(tqdm):  # ty: ignore[unsupported-base]
         return {**known, "rate": steps / elapsed if steps > 0 and elapsed >= 1 else 0}  # 0: unknown
 
     def update(self, n: float | int | None = 1) -> bool | None:
-        told = super().update(n)
+        displayed = super().update(n)
         if self._first is None and not self.disable:
             self._first = self.n, time.time()
-        return told
+        return displayed
 
     def display(self, *arguments: Any, **options: Any) -> Any:
-        if _last() is self or self._told:
-            self._told = True
+        if _last() is self or self._displayed:
+            self._displayed = True
             return super().display(*arguments, **options)
         return None
 
     def hide(self) -> None:
         """Leave the line to others, until it is shown again."""
-        if self._told:
-            self._told = False
+        if self._displayed:
+            self._displayed = False
             self.clear()
 
     def close(self) -> None:
@@ -92,14 +91,14 @@ class Bar(tqdm):  # ty: ignore[unsupported-base]
 
 
 def _last() -> Bar | None:
-    """That which has the line."""
+    """Return the bar that has the line."""
     while _open and _open[-1]() is None:
         _open.pop()
     return _open[-1]() if _open else None
 
 
 def _tick() -> None:
-    """Keep the time of what has the line moving."""
+    """Keep the time of the bar that has the line moving."""
     began = time.time()
     while not _over.wait(TICK):
         if time.time() - began >= DELAY:
@@ -108,7 +107,7 @@ def _tick() -> None:
 
 
 def _show() -> None:
-    """Give the line to what was begun last. A function, so that the thread holds none of them."""
+    """Give the line to the bar that began last. A function, so that the thread holds no bar."""
     shown = _last()
     for one in (other() for other in _open[:-1]):
         if one is not None:
@@ -118,8 +117,8 @@ def _show() -> None:
         shown.delay = 0  # so that it is cleared in the end
 
 
-def watched() -> bool:
-    """Whether somebody looks on: stderr is a terminal, or the code runs in a notebook."""
+def is_interactive() -> bool:
+    """Return true if stderr is a terminal, or the code runs in a notebook."""
     kernel = sys.modules.get("ipykernel")
     return sys.stderr.isatty() or kernel is not None
 
@@ -132,10 +131,17 @@ def bar(
     progress: bool | None = None,
     **more: Any,
 ) -> Bar:
-    """A bar on stderr that appears after 2 s and goes when done; see `tqdm` for further options.
+    """Make a bar on stderr that appears after 2 s and goes when done.
 
-    `desc` says what is done. `progress` shows or hides it; None: shown where somebody looks on
-    (`watched`).
+    Args:
+        items: Items to iterate over, as `tqdm` takes them.
+        desc: Activity that the bar shows.
+        unit: Name of a step.
+        progress: Whether to show it; None shows it where the process `is_interactive`.
+        **more: Further options of `tqdm`.
+
+    Returns:
+        The bar, an iterable and a context.
     """
     return Bar(
         items, desc=desc, unit=unit, delay=DELAY, leave=False, position=0,
@@ -144,12 +150,15 @@ def bar(
 
 
 def stage(desc: str, progress: bool | None = None) -> Bar:
-    """A context during which a line says what is done, and for how long; as `bar` does."""
+    """Make a context during which a line shows an activity and its duration.
+
+    Options as of `bar`.
+    """
     return bar(desc=desc, unit="", progress=progress, bar_format="{desc} [{elapsed}]")
 
 
 def hide() -> None:
-    """Clear the line, for what is printed next; it comes again while what it tells of goes on."""
+    """Clear the line before something is printed; it returns while its activity goes on."""
     with tqdm.get_lock():
         for one in (other() for other in _open):
             if one is not None:
@@ -157,5 +166,5 @@ def hide() -> None:
 
 
 def is_shown(progress: bool | None) -> bool:
-    """Whether a bar is shown: as `progress` says, and if it says nothing, where `watched`."""
-    return watched() if progress is None else progress
+    """Return `progress`, or where it is None whether the process `is_interactive`."""
+    return is_interactive() if progress is None else progress

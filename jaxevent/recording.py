@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent import arrays
 from jaxevent.camera import PinholeCamera, Response, TableResponse, UnknownResponse
+from jaxevent.display import HtmlRepr, plural
 from jaxevent.errors import InputError, OrderError
-from jaxevent.shown import Shown, plural
 
 if TYPE_CHECKING:
     import pandas
@@ -494,7 +494,7 @@ class Triggers:
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Recording(Shown):
+class Recording(HtmlRepr):
     """One recording of one sensor; see the module for the conventions.
 
     `extra` keeps, by name, whatever arrays the file held beyond these fields (a contrast threshold,

@@ -1,4 +1,4 @@
-"""How recordings are shared out to fit, to validate and to test."""
+"""Partition of recordings into parts to fit, to validate and to test."""
 
 from collections.abc import Sequence
 
@@ -9,9 +9,16 @@ SPLITS = ("fit", "validation", "test")
 
 
 def interleave(split: Sequence[int], count: int) -> NDArray[np.int64]:
-    """Which of SPLITS each of `count` images is for: shares `split`, in a fixed pattern.
+    """Assign each of `count` images to one of SPLITS, with shares `split` in a fixed pattern.
 
     [2, 1, 1] repeats fit, validation, fit, test.
+
+    Args:
+        split: Shares of fit, validation and test.
+        count: Number of images.
+
+    Returns:
+        (count,) index in SPLITS.
     """
 
     def spread(share: int, of: int) -> NDArray[np.bool_]:
@@ -27,10 +34,18 @@ def interleave(split: Sequence[int], count: int) -> NDArray[np.int64]:
 def windows(
     first: int, stop: int, window: float | int | None, split: Sequence[int] | None, place: int
 ) -> list[tuple[int, int, int]]:
-    """Start, end (us) and place in SPLITS of the windows from `first` to `stop`.
+    """Cut the time from `first` to `stop` into windows.
 
-    They last `window` seconds, by default an eighth of it if a recording is `split`, else all of
-    it, for `place`.
+    Args:
+        first: Start of the first window, us.
+        stop: End of the last window, us.
+        window: Length of a window, s; by default an eighth of the time if `split` is given, else
+            all.
+        split: Shares of fit, validation and test; None assigns all windows to `place`.
+        place: Index in SPLITS of all windows without `split`.
+
+    Returns:
+        Start (us), end (us) and index in SPLITS of each window.
     """
     length = stop - first
     if window is not None:

@@ -23,8 +23,9 @@ from jaxtyping import Array, Float, Int
 from tqdm import tqdm
 
 from jaxevent import devices
+from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
-from jaxevent.parameters import Parameters, nearest
+from jaxevent.parameters import Parameters, suggest_name
 from jaxevent.progress import bar
 
 P = TypeVar("P", bound=Parameters)
@@ -41,18 +42,18 @@ Interval = tuple[float | int, float | int, int]
 
 
 @runtime_checkable
-class Weighted(Protocol):
-    """A batch that counts more or less than others in means over batches."""
+class WeightedBatch(Protocol):
+    """A batch with a weight of its own in means over batches."""
 
     weight: Any
 
 
 @dataclasses.dataclass(frozen=True)
-class Believed:
-    """A loss plus what is believed of some numbers beforehand: `with_prior` makes it.
+class LossWithPrior:
+    """A loss plus a Gaussian prior of some unconstrained numbers; `with_prior` makes it.
 
-    It adds weight / 2 ((u - centre) / spread)^2 for each of `terms`, (name, centre, spread), with u
-    the unconstrained number, the logarithm of a positive one.
+    The prior adds weight / 2 ((u - centre) / spread)^2 for each of `terms`, (name, centre, spread),
+    with u the unconstrained number, the logarithm of a positive one.
     """
 
     loss: Loss
@@ -61,11 +62,11 @@ class Believed:
 
     @property
     def likelihood(self) -> bool:
-        """Whether the loss is the mean of -ln p, see `jaxevent.confidence.examine`."""
+        """True if the loss is the mean of -ln p, see `jaxevent.confidence.confidence_intervals`."""
         return bool(getattr(self.loss, "likelihood", False))
 
     def penalty(self, params: Any) -> Array:
-        """What is added, ()."""
+        """Compute the term that the prior adds, ()."""
         parts = [(((params.raw[k] - c) / s) ** 2).mean() for k, c, s in self.terms]
         return 0.5 * self.weight * jnp.stack(parts).sum()
 
@@ -74,11 +75,19 @@ class Believed:
 
 
 @dataclasses.dataclass(frozen=True)
-class BelievedParts(Believed):
-    """The same of a loss that tells parts apart, see `jaxevent.confidence.Parted`."""
+class PartwiseLossWithPrior(LossWithPrior):
+    """A `jaxevent.confidence.PartwiseLoss` plus a prior."""
 
     def parts(self, params: Any, batch: Any) -> tuple[Array, Array]:
-        """The mean of each part, with what is added, and its weight."""
+        """Compute the loss of each part, with the prior's term, and its weight.
+
+        Args:
+            params: Parameters of an estimator.
+            batch: One batch, as the loss takes it.
+
+        Returns:
+            The mean of each part, (parts,), and its weight, (parts,).
+        """
         part: Any = self.loss
         values, weights = part.parts(params, batch)
         return values + self.penalty(params), weights
@@ -90,15 +99,18 @@ def with_prior(
     prior: Mapping[str, Sequence[float | int]],
     weight: float | int = 1.0,
 ) -> Loss:
-    """A loss that rises as numbers leave what is believed of them: a log-normal prior.
+    """Add a log-normal prior to a loss.
 
     Args:
-        loss: To be minimised by `optimise`.
-        params: Of the kind that is fitted.
-        prior: Of each number (centre, spread): the believed value in the number's unit, and the
-            standard deviation of its logarithm (of a share ln(p / (1 - p))).
-        weight: Twice what one standard deviation costs, in the loss's unit. Of a loss that is the
+        loss: The loss that `optimise` would minimise.
+        params: Parameters of the class that is fitted.
+        prior: For each number (centre, spread): its expected value in its unit, and the standard
+            deviation of its logarithm (for a share in [0, 1) of ln(p / (1 - p))).
+        weight: Twice the cost of one standard deviation, in the loss's unit. For a loss that is the
             mean of -ln p over n measurements 1 / n is Bayes' weight.
+
+    Returns:
+        A loss that `optimise` takes.
 
     Raises:
         InputError: A number does not exist, a centre is not one of its values or has no logarithm,
@@ -110,7 +122,7 @@ def with_prior(
     for name, (centre, spread) in prior.items():
         if name not in params.raw:
             raise InputError(
-                f"the prior names {name!r}, which is no number; {nearest(name, params.raw)}"
+                f"the prior names {name!r}, which is no number; {suggest_name(name, params.raw)}"
             )
         if not 0 < spread < math.inf:
             raise InputError(
@@ -123,22 +135,22 @@ def with_prior(
         terms.append((name, raw, float(spread)))
     if not terms:
         return loss
-    kind = BelievedParts if hasattr(loss, "parts") else Believed
+    kind = PartwiseLossWithPrior if hasattr(loss, "parts") else LossWithPrior
     return kind(loss, tuple(terms), float(weight))
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """How `optimise` goes about it.
+    """Settings of `optimise`.
 
-    A round is a search of all searched parameters followed by `iterations` steps of Adam, whose
-    rate falls from `learning_rate`, halved with every round, to a tenth along a cosine. Every
-    `every` iterations the validation loss is looked at; a start that has not improved for
-    `patience` iterations stops, and the best of what was looked at counts, of parameters within
-    their bounds. `starts` starting points
-    are followed at once: the given one, and others drawn around it with a standard deviation of
-    `spread` in the unconstrained numbers. `batch` batches make a step, drawn without replacement;
-    None: all. `forward` chooses the derivatives' mode; None: the faster.
+    A round is a search of all searched parameters followed by `iterations` steps of Adam. Its rate
+    falls from `learning_rate`, halved with every round, to a tenth along a cosine. Every `every`
+    iterations the validation loss is computed; a start that has not improved for `patience`
+    iterations stops. The result is the best of these, with parameters within their bounds. `starts`
+    starting points are followed at once: the given one, and others drawn around it with a standard
+    deviation of `spread` in the unconstrained numbers. `batch` batches make a step, drawn without
+    replacement; None takes all. `forward` chooses the mode of differentiation; None takes the
+    faster.
     """
 
     iterations: int = 300
@@ -154,7 +166,10 @@ class Settings:
 
 
 class Position(eqx.Module):
-    """Where all starting points are; leaves of `raw`, `best`, `optimiser` begin with [starts]."""
+    """Parameters of all starting points.
+
+    Leaves of `raw`, `best`, `optimiser` begin with [starts].
+    """
 
     raw: dict[str, Array]  # the fitted parameters, unconstrained
     optimiser: Any
@@ -166,7 +181,7 @@ class Position(eqx.Module):
 
 @dataclasses.dataclass
 class Run:
-    """All that changes while a fit runs: written to checkpoints.
+    """State of a fit that runs, as checkpoints hold it.
 
     Stage 2 r is the search of round r, 2 r + 1 its descent; one last search follows. `tried` are
     the losses of this search's candidates in order: the search is a function of them, so it is
@@ -182,8 +197,11 @@ class Run:
 
 
 @dataclasses.dataclass(frozen=True)
-class Fitted(Generic[P]):
-    """The parameters found, their validation loss (without validation: fit loss), the history."""
+class FitResult(Generic[P]):
+    """The parameters found, their validation loss (without validation.
+
+    Fit loss), and the history.
+    """
 
     params: P
     loss: float
@@ -191,9 +209,9 @@ class Fitted(Generic[P]):
 
     @property
     def diverged(self) -> bool:
-        """Whether the last steps had come to a greater loss than the start, or to none.
+        """True if the last steps ended at a greater loss than the start, or at none that is finite.
 
-        `params` are the best that was looked at all the same.
+        `params` are the best that were evaluated all the same.
         """
         seen = [line for line in self.history if line[4] is not None]
         lasts = {line[0]: line[4] for line in seen}  # by start
@@ -206,11 +224,24 @@ def begin(
     settings: Settings = Settings(),
     search: Mapping[str, Interval] | None = None,
 ) -> Run:
-    """The state of a fit before its first step; see `optimise`."""
+    """Make the state of a fit before its first step.
+
+    Args:
+        params: Parameters at the start.
+        names: Parameters to fit by gradient.
+        settings: See `Settings`.
+        search: Parameters to search, see `optimise`.
+
+    Returns:
+        The state that `optimise` takes as `run`.
+
+    Raises:
+        InputError: A name does not exist, has no gradient, or cannot start where it is.
+    """
     search = search or {}
     for name in [*names, *search]:
         if name not in params.raw:
-            raise InputError(f"there is no parameter {name!r}; {nearest(name, params.raw)}")
+            raise InputError(f"there is no parameter {name!r}; {suggest_name(name, params.raw)}")
     stuck = params.without_gradient()
     for name in names:
         if name in stuck:
@@ -264,33 +295,36 @@ def optimise(
     save: Callable[[Run, bool], None] | None = None,
     progress: bool | None = None,
     title: str = "fit",
-) -> Fitted[P]:
+) -> FitResult[P]:
     """Fit some parameters of an estimator: minimise the mean loss over batches.
 
     Args:
         loss: `loss(params, batch)`, the mean over a batch's measurements; pure.
-        params: Where to start; what is not named stays as it is.
+        params: Parameters at the start; those not named keep their values.
         names: Parameters to follow the gradient of. Where a loss jumps as they change, its gradient
             is not its slope; that of the AKF does with `ratio_width = 0`.
         batches: Pytrees, one compilation for each shape. A batch with an attribute `weight` counts
             that much in means over batches. Or a function `prepare(params)` that gives batches to
             fit to and batches to validate on, for parameters that act when batches are made. Of
             several processes (`devices.join`) all give the same list and each computes its share;
-            a function gives `devices.ELSEWHERE` in place of what other processes compute.
+            a function gives `devices.REMOTE` in place of what other processes compute.
         validation: Batches for early stopping, if `batches` is a list; without any, the fit's.
         settings: See `Settings`.
         search: By name, (from, to, number of points): parameters searched without gradients, one
             after another, by the fit loss of the best start. Every round looks at all points and
             around the best, ever closer.
-        run: Where an interrupted fit is to go on; by default at `begin(...)`.
+        run: State of an interrupted fit to continue; by default `begin(...)`.
         save: Called with the run and whether to save it for sure, after every step.
-        progress: Whether a bar is shown; None: where somebody looks on.
-        title: What the bar calls the fit.
+        progress: Whether to show a bar; None shows it in a terminal or notebook.
+        title: Name of the fit in the bar.
+
+    Returns:
+        The parameters of the best start, their loss, and the history.
 
     Raises:
         InputError: A name does not exist, or the loss is not finite at the start.
     """
-    prepare = Prepared.of(batches, validation, settings.batch)
+    prepare = PreparedBatches.of(batches, validation, settings.batch)
     fresh = run is None
     run = begin(params, names, settings, search) if run is None else run
     loop = _Loop(loss, params, prepare, settings, search or {}, run, save or (lambda *_: None))
@@ -305,7 +339,7 @@ def optimise(
             run.stage, run.iteration, run.tried = run.stage + 1, 0, []
             loop.save(run, True)
         fitted = loop.leader()
-        return Fitted(fitted, loop.loss(fitted, loop.watched(fitted)), run.history)
+        return FitResult(fitted, loop.loss(fitted, loop.watched(fitted)), run.history)
 
 
 # A step whose gradient is not finite is left out, however many there are.
@@ -313,14 +347,23 @@ ADAM = optax.apply_if_finite(optax.scale_by_adam(), max_consecutive_errors=2**31
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def loss_of(loss: Loss, params: Parameters, batch: Any) -> Array:
-    """The loss of a batch, compiled."""
+def evaluate_loss(loss: Loss, params: Parameters, batch: Any) -> Array:
+    """Compute the loss of a batch, compiled.
+
+    Args:
+        loss: `loss(params, batch)`, a scalar.
+        params: Parameters of an estimator.
+        batch: One batch.
+
+    Returns:
+        The loss, ().
+    """
     return loss(params, batch)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _values(loss: Loss, params: Parameters, raw: dict[str, Array], batch: Any) -> Array:
-    """The loss of each start, (starts,); infinite where a parameter is out of bounds."""
+    """Compute the loss of each start, (starts,); infinite where a parameter is out of bounds."""
 
     def value(one: dict[str, Array]) -> Array:
         stepped = params.with_raw(one)
@@ -331,10 +374,21 @@ def _values(loss: Loss, params: Parameters, raw: dict[str, Array], batch: Any) -
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def slopes(
+def loss_and_grad(
     loss: Loss, forward: bool, params: Parameters, raw: dict[str, Array], batch: Any
 ) -> tuple[Array, dict[str, Array]]:
-    """The loss of each start, (starts,), and its derivatives in the shape of `raw`."""
+    """Compute the loss of each start and its gradient by the unconstrained numbers.
+
+    Args:
+        loss: `loss(params, batch)`, a scalar.
+        forward: True for forward-mode differentiation, false for reverse.
+        params: Parameters of an estimator; those in `raw` are replaced.
+        raw: Unconstrained numbers by name, each (starts, ...).
+        batch: One batch.
+
+    Returns:
+        The losses, (starts,), and the gradient in the shape of `raw`.
+    """
 
     def value(one: dict[str, Array]) -> Array:
         return loss(params.with_raw(one), batch)
@@ -361,12 +415,12 @@ def _step(position: Position, slope: dict[str, Array], rate: float | Array) -> P
 
 
 @jax.jit
-def _judge(
+def _update_best(
     position: Position, seen: Array, i: int | Array, patience: int | Array
 ) -> tuple[Position, Array]:
-    """Keep the best of each start at iteration i; and whether any has not stopped yet.
+    """Keep the best of each start at iteration i, and return whether any start goes on.
 
-    A start that has stopped keeps its best, however long the others make it go on.
+    A start that has stopped keeps its best, however long the others go on.
     """
     first = i == 0
     going = first | (i - position.best_at < patience)
@@ -386,23 +440,31 @@ def _judge(
     return position, (i - best_at < patience).any()
 
 
-def each_of(function: Callable[[Any], Any], batches: Sequence[Any]) -> list[tuple[float, Any]]:
-    """The weight of every batch and what a function gives for it, of all processes' batches."""
-    if devices.alone():
+def map_batches(function: Callable[[Any], Any], batches: Sequence[Any]) -> list[tuple[float, Any]]:
+    """Apply a function to the batches of all processes.
+
+    Args:
+        function: A function of a batch that gives a pytree of arrays.
+        batches: All batches, those of other processes as `devices.REMOTE`.
+
+    Returns:
+        For each batch its weight and the function's value.
+    """
+    if devices.is_single_device():
         return [(_weight(batch), function(batch)) for batch in batches]
-    own = ((k, batch) for k, batch in enumerate(batches) if batch is not devices.ELSEWHERE)
+    own = ((k, batch) for k, batch in enumerate(batches) if batch is not devices.REMOTE)
     mine = {k: (batch, function(batch)) for k, batch in own}  # before any is waited for
     said = {k: (_weight(batch), jax.device_get(part)) for k, (batch, part) in mine.items()}
-    told = {k: v for some in devices.gathered(said) for k, v in some.items()}
+    told = {k: v for some in devices.allgather(said) for k, v in some.items()}
     return [(told[k][0], jax.tree.map(jnp.asarray, told[k][1])) for k in range(len(batches))]
 
 
 def _mean(function: Callable[[Any], Any], batches: Sequence[Any]) -> Any:
-    """The mean of a function of batches (a pytree), weighted by the batches' `weight`.
+    """Compute the mean of a function of batches (a pytree), weighted by the batches' `weight`.
 
     On several devices or in several processes the results are added in the same order as on one.
     """
-    found = each_of(function, batches)
+    found = map_batches(function, batches)
     if len(batches) == 1:
         return found[0][1]
     whole, total = sum(weight for weight, _ in found), None
@@ -414,18 +476,20 @@ def _mean(function: Callable[[Any], Any], batches: Sequence[Any]) -> Any:
 
 
 def _weight(batch: Any) -> float:
-    return float(batch.weight) if isinstance(batch, Weighted) else 1.0
+    return float(batch.weight) if isinstance(batch, WeightedBatch) else 1.0
 
 
-class Prepared:
+class PreparedBatches:
     """The batches to fit to and to validate on, on the devices that compute with them.
 
-    `prepare` is as `optimise` has it; `batch` batches make a step, None: all.
+    Args:
+        prepare: A function from parameters to batches, see `optimise`.
+        batch: Number of batches in a step; None takes all.
     """
 
     def __init__(self, prepare: Callable[[Any], Batches], batch: int | None):
         self._prepare = prepare
-        self._places = devices.Places(batch), devices.Places(None)
+        self._places = devices.BatchPlacement(batch), devices.BatchPlacement(None)
 
     @classmethod
     def of(
@@ -433,18 +497,27 @@ class Prepared:
         batches: Sequence[Any] | Callable[[Any], Batches],
         validation: Sequence[Any],
         batch: int | None,
-    ) -> "Prepared":
-        """From what `optimise` is given."""
+    ) -> "PreparedBatches":
+        """Make the batches from the arguments of `optimise`.
+
+        Args:
+            batches: Batches to fit to, or a function `prepare(params)`.
+            validation: Batches to validate on, if `batches` is a list.
+            batch: Number of batches in a step; None takes all.
+
+        Returns:
+            A function from parameters to the batches to fit to and to validate on.
+        """
         if callable(batches):
             return cls(batches, batch)  # ty: ignore[invalid-argument-type]
-        shares = devices.shared_out(batches), devices.shared_out(validation)
+        shares = devices.partition_batches(batches), devices.partition_batches(validation)
         return cls(lambda _: shares, batch)
 
     def __call__(self, params: Any) -> Batches:
-        if devices.alone():
+        if devices.is_single_device():
             return self._prepare(params)
         with devices.on_host():
-            fit, validation = devices.in_step(lambda: self._prepare(params))
+            fit, validation = devices.on_all_processes(lambda: self._prepare(params))
         return self._places[0](fit), self._places[1](validation)
 
 
@@ -457,7 +530,7 @@ class _Loop:
         self,
         loss: Loss,
         params: Parameters,
-        prepare: Prepared,
+        prepare: PreparedBatches,
         settings: Settings,
         intervals: Mapping[str, Interval],
         run: Run,
@@ -481,7 +554,7 @@ class _Loop:
         return validation or fit
 
     def loss(self, params: Any, batches: Sequence[Any]) -> float:
-        return float(_mean(lambda batch: loss_of(self.function, params, batch), batches))
+        return float(_mean(lambda batch: evaluate_loss(self.function, params, batch), batches))
 
     def check(self) -> None:
         """Raise `InputError` unless the losses of the given parameters are finite."""
@@ -496,14 +569,14 @@ class _Loop:
                 )
 
     def search(self) -> None:
-        """All searched parameters in turn, the others as the best start has them."""
+        """Search all searched parameters in turn, the others at the best start's values."""
         replay, leader = iter(list(self.run.tried)), self.leader()
 
-        def look(name: str, value: float) -> float:
+        def objective(name: str, value: float) -> float:
             """The fit loss of a candidate; infinite if it is not a number."""
             loss = next(replay, None)
             if loss is None:
-                candidate = self._searched(leader, name, value)
+                candidate = self._with_value(leader, name, value)
                 loss = self.loss(candidate, self.prepare(candidate)[0])
                 loss = loss if math.isfinite(loss) else math.inf
                 self.run.tried.append(loss)
@@ -513,17 +586,19 @@ class _Loop:
 
         for name, interval in self.intervals.items():
             here = float(getattr(leader, name))
-            found = _minimise(functools.partial(look, name), interval, here, self.run.stage // 2)
-            leader = self._searched(leader, name, found)
+            found = _search_minimum(
+                functools.partial(objective, name), interval, here, self.run.stage // 2
+            )
+            leader = self._with_value(leader, name, found)
         searched = {name: leader.raw[name] for name in self.intervals}
         self.run.position = dataclasses.replace(self.run.position, searched=searched)
 
-    def _searched(self, params: Any, name: str, value: float) -> Any:
+    def _with_value(self, params: Any, name: str, value: float) -> Any:
         raw = params.numbers[name].unconstrained(jnp.asarray(value, params.raw[name].dtype))
         return params.with_raw({name: raw})
 
     def descend(self) -> None:
-        """The gradient steps of a round, from where all starts are to the best they come by."""
+        """Take the gradient steps of a round, and move to the best parameters found."""
         run, settings = self.run, self.settings
         position, turn = run.position, run.stage // 2
         if not position.raw:
@@ -537,14 +612,16 @@ class _Loop:
         while True:
             i, seen = run.iteration, None
             if i % settings.every == 0 or i == settings.iterations:
-                look = functools.partial(_values, self.function, params, position.raw)
-                seen = _mean(look, watched)
-                position, going = _judge(position, seen, i, settings.patience)
+                objective = functools.partial(_values, self.function, params, position.raw)
+                seen = _mean(objective, watched)
+                position, going = _update_best(position, seen, i, settings.patience)
                 if i == settings.iterations or not bool(going):
                     self._record(turn, i, None, seen)
                     break
-            look = functools.partial(slopes, self.function, self.forward, params, position.raw)
-            losses, slope = _mean(look, [fit[k] for k in self._drawn(len(fit))])
+            objective = functools.partial(
+                loss_and_grad, self.function, self.forward, params, position.raw
+            )
+            losses, slope = _mean(objective, [fit[k] for k in self._drawn(len(fit))])
             fall = 0.55 + 0.45 * math.cos(math.pi * i / settings.iterations)
             position = _step(position, slope, settings.learning_rate / 2**turn * fall)
             self._record(turn, i, losses, seen)
@@ -555,7 +632,7 @@ class _Loop:
         run.position = dataclasses.replace(position, raw=position.best)
 
     def _drawn(self, count: int) -> Sequence[int]:
-        """The batches of this iteration: the next ones of one random order after another."""
+        """Return the batches of this iteration: the next ones of successive random orders."""
         size = self.settings.batch
         if size is None or size >= count:
             return range(count)
@@ -572,23 +649,25 @@ class _Loop:
             self.run.history.append([start, turn, i, *pair])
 
 
-def _minimise(look: Callable[[float], float], interval: Interval, value: float, turn: int) -> float:
-    """Where a search of one number ends: the least of what it saw, `value` among it.
+def _search_minimum(
+    objective: Callable[[float], float], interval: Interval, value: float, turn: int
+) -> float:
+    """Search one number for the least loss; `value` is among the candidates.
 
-    Every turn looks at all points of the interval, as the best one may be another once the other
-    parameters have moved. The first goes on to the vertex of the parabola through the best point
-    and its neighbours, later ones close in on the minimum around the best, by Brent's method.
+    Every turn evaluates all points of the interval, as the best one may change once the other
+    parameters have moved. The first turn adds the vertex of the parabola through the best point and
+    its neighbours; later turns approach the minimum around the best by Brent's method.
     """
     low, high, count = interval
     step = (high - low) / (count - 1)
     grid = [float(x) for x in np.linspace(low, high, count)]
-    losses = [look(x) for x in grid]
+    losses = [objective(x) for x in grid]
     k = int(np.argmin(losses))
-    best = min((losses[k], grid[k]), (look(value), value))
+    best = min((losses[k], grid[k]), (objective(value), value))
     if turn:
         reach, middle = step / 2 ** (turn - 1), min(max(best[1], low), high)
         found = scipy.optimize.minimize_scalar(
-            look,
+            objective,
             bounds=(max(low, middle - reach), min(high, middle + reach)),
             method="bounded",
             options={"xatol": step / 100, "maxiter": 20},
@@ -598,5 +677,8 @@ def _minimise(look: Callable[[float], float], interval: Interval, value: float, 
         a, b, c = losses[k - 1 : k + 2]
         if math.isfinite(a + c) and a - 2 * b + c > 0:
             vertex = grid[k] + step * (a - c) / (a - 2 * b + c) / 2
-            best = min((look(vertex), vertex), best)
+            best = min((objective(vertex), vertex), best)
     return best[1]
+
+
+__getattr__ = renamed_names(__name__)

@@ -9,7 +9,7 @@ import pytest
 import scipy.stats
 
 from jaxevent import confidence
-from jaxevent.confidence import examine
+from jaxevent.confidence import confidence_intervals
 from jaxevent.parameters import Number, Parameters, Positive
 from jaxevent.tuning import Settings, optimise
 
@@ -36,7 +36,7 @@ def square(params: Toy, batch: Any) -> jax.Array:
 
 def test_the_interval_of_a_mean_is_students():
     found = Toy(mean=float(DRAWN.mean()))
-    (one,) = examine(square, Toy(), found, ["mean"], EACH).findings
+    (one,) = confidence_intervals(square, Toy(), found, ["mean"], EACH).intervals
     n = len(DRAWN)
     low, high = scipy.stats.t.interval(0.95, n - 1, DRAWN.mean(), DRAWN.std(ddof=1) / np.sqrt(n))
     assert (one.low, one.high) == pytest.approx((low, high), rel=1e-4)
@@ -53,8 +53,8 @@ def test_parts_that_the_loss_tells_apart_count_as_batches_do():
             return (params.mean - batch) ** 2, jnp.ones_like(batch)
 
     found = Toy(mean=float(DRAWN.mean()))
-    apart = examine(square, Toy(), found, ["mean"], EACH)
-    whole = examine(Whole(), Toy(), found, ["mean"], [jnp.asarray(DRAWN)])
+    apart = confidence_intervals(square, Toy(), found, ["mean"], EACH)
+    whole = confidence_intervals(Whole(), Toy(), found, ["mean"], [jnp.asarray(DRAWN)])
     assert apart.parts == whole.parts == 60
     assert whole["mean"].low == pytest.approx(apart["mean"].low, rel=1e-5)
 
@@ -95,7 +95,9 @@ def test_one_batch_of_a_likelihood_has_the_interval_of_its_information():
 
     s, n = float(DRAWN.std()), len(DRAWN)
     found = Toy(mean=float(DRAWN.mean()), spread=s)
-    told = examine(Loss(), Toy(), found, ["mean", "spread"], [Measured(jnp.asarray(DRAWN))])
+    told = confidence_intervals(
+        Loss(), Toy(), found, ["mean", "spread"], [Measured(jnp.asarray(DRAWN))]
+    )
     assert told.parts == 0
     half = 1.959964 * s / np.sqrt(n)
     assert told["mean"].high == pytest.approx(told["mean"].value + half, rel=1e-4)
@@ -107,16 +109,16 @@ def test_one_batch_of_a_likelihood_has_the_interval_of_its_information():
 def test_intervals_hold_the_truth_as_often_as_they_say():
     """Of 100 samples; the interval of a spread is that of large samples, a little narrow."""
 
-    class Parted(Likelihood):
+    class PartwiseLoss(Likelihood):
         def parts(self, params, batch):
             z = (batch - params.mean) / params.spread
             return z**2 / 2 + jnp.log(params.spread), jnp.ones_like(batch)
 
-    rng, held, loss = np.random.default_rng(0), np.zeros(2), Parted()
+    rng, held, loss = np.random.default_rng(0), np.zeros(2), PartwiseLoss()
     for _ in range(100):
         drawn = rng.normal(2.0, 0.7, 80)
         found = Toy(mean=float(drawn.mean()), spread=float(drawn.std()))
-        told = examine(loss, Toy(), found, ["mean", "spread"], [jnp.asarray(drawn)])
+        told = confidence_intervals(loss, Toy(), found, ["mean", "spread"], [jnp.asarray(drawn)])
         held += told["mean"].holds(2.0), told["spread"].holds(0.7)
     assert 89 <= held[0] < 100 and 86 <= held[1] < 100
 
@@ -132,7 +134,7 @@ def test_what_ran_away_and_what_does_nothing_is_told():
 
     names, start = ["mean", "idle", "gain"], Toy(mean=1.5)
     fitted = optimise(loss, start, names, EACH[:20], settings=STEPS)
-    told = examine(loss, start, fitted.params, names, EACH[:20])
+    told = confidence_intervals(loss, start, fitted.params, names, EACH[:20])
     assert told["gain"].remark == confidence.RAN_AWAY and told["gain"].high is None
     assert told["gain"].interval.startswith("above") and told["gain"].value > 10
     assert told["idle"].remark == confidence.UNKNOWN and told["idle"].interval == "any"
@@ -144,14 +146,14 @@ def test_what_ran_to_its_bound_is_told():
         return (params.capped - 1) ** 2 * (1 + batch)
 
     fitted = optimise(loss, Toy(), ["capped"], EACH[:8], settings=STEPS)
-    (one,) = examine(loss, Toy(), fitted.params, ["capped"], EACH[:8]).findings
+    (one,) = confidence_intervals(loss, Toy(), fitted.params, ["capped"], EACH[:8]).intervals
     assert 0.7 < one.value <= 0.8 and one.remark == confidence.AT_BOUND.format(0.8)
 
 
 def test_a_number_that_stopped_on_its_way_is_told():
     settings = Settings(iterations=3, learning_rate=0.1, rounds=1)
     fitted = optimise(square, Toy(), ["mean"], EACH, settings=settings)
-    one = examine(square, Toy(), fitted.params, ["mean"], EACH)["mean"]
+    one = confidence_intervals(square, Toy(), fitted.params, ["mean"], EACH)["mean"]
     assert one.remark == confidence.UNSETTLED and one.value < 1
 
 
@@ -169,7 +171,9 @@ def test_a_searched_number(to, found, remark):
     def loss(params, batch):
         return batch + 0 * params.mean
 
-    one = examine(loss, Toy(), Toy(late=found), [], prepare, {"late": (-1, to, 9)})["late"]
+    one = confidence_intervals(loss, Toy(), Toy(late=found), [], prepare, {"late": (-1, to, 9)})[
+        "late"
+    ]
     assert one.remark == remark and one.start == 0
     if remark:
         assert one.high is None
@@ -180,5 +184,5 @@ def test_a_searched_number(to, found, remark):
 
 
 def test_few_parts_give_no_interval():
-    (one,) = examine(square, Toy(), Toy(mean=2.0), ["mean"], EACH[:2]).findings
+    (one,) = confidence_intervals(square, Toy(), Toy(mean=2.0), ["mean"], EACH[:2]).intervals
     assert one.interval == "-" and not one.holds(2.0)

@@ -26,7 +26,7 @@ from jaxevent.methods import METHODS
 from jaxevent.runs import egomotion
 from jaxevent.runs.evaluate import evaluate
 from jaxevent.runs.fit import fit
-from jaxevent.runs.reconstruction import Objective, Problem, parts
+from jaxevent.runs.reconstruction import Objective, Problem, cut_windows
 
 TWO = "--xla_force_host_platform_device_count=2"
 
@@ -80,8 +80,8 @@ def reconstructions(folder: Path) -> dict[str, Any]:
     method = METHODS["edi"]
     params = method.Params(c_on=0.02, c_off=0.013)
     objective = Objective(method)
-    batch = Problem(objective, parts(recording, "held-out"))(params)[0][0]
-    batch = batch if devices.alone() else batch.over(devices.local())
+    batch = Problem(objective, cut_windows(recording, "held-out"))(params)[0][0]
+    batch = batch if devices.is_single_device() else batch.over(devices.local_devices())
     found["shared out"] = batch.truth.sharding.num_devices
 
     def loss(params):
@@ -94,8 +94,8 @@ def reconstructions(folder: Path) -> dict[str, Any]:
     # The smoother looks at neighbours too.
     aks = METHODS["aks"]
     features, out = aks.prepare(recording, np.linspace(0.05, 0.45, 5))
-    if not devices.alone():
-        features, out = (part.over(devices.local()) for part in (features, out))
+    if not devices.is_single_device():
+        features, out = (part.over(devices.local_devices()) for part in (features, out))
     params = aks.Params()
     found["aks"] = jax.jit(lambda f, out: aks.read(params, aks.run(params, f)[0], out))(
         features, out
@@ -106,7 +106,7 @@ def reconstructions(folder: Path) -> dict[str, Any]:
 def video(folder: Path) -> dict[str, Any]:
     """Images of windows one after another."""
     recording = jaxevent.load(folder / "moving.h5")
-    cf = METHODS["cf"].estimate(recording, window_events=4000, devices=devices.local())
+    cf = METHODS["cf"].estimate(recording, window_events=4000, devices=devices.local_devices())
     return {"windows": cf(np.linspace(0.05, 0.45, 5))}
 
 
@@ -120,8 +120,8 @@ def motions(folder: Path) -> dict[str, Any]:
     problem = goal.problem({"fit": [("", recording)], "validation": [], "test": []}, None, None)
     four = problem(params)[0][0]
     three = dataclasses.replace(four, noise=jax.tree.map(lambda leaf: leaf[:3], four.noise))
-    if not devices.alone():
-        four, three = (batch.over(devices.local()) for batch in (four, three))
+    if not devices.is_single_device():
+        four, three = (batch.over(devices.local_devices()) for batch in (four, three))
     return {
         "4 runs": four.noise.normal.addressable_shards[0].data.shape,
         "3 runs": three.noise.normal.addressable_shards[0].data.shape,
@@ -217,24 +217,24 @@ class Placed:
 
 
 def test_few_batches_are_spread_and_many_are_shared_out(monkeypatch):
-    monkeypatch.setattr(devices, "local", lambda: ["a", "b", "c"])
+    monkeypatch.setattr(devices, "local_devices", lambda: ["a", "b", "c"])
     monkeypatch.setattr(jax, "device_put", lambda batch, device: device)
     batches: list[Any] = [Placed() for _ in range(5)]
-    assert devices.Places(None)(batches) == ["a", "b", "c", "a", "b"]
-    assert devices.Places(2)(batches) == [3] * 5  # two at a time
-    assert devices.Places(None)(batches[:2]) == [3, 3]
-    assert devices.Places(None)([0, 1]) == ["a", "b"]  # these cannot be spread
-    there = devices.ELSEWHERE
+    assert devices.BatchPlacement(None)(batches) == ["a", "b", "c", "a", "b"]
+    assert devices.BatchPlacement(2)(batches) == [3] * 5  # two at a time
+    assert devices.BatchPlacement(None)(batches[:2]) == [3, 3]
+    assert devices.BatchPlacement(None)([0, 1]) == ["a", "b"]  # these cannot be spread
+    there = devices.REMOTE
     mine: list[Any] = [there, batches[0], there, batches[1], there, batches[2]]
-    assert devices.Places(None)(mine) == [there, "a", there, "b", there, "c"]
-    assert devices.Places(4)(mine) == [there, 3, there, 3, there, 3]
-    places = devices.Places(None)
+    assert devices.BatchPlacement(None)(mine) == [there, "a", there, "b", there, "c"]
+    assert devices.BatchPlacement(4)(mine) == [there, 3, there, 3, there, 3]
+    places = devices.BatchPlacement(None)
     assert places(mine) is places(mine)
 
 
 def test_meshes_take_as_many_devices_as_divide():
     for places, sizes in (("abcd", [4, 3, 3, None]), ("a", [None] * 4)):
-        meshes = [devices.mesh(list(places), n) for n in (64, 6, 9, 7)]
+        meshes = [devices.make_mesh(list(places), n) for n in (64, 6, 9, 7)]
         assert [mesh and mesh.size for mesh in meshes] == sizes
 
 
@@ -245,15 +245,15 @@ def test_an_error_of_one_process_is_one_of_all(monkeypatch):
     monkeypatch.setattr(jax, "process_count", lambda: 2)
     for index, mine in ((0, refuse), (1, lambda: 5)):
         monkeypatch.setattr(jax, "process_index", lambda index=index: index)
-        monkeypatch.setattr(devices, "gathered", lambda said: ["no such file", None])
+        monkeypatch.setattr(devices, "allgather", lambda said: ["no such file", None])
         with pytest.raises(InputError, match="no such file"):
-            devices.in_step(mine)
-        monkeypatch.setattr(devices, "gathered", lambda said: [("error", "no such file"), ("", 0)])
+            devices.on_all_processes(mine)
+        monkeypatch.setattr(devices, "allgather", lambda said: [("error", "no such file"), ("", 0)])
         with pytest.raises(InputError, match="no such file"):
-            devices.by_first(mine)
-    monkeypatch.setattr(devices, "gathered", lambda said: [("value", 7), said])
-    assert devices.by_first(refuse) == 7  # what process 1 would say is not asked
-    assert devices.shared_out([10, 11, 12]) == [devices.ELSEWHERE, 11, devices.ELSEWHERE]
+            devices.on_process_zero(mine)
+    monkeypatch.setattr(devices, "allgather", lambda said: [("value", 7), said])
+    assert devices.on_process_zero(refuse) == 7  # what process 1 would say is not asked
+    assert devices.partition_batches([10, 11, 12]) == [devices.REMOTE, 11, devices.REMOTE]
 
 
 class Trap:
@@ -272,10 +272,10 @@ def test_what_processes_say_is_kept_to_the_bit_and_never_run(monkeypatch):
         "rows": [{"mse": 1 / 3, "lost": float("nan"), "name": "\u00b5\n", "ok": True, "no": None}],
         "checkpoint": bytes(range(256)),
     }
-    got = devices.unpacked(devices.packed(said))
+    got = devices.deserialise(devices.serialise(said))
     jax.tree.map(np.testing.assert_array_equal, got, said)
     assert jax.tree.structure(got) == jax.tree.structure(said) and list(got) == list(said)
-    assert devices.unpacked(devices.packed({3: "a", "3": "b"})) == {3: "a", "3": "b"}
+    assert devices.deserialise(devices.serialise({3: "a", "3": "b"})) == {3: "a", "3": "b"}
     assert got["3"][1][1].dtype == np.float32
 
     # Of two processes, a stranger in place of the other.
@@ -289,13 +289,13 @@ def test_what_processes_say_is_kept_to_the_bit_and_never_run(monkeypatch):
         b'{"array": null}\n' + pickle.dumps(Trap()),
         b"[" * 100_000,
     ):
-        messages = [devices.packed("mine"), strange]
+        messages = [devices.serialise("mine"), strange]
         room = max(1024, 1 << (max(map(len, messages)) - 1).bit_length())
         rows = [np.frombuffer(one.ljust(room, b"\0"), np.uint8) for one in messages]
         answers = iter([np.array([len(one) for one in messages]), np.stack(rows)])
         monkeypatch.setattr(multihost_utils, "process_allgather", lambda _: next(answers))  # noqa: B023
         with pytest.raises(InputError, match="cannot be read"):
-            devices.gathered("mine")
+            devices.allgather("mine")
 
 
 @pytest.mark.slow
@@ -321,14 +321,14 @@ for table in ("tcp", "tcp6"):
 def test_each_process_prepares_its_own_windows(monkeypatch):
     from texture import moving
 
-    windows = parts(moving(), "held-out", (1, 1, 0), 0.126)
+    windows = cut_windows(moving(), "held-out", (1, 1, 0), 0.126)
     edi = METHODS["edi"]
     monkeypatch.setattr(jax, "process_count", lambda: 3)
     owners: list[list[int]] = [[], []]
     for index in range(3):
         monkeypatch.setattr(jax, "process_index", lambda index=index: index)
         for s, batches in enumerate(Problem(Objective(edi), windows)(edi.Params())):
-            owners[s] += [k for k, batch in enumerate(batches) if batch is not devices.ELSEWHERE]
+            owners[s] += [k for k, batch in enumerate(batches) if batch is not devices.REMOTE]
             assert len(batches) == 4
     assert [sorted(each) for each in owners] == [[0, 1, 2, 3]] * 2
     assert owners[0] == [0, 3, 1, 2]

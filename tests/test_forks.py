@@ -15,7 +15,7 @@ from jaxevent import codegen, progress
 from jaxevent.codegen import host
 from jaxevent.errors import InputError
 from jaxevent.io import prophesee
-from jaxevent.sharing import Turns
+from jaxevent.locks import TurnLock
 
 pytestmark = [
     pytest.mark.skipif(not hasattr(os, "fork"), reason="there are no forks"),
@@ -151,7 +151,7 @@ def test_what_another_thread_was_reading_is_refused():
 
 
 def test_own_turns_go_on():
-    turns = Turns("a thing")
+    turns = TurnLock("a thing")
 
     def enter():
         with turns:

@@ -7,7 +7,7 @@ import optax
 import pytest
 
 from jaxevent.errors import InputError
-from jaxevent.parameters import Count, Number, Parameters, Positive, Share
+from jaxevent.parameters import Count, Number, Parameters, Positive, UnitInterval
 
 
 class Given(Parameters):
@@ -15,7 +15,7 @@ class Given(Parameters):
 
     offset = Number(-1.0, "s", "an offset")
     sigma = Positive(0.5, "px", "a spread")
-    outliers = Share(0.1, "", "share of outliers")
+    outliers = UnitInterval(0.1, "", "share of outliers")
     late = Positive(0.2, "s", "acts when data are prepared", gradient=False)
     cells = Count(3, "", "number of cells")
 

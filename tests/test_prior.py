@@ -7,7 +7,7 @@ import pytest
 
 import jaxevent
 from jaxevent.errors import InputError
-from jaxevent.tuning import Believed, Settings, with_prior
+from jaxevent.tuning import LossWithPrior, Settings, with_prior
 
 SPREAD, N = 0.3, 40
 PRIOR = {"c_on": (0.2, 0.1)}
@@ -59,7 +59,7 @@ def test_parts_and_likelihood_of_the_loss_remain():
     np.testing.assert_allclose(rise, 0.25 * (np.log(0.3 / 0.2) / 0.1) ** 2)
     assert with_prior(measured, params, {}) is measured
     same = with_prior(measured, params, PRIOR)
-    assert same == believed and hash(same) == hash(believed) and isinstance(same, Believed)
+    assert same == believed and hash(same) == hash(believed) and isinstance(same, LossWithPrior)
 
 
 @pytest.mark.parametrize(

@@ -33,8 +33,8 @@ from jaxevent.blob.steps import Filter
 from jaxevent.blob.targets import Slots
 from jaxevent.errors import InputError
 from jaxevent.events.tail import Tail
+from jaxevent.locks import TurnLock, refuse_to_pickle, synchronized
 from jaxevent.recording import Events, Recording, Times, microseconds
-from jaxevent.sharing import Turns, in_turn, refuse_to_pickle
 
 STEPS, CHUNKS = 64, 8  # of a chunk, and chunks run together
 BORN = 1 << 20  # serial number of the first target that is born; those given have lower ones
@@ -70,7 +70,7 @@ class LiveTracks:
         kernel: Callable[[Packing], FusedRun | None],
     ):
         self.params, self._filter, self._kernel = params, filter, kernel
-        self._turns = Turns("live tracks")
+        self._turns = TurnLock("live tracks")
         self._tail = Tail(*size)
         self._recording = Recording("live", *size, self._tail)
         self._detect = seeds is None if detect is None else detect
@@ -93,19 +93,19 @@ class LiveTracks:
         refuse_to_pickle("live tracks", "keep what they tell, live(times)")
 
     @property
-    @in_turn
+    @synchronized
     def start(self) -> int:
         """The first time (us) of which states can still be had."""
         self._opened()
         return self._mark.start
 
     @property
-    @in_turn
+    @synchronized
     def stop(self) -> int:
         """The time (us) of the last event, or where tracking begins if there is none."""
         return max(self._opened().start, self._tail.last)
 
-    @in_turn
+    @synchronized
     def add(self, events: Events) -> None:
         """Add events that are not earlier than those before; raises `InputError` for bad ones."""
         if self._start is not None and isinstance(events, Events):
@@ -117,7 +117,7 @@ class LiveTracks:
             self._open(int(events.t[0]))
         self._settle()
 
-    @in_turn
+    @synchronized
     def add_target(
         self, x: float | int, y: float | int, size: float | int, time: int | float | None = None
     ) -> int:
@@ -131,7 +131,7 @@ class LiveTracks:
         self._give([(x, y, size) if time is None else (x, y, size, time)])
         return self._count - 1
 
-    @in_turn
+    @synchronized
     def __call__(self, times: Times) -> TrackStates:
         """States at `times` from `start` on, of the targets alive at one of them.
 

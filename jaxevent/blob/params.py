@@ -1,6 +1,6 @@
 """Parameters that all trackers of blobs have; a filter's own `Params` adds its numbers."""
 
-from jaxevent.parameters import Choice, Count, Parameters, Positive, Share
+from jaxevent.parameters import Choice, Count, Parameters, Positive, UnitInterval
 
 
 class TrackerParams(Parameters):
@@ -58,7 +58,7 @@ class TrackerParams(Parameters):
     clutter = Positive(
         0.0, "1/px^2", "soft: density of stray events inside a gate, per event of the target"
     )
-    outliers = Share(0.1, "", "likelihood of all events: share of events of no target")
+    outliers = UnitInterval(0.1, "", "likelihood of all events: share of events of no target")
     max_targets = Count(16, "", "most targets at a time that detection may hold")
 
     prefilter = Choice((False, True), "leave out events without recent neighbours")

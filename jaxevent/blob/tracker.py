@@ -17,7 +17,7 @@ from jaxevent.blob.live import LiveTracks
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Packing, ReadOut
 from jaxevent.blob.run import run
-from jaxevent.blob.search import Found, find
+from jaxevent.blob.search import TargetSearchResult, find
 from jaxevent.blob.smoother import Smoothed, at_end, look_back, nothing_later, tell_smoothed
 from jaxevent.blob.states import TrackStates, is_alive, tell
 from jaxevent.blob.steps import Filter
@@ -44,7 +44,7 @@ class Tracker(Estimator[P]):
     family: ClassVar[str] = "blob"
     option_kinds: ClassVar[Mapping[str, OptionKind]] = {
         **Estimator.option_kinds,
-        "found": of_class(Found),
+        "found": of_class(TargetSearchResult),
     }
     options: frozenset[str] = dataclasses.field(
         default=frozenset({"seeds", "start", "stop", "detect", "found", "smooth", "compiler"}),
@@ -61,7 +61,7 @@ class Tracker(Estimator[P]):
         start: int | float | None = None,
         stop: int | float | None = None,
         detect: bool | None = None,
-        found: Found | None = None,
+        found: TargetSearchResult | None = None,
         extrapolate: bool = False,
     ) -> tuple[Features, ReadOut]:
         """All events of a recording, or of a part of it, for `run`, and `times` for `read`.
@@ -157,7 +157,7 @@ class Tracker(Estimator[P]):
         start: int | float | None = None,
         stop: int | float | None = None,
         detect: bool | None = None,
-        found: Found | None = None,
+        found: TargetSearchResult | None = None,
         smooth: bool | None = None,
         compiler: str | None = None,
         progress: bool | None = None,

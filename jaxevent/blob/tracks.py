@@ -18,11 +18,11 @@ from jaxevent.blob.scan import ScanRun, numbers_in
 from jaxevent.blob.states import TrackStates
 from jaxevent.blob.steps import Filter
 from jaxevent.blob.tables import TABLE_RATE, TABLE_UNITS, evenly, table_columns
+from jaxevent.display import HtmlRepr
 from jaxevent.errors import InputError
+from jaxevent.locks import TurnLock
 from jaxevent.progress import bar
 from jaxevent.recording import Times, microseconds
-from jaxevent.sharing import Turns
-from jaxevent.shown import Shown
 
 if TYPE_CHECKING:
     import pandas
@@ -73,7 +73,7 @@ class _History:
             self.birth.setdefault(int(log.after[chunk, slot]), int(end[chunk]))
 
 
-class Tracks(Shown):
+class Tracks(HtmlRepr):
     """Tracks of a recording: `mean, covariance, valid = tracks(times)`.
 
     Times, arrays of shape (tracks,): `birth`, `death` (the first moment when it is no more; for a
@@ -104,7 +104,7 @@ class Tracks(Shown):
         self._runner: Any = ScanRun(filter, params) if fused is None else fused
         self.start, self.stop = packing.start, packing.stop
         self._packing, self._progress = packing, progress
-        self._turns = Turns(f"tracks of {packing.recording.name}")
+        self._turns = TurnLock(f"tracks of {packing.recording.name}")
         self._begins: list[tuple[Mark, int, Any]] = []
         self._following: dict[Mark, Any] = {}  # of the last stretches, up to `KEPT`
         self._number(self._follow())

@@ -73,7 +73,11 @@ def source_of(function: Callable) -> str:
             called = getattr(value, "py_func", None)
             if called is not None:
                 waiting.append(called)
-            elif isinstance(value, int | float | str) and not name.startswith("__"):
+            # A NamedTuple of numbers is read like a number.
+            elif not name.startswith("__") and (
+                isinstance(value, int | float | str)
+                or (isinstance(value, tuple) and hasattr(value, "_fields"))
+            ):
                 parts[path].append(f"{name} = {value!r}")
     about = repr(sorted(parts.values()))
     return hashlib.blake2b(about.encode(), digest_size=_HASH).hexdigest()

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.codegen import njit_noalloc
-from jaxevent.deprecated import RenamedAttribute, renamed_names
+from jaxevent.deprecated import renamed_methods, renamed_names
 from jaxevent.egomotion.geometry import undistort
 from jaxevent.recording import Recording
 
@@ -42,6 +42,7 @@ class ExpectedFlow(NamedTuple):
     margin: float  # px
 
 
+@renamed_methods(room="bounds", reach="radius")
 class Candidates(eqx.Module):
     """Batches of K events with up to C candidates each; an axis of batches leads where stacked.
 
@@ -59,9 +60,6 @@ class Candidates(eqx.Module):
     elapsed: Float[Numeric, "*batches"]  # s, from the last event of the batch before to this one's
     history: Float[Numeric, "*batches"]  # s, age up to which all candidates are known
     radius: int = eqx.field(static=True)  # px, largest distance of a candidate in x and y
-
-    room = RenamedAttribute("bounds")
-    reach = RenamedAttribute("radius")
 
     @property
     def mask(self) -> Bool[Numeric, "*batches K C"]:
@@ -100,6 +98,7 @@ def pixel_coordinates(
     return xi.reshape(height, width, 2), f
 
 
+@renamed_methods(gather="sample", whole="sample_all", done="is_exhausted")
 class CandidateSampler:
     """Sampler of the candidates of a recording, some batches after another.
 
@@ -146,10 +145,6 @@ class CandidateSampler:
         self._row, self._end = 0, len(recording.events)
         self._last = int(recording.events[:1].t[0]) if self._end else 0
         self._clock = np.array([self._last, self._last])  # start of the history, last event
-
-    gather = RenamedAttribute("sample")
-    whole = RenamedAttribute("sample_all")
-    done = RenamedAttribute("is_exhausted")
 
     @property
     def is_exhausted(self) -> bool:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
-from jaxevent.deprecated import RenamedAttribute, adopt_old_overrides
+from jaxevent.deprecated import renamed_methods
 from jaxevent.egomotion.models import MODELS, Model, find_model, in_words
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.patches import ImageSpeed, describe_windows, measure_image_speed
@@ -110,6 +110,13 @@ class TrainingRuns(eqx.Module):
         return jax.device_put(self, devices[0])
 
 
+@renamed_methods(
+    knows="supports",
+    place="find_model_and_camera",
+    start="initial_params",
+    suit="adapt_params",
+    follow="training_runs",
+)
 @dataclasses.dataclass(frozen=True, repr=False)
 class MotionEstimator(Estimator[P]):
     """A method that estimates the camera's motion.
@@ -131,16 +138,6 @@ class MotionEstimator(Estimator[P]):
         default=None, kw_only=True
     )
     options: frozenset[str] = dataclasses.field(default=COMMON_OPTIONS, kw_only=True)
-
-    knows = RenamedAttribute("supports")
-    place = RenamedAttribute("find_model_and_camera")
-    start = RenamedAttribute("initial_params")
-    suit = RenamedAttribute("adapt_params")
-    follow = RenamedAttribute("training_runs")
-
-    def __init_subclass__(cls, **kwargs: Any):
-        super().__init_subclass__(**kwargs)
-        adopt_old_overrides(cls)
 
     def supports(self, model: type[Model]) -> bool:
         """Return whether it can estimate the motion of a model."""

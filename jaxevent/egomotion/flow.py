@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from jaxevent.camera import PinholeCamera
-from jaxevent.deprecated import RenamedAttribute, renamed_names
+from jaxevent.deprecated import renamed_methods, renamed_names
 from jaxevent.egomotion.candidates import Candidates, CandidateSampler, pixel_coordinates
 from jaxevent.egomotion.geometry import length
 from jaxevent.egomotion.models import Model
@@ -65,6 +65,7 @@ class Params(Parameters):
     limit = Positive(1.0, "px", "an event none of whose candidates is so near is an outlier")
 
 
+@renamed_methods(outliers="outlier_percentage")
 class Flow(NamedTuple):
     """Flow of n events.
 
@@ -82,8 +83,6 @@ class Flow(NamedTuple):
     flow: NDArray[np.float32]
     valid: NDArray[np.bool_]
     residual: NDArray[np.float32]
-
-    outliers = RenamedAttribute("outlier_percentage", "outliers")
 
     def outlier_percentage(self, limit: float | int = 1.0) -> float:
         """Return the percentage of events with a residual above `limit` px.

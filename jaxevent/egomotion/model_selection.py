@@ -24,8 +24,8 @@ from scipy.ndimage import map_coordinates
 from scipy.optimize import minimize
 
 from jaxevent.camera import PinholeCamera
-from jaxevent.deprecated import RenamedAttribute, renamed_names
-from jaxevent.egomotion.bundle.translation import Guess, told
+from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
+from jaxevent.egomotion.bundle.hypotheses import MotionGuess, translation_z
 from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.geometry import A, rotation_basis
 from jaxevent.egomotion.models import MODELS, General, Model, Planar, Rotation
@@ -75,6 +75,8 @@ class ModelSelection:
     z: dict[tuple[str, str], float]
 
 
+@renamed_fields(both="both_directions")
+@renamed_methods(several="is_inconsistent")
 @dataclasses.dataclass(frozen=True)
 class FlowConsistency:
     """Differences between the motions of parts of the image, along the model's direction.
@@ -92,9 +94,6 @@ class FlowConsistency:
     slow: float
     fast: float
     both_directions: bool
-
-    both = RenamedAttribute("both_directions")
-    several = RenamedAttribute("is_inconsistent")
 
     @property
     def is_inconsistent(self) -> bool:
@@ -145,7 +144,7 @@ def select_model(recording: Recording, camera: PinholeCamera | None = None) -> M
         sharpness["general"].append(log_sharpness(window, 1, along[best, rows]))
         duration = window.duration
         guesses.append(
-            Guess(
+            MotionGuess(
                 window.middle, WINDOW_DISPLACEMENT_PX / duration, turn / duration, six[:3],
                 six[3:] / duration,
             )
@@ -156,7 +155,7 @@ def select_model(recording: Recording, camera: PinholeCamera | None = None) -> M
         for pair in (("rotation", "planar"), ("general", "planar"), ("general", "rotation"))
     }
     step = -(-len(guesses) // N_LONG_WINDOWS)
-    return select_by_z(z, lambda: told(recording, camera, guesses[::step]))
+    return select_by_z(z, lambda: translation_z(recording, camera, guesses[::step]))
 
 
 def select_by_z(

@@ -34,12 +34,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
-from jaxevent.deprecated import RenamedAttribute, adopt_old_overrides
+from jaxevent.deprecated import renamed_methods
 from jaxevent.devices import full_precision
 from jaxevent.egomotion.geometry import A, rotation_basis, rotation_exp, unit
 from jaxevent.errors import InputError
 from jaxevent.estimator import imported
-from jaxevent.parameters import nearest
+from jaxevent.parameters import suggest_name
 
 if TYPE_CHECKING:
     from jaxevent.egomotion.truth import Twists
@@ -68,6 +68,15 @@ class Part:
     direction: bool = False
 
 
+@renamed_methods(
+    known_from="truth_sources", unknown="prior_sigma", method="best_method",
+    otherwise="fallback_method", line="half_line_direction", arms="pixel_scale",
+    extent="search_bound", first="initial_particle", oldest="max_age", certain="is_converged",
+    moved="retract", on_manifold="project", apart="deviation", share="relative_size",
+    spreads="standard_deviations", between="interpolate", of_twist="from_twist",
+    of_scene="from_scene", at_one_depth="from_twists_at_fitted_depth",
+    at_depth="from_twists_at_depth",
+)  # fmt: skip
 class Model(eqx.Module):
     """A motion of d components that moves the image by the flow U = basis(xi) @ motion.
 
@@ -110,31 +119,6 @@ class Model(eqx.Module):
     best_method: ClassVar[str] = "voting"
     fallback_method: ClassVar[str | None] = "contrast"
     preset: ClassVar[str | None] = None
-
-    known_from = RenamedAttribute("truth_sources")
-    unknown = RenamedAttribute("prior_sigma")
-    method = RenamedAttribute("best_method")
-    otherwise = RenamedAttribute("fallback_method")
-    line = RenamedAttribute("half_line_direction")
-    arms = RenamedAttribute("pixel_scale")
-    extent = RenamedAttribute("search_bound")
-    first = RenamedAttribute("initial_particle")
-    oldest = RenamedAttribute("max_age")
-    certain = RenamedAttribute("is_converged")
-    moved = RenamedAttribute("retract")
-    on_manifold = RenamedAttribute("project")
-    apart = RenamedAttribute("deviation")
-    share = RenamedAttribute("relative_size")
-    spreads = RenamedAttribute("standard_deviations")
-    between = RenamedAttribute("interpolate")
-    of_twist = RenamedAttribute("from_twist")
-    of_scene = RenamedAttribute("from_scene")
-    at_one_depth = RenamedAttribute("from_twists_at_fitted_depth")
-    at_depth = RenamedAttribute("from_twists_at_depth")
-
-    def __init_subclass__(cls, **kwargs: Any):
-        super().__init_subclass__(**kwargs)
-        adopt_old_overrides(cls)
 
     @property
     def dimension(self) -> int:
@@ -604,7 +588,7 @@ def find_model(model: str | type[Model]) -> type[Model]:
     if ":" in model:
         return _load(model)
     if model not in MODELS:
-        raise InputError(f"there is no motion model {model!r}; {nearest(model, MODELS)}")
+        raise InputError(f"there is no motion model {model!r}; {suggest_name(model, MODELS)}")
     return MODELS[model]
 
 

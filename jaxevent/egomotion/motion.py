@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
-from jaxevent.deprecated import RenamedAttribute, renamed_names
+from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
+from jaxevent.display import HtmlRepr
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.estimator import Estimate
 from jaxevent.recording import Recording, Times, check_times, microseconds
-from jaxevent.shown import Shown
 
 if TYPE_CHECKING:
     import pandas
@@ -80,8 +80,7 @@ class CovarianceCalibration(NamedTuple):
 
     The calibrated covariance is factor C + share^2 |m|^2 + speed^2 m m' + change^2 (d d' + b b').
     Here d is the change of the motion within the time span of an estimate, and b the deviation of
-    its middle from a straight line. The coefficients are fitted to simulated scenes by
-    `experiments/egomotion_sigmas.py`.
+    its middle from a straight line. `experiments/studies/predicted_errors.md` has their choice.
 
     Attributes:
         factor: Factor of the covariance of the fit.
@@ -100,8 +99,17 @@ class CovarianceCalibration(NamedTuple):
         return self._replace(share=float(np.hypot(self.share, lens_error(camera))))
 
 
+@renamed_fields(held="n_extended")
+@renamed_methods(
+    of="from_arrays",
+    nothing="empty",
+    calibrated="with_calibrated_covariance",
+    with_layers="with_flow_consistency",
+    within="with_recording",
+    reaching="extended_to",
+)
 @dataclasses.dataclass(frozen=True)
-class MotionEstimate(Shown):
+class MotionEstimate(HtmlRepr):
     """An estimated motion, a function of time: `mean, covariance, valid = motion(times)`.
 
     The components are those of its `model`. Planar motion has the image velocity (px/s), and a
@@ -139,14 +147,6 @@ class MotionEstimate(Shown):
     recording: str = "the recording"
     span: tuple[int, int] | None = None
     n_extended: int = 0
-
-    held = RenamedAttribute("n_extended")
-    of = RenamedAttribute("from_arrays")
-    nothing = RenamedAttribute("empty")
-    calibrated = RenamedAttribute("with_calibrated_covariance")
-    with_layers = RenamedAttribute("with_flow_consistency")
-    within = RenamedAttribute("with_recording")
-    reaching = RenamedAttribute("extended_to")
 
     @classmethod
     def from_arrays(

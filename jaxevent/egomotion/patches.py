@@ -24,7 +24,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.codegen import njit_noalloc
-from jaxevent.deprecated import RenamedAttribute, renamed_names
+from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
 from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.recording import Recording
 
@@ -49,6 +49,7 @@ MAX_STATIC_EDGES = 0.3  # fraction of edges with events, below which the camera 
 _latest: tuple[Any, Any, "ImageSpeed | None"] = (lambda: None, None, None)
 
 
+@renamed_fields(usual="median", at="by_time")
 @dataclasses.dataclass(frozen=True)
 class ImageSpeed:
     """Speeds of patches of the image.
@@ -65,10 +66,8 @@ class ImageSpeed:
     fast: float
     by_time: tuple[tuple[int, float], ...]
 
-    usual = RenamedAttribute("median")
-    at = RenamedAttribute("by_time")
 
-
+@renamed_methods(length="duration", ways="displacements")
 class PatchSharpness(NamedTuple):
     """Sharpness of the patches of a window by displacement, for two halves of the pixels.
 
@@ -82,9 +81,6 @@ class PatchSharpness(NamedTuple):
     # (2, patches, n, n) sum of squares of the signed image per event; rows by the displacement in y
     energy: NDArray[np.float64]
     displacements: NDArray[np.float64]  # (n,) px in the window's duration, in x and in y
-
-    length = RenamedAttribute("duration", "length")
-    ways = RenamedAttribute("displacements", "ways")
 
 
 def spread_times(recording: Recording, number: int) -> list[int]:

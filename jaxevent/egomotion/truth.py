@@ -18,7 +18,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from jaxevent.deprecated import RenamedAttribute, renamed_names
+from jaxevent.deprecated import renamed_methods, renamed_names
 from jaxevent.egomotion.models import Model, find_model, in_words, unit_vectors
 from jaxevent.errors import InputError
 from jaxevent.recording import Imu, Poses, Recording, Times, microseconds
@@ -33,9 +33,7 @@ AXES = {
 MAX_GYRO_BIAS = 0.2  # rad/s
 
 
-def _check_known(
-    us: NDArray[np.int64], start: int | np.integer, stop: int | np.integer
-) -> None:
+def _check_known(us: NDArray[np.int64], start: int | np.integer, stop: int | np.integer) -> None:
     """Raise `InputError` for times (us) at which a motion is unknown."""
     if len(us) and (us.min() < start or us.max() > stop):
         raise InputError(
@@ -262,6 +260,7 @@ def find_imu_axes(estimate: NDArray[np.floating], measured: NDArray[np.floating]
     return found if least < named["camera"] / 2 else None
 
 
+@renamed_methods(within="covers")
 @dataclasses.dataclass(frozen=True)
 class KnownMotion:
     """A motion that is known at some times, a function of time: `values = truth(times)`.
@@ -275,8 +274,6 @@ class KnownMotion:
     model: type[Model]
     t: NDArray[np.int64]
     values: NDArray[np.float64]
-
-    within = RenamedAttribute("covers")
 
     def __call__(self, times: Times) -> NDArray[np.float64]:
         """Interpolate the motion (times, d) linearly, at integers (us) or floats (s).

@@ -20,9 +20,9 @@ from jaxevent.errors import InputError, OrderError
 from jaxevent.io import checked_events, disorder, reading
 from jaxevent.io.options import ReadOptions
 from jaxevent.io.reopening import EventsInFile, ImagesInFile
+from jaxevent.locks import TurnLock, synchronized
 from jaxevent.progress import bar
 from jaxevent.recording import Events, EventSource, Triggers
-from jaxevent.sharing import Turns, in_turn
 
 BLOCK = 1 << 20  # events decoded together: 13 MB
 
@@ -179,12 +179,12 @@ class DecodedEvents(EventsInFile):
         self._stream: Iterator[tuple[Any, Columns]] = iter(())
         self._next = -1
         self.checked_size, self._source, self._origin = size, source, origin
-        self._turns, self._process = Turns(source), os.getpid()
+        self._turns, self._process = TurnLock(source), os.getpid()
 
     def __len__(self) -> int:
         return int(self._rows[-1])
 
-    @in_turn
+    @synchronized
     def __getitem__(self, rows: slice) -> Events:
         """Decode the events of a range of rows; the file must not have changed since."""
         start, stop, step = rows.indices(len(self))
@@ -200,7 +200,7 @@ class DecodedEvents(EventsInFile):
             block += 1
         return _joined(pieces)
 
-    @in_turn
+    @synchronized
     def index(self, time: int) -> int:
         """The number of events earlier than `time` (us): at most one block is decoded."""
         block = int(np.searchsorted(self._first, time)) - 1
@@ -285,7 +285,7 @@ class _ImageReader:
     ):
         self.shape, self.dtype = shape, dtype
         self._images, self._source = images, source
-        self.turns, self._process = Turns(source), os.getpid()
+        self.turns, self._process = TurnLock(source), os.getpid()
         self._stream: Iterator[NDArray] = iter(())
         self._next = -1
 

@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.display import plural
 from jaxevent.errors import InputError, OrderError
-from jaxevent.shown import plural
 
 BOUND = 10_000  # us that an event may be late where sorting has no bound of its own
 _RUN = 1000  # events that may be outliers together

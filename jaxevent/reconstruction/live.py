@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.events.tail import Tail
+from jaxevent.locks import TurnLock, refuse_to_pickle, synchronized
 from jaxevent.reconstruction.video import PixelMethod, Video
 from jaxevent.recording import Events, Frames, Recording, Times, microseconds
-from jaxevent.sharing import Turns, in_turn, refuse_to_pickle
 
 WINDOW_EVENTS = 1 << 17  # filtered together, and at most so many anew for an image
 
@@ -70,7 +70,7 @@ class LiveVideo:
     ):
         self.estimator, self.params, self.window_events = estimator, params, window_events
         self._expects_frames = frames
-        self._turns = Turns("live images")
+        self._turns = TurnLock("live images")
         self._recording = Recording("live", *size, Tail(*size), extra=extra or {})
         self._video: Video | None = None
         self._grown = False
@@ -88,7 +88,7 @@ class LiveVideo:
         refuse_to_pickle("live images", "keep what they show, live(times)")
 
     @property
-    @in_turn
+    @synchronized
     def start(self) -> int:
         """The first time (us) of which images can still be had."""
         self._check()
@@ -96,20 +96,20 @@ class LiveVideo:
         return self._recording.start if settled is None else settled
 
     @property
-    @in_turn
+    @synchronized
     def stop(self) -> int:
         """The time (us) of the last event or frame."""
         self._check()
         return self._recording.stop
 
-    @in_turn
+    @synchronized
     def add(self, events: Events) -> None:
         """Add events that are not earlier than those before; raises `InputError` for bad ones."""
         self._events.add(events)
         self._grown = True
         self._settle()
 
-    @in_turn
+    @synchronized
     def add_frame(self, time: Times, image: NDArray, exposure: int | float = 0) -> None:
         """Add a frame (H, W): mid-exposure time and length of the exposure, us or s."""
         if not self._expects_frames:
@@ -138,7 +138,7 @@ class LiveVideo:
         self._grown = True
         self._settle()
 
-    @in_turn
+    @synchronized
     def __call__(self, times: Times) -> Estimate:
         """Images at `times`, from `start` to `stop`, as `Video` gives them."""
         us = np.atleast_1d(microseconds(times))

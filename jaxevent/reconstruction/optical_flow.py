@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import Response
 from jaxevent.errors import InputError, require
-from jaxevent.estimator import Described, Estimate
+from jaxevent.estimator import Estimate, ShortRepr
+from jaxevent.locks import synchronized
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.clock import Clock, Timing
 from jaxevent.reconstruction.estimator import ImageEstimator
-from jaxevent.reconstruction.frames import FrameImages
+from jaxevent.reconstruction.frames import Clock, FrameImages, Timing
 from jaxevent.reconstruction.video import BATCH, ImageSequence
 from jaxevent.recording import Recording, Times, microseconds
-from jaxevent.sharing import in_turn
 
 SMALLEST = 12  # pixels that OpenCV's search needs in width or height
 OUTLIERS = 1e-3  # of the greys of two frames, at either end, that do not set the range
@@ -32,7 +31,7 @@ class Params(FrameParams):
     """Parameters of `flow`; of them only `clock_offset` acts."""
 
 
-class FrameSeries(Described):
+class FrameSeries(ShortRepr):
     """Frames in time: what `run` is given."""
 
     mid: NDArray[np.floating]  # (frames,), mid-exposures, us from the recording's start
@@ -160,7 +159,7 @@ class FlowVideo(ImageSequence[Params]):
             images = np.stack([self._image(int(frame), float(share)) for frame, share in places])
             yield times[batch], _estimate(images)
 
-    @in_turn
+    @synchronized
     def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.floating]:
         """The flow (T, H, W, 2) in px/s, x before y, at times as images are asked for; any order.
 
@@ -200,7 +199,7 @@ def _estimate(images: NDArray[np.floating]) -> Estimate:
     return Estimate(images, np.full_like(images, np.nan), np.isfinite(images))
 
 
-class Flows(Described):
+class Flows(ShortRepr):
     """The trajectory: frames, and the flows (H, W, 2) from each to the next and back, pixels."""
 
     frames: FrameSeries

@@ -13,20 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent import dispatch
-from jaxevent.devices import accelerated
+from jaxevent.devices import has_accelerator
+from jaxevent.display import HtmlRepr
 from jaxevent.errors import InputError, InputWarning, require
 from jaxevent.estimator import Estimate
+from jaxevent.locks import TurnLock, refuse_to_pickle
 from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.consistency import events_contradict_frames
 from jaxevent.reconstruction.features import Features, ReadOut, over_pixels, pixel_mesh
-from jaxevent.reconstruction.reading import ImageReader
+from jaxevent.reconstruction.frames import Timing
 from jaxevent.reconstruction.stream import StreamState
-from jaxevent.reconstruction.windows import WINDOW_EVENTS, EventWindow, WindowedRecording
+from jaxevent.reconstruction.windows import (
+    WINDOW_EVENTS,
+    EventWindow,
+    ImageReader,
+    WindowedRecording,
+)
 from jaxevent.recording import Recording, Times, microseconds
-from jaxevent.sharing import Turns, refuse_to_pickle
-from jaxevent.shown import Shown
 
 P = TypeVar("P", bound=FrameParams)
 S = TypeVar("S", bound="ImageSequence")
@@ -58,12 +62,12 @@ class PixelMethod(ImageMethod, Protocol):
     """What a video needs of its estimator; see `estimator.PixelEstimator`."""
 
     @property
-    def filters(self) -> bool: ...
+    def is_event_driven(self) -> bool: ...
 
     @property
-    def looks_ahead(self) -> bool: ...
+    def needs_future(self) -> bool: ...
 
-    def start(self, params: Any, features: Features) -> Any: ...
+    def init_state(self, params: Any, features: Features) -> Any: ...
 
     def run(
         self, params: Any, features: Features, state: Any = None, future: Any = None
@@ -75,7 +79,7 @@ class PixelMethod(ImageMethod, Protocol):
 # jax.jit returns before the result is there; eqx.filter_jit waits for it.
 @functools.partial(jax.jit, static_argnums=0)
 def _start(estimator: PixelMethod, params, features: Features):
-    return estimator.start(params, features)
+    return estimator.init_state(params, features)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -112,7 +116,7 @@ class FilteredWindow(NamedTuple):
         return (start is None or start <= time) and (stop is None or time < stop)
 
 
-class ImageSequence(Shown, abc.ABC, Generic[P]):
+class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
     """Images of a reconstruction: `image, variance, valid = sequence(times)`.
 
     A subclass reads images in `_read`. Images do not depend on which others were asked for. Threads
@@ -142,7 +146,7 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
         self.estimator, self.recording, self.params = estimator, recording, params
         self.progress = progress
         self._compared = not estimator.fuses
-        self._turns = Turns(f"images of {recording.name}")
+        self._turns = TurnLock(f"images of {recording.name}")
 
     def __reduce__(self) -> tuple[Any, ...]:
         given, options = self._made_of
@@ -236,7 +240,7 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
                 warnings.warn(contradiction, InputWarning, stacklevel=2)
         start, stop = self.recording.start, self.recording.stop
         with bar(total=len(times), desc="images", unit="image", progress=self.progress) as shown:
-            for batch, images in self._turns.each(self._read(times)):
+            for batch, images in self._turns.iterate(self._read(times)):
                 shape = (len(batch), self.recording.height, self.recording.width)
                 image, variance, valid = (
                     np.asarray(v)[: len(batch)].reshape(shape) for v in images
@@ -246,18 +250,6 @@ class ImageSequence(Shown, abc.ABC, Generic[P]):
                     valid = valid & inside[:, None, None]
                 yield batch, Estimate(image, variance, valid)
                 shown.update(len(batch))
-
-
-def _windows_of(
-    recording: Recording, timing: Timing, devices: int, **options: Any
-) -> WindowedRecording:
-    """A recording in windows: prepared on a GPU where images are made on one, else on the host."""
-    if accelerated() and devices < 2:
-        from jaxevent.reconstruction.on_device import DeviceWindows  # others need not load it
-
-        if DeviceWindows.serves(timing):
-            return DeviceWindows(recording, timing, **options)
-    return WindowedRecording(recording, timing, **options)
 
 
 class Video(ImageSequence[P]):
@@ -287,12 +279,11 @@ class Video(ImageSequence[P]):
         super().__init__(estimator, recording, params, progress=progress)
         self._devices, self._factors = devices, factors
         self._mesh = pixel_mesh(devices)
-        self._batch = DEVICE_BATCH if accelerated() else BATCH
-        self._windows = _windows_of(
+        self._batch = DEVICE_BATCH if has_accelerator() else BATCH
+        self._windows = WindowedRecording(
             recording,
             Timing.of(params),
-            len(devices),
-            filtering=estimator.filters,
+            filtering=estimator.is_event_driven,
             events=window_events,
             reuse=True,
         )
@@ -350,7 +341,7 @@ class Video(ImageSequence[P]):
 
     def _window_of(self, time: int) -> FilteredWindow:
         """The filtered window that contains `time`; windows on the way are filtered in order."""
-        if self.estimator.looks_ahead and self._future is None:
+        if self.estimator.needs_future and self._future is None:
             self._look_ahead()
         if self._open is not None and self._open.contains(time):
             return self._open
@@ -405,7 +396,7 @@ class Video(ImageSequence[P]):
                     break
         message, future = links[-1][1], {starts[-1]: None}
         for place in range(len(starts) - 1, 0, -1):
-            message = links[place][0].before(message)
+            message = links[place][0].apply(message)
             future[starts[place - 1]] = message
         self._future = future
         self._open = filtered  # the last window has nothing later to know of

@@ -1,4 +1,4 @@
-"""What trackers are fitted to: the likelihood of events, or positions that are known.
+"""Fits of trackers: to the likelihood of events, or to known positions.
 
 Settings of trackers in a configuration of `jaxevent.runs.fit`:
 
@@ -45,13 +45,18 @@ from jaxevent.blob.losses import Positions
 from jaxevent.blob.prepare import Features, packing_key
 from jaxevent.errors import InputError
 from jaxevent.io.output import finite, values_of
-from jaxevent.parameters import Parameters, nearest
+from jaxevent.parameters import Parameters, suggest_name
 from jaxevent.recording import Recording
 from jaxevent.runs import blob_positions
-from jaxevent.runs.blob_positions import Known, Targets, seed_at, span_of_events
+from jaxevent.runs.blob_positions import (
+    KnownPositions,
+    Targets,
+    event_time_span,
+    seed_from_positions,
+)
 from jaxevent.runs.blob_scores import TrackProtocol
 from jaxevent.runs.config import NAME
-from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources, share_out
+from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources, batches_by_split
 from jaxevent.show.report import aligned, legend
 from jaxevent.splits import SPLITS, windows
 from jaxevent.tuning import Batches
@@ -68,7 +73,7 @@ class Batch(eqx.Module):
 
 
 @dataclasses.dataclass(frozen=True)
-class Loss:
+class TrackLoss:
     """A mean over events (-ln p) or positions (px^2): `loss(params, batch)`."""
 
     tracker: Tracker
@@ -77,7 +82,7 @@ class Loss:
 
     @property
     def likelihood(self) -> bool:
-        """Whether it is the mean of -ln p over events."""
+        """True if it is the mean of -ln p over events."""
         return self.name == "likelihood"
 
     def __call__(self, params: TrackerParams, batch: Batch) -> Float[Array, ""]:
@@ -86,14 +91,14 @@ class Loss:
         return negative_log_likelihood(self.tracker, params, batch.features, self.events)
 
 
-class Part(NamedTuple):
-    """A window of a recording, of times in us, and how tracking begins in it."""
+class TrackWindow(NamedTuple):
+    """A window of a recording, in us, and the start of tracking in it."""
 
     recording: Recording
     start: int
     stop: int
     seeds: list[tuple[float, float, float, int]] | None  # x, y, size; 0: lambda0, and time (us)
-    known: Known | None  # of the targets of these seeds
+    known: KnownPositions | None  # of the targets of these seeds
     split: int  # the place in SPLITS
 
 
@@ -103,13 +108,14 @@ class TrackGoal(Goal):
 
     tracker: Tracker
     start: TrackerParams
-    loss: Loss
+    loss: TrackLoss
     targets: Targets
     # Loss and gradient by 2 numbers of 4,000 events in steps of 16: forwards 37 ms, in reverse 310.
     forward = True
 
     @property
     def measure(self) -> str:
+        """Key of the error in a row: "rmse" of positions, or "nll"."""
         return "rmse" if self.loss.name == "positions" else "nll"
 
     def files(self, recording: Path) -> list[Path]:
@@ -118,12 +124,14 @@ class TrackGoal(Goal):
     def problem(
         self, sources: Sources, split: Shares, window: float | int | None
     ) -> Callable[[TrackerParams], Batches]:
-        found = [part for part in self._parts(sources, split, window) if part.split < 2]
+        found = [part for part in self._windows(sources, split, window) if part.split < 2]
         if self.loss.name == "positions":
             found = [p for p in found if p.known is not None and np.isfinite(p.known.xi).any()]
 
         def make(params: TrackerParams) -> Batches:
-            return share_out(found, jax.device_put(self._packed(found, params, self.loss.name)))
+            return batches_by_split(
+                found, jax.device_put(self._packed(found, params, self.loss.name))
+            )
 
         return LastBatches(packing_key, make)
 
@@ -135,7 +143,7 @@ class TrackGoal(Goal):
         params: TrackerParams,
         progress: bool | None,
     ) -> Iterator[dict[str, Any]]:
-        found = self._parts(sources, split, window)
+        found = self._windows(sources, split, window)
         packed = self._packed(found, params, "likelihood")
         for place, (given, recording) in (
             (place, source) for place, name in enumerate(SPLITS) for source in sources[name]
@@ -179,26 +187,28 @@ class TrackGoal(Goal):
             columns[3:3] = [("covered", "covered", 1, 3)]
         return aligned(rows, columns) + legend(columns)
 
-    def _parts(self, sources: Sources, split: Shares, window: float | int | None) -> list[Part]:
-        """The windows of all recordings, those without events left out."""
+    def _windows(
+        self, sources: Sources, split: Shares, window: float | int | None
+    ) -> list[TrackWindow]:
+        """Cut all recordings into windows, and leave out those without events."""
         found = []
         for place, (_, recording) in (
             (place, source) for place, name in enumerate(SPLITS) for source in sources[name]
         ):
             known = self.targets.known(recording)
-            first, stop = span_of_events(recording)
+            first, stop = event_time_span(recording)
             spans = windows(first, stop, window, split, place)
             cuts = self._seeds(recording, known, np.array([begin for begin, _, _ in spans]))
             for (begin, end, s), seeds in zip(spans, cuts, strict=True):
                 index = recording.events.index
                 if index(begin) < index(end):
-                    found.append(_part(recording, begin, end, seeds, known, s))
+                    found.append(_cut_window(recording, begin, end, seeds, known, s))
         return found
 
     def _seeds(
-        self, recording: Recording, known: Known | None, begins: NDArray
+        self, recording: Recording, known: KnownPositions | None, begins: NDArray
     ) -> Sequence[list[tuple[float, float, float, int]] | None]:
-        """Of every window: for each target x, y, size (0: lambda0) and time; NaN: not there."""
+        """Return for every window x, y, size (0: lambda0) and time of each target; NaN: absent."""
         if self.targets.seeds is None and known is None:
             return [None] * len(begins)
         given = [
@@ -208,7 +218,7 @@ class TrackGoal(Goal):
         if known is not None:
             sizes = [s[2] for s in given] or [0.0] * known.xi.shape[1]
             cuts = [
-                [seed_at(known, k, int(begin), size) for k, size in enumerate(sizes)]
+                [seed_from_positions(known, k, int(begin), size) for k, size in enumerate(sizes)]
                 for begin in begins
             ]
         elif all(s[3] >= begins[-1] for s in given):  # none begins before a window
@@ -229,8 +239,10 @@ class TrackGoal(Goal):
             for begin, cut in zip(begins, cuts, strict=True)
         ]
 
-    def _packed(self, found: Sequence[Part], params: TrackerParams, loss: str) -> list[Batch]:
-        """Batches of one shape, so that one program serves all."""
+    def _packed(
+        self, found: Sequence[TrackWindow], params: TrackerParams, loss: str
+    ) -> list[Batch]:
+        """Pack the windows into batches of one shape, so that one program serves all."""
         batches, used = [], [1, 1, 0, 0]
         no_times = np.empty(0, np.int64)
         for part in found:
@@ -265,12 +277,17 @@ class TrackGoal(Goal):
         return [Batch(_filled(b, f, used), weight) for b, f, weight in batches]
 
 
-def _part(
-    recording: Recording, start: int, stop: int, seeds: Any, known: Known | None, split: int
-) -> Part:
-    """A window with the seeds that begin in it on the sensor, and their positions since then."""
+def _cut_window(
+    recording: Recording,
+    start: int,
+    stop: int,
+    seeds: Any,
+    known: KnownPositions | None,
+    split: int,
+) -> TrackWindow:
+    """Make a window with the seeds that begin in it on the sensor, and their positions."""
     if seeds is None:
-        return Part(recording, start, stop, None, None, split)
+        return TrackWindow(recording, start, stop, None, None, split)
     right, low = recording.width - 0.5, recording.height - 0.5
     here = [
         k
@@ -283,12 +300,12 @@ def _part(
         t, xi = known.t[rows], known.xi[rows][:, here].copy()
         for k, seed in enumerate(chosen):
             xi[t < seed[3], k] = np.nan
-        known = Known(t, xi)
-    return Part(recording, start, stop, chosen, known, split)
+        known = KnownPositions(t, xi)
+    return TrackWindow(recording, start, stop, chosen, known, split)
 
 
 def _filled(batch: Features | Positions, f: Features, used: Sequence[int]) -> Any:
-    """The batch with `f` in it, with chunks, steps, seeds and times that do not count."""
+    """Pad a batch with chunks, steps, seeds and times that do not count."""
     chunks, steps, seeds, times = used
 
     def fill(array: Any, *sizes: int, value: Any = 0) -> NDArray:
@@ -331,13 +348,13 @@ class Blobs(Family):
         assert isinstance(params, TrackerParams)
         loss = settings.get("loss", "likelihood")
         if loss not in LOSSES:
-            raise InputError(f"there is no loss {loss!r}; {nearest(loss, LOSSES)}")
+            raise InputError(f"there is no loss {loss!r}; {suggest_name(loss, LOSSES)}")
         if loss == "positions" and settings.get("positions") is None:
             raise InputError(
                 "the loss 'positions' needs tables of them; give their name beside the "
                 'recordings, as positions = "*.csv"'
             )
-        one = Loss(method, loss, settings.get("events", "all"))
+        one = TrackLoss(method, loss, settings.get("events", "all"))
         return TrackGoal(method, params, one, Targets.of(settings))
 
 

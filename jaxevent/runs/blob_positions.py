@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from jaxevent.blob import Tracker, TrackerParams
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording
-from jaxevent.runs.config import Check, Tables, is_table, table_files, table_of
+from jaxevent.runs.config import Check, TruthTables, is_table, truth_files, truth_table
 
 
 def _is_seed(value: Any) -> bool:
@@ -46,8 +46,8 @@ MORE = ("vx", "vy", "lambda1", "lambda2", "theta", "inverse_ttc", "range")  # co
 
 
 @dataclasses.dataclass(frozen=True)
-class Known:
-    """Given positions: times (T,) us, xi (T, targets, 2) in px, NaN where not known.
+class KnownPositions:
+    """Given positions: times (T,) us, xi (T, targets, 2) in px, NaN where unknown.
 
     `more` are further columns, of `MORE`, (T, targets) each, and `id` the targets' numbers.
     """
@@ -58,8 +58,8 @@ class Known:
     id: NDArray[Any] = dataclasses.field(default_factory=lambda: np.zeros(1, np.int64))
 
 
-def read_positions(path: str | Path) -> Known:
-    """Positions from a table; see the text of this module.
+def read_positions(path: str | Path) -> KnownPositions:
+    """Read positions from a table in a file; see the text of this module.
 
     Raises `InputError` for a file that cannot be read and for missing columns or numbers.
     """
@@ -73,14 +73,19 @@ def read_positions(path: str | Path) -> Known:
     return positions_of(table, str(path), "line", 2)
 
 
-def positions_of(table: pd.DataFrame, path: str, row_name: str = "row", first: int = 0) -> Known:
-    """Positions from a table of the columns that the text of this module describes.
+def positions_of(
+    table: pd.DataFrame, path: str, row_name: str = "row", first: int = 0
+) -> KnownPositions:
+    """Read positions from a table with the columns that the text of this module describes.
 
     Args:
         table: t (s), x, y (px), and further columns.
-        path: How messages call it.
-        row_name: How messages call a row.
-        first: The number of the first row in messages.
+        path: Name of the table in messages.
+        row_name: Word for a row in messages.
+        first: Number of the first row in messages.
+
+    Returns:
+        The positions.
 
     Raises:
         InputError: Columns or numbers are missing.
@@ -111,34 +116,34 @@ def positions_of(table: pd.DataFrame, path: str, row_name: str = "row", first: i
     values = {name: np.full((len(t), len(targets)), np.nan) for name in more}
     for name, value in values.items():
         value[row, column] = table[name].to_numpy(np.float64)
-    return Known(t, xi, values, targets)
+    return KnownPositions(t, xi, values, targets)
 
 
 @dataclasses.dataclass(frozen=True)
 class Targets:
-    """What a configuration says of the targets: seeds, and the name of tables of positions."""
+    """Targets of a configuration: seeds, and the name of tables of positions."""
 
     seeds: tuple[tuple[float, ...], ...] | None
-    positions: str | Tables | None
+    positions: str | TruthTables | None
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> "Targets":
-        """From settings of a configuration, those named in `SETTINGS`."""
+        """Make them from settings of a configuration, those named in `SETTINGS`."""
         seeds = given.get("seeds")
         seeds = None if seeds is None else tuple(tuple(map(float, seed)) for seed in seeds)
         return cls(seeds, given.get("positions"))
 
     def files(self, recording: Path) -> list[Path]:
-        """The tables beside a recording."""
+        """Return the tables beside a recording."""
         if self.positions is None:
             return []
-        return table_files(self.positions, str(recording))
+        return truth_files(self.positions, str(recording))
 
-    def known(self, recording: Recording) -> Known | None:
-        """The positions of a recording, those in the time of its events."""
+    def known(self, recording: Recording) -> KnownPositions | None:
+        """Return the positions of a recording within the time of its events."""
         if self.positions is None:
             return None
-        table = table_of(self.positions, recording.name)
+        table = truth_table(self.positions, recording.name)
         if isinstance(table, Path):
             path, known = str(table), read_positions(table)
         else:
@@ -150,7 +155,7 @@ class Targets:
                 f"{path}: holds {targets} targets, but there are {len(self.seeds)} seeds; "
                 "give one for each, by rising id, or leave out the seeds"
             )
-        first, stop = span_of_events(recording)
+        first, stop = event_time_span(recording)
         inside = (first <= known.t) & (known.t < stop)
         if not inside.any():
             raise InputError(
@@ -158,17 +163,17 @@ class Targets:
                 f"events' time in {recording.name}; times are seconds on its clock"
             )
         more = {name: value[inside] for name, value in known.more.items()}
-        return Known(known.t[inside], known.xi[inside], more, known.id)
+        return KnownPositions(known.t[inside], known.xi[inside], more, known.id)
 
-    def first_seeds(self, known: Known | None, params: TrackerParams) -> list[Any] | None:
-        """Where tracking of a whole recording begins; None: tracks are born."""
+    def first_seeds(self, known: KnownPositions | None, params: TrackerParams) -> list[Any] | None:
+        """Return the seeds of a whole recording; None if tracks are born."""
         if self.seeds is not None:
             return [tuple(seed) for seed in self.seeds]
         if known is None:
             return None
         size = float(params.lambda0)
         first = int(known.t[0])
-        return [seed_at(known, k, first, size) for k in range(known.xi.shape[1])]
+        return [seed_from_positions(known, k, first, size) for k in range(known.xi.shape[1])]
 
     def errors(
         self,
@@ -177,7 +182,10 @@ class Targets:
         params: TrackerParams,
         progress: bool | None,
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Time (us) and distance (px) of all known positions; NaN where the track is not alive."""
+        """Compute time (us) and distance (px) of all known positions.
+
+        NaN where the track is not alive.
+        """
         known = self.known(recording)
         if known is None:
             return None
@@ -189,16 +197,18 @@ class Targets:
         return np.broadcast_to(known.t[:, None], given.shape)[given], distance[given]
 
 
-def span_of_events(recording: Recording) -> tuple[int, int]:
-    """The first event's time and that after the last, us."""
+def event_time_span(recording: Recording) -> tuple[int, int]:
+    """Return the time of the first event and the time after the last, us."""
     events, count = recording.events, len(recording.events)
     if not count:
         raise InputError(f"{recording.name}: holds no events; choose another recording")
     return int(events[:1].t[0]), int(events[count - 1 : count].t[0]) + 1
 
 
-def seed_at(known: Known, target: int, begin: int, size: float) -> tuple[float, float, float, int]:
-    """The seed of a target from a time on: there, or where it is seen first; NaN after the last."""
+def seed_from_positions(
+    known: KnownPositions, target: int, begin: int, size: float
+) -> tuple[float, float, float, int]:
+    """Make the seed of a target from a time on, or from its first position; NaN after the last."""
     seen = np.isfinite(known.xi[:, target]).all(1)
     t, xi = known.t[seen], known.xi[seen, target]
     if t[-1] < begin:

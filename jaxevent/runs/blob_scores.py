@@ -47,10 +47,10 @@ from jaxevent.blob.states import THETA_RATIO
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording
-from jaxevent.runs.blob_positions import SETTINGS, Known, Targets
+from jaxevent.runs.blob_positions import SETTINGS, KnownPositions, Targets
 from jaxevent.runs.config import METRICS, Check
 from jaxevent.runs.family import Protocol
-from jaxevent.runs.own import Function, find_metrics, own_names
+from jaxevent.runs.own import MethodFunction, find_metrics, own_names
 
 # Measures that rows have in any case.
 MEASURES = (
@@ -108,7 +108,7 @@ class TrackProtocol(Protocol):
     def score(
         self,
         recording: Recording,
-        method: Tracker | Function,
+        method: Tracker | MethodFunction,
         params: TrackerParams | None,
         options: Mapping[str, Any],
         progress: bool | None = None,
@@ -120,18 +120,21 @@ class TrackProtocol(Protocol):
         clock = time.perf_counter()
         metrics = find_metrics(options.get("metrics", ()), MEASURES)
         noise = None
-        if isinstance(method, Function):
+        if isinstance(method, MethodFunction):
             mean, covariance = _of_function(recording, method, known.t)
         else:
             params = params or method.Params()
-            tracks = _tracked(recording, method, params, begin, targets, known, options, progress)
+            tracks = _track(
+                recording, method, params, begin=begin, targets=targets, known=known,
+                options=options, progress=progress,
+            )  # fmt: skip
             mean, covariance = _states(tracks, known.t)
             noise = float(tracks.params.Q_lambda)
         seconds = time.perf_counter() - clock
         told = score_tracks(known.xi, mean[..., :2], options.get("reach", REACH))
         own = told.match
         if begin == "positions" and not isinstance(
-            method, Function
+            method, MethodFunction
         ):  # whose a track is needs no matching
             own = np.where(np.isfinite(mean[..., 0]), np.arange(mean.shape[1]), -1)
         given = np.isfinite(known.xi).all(2)
@@ -165,13 +168,14 @@ class TrackProtocol(Protocol):
         }
 
 
-def _tracked(
+def _track(
     recording: Recording,
     method: Tracker,
     params: TrackerParams,
+    *,
     begin: str,
     targets: Targets,
-    known: Known,
+    known: KnownPositions,
     options: Mapping[str, Any],
     progress: bool | None,
 ) -> Tracks:
@@ -189,7 +193,10 @@ def _tracked(
 
 
 def _states(tracks: Tracks, t: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
-    """Means (times, tracks, 8) and covariances (times, tracks, 8, 8); NaN where not valid."""
+    """Return means (times, tracks, 8) and covariances (times, tracks, 8, 8).
+
+    NaN where not valid.
+    """
     parts = [states for _, states in tracks.batches(t)]
     mean, covariance, valid = (
         np.concatenate([np.asarray(getattr(part, name)) for part in parts])
@@ -203,7 +210,7 @@ def _states(tracks: Tracks, t: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
 
 
 def _taken(values: NDArray, match: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Of (times, tracks, ...) those of each target's track (times, targets, ...); NaN: none."""
+    """Select from (times, tracks, ...) the row of each target's track, (times, targets, ...)."""
     none = np.full((len(values), 1, *values.shape[2:]), np.nan)
     values = np.concatenate([values, none], 1)
     index = match.reshape(*match.shape, *[1] * (values.ndim - 2))
@@ -216,9 +223,9 @@ def _rms(error: NDArray) -> float | None:
 
 
 def _of_function(
-    recording: Recording, method: Function, times: NDArray[np.int64]
+    recording: Recording, method: MethodFunction, times: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """States that a function estimates and their covariances, as `_states`; NaN where unknown."""
+    """Return states that a function estimates, and their covariances; NaN where unknown."""
     mean, covariance, _ = method.estimate(recording, times, [(-1, 2), (-1, 8)])
     states = np.full((*mean.shape[:2], 8), np.nan)
     states[..., : mean.shape[2]] = mean
@@ -229,7 +236,7 @@ def _of_function(
 
 
 def _errors(
-    known: Known,
+    known: KnownPositions,
     mean: NDArray[np.float64],
     covariance: NDArray[np.float64],
     options: Mapping[str, Any],
@@ -267,7 +274,7 @@ def _errors(
 
 
 def _closing(
-    known: Known,
+    known: KnownPositions,
     mean: NDArray[np.float64],
     covariance: NDArray[np.float64],
     options: Mapping[str, Any],

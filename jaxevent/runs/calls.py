@@ -1,7 +1,7 @@
-"""Calls from Python as tables of a configuration, so that one code path serves both.
+"""Calls from Python, converted to tables of a configuration, so that one code path serves both.
 
-What TOML has no word for stays an object in the table: recordings, methods, parameters, metrics,
-tables of what is true.
+Objects that TOML has no type for stay in the table: recordings, methods, parameters, metrics, and
+tables of ground truth.
 """
 
 import os
@@ -12,14 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxevent import methods
+from jaxevent.display import describe_type
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
 from jaxevent.io.output import values_of
 from jaxevent.parameters import Parameters, read_toml
 from jaxevent.recording import Recording
-from jaxevent.runs.config import Named, Tables
+from jaxevent.runs.config import NamedRecording, TruthTables
 from jaxevent.runs.own import Metric, find_method, import_path, named_metric
-from jaxevent.shown import a_kind
 
 PathLike = str | os.PathLike
 OF_TRUTH = ("positions", "truth")  # settings that take tables
@@ -27,18 +27,18 @@ CALLED = "# As called from Python; of objects only the names are told.\n"
 
 
 class Forms(NamedTuple):
-    """The two forms of a call: of a configuration, and of objects."""
+    """The two forms of a call: with a configuration, and with objects."""
 
     example: str  # of objects
     of_file: Collection[str]  # names of arguments that a configuration may have beside it
     of_objects: Collection[str]  # of those that tell objects from a configuration
 
     def is_config(self, arguments: Sequence[Any], settings: Mapping[str, Any]) -> bool:
-        """Tell whether a call names a configuration rather than recordings.
+        """Return true if a call names a configuration rather than recordings.
 
         Args:
-            arguments: By position.
-            settings: By name.
+            arguments: Positional arguments.
+            settings: Keyword arguments.
 
         Raises:
             InputError: There are arguments beside the path of a TOML file that go with recordings
@@ -70,23 +70,26 @@ def is_path(value: Any) -> bool:
 
 
 def names_method(value: Any) -> bool:
-    """Tell whether an argument can only mean a method, or several."""
+    """Return true if an argument can only be a method, or several."""
     if is_path(value):
         return isinstance(value, str) and (value in methods.names() or ":" in value)
     return value is not None
 
 
 def recordings_of(given: Any) -> list[Any]:
-    """Recordings as a configuration lists them.
+    """Convert recordings to the list of a configuration.
 
     Args:
         given: A recording or a path, a list of them, or a mapping from names.
     """
     if isinstance(given, Mapping):
-        return [Named(_text(name, "a recording"), _recording(one)) for name, one in given.items()]
+        return [
+            NamedRecording(_text(name, "a recording"), _recording(one))
+            for name, one in given.items()
+        ]
     if is_path(given) or isinstance(given, Recording):
         given = [given]
-    return [_recording(one) for one in _listed(given, "recordings", "recordings or paths")]
+    return [_recording(one) for one in _as_list(given, "recordings", "recordings or paths")]
 
 
 def _recording(given: Any) -> str | Recording:
@@ -94,11 +97,13 @@ def _recording(given: Any) -> str | Recording:
         return given
     if is_path(given):
         return os.fspath(given)
-    raise InputError(f"recordings hold {a_kind(given)}; give jaxevent.Recording objects or paths")
+    raise InputError(
+        f"recordings hold {describe_type(given)}; give jaxevent.Recording objects or paths"
+    )
 
 
 def methods_of(given: Any) -> list[dict[str, Any]]:
-    """Methods as the tables [[method]] of a configuration.
+    """Convert methods to the tables [[method]] of a configuration.
 
     Args:
         given: A method, a list of methods, or a mapping from labels. A method is a name, an
@@ -107,8 +112,8 @@ def methods_of(given: Any) -> list[dict[str, Any]]:
     if isinstance(given, Mapping) and "name" not in given:
         return [{**_method(one), "label": _text(label, "a method")} for label, one in given.items()]
     one = isinstance(given, str | Estimator | Mapping) or callable(given) or _is_pair(given)
-    tables = [_method(each) for each in ([given] if one else _listed(given, "methods", "methods"))]
-    return _labelled(tables)
+    tables = [_method(each) for each in ([given] if one else _as_list(given, "methods", "methods"))]
+    return _with_labels(tables)
 
 
 def _is_pair(given: Any) -> bool:
@@ -123,7 +128,7 @@ def _is_pair(given: Any) -> bool:
 
 def _method(given: Any) -> dict[str, Any]:
     if isinstance(given, Mapping):
-        return {name: plain(value) for name, value in given.items()}
+        return {name: to_toml_value(value) for name, value in given.items()}
     if isinstance(given, tuple):
         if not _is_pair(given):
             raise InputError(
@@ -131,12 +136,12 @@ def _method(given: Any) -> dict[str, Any]:
                 "mapping"
             )
         method, params = given
-        return {"name": method, "params": plain(params)}
+        return {"name": method, "params": to_toml_value(params)}
     return {"name": given}
 
 
-def _labelled(tables: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The tables, those of one method told apart by what differs from its defaults."""
+def _with_labels(tables: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Label the tables of one method by the values that differ from its defaults."""
     names = [method_name(table.get("name")) for table in tables]
     for table, name in zip(tables, names, strict=True):
         params = table.get("params")
@@ -146,12 +151,12 @@ def _labelled(tables: list[dict[str, Any]]) -> list[dict[str, Any]]:
             if isinstance(params, Mapping):
                 values = params
             changed = {k: v for k, v in values.items() if k not in usual or v != usual[k]}
-            table["label"] = ", ".join([name, *(point(k, v) for k, v in changed.items())])
+            table["label"] = ", ".join([name, *(format_setting(k, v) for k, v in changed.items())])
     return tables
 
 
-def point(name: str, value: Any) -> str:
-    """A setting in a label."""
+def format_setting(name: str, value: Any) -> str:
+    """Format a setting for a label."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return f"{name} {value:g}" if number else f"{name} {value}"
 
@@ -162,7 +167,7 @@ def method_name(given: Any) -> str:
 
 
 def metrics_of(given: Any) -> list[str | Metric]:
-    """Metrics as a configuration lists them.
+    """Convert metrics to the list of a configuration.
 
     Args:
         given: A metric, a list of metrics, or a mapping from names. A metric is a name, a function,
@@ -172,7 +177,7 @@ def metrics_of(given: Any) -> list[str | Metric]:
         given = list(given.items())
     elif isinstance(given, str | Metric) or callable(given):
         given = [given]
-    return [_metric(one) for one in _listed(given, "metrics", "names or functions")]
+    return [_metric(one) for one in _as_list(given, "metrics", "names or functions")]
 
 
 def _metric(given: Any) -> str | Metric:
@@ -186,22 +191,22 @@ def _metric(given: Any) -> str | Metric:
 
 
 def settings_of(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a protocol or a fit as TOML has them, and tables of truth as `Tables`."""
+    """Convert settings to TOML's types, and tables of ground truth to `TruthTables`."""
     return {
-        name: Tables.of(value) if name in OF_TRUTH else plain(value)
+        name: TruthTables.of(value) if name in OF_TRUTH else to_toml_value(value)
         for name, value in given.items()
         if value is not None
     }
 
 
-def plain(value: Any) -> Any:
-    """A value as TOML has it: lists, numbers, text; what TOML has no word for as it is."""
-    if isinstance(value, Parameters | Recording | Estimator | Tables):
+def to_toml_value(value: Any) -> Any:
+    """Convert a value to TOML's types: lists, numbers, text; others stay objects."""
+    if isinstance(value, Parameters | Recording | Estimator | TruthTables):
         return value
     if isinstance(value, Mapping):
-        return {name: plain(one) for name, one in value.items()}
+        return {name: to_toml_value(one) for name, one in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
-        return [plain(one) for one in value]
+        return [to_toml_value(one) for one in value]
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     if isinstance(value, np.generic | np.ndarray):
@@ -209,32 +214,32 @@ def plain(value: Any) -> Any:
     return value
 
 
-def described(value: Any) -> Any:
-    """A table as TOML can hold it: objects by their names."""
-    if isinstance(value, Named):
-        return described(value.recording) if is_path(value.recording) else value.name
+def to_toml_table(value: Any) -> Any:
+    """Convert a table to one that TOML can hold: objects become their names."""
+    if isinstance(value, NamedRecording):
+        return to_toml_table(value.recording) if is_path(value.recording) else value.name
     if isinstance(value, Recording | Metric):
         return value.name
-    if isinstance(value, Tables):
+    if isinstance(value, TruthTables):
         return "given in Python"
     if isinstance(value, Parameters):
-        return described(values_of(value))
+        return to_toml_table(values_of(value))
     if isinstance(value, Mapping):
-        return {name: described(one) for name, one in value.items() if one is not None}
+        return {name: to_toml_table(one) for name, one in value.items() if one is not None}
     if isinstance(value, list):
-        return [described(one) for one in value]
+        return [to_toml_table(one) for one in value]
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, str | bool | int | float):
         return value
     if isinstance(value, Estimator) or callable(value):
         return method_name(value)
-    return a_kind(value)
+    return describe_type(value)
 
 
-def _listed(given: Any, what: str, of: str) -> Sequence[Any]:
+def _as_list(given: Any, what: str, of: str) -> Sequence[Any]:
     if not isinstance(given, Iterable):
-        raise InputError(f"{what} are {a_kind(given)}; give a list of {of}")
+        raise InputError(f"{what} are {describe_type(given)}; give a list of {of}")
     return list(given)
 
 

@@ -1,4 +1,4 @@
-"""What configurations of `evaluate` and `fit` share: recordings, methods, parameters, checks."""
+"""Settings that `evaluate` and `fit` share: recordings, methods, parameters, and their checks."""
 
 import contextlib
 import dataclasses
@@ -11,26 +11,26 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from jaxevent import datasets
+from jaxevent.display import describe_type
 from jaxevent.errors import InputError
-from jaxevent.parameters import Parameters, nearest, read_toml
+from jaxevent.parameters import Parameters, read_toml, suggest_name
 from jaxevent.recording import Recording
-from jaxevent.shown import a_kind
 
 P = TypeVar("P", bound=Parameters)
 
 Check = tuple[Callable[[Any], bool], str]  # of a setting: what is accepted, and how to say so
 
 
-class Named(NamedTuple):
-    """A recording, or its path, with the name that results give it."""
+class NamedRecording(NamedTuple):
+    """A recording, or its path, and its name in results."""
 
     name: str
     recording: "Recording | str"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Tables:
-    """Tables of what is true, given in Python: one of all recordings, or by a recording's name.
+class TruthTables:
+    """Tables of ground truth, given in Python: one for all recordings, or one for each by name.
 
     A table is a pandas DataFrame or the path of a file.
     """
@@ -38,8 +38,11 @@ class Tables:
     given: Any
 
     @classmethod
-    def of(cls, given: Any) -> "Tables | str":
-        """Make them of a table, or of a mapping from recordings' names; a text stays one."""
+    def of(cls, given: Any) -> "TruthTables | str":
+        """Make them from a table, or a mapping from recordings' names.
+
+        A text is returned unchanged.
+        """
         if isinstance(given, str):
             return given
         if isinstance(given, os.PathLike):
@@ -49,40 +52,41 @@ class Tables:
         return cls(_table(given))
 
     def find(self, recording: str) -> Any:
-        """The table of the recording of that name; raises `InputError` where there is none."""
+        """Return the table of a recording by its name; raise `InputError` if there is none."""
         if not isinstance(self.given, dict):
             return self.given
-        for name in (recording, known_as(Path(recording))):
+        for name in (recording, external_name(Path(recording))):
             if name in self.given:
                 return self.given[name]
         raise InputError(
-            f"{recording}: no table of what is true has this name; {nearest(recording, self.given)}"
+            f"{recording}: no table of the ground truth has this name; "
+            f"{suggest_name(recording, self.given)}"
         )
 
 
-def table_of(given: Tables | str, recording: str) -> Any:
-    """The table of what is true of the recording of that name: a DataFrame, or the path of a file.
+def truth_table(given: TruthTables | str, recording: str) -> Any:
+    """Find the table of a recording's ground truth: a DataFrame, or the path of a file.
 
-    A text is the name of files beside recordings, * being their names without suffix.
+    A text is the name of files beside recordings, in which * stands for their names without suffix.
     """
-    if isinstance(given, Tables):
+    if isinstance(given, TruthTables):
         return given.find(recording)
     path = Path(recording)
-    return path.with_name(given.replace("*", known_as(path)))
+    return path.with_name(given.replace("*", external_name(path)))
 
 
-def table_files(given: Tables | str, recording: str) -> list[Path]:
-    """The file of a recording's table, if it is in one."""
-    table = table_of(given, recording)
+def truth_files(given: TruthTables | str, recording: str) -> list[Path]:
+    """Return the file of a recording's table, if it is in one."""
+    table = truth_table(given, recording)
     return [table] if isinstance(table, Path) else []
 
 
 def is_table(value: Any) -> bool:
-    return isinstance(value, Tables) or (isinstance(value, str) and value != "")
+    return isinstance(value, TruthTables) or (isinstance(value, str) and value != "")
 
 
 def is_column(value: Any) -> bool:
-    """Tell whether a value of a mapping is a column of numbers rather than a table."""
+    """Return true if a value of a mapping is a column of numbers rather than a table."""
     return not (isinstance(value, str | os.PathLike | Mapping) or hasattr(value, "columns")) and (
         not hasattr(value, "to_dataframe")
     )
@@ -100,12 +104,12 @@ def _table(given: Any) -> Any:
         return pd.DataFrame(given).reset_index(drop=True)
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"what is true is {a_kind(given)} that is no table ({error}); give a "
+            f"the ground truth is {describe_type(given)} that is no table ({error}); give a "
             "DataFrame, the path of a CSV file, or a mapping from recordings' names to them"
         ) from None
 
 
-def known_as(path: Path) -> str:
+def external_name(path: Path) -> str:
     """Return the name of a recording in other programs' results: that of its file, no suffix."""
     return path.name if path.is_dir() else path.stem
 
@@ -133,7 +137,7 @@ NAME = (is_text, "text")
 PATHS = (
     lambda value: (
         isinstance(value, list)
-        and all(is_text(one) or isinstance(one, Recording | Named) for one in value)
+        and all(is_text(one) or isinstance(one, Recording | NamedRecording) for one in value)
     ),
     'a list of paths, as ["file.zip"]',
 )
@@ -154,31 +158,32 @@ SIZE: Check = (
 def check(table: Mapping[str, Any], known: Mapping[str, Check]) -> None:
     for name, value in table.items():
         if name not in known:
-            raise InputError(f"there is no setting {name!r}; {nearest(name, known)}")
+            raise InputError(f"there is no setting {name!r}; {suggest_name(name, known)}")
         accepts, text = known[name]
         if not accepts(value):
             raise InputError(f"{name} is {str(value)[:60]!r}; give {text}")
 
 
-def one_of(value: str, what: str, known: Sequence[str]) -> str:
-    """The value; raises `InputError` unless it is one of those known."""
+def check_choice(value: str, what: str, known: Sequence[str]) -> str:
+    """Return the value; raise `InputError` unless it is one of those known."""
     if value not in known:
-        raise InputError(f"there is no {what} {value!r}; {nearest(value, known)}")
+        raise InputError(f"there is no {what} {value!r}; {suggest_name(value, known)}")
     return value
 
 
 def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path | Recording]]:
-    """Recordings by name: objects, or the paths of those given by paths and globs.
+    """Find recordings by name: objects, or the paths of those given by paths and globs.
 
     Paths are relative to `folder` and named as they are given. "NAME:FOLDER" stands for all
     recordings of a data set of `jaxevent.datasets`. $NAME is expanded. Objects have their own
-    names; further ones of a name get a number. Raises `InputError` for what is not there.
+    names; further ones of a name get a number. Raises `InputError` for a recording that does not
+    exist.
     """
     if not (given and PATHS[0](given)):
         raise InputError('recordings is missing or not a list; give recordings = ["file.zip", ...]')
     found: dict[Any, tuple[str, Path | Recording]] = {}
     for one in given:
-        name, what = one if isinstance(one, Named) else (None, one)
+        name, what = one if isinstance(one, NamedRecording) else (None, one)
         if isinstance(what, Recording):
             found.setdefault((id(what), name), (name or what.name or "recording", what))
             continue
@@ -189,13 +194,13 @@ def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path | Recordin
             )
         for path, text in paths.items():
             found.setdefault(path, (name or text, path))
-    return _told_apart(list(found.values()))
+    return _with_unique_names(list(found.values()))
 
 
-def _told_apart(
+def _with_unique_names(
     recordings: list[tuple[str, Path | Recording]],
 ) -> list[tuple[str, Path | Recording]]:
-    """The recordings with names that differ: the second of a name is "name (2)"."""
+    """Rename recordings that share a name: the second is "name (2)"."""
     taken: set[str] = set()
     found: list[tuple[str, Path | Recording]] = []
     for name, recording in recordings:
@@ -234,9 +239,9 @@ def _data_set(text: str, folder: Path) -> tuple[str, str]:
     return (name, rest) if known else ("", text)
 
 
-def from_anywhere(given: Any) -> Any:
+def absolute_path(given: Any) -> Any:
     """A recording as given in the working directory, named so that any configuration finds it."""
-    if isinstance(given, Recording | Named):
+    if isinstance(given, Recording | NamedRecording):
         return given
     given = os.fspath(given)
     name, rest = _data_set(given, Path.cwd())
@@ -244,20 +249,20 @@ def from_anywhere(given: Any) -> Any:
     return f"{name}:{path}" if name else path
 
 
-def named_files(config: Path) -> list[Path]:
-    """The existing files that a configuration names, in whichever setting."""
+def files_named_in(config: Path) -> list[Path]:
+    """Return the existing files that a configuration names, in any setting."""
     found: list[Path] = []
 
-    def look(value: Any) -> None:
+    def collect(value: Any) -> None:
         if isinstance(value, str):
             with contextlib.suppress(OSError, ValueError):  # text that can be no name
                 path = config.parent / os.path.expanduser(os.path.expandvars(value))
                 found.extend([path] if path.is_file() else [])
         elif isinstance(value, dict | list):
             for part in value.values() if isinstance(value, dict) else value:
-                look(part)
+                collect(part)
 
-    look(read_toml(config))
+    collect(read_toml(config))
     return found
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from jaxevent.display import describe_type
 from jaxevent.errors import InputError
 from jaxevent.io import load
 from jaxevent.io.companions import companions
@@ -20,10 +21,9 @@ from jaxevent.io.output import complete
 from jaxevent.parameters import Parameters
 from jaxevent.progress import bar
 from jaxevent.recording import EventSource, Recording
-from jaxevent.shown import a_kind
 
 
-class Opened(threading.local):
+class RecordingCache(threading.local):
     """The recording last loaded: methods are run on it one after another."""
 
     def __init__(self):
@@ -64,7 +64,7 @@ def _stamp(file: Path) -> tuple[str, int, int]:
     return str(file), about.st_size, about.st_mtime_ns
 
 
-class Contents:
+class FileHashes:
     """Hashes of what files and folders hold, kept in a file as long as size and time agree."""
 
     # A file changed again within the clock's tick (s) after it was read would look unchanged.
@@ -192,13 +192,13 @@ def _feed(thing: Any, update: Callable[[Any], None]) -> None:
             update(np.ascontiguousarray(thing[first : first + rows]).tobytes())
     else:
         raise InputError(
-            f"{a_kind(thing)} in a recording or a setting has no content that can be "
+            f"{describe_type(thing)} in a recording or a setting has no content that can be "
             "compared; remove it"
         )
 
 
 def fingerprint(path: Path, update: Callable[[bytes], None]) -> None:
-    """Feed a hash the file's name, size and content; of a large file 64 pieces of 1 MiB."""
+    """Feed a hash with the file's name, size and content; of a large file 64 pieces of 1 MiB."""
     size, piece = path.stat().st_size, 1 << 20
     update(f"{path.name} {size}".encode())
     step = max(piece, size // 64)

@@ -11,7 +11,7 @@ from jaxevent.io import load
 from jaxevent.methods import find, names
 from jaxevent.recording import Recording
 from jaxevent.runs.protocols import frame_times, held_out
-from jaxevent.runs.results import check_folder, results, write_rows
+from jaxevent.runs.results import check_folder, open_results, write_rows
 from jaxevent.runs.scores import score
 from jaxevent.show.export import evenly, shown
 from jaxevent.show.report import Kind, comparison_figure, markdown_table, video_writer
@@ -46,7 +46,7 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
             for name in by_hand
         ),
     ]
-    with results(out) as write:
+    with open_results(out) as write:
         rows, skipped = [], []
         for label, method, params in runs:
             try:
@@ -74,7 +74,7 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
 
 
 def _figure(recording: Recording, params: dict[str, Any], path: Path) -> None:
-    """What a few methods make of one hidden frame, and how `mc` is wrong and in doubt there."""
+    """Draw the reconstructions of one hidden frame, and error and uncertainty of `mc`."""
     given, hidden = held_out(recording)
     middle = hidden[len(hidden) // 2 :][:1]
     assert given.frames is not None
@@ -106,7 +106,7 @@ def _figure(recording: Recording, params: dict[str, Any], path: Path) -> None:
 
 
 def _video(recording: Recording, params: Any, path: Path, progress: bool | None) -> float:
-    """200 images per second of the recording's time, shown at 30; returns the slow-down."""
+    """Write 200 images per second of the recording, shown at 30; return the slow-down."""
     rate, fps, longest = 200.0, 30.0, 180
     video = find("akf").estimate(recording, params, progress=progress)
     zoom = 2 if recording.width < 480 else 1

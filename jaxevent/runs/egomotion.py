@@ -1,4 +1,4 @@
-"""What evaluations and fits ask of egomotion; what methods are fitted to: motion that is known.
+"""Fits of egomotion methods to known motion, and their scores.
 
 Settings of a method of egomotion in a configuration of `jaxevent.runs.fit`:
 
@@ -58,15 +58,14 @@ from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
 from jaxevent.runs import egomotion_scores as scores
 from jaxevent.runs.config import NATURAL
-from jaxevent.runs.family import Family, LastBatches, Shares, Sources, share_out
-from jaxevent.runs.family import Goal as FamilyGoal
+from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources, batches_by_split
 from jaxevent.show.report import aligned, legend
 from jaxevent.splits import SPLITS, windows
 from jaxevent.tuning import Batches
 
 
 @dataclasses.dataclass(frozen=True)
-class Loss:
+class MotionLoss:
     """The mean relative squared error of estimates, over runs: `loss(params, batch)`."""
 
     centred: bool = False
@@ -78,7 +77,16 @@ class Loss:
     def one(
         self, batch: TrainingRuns, mean: Float[Array, "T d"], lag: Float[Array, " T"]
     ) -> Float[Array, ""]:
-        """Of one run."""
+        """Compute the loss of one run.
+
+        Args:
+            batch: A window of a recording with the true motion.
+            mean: Estimated components at `batch.time`.
+            lag: Lag of the estimates, s.
+
+        Returns:
+            The loss, ().
+        """
         at = jnp.asarray(batch.time) - (jax.lax.stop_gradient(lag) if self.centred else 0)
         truth = jax.vmap(lambda column: jnp.interp(at, batch.grid, column), 1, 1)(
             jnp.asarray(batch.truth)
@@ -93,11 +101,11 @@ class Loss:
 
 
 @dataclasses.dataclass(frozen=True)
-class Goal(FamilyGoal):
-    """How a method is fitted to known motion and scored."""
+class MotionGoal(Goal):
+    """The fit of a method to known motion, and its scores."""
 
     method: MotionEstimator
-    loss: Loss
+    loss: MotionLoss
     model: str
     truth: str
     runs: int
@@ -109,6 +117,7 @@ class Goal(FamilyGoal):
 
     @property
     def kind(self) -> type[Model]:
+        """The motion model."""
         return find_model(self.model)
 
     def files(self, recording: Path) -> list[Path]:
@@ -117,7 +126,7 @@ class Goal(FamilyGoal):
     def problem(
         self, sources: Sources, split: Shares, window: float | int | None
     ) -> Callable[[Any], Batches]:
-        found = [one for one in self._stretches(sources, split, window) if one.split < 2]
+        found = [one for one in self._windows(sources, split, window) if one.split < 2]
 
         def acting(params: Any) -> dict[str, float]:
             acts = params.without_gradient() if self.method.differentiable else params.numbers
@@ -125,7 +134,7 @@ class Goal(FamilyGoal):
 
         def make(params: Any) -> Batches:
             made = self.method.training_runs(found, params, self.kind, self.runs, self.settle)
-            return share_out(found, made)
+            return batches_by_split(found, made)
 
         return LastBatches(acting, make)
 
@@ -137,7 +146,7 @@ class Goal(FamilyGoal):
         params: Parameters,
         progress: bool | None,
     ) -> Iterator[dict[str, Any]]:
-        found = self._stretches(sources, split, window)
+        found = self._windows(sources, split, window)
         for place, (given, recording) in (
             (place, source) for place, name in enumerate(SPLITS) for source in sources[name]
         ):
@@ -175,14 +184,14 @@ class Goal(FamilyGoal):
         return aligned(rows, columns) + legend(columns)
 
     def known(self, recording: Recording) -> KnownMotion:
-        """What is true of the motion of a recording, whose name is its path."""
+        """Return the true motion of a recording, whose name is its path."""
         settings = {"model": self.model, "truth": self.truth, **self.of_truth}
         return scores.true_motion(recording, settings)
 
-    def _stretches(
+    def _windows(
         self, sources: Sources, split: Shares, window: float | int | None
     ) -> list[TrainingSegment]:
-        """The windows of all recordings whose truth is known and that hold events."""
+        """Cut all recordings with known truth into windows that hold events."""
         found = []
         for place, (_, recording) in (
             (place, source) for place, name in enumerate(SPLITS) for source in sources[name]
@@ -204,9 +213,9 @@ class Goal(FamilyGoal):
 
 
 def find_estimator(name: str) -> MotionEstimator:
-    """The method of egomotion of that name, or of "package.module:object".
+    """Return the egomotion method of a name, or of "package.module:object".
 
-    Raises `InputError` for an unknown name, naming the nearest, and for any other object.
+    Raises `InputError` for an unknown name, and for any other object.
     """
     found = find(name, "egomotion")
     if not isinstance(found, MotionEstimator):
@@ -215,7 +224,7 @@ def find_estimator(name: str) -> MotionEstimator:
 
 
 class Egomotion(Family):
-    """The methods that tell how the camera moved."""
+    """The methods that estimate the camera's motion."""
 
     protocols = {"motion": scores.MotionProtocol()}
     fit_settings = {
@@ -229,12 +238,12 @@ class Egomotion(Family):
 
     def goal(
         self, method: MotionEstimator, params: Parameters, settings: Mapping[str, Any]
-    ) -> Goal:
+    ) -> MotionGoal:
         scores.check(settings)
         method.find_model(scores.model_of(settings))
-        return Goal(
+        return MotionGoal(
             method,
-            Loss(settings.get("centred", False)),
+            MotionLoss(settings.get("centred", False)),
             settings.get("model", "planar"),
             settings["truth"],
             settings.get("runs", 4),

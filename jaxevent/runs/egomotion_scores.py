@@ -44,11 +44,11 @@ from jaxevent.runs.config import (
     POSITIVE,
     Check,
     is_table,
-    table_files,
-    table_of,
+    truth_files,
+    truth_table,
 )
 from jaxevent.runs.family import Protocol
-from jaxevent.runs.own import Function, Metric, find_metrics, own_names
+from jaxevent.runs.own import MethodFunction, Metric, find_metrics, own_names
 
 
 def _vector(value: Any) -> bool:
@@ -90,11 +90,11 @@ MEASURES = (
 
 
 RECORDED = ("poses", "gyro")  # truth that recordings hold themselves
-OF_TRUTH = ("gyro_bias", "imu_rotation", "depth")  # settings that say what is true
+OF_TRUTH = ("gyro_bias", "imu_rotation", "depth")  # settings of the ground truth
 
 
 def model_of(options: Mapping[str, Any]) -> type[Model]:
-    """The model that settings name; raises `InputError` for an unknown one."""
+    """Return the motion model in the settings; raise `InputError` for an unknown one."""
     return find_model(options.get("model", "planar"))
 
 
@@ -110,18 +110,18 @@ def check(options: Mapping[str, Any]) -> None:
 
 
 def files(path: Path, options: Mapping[str, Any]) -> list[Path]:
-    """Further files that a row of the recording depends on."""
+    """Return further files that a row of the recording depends on."""
     truth = options["truth"]
     if isinstance(truth, str) and truth in RECORDED:
         return []
-    return table_files(truth, str(path))
+    return truth_files(truth, str(path))
 
 
 def true_motion(recording: Recording, options: Mapping[str, Any]) -> KnownMotion:
-    """What is true of the motion of a recording, whose name is its path."""
+    """Return the true motion of a recording, whose name is its path."""
     source = options["truth"]
     if not (isinstance(source, str) and source in RECORDED):
-        source = table_of(source, recording.name)
+        source = truth_table(source, recording.name)
     return known_motion(
         recording,
         model_of(options),
@@ -159,7 +159,7 @@ class MotionProtocol(Protocol):
     def score(
         self,
         recording: Recording,
-        method: MotionEstimator | Function,
+        method: MotionEstimator | MethodFunction,
         params: Parameters | None,
         options: Mapping[str, Any],
         progress: bool | None = None,
@@ -180,7 +180,7 @@ class MotionProtocol(Protocol):
                 "seconds on the recording's clock"
             )
         clock = time.perf_counter()
-        if isinstance(method, Function):
+        if isinstance(method, MethodFunction):
             motion = _of_function(recording, method, times, model)
         else:
             motion = method.estimate(
@@ -226,7 +226,7 @@ def _settings(
     options: Mapping[str, Any],
     bias: NDArray[np.float64],
 ) -> dict[str, Any]:
-    """Return those of the protocol's settings that the method's `estimate` takes."""
+    """Return the settings of the protocol that the method's `estimate` takes."""
     settings: dict[str, Any] = {}
     if options.get("smooth", False) and "smooth" in method.options:
         settings["smooth"] = True
@@ -238,7 +238,7 @@ def _settings(
 
 
 class SampledMotion(MotionEstimate):
-    """A motion that is known at the times of its estimates alone: nothing is interpolated."""
+    """A motion that is known at the times of its estimates alone, without interpolation."""
 
     def __call__(
         self, times: Times, *, centred: bool = False, extrapolate: bool = False
@@ -248,9 +248,9 @@ class SampledMotion(MotionEstimate):
 
 
 def _of_function(
-    recording: Recording, method: Function, times: NDArray[np.int64], model: type[Model]
+    recording: Recording, method: MethodFunction, times: NDArray[np.int64], model: type[Model]
 ) -> MotionEstimate:
-    """The motion that a function estimates at `times` (us); lost where it is NaN."""
+    """Return the motion that a function estimates at `times` (us); lost where it is NaN."""
     d = len(model.components)
     mean, covariance, _ = method.estimate(recording, times, [(d,)])
     if covariance is None or covariance.shape != (len(times), d, d):
@@ -261,5 +261,5 @@ def _of_function(
 def _own(
     metrics: Sequence[Metric], mean: NDArray, truth: NDArray, recording: str
 ) -> dict[str, float | None]:
-    """The metrics of the user's own; None where no motion was found."""
+    """Compute the user's metrics; None where no motion was found."""
     return {one.name: one(mean, truth, recording) if len(mean) else None for one in metrics}

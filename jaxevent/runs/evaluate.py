@@ -79,13 +79,13 @@ from jaxevent.runs.calls import (
     CALLED,
     Forms,
     PathLike,
-    described,
+    format_setting,
     method_name,
     methods_of,
     metrics_of,
-    point,
     recordings_of,
     settings_of,
+    to_toml_table,
 )
 from jaxevent.runs.config import (
     NAME,
@@ -93,17 +93,16 @@ from jaxevent.runs.config import (
     STREAM,
     Check,
     check,
+    external_name,
+    files_named_in,
     find_recordings,
-    known_as,
-    named_files,
     read_params,
 )
-from jaxevent.runs.contents import Contents, Opened, digest
-from jaxevent.runs.families import family_of, find_protocol
-from jaxevent.runs.family import Protocol, Source
-from jaxevent.runs.own import Function, Metric, code_of, find_method, import_path
-from jaxevent.runs.results import Evaluation, check_folder, results, write_rows
-from jaxevent.runs.tasks import Outcome, Place, Task, run
+from jaxevent.runs.contents import FileHashes, RecordingCache, digest
+from jaxevent.runs.family import Protocol, Source, family_of, find_protocol
+from jaxevent.runs.own import MethodFunction, Metric, find_method, import_path, module_hash
+from jaxevent.runs.results import Evaluation, check_folder, open_results, write_rows
+from jaxevent.runs.tasks import ComputeResources, Outcome, Task, run
 from jaxevent.show.report import write_parquet
 
 # Part of the keys of stored results: raised whenever the same recording, method and parameters give
@@ -111,7 +110,7 @@ from jaxevent.show.report import write_parquet
 RESULTS_VERSION = 4
 FILES = ("report.html", "results.json", "results.md", "results.parquet", "config.toml")
 
-_opened = Opened()
+_opened = RecordingCache()
 
 
 @overload
@@ -224,7 +223,7 @@ def _evaluate_file(
     plan = read_plan(path, further)
     text = path.read_bytes()
     if further:
-        names = ", ".join(described(further))
+        names = ", ".join(to_toml_table(further))
         text = f"# With the further metrics {names}.\n".encode() + text
     return _evaluate(plan, Origin(path.name, text, plan.inputs(path)), out, progress, **where)
 
@@ -248,7 +247,7 @@ def _evaluate_objects(
     if further:
         table["metrics"] = further
     plan = plan_of(table, Path())
-    text = CALLED + toml.dump(described(table))
+    text = CALLED + toml.dump(to_toml_table(table))
     return _evaluate(
         plan,
         Origin("evaluation", text.encode(), plan.inputs()),
@@ -259,7 +258,7 @@ def _evaluate_objects(
 
 
 class Origin(NamedTuple):
-    """Title and text of a configuration or a call, and the files that it reads."""
+    """Title and text of a configuration or a call, and its input files."""
 
     title: str
     text: bytes
@@ -282,12 +281,14 @@ def _evaluate(
     if out is not None:
         own = (Path(out) / "tasks").is_dir()
         check_folder(Path(out), FILES, source.files, replace=replace, own=own)
-    place = Place(workers, cluster, None if scheduler_file is None else Path(scheduler_file))
+    place = ComputeResources(
+        workers, cluster, None if scheduler_file is None else Path(scheduler_file)
+    )
     with contextlib.ExitStack() as stack:
-        write = None if out is None else stack.enter_context(results(Path(out)))
+        write = None if out is None else stack.enter_context(open_results(Path(out)))
         folder = None if out is None else Path(out) / "tasks"
         stack.callback(_opened.clear)
-        tasks = _tasks(plan, folder, progress, place == Place())
+        tasks = _tasks(plan, folder, progress, place == ComputeResources())
         if place.workers is not None:
             for task in tasks:
                 task.check_sendable()
@@ -307,7 +308,7 @@ def _evaluate(
 
 
 def _rows(plan: "Plan", outcomes: list[Outcome]) -> list[dict[str, Any]]:
-    """The rows, named as the configuration does; raises `InputError` if all are errors."""
+    """Name the rows as the configuration does; raise `InputError` if all are errors."""
     rows: list[dict[str, Any]] = []
     pairs = itertools.product(plan.recordings, plan.methods)
     for ((given, _), entry), outcome in zip(pairs, outcomes, strict=True):
@@ -316,7 +317,9 @@ def _rows(plan: "Plan", outcomes: list[Outcome]) -> list[dict[str, Any]]:
             rows.append({**outcome.result["row"], **named})
         else:
             skipped = {"skipped": True} if outcome.skipped else {}
-            rows.append({**named, "params": entry.shown(), "error": outcome.error, **skipped})
+            rows.append(
+                {**named, "params": entry.display_values(), "error": outcome.error, **skipped}
+            )
     errors = list(dict.fromkeys(row["error"] for row in rows if "error" in row))
     if all("error" in row for row in rows):
         more = f" (and {len(errors) - 1} further errors)" if len(errors) > 1 else ""
@@ -325,11 +328,11 @@ def _rows(plan: "Plan", outcomes: list[Outcome]) -> list[dict[str, Any]]:
 
 
 def _tasks(plan: "Plan", folder: Path | None, progress: bool | None, here: bool) -> list[Task]:
-    """A task for each recording and method; with a folder, keyed by all that its row depends on.
+    """Make a task for each recording and method; with a folder, keyed by all inputs of its row.
 
-    Tasks that are run `here` show a bar of their own.
+    Tasks that run `here` show a bar of their own.
     """
-    contents = None if folder is None else Contents(folder / "contents", progress)
+    contents = None if folder is None else FileHashes(folder / "contents", progress)
     double = jnp.result_type(float) == jnp.float64
     tasks: list[Task] = []
     for (given, recording), entry in itertools.product(plan.recordings, plan.methods):
@@ -361,7 +364,7 @@ def _tasks(plan: "Plan", folder: Path | None, progress: bool | None, here: bool)
 
 def _key(
     plan: "Plan",
-    contents: Contents,
+    contents: FileHashes,
     recording: "tuple[str, Path | Recording]",
     entry: "Entry",
     about: Mapping[str, Any],
@@ -374,7 +377,7 @@ def _key(
     named = [one for one in objects if isinstance(one, str)]
     if len(named) < len(objects):
         return None
-    code = [code_of(one) for one in named if ":" in one]
+    code = [module_hash(one) for one in named if ":" in one]
     if None in code:
         return None
     whole = {**about, **({"code": code} if code else {})}
@@ -388,7 +391,7 @@ def _key(
         whole["content"] = contents.of(path)
         files = [*companions(path), *plan.protocol.files(path, plan.options)]
     if isinstance(entry.method, Source):
-        files = [*files, *entry.method.files(known_as(path))]
+        files = [*files, *entry.method.files(external_name(path))]
         whole["params"] = entry.method.values()
         # Images of other programs are found by the recording's name.
         whole |= {"name": given} if isinstance(what, Recording) else {}
@@ -398,8 +401,9 @@ def _key(
 
 
 def _compute(
+    *,
     recording: str | Recording,
-    method: str | Estimator | Function,
+    method: str | Estimator | MethodFunction,
     params: dict[str, Any],
     protocol: str,
     options: dict[str, Any],
@@ -409,7 +413,7 @@ def _compute(
     version: str,
     progress: bool | None,
 ) -> dict[str, Any]:
-    """The task: {"row", "picture"} of a recording and a method, on whichever machine."""
+    """Compute one task: {"row", "picture"} of a recording and a method, on any machine."""
     from jaxevent.show.page import picture
 
     path = recording if isinstance(recording, str) else recording.name
@@ -422,7 +426,7 @@ def _compute(
     source: Any = None
     if isinstance(method, str) and method in kind.sources:
         source = kind.sources[method](**params)
-        known = source.row(known_as(Path(path)))
+        known = source.row(external_name(Path(path)))
         if known is not None:
             row = {"method": method, **known, "params": source.values()}
             return {"row": row, "picture": None}
@@ -445,7 +449,7 @@ def _compute(
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """A checked configuration: recordings (as given, path), methods and how they are scored."""
+    """A checked configuration: recordings (as given, path), methods, and the protocol."""
 
     recordings: list[tuple[str, Path | Recording]]
     methods: list["Entry"]
@@ -456,8 +460,8 @@ class Plan:
     stream: str | None
 
     def inputs(self, config: Path | None = None) -> list[Path]:
-        """All files that are read, and can be."""
-        found = [] if config is None else [config, *named_files(config)]
+        """Return all input files that can be read."""
+        found = [] if config is None else [config, *files_named_in(config)]
         for name, path in self.recordings:
             if isinstance(path, Recording):
                 path = Path(name)
@@ -468,7 +472,7 @@ class Plan:
             for entry in self.methods:
                 if isinstance(entry.method, Source):
                     with contextlib.suppress(OSError, InputError):
-                        found += entry.method.files(known_as(path))
+                        found += entry.method.files(external_name(path))
         return found
 
 
@@ -477,28 +481,36 @@ class Entry:
     """A method of a configuration with one set of parameters; a `Source` has none."""
 
     label: str
-    sent: str | Estimator | Function  # what any process finds the method by, else the method
-    method: Estimator | Function | Source
+    sent: str | Estimator | MethodFunction  # what any process finds the method by, else the method
+    method: Estimator | MethodFunction | Source
     params: Parameters | None
     own: dict[str, Any]  # settings of the protocol that this method has for itself
 
     def settings(self) -> dict[str, Any]:
-        """What `_compute` makes it from again."""
+        """Return the settings from which `_compute` makes the method again."""
         if isinstance(self.method, Source):
             return dict(vars(self.method))
         return {} if self.params is None else self.params.values()
 
-    def shown(self) -> dict[str, Any]:
-        """The parameters as a row shows them."""
+    def display_values(self) -> dict[str, Any]:
+        """Return the parameters as a row shows them."""
         if isinstance(self.method, Source):
             return self.method.values()
         return {} if self.params is None else values_of(self.params)
 
 
 def read_plan(config: Path, metrics: Sequence[str | Metric] = ()) -> Plan:
-    """Read and check a configuration; raises `InputError` naming the file and the setting.
+    """Read and check a configuration.
 
-    `metrics` are added to those that it names.
+    Args:
+        config: The TOML file.
+        metrics: Metrics in addition to those of the file.
+
+    Returns:
+        The plan of an evaluation.
+
+    Raises:
+        InputError: A setting cannot be used; the message names file and setting.
     """
     table = read_toml(config)
     try:
@@ -508,9 +520,18 @@ def read_plan(config: Path, metrics: Sequence[str | Metric] = ()) -> Plan:
 
 
 def plan_of(table: Mapping[str, Any], folder: Path, metrics: Sequence[str | Metric] = ()) -> Plan:
-    """Check the table of a configuration, in which paths are relative to `folder`.
+    """Check the table of a configuration.
 
-    `metrics` are added to those that it names. Raises `InputError` naming the setting.
+    Args:
+        table: The settings.
+        folder: Folder that paths are relative to.
+        metrics: Metrics in addition to those of the table.
+
+    Returns:
+        The plan of an evaluation.
+
+    Raises:
+        InputError: A setting cannot be used; the message names it.
     """
     name = table.get("protocol") or _usual_protocol(table)
     protocol, family = find_protocol(name)
@@ -583,7 +604,7 @@ def _entries(
     check(rest, {**dict.fromkeys(("name", "params", "label", "grid"), anything), **protocol.own})
     method = find_method(name, family)
     sent = name if isinstance(name, str) else import_path(method) or method
-    if isinstance(method, Function):
+    if isinstance(method, MethodFunction):
         for setting in ("params", "grid"):
             if rest.get(setting):
                 raise InputError(
@@ -601,6 +622,6 @@ def _entries(
         raise InputError("a preset cannot be in a grid; add a [[method]] for each preset")
     for combination in itertools.product(*grid.values()):
         values = dict(zip(grid, combination, strict=True))
-        said = "".join(f", {point(key, value)}" for key, value in values.items())
+        suffix = "".join(f", {format_setting(key, value)}" for key, value in values.items())
         chosen = method.Params.of({**params.values(), **values}) if values else params
-        yield Entry(f"{label}{said}{ending}", sent, method, chosen, own)
+        yield Entry(f"{label}{suffix}{ending}", sent, method, chosen, own)

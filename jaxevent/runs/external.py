@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.io.images import TIMES, Scale, Series, read_series
-from jaxevent.parameters import nearest
+from jaxevent.parameters import suggest_name
 from jaxevent.runs.family import Source
 
 Normalise = Literal["none", "affine"]
@@ -44,8 +44,8 @@ SAMPLE = 1 << 13  # pixels that the brightness is fitted to, at most
 
 
 @dataclasses.dataclass(frozen=True)
-class External(Source):
-    """Where the images are and how they are stored; the text of this module has more."""
+class ExternalImages(Source):
+    """Images of another program: their place and format; see the text of this module."""
 
     images: str
     timestamps: str | None = None
@@ -58,12 +58,23 @@ class External(Source):
     name = "external"
 
     @classmethod
-    def of(cls, table: Mapping[str, Any], folder: Path) -> "External":
-        """From the settings of a configuration; raises `InputError` naming a bad one."""
+    def of(cls, table: Mapping[str, Any], folder: Path) -> "ExternalImages":
+        """Make them from the settings of a configuration.
+
+        Args:
+            table: Settings of a [[method]].
+            folder: Folder of the configuration.
+
+        Returns:
+            The images' place and format.
+
+        Raises:
+            InputError: A setting cannot be used; the message names it.
+        """
         known = {field.name: field for field in dataclasses.fields(cls) if field.name != "folder"}
         for name, value in table.items():
             if name not in known:
-                raise InputError(f"there is no setting {name!r}; {nearest(name, known)}")
+                raise InputError(f"there is no setting {name!r}; {suggest_name(name, known)}")
             if name in ("images", "timestamps"):
                 if not isinstance(value, str) or not value:
                     raise InputError(f"{name} is {value!r}; give a path")
@@ -79,14 +90,14 @@ class External(Source):
         return cls(**table, folder=str(folder))
 
     def values(self) -> dict[str, Any]:
-        """The settings."""
+        """Return the settings."""
         return {name: value for name, value in vars(self).items() if name != "folder"}
 
     def files(self, recording: str) -> Sequence[Path]:
         return self.find(recording).files
 
     def find(self, recording: str) -> Series:
-        """The images of the recording of that name; raises `InputError` naming what is wrong."""
+        """Return the images of a recording by its name; raise `InputError` for missing ones."""
         root = Path(self.folder)
         images = root / _named(self.images, recording)
         if not images.exists():
@@ -98,7 +109,15 @@ class External(Source):
         return read_series(images, Scale(self.white, self.gamma), names, root)
 
     def nearest(self, series: Series, times: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-        """(row of `times`, row of the series) wherever there is an image within `tolerance`."""
+        """Yield the nearest image for every time that has one within `tolerance`.
+
+        Args:
+            series: Images of a recording.
+            times: Times, us.
+
+        Returns:
+            Pairs of an index of `times` and an index of the series.
+        """
         for row, time in enumerate(times):
             after = int(np.searchsorted(series.t, time))
             near = min(
@@ -121,10 +140,17 @@ def check_normalise(how: Any) -> None:
 
 
 def fit_brightness(image: NDArray, truth: NDArray) -> NDArray[np.float64]:
-    """a * image + b closest to the truth by Huber's loss, a >= 0; both (height, width).
+    """Fit a * image + b, a >= 0, to the truth by Huber's loss.
 
-    Hot pixels and those of which either is not finite are not looked at, and of the others at most
-    `SAMPLE`, evenly spread.
+    Hot pixels and pixels that are not finite are left out, and at most `SAMPLE` others are used,
+    evenly spread.
+
+    Args:
+        image: Image, (height, width).
+        truth: True image, (height, width).
+
+    Returns:
+        The fitted image, (height, width).
     """
     from scipy.optimize import least_squares
 

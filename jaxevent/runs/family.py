@@ -1,7 +1,7 @@
-"""What evaluations and fits ask of a family of estimators.
+"""The interface between a family of estimators and evaluations or fits.
 
 A family offers `Protocol`s, by which `evaluate` scores methods, and a `Goal` for each method, to
-which `fit` fits it. `jaxevent.runs.families` names the families.
+which `fit` fits it. `family_of` and `find_protocol` find them.
 """
 
 import abc
@@ -9,9 +9,10 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from jaxevent.devices import shared_out
-from jaxevent.estimator import Estimator
-from jaxevent.parameters import Parameters
+from jaxevent.devices import partition_batches
+from jaxevent.errors import InputError
+from jaxevent.estimator import Estimator, imported
+from jaxevent.parameters import Parameters, suggest_name
 from jaxevent.recording import Recording
 from jaxevent.runs.config import Check
 from jaxevent.tuning import Batches, Loss
@@ -21,30 +22,30 @@ Shares = tuple[int, ...] | None  # of fit, validation, test; None: they have the
 
 
 class Source(abc.ABC):
-    """What a protocol scores beside estimators: results that something else made."""
+    """Results that something else made, scored by a protocol beside estimators."""
 
     name: ClassVar[str]
 
     @classmethod
     @abc.abstractmethod
     def of(cls, table: Mapping[str, Any], folder: Path) -> "Source":
-        """From the settings of a [[method]]; raises `InputError` naming a bad one."""
+        """Make a source from the settings of a [[method]]; raise `InputError` naming a bad one."""
 
     @abc.abstractmethod
     def values(self) -> dict[str, Any]:
-        """The settings, as a row shows them."""
+        """Return the settings, as a row shows them."""
 
     def row(self, recording: str) -> dict[str, Any] | None:
-        """The results of the recording of that name, where they are known; None: to be scored."""
+        """Return known results of a recording by its name; None if they have to be scored."""
         return None
 
     @abc.abstractmethod
     def files(self, recording: str) -> Sequence[Path]:
-        """What is read for the recording of that name."""
+        """Return the files that are read for a recording."""
 
 
 class Protocol(abc.ABC):
-    """How results are compared with what is known of a recording.
+    """A way of comparing results with the ground truth of a recording.
 
     `settings` may stand beside `protocol = NAME` in a configuration, `own` in a [[method]].
     """
@@ -57,20 +58,20 @@ class Protocol(abc.ABC):
         """Raise `InputError` for settings that are missing or not possible together."""
 
     def available(self, options: Mapping[str, Any]) -> dict[str, Any]:
-        """The settings without what needs an extra that is not installed, if it is optional."""
+        """Return the settings without optional ones whose extra is not installed."""
         return dict(options)
 
     def check_method(  # noqa: B027
         self, method: Estimator, options: Mapping[str, Any]
     ) -> None:
-        """Raise `InputError` if the settings ask for what the method cannot do."""
+        """Raise `InputError` if the settings ask for something that the method cannot do."""
 
     def label(self, options: Mapping[str, Any]) -> str:
-        """What the label of a method ends in, of settings of the protocol and of its own."""
+        """Return the ending of a method's label, from settings of the protocol and the method."""
         return ""
 
     def files(self, path: Path, options: Mapping[str, Any]) -> list[Path]:
-        """Further files that a row of the recording depends on."""
+        """Return further files that a row of the recording depends on."""
         return []
 
     @abc.abstractmethod
@@ -82,18 +83,27 @@ class Protocol(abc.ABC):
         options: Mapping[str, Any],
         progress: bool | None = None,
     ) -> dict[str, Any]:
-        """A row of results without names; raises `InputError` where it cannot be made.
+        """Score a method on a recording.
 
-        `method` is an `Estimator` with its `params`, or a `Source` and None. `options` are the
-        settings of the protocol and the method's own. A `sample` in the row is the picture that the
-        report shows.
+        Args:
+            recording: The recording, with its ground truth.
+            method: An `Estimator`, or a `Source`.
+            params: Parameters of the estimator; None for a source.
+            options: Settings of the protocol and the method's own.
+            progress: Whether to show a bar; None shows it in a terminal or notebook.
+
+        Returns:
+            A row of results without names. A `sample` in it is the picture that the report shows.
+
+        Raises:
+            InputError: The recording or the method cannot be scored.
         """
 
 
 class LastBatches:
-    """Batches as a function of parameters, made again only where `key(params)` is another.
+    """Batches as a function of parameters, made again only if `key(params)` changes.
 
-    `make(params)` gives those to fit to and those to validate on.
+    `make(params)` gives the batches to fit to and to validate on.
     """
 
     def __init__(self, key: Callable[[Any], Any], make: Callable[[Any], Batches]):
@@ -108,30 +118,44 @@ class LastBatches:
         return self._last[1]
 
 
-def share_out(parts: Sequence[Any], batches: Sequence[Any]) -> Batches:
-    """The batches of parts by their `split`, those of other processes left to them."""
+def batches_by_split(parts: Sequence[Any], batches: Sequence[Any]) -> Batches:
+    """Return the batches to fit to and to validate on, by the parts' `split`.
+
+    Remote ones marked so.
+    """
     pairs = list(zip(parts, batches, strict=True))
-    fit, validation = (shared_out([b for part, b in pairs if part.split == s]) for s in (0, 1))
+    fit, validation = (
+        partition_batches([b for part, b in pairs if part.split == s]) for s in (0, 1)
+    )
     return fit, validation
 
 
 class Goal(abc.ABC):
-    """What one method of a configuration is fitted to, and how what comes of it is scored."""
+    """Data and loss of the fit of one method, and the scores of the result."""
 
     loss: Loss  # of `optimise`; equal goals have losses that are equal and hash alike
     forward: bool | None = None  # derivatives forwards or in reverse; None: see `tuning.FORWARD`
     measure: str  # of a row, what the gain of a fit is told in; the smaller the better
-    part: str = "window"  # of which parts the loss is a mean; see `jaxevent.confidence`
+    part_name: str = "window"  # word for the parts that the loss averages over
 
     def files(self, recording: Path) -> list[Path]:
-        """What is read besides the recording."""
+        """Return the files that are read besides the recording."""
         return []
 
     @abc.abstractmethod
     def problem(
         self, sources: Sources, split: Shares, window: float | int | None
     ) -> Callable[[Any], Batches]:
-        """The batches to fit to and to validate on, as functions of parameters."""
+        """Make the batches to fit to and to validate on, as functions of parameters.
+
+        Args:
+            sources: Recordings by split.
+            split: Shares of fit, validation and test; None if recordings are given for each.
+            window: Length of a window, s; None for the default.
+
+        Returns:
+            A function from parameters to batches, as `tuning.optimise` takes it.
+        """
 
     @abc.abstractmethod
     def score(
@@ -142,15 +166,26 @@ class Goal(abc.ABC):
         params: Any,
         progress: bool | None,
     ) -> Iterator[dict[str, Any]]:
-        """Rows of every recording and split: they have the keys recording and split."""
+        """Yield rows of every recording and split, with the keys recording and split.
+
+        Args:
+            sources: Recordings by split.
+            split: Shares of fit, validation and test; None if recordings are given for each.
+            window: Length of a window, s; None for the default.
+            params: Parameters to score.
+            progress: Whether to show a bar; None shows it in a terminal or notebook.
+
+        Returns:
+            Rows, one at a time.
+        """
 
     @abc.abstractmethod
     def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
-        """Rows, which now have the key method too, as a Markdown table."""
+        """Format rows, which now have the key method too, as a Markdown table."""
 
 
 class Family(abc.ABC):
-    """A family of estimators, as configurations know it."""
+    """A family of estimators, as configurations use it."""
 
     protocols: Mapping[str, Protocol]
     fit_settings: Mapping[str, Check]  # of a fit's configuration
@@ -158,4 +193,45 @@ class Family(abc.ABC):
 
     @abc.abstractmethod
     def goal(self, method: Any, params: Parameters, settings: Mapping[str, Any]) -> Goal:
-        """From checked settings, the method's own before those of the file."""
+        """Make the goal of a method.
+
+        Args:
+            method: The estimator.
+            params: Parameters that the fit starts from.
+            settings: Checked settings; the method's own win over those of the file.
+
+        Returns:
+            The goal.
+        """
+
+
+HOMES = {
+    "reconstruction": "jaxevent.runs.reconstruction:FAMILY",
+    "blob": "jaxevent.runs.blob:FAMILY",
+    "egomotion": "jaxevent.runs.egomotion:FAMILY",
+}
+
+
+def family_of(method: Estimator) -> Family:
+    """Return the family of an estimator; raise `InputError` for an unknown one."""
+    if method.family not in HOMES:
+        raise InputError(
+            f"the method {method.name!r} is of the family {method.family!r}; "
+            f"{suggest_name(method.family, HOMES)}"
+        )
+    return find_family(method.family)
+
+
+def find_family(name: str) -> Family:
+    return imported(HOMES[name], Family, "family")
+
+
+def find_protocol(name: Any) -> tuple[Protocol, str]:
+    """Return the protocol of a name and its family's name.
+
+    Raise `InputError` for an unknown one.
+    """
+    known = {protocol: family for family in HOMES for protocol in find_family(family).protocols}
+    if name not in known:
+        raise InputError(f"there is no protocol {name!r}; {suggest_name(str(name), known)}")
+    return find_family(known[name]).protocols[name], known[name]

@@ -56,28 +56,38 @@ from typing import Any, overload
 import jax
 
 from jaxevent import devices
+from jaxevent.display import describe_type
 from jaxevent.errors import InputError, InputWarning, MissingExtra
 from jaxevent.io import load, toml
 from jaxevent.progress import stage
 from jaxevent.recording import Recording
-from jaxevent.runs import findings
 from jaxevent.runs.calls import (
     CALLED,
     Forms,
     PathLike,
-    described,
     recordings_of,
     settings_of,
+    to_toml_table,
 )
-from jaxevent.runs.checkpoint import finished_rows, restore, save
 from jaxevent.runs.contents import digest
 from jaxevent.runs.family import Sources
 from jaxevent.runs.fit_config import Plan, Task, plan_of, read_plan
-from jaxevent.runs.results import Fits, alone, check_folder, results, write_rows
+from jaxevent.runs.results import (
+    Fits,
+    check_folder,
+    compute_gains,
+    find_intervals,
+    finished_rows,
+    format_findings,
+    lock_folder,
+    open_results,
+    restore_checkpoint,
+    save_checkpoint,
+    write_rows,
+)
 from jaxevent.show import plot_losses
-from jaxevent.shown import a_kind
 from jaxevent.splits import SPLITS
-from jaxevent.tuning import Fitted, Run, optimise
+from jaxevent.tuning import FitResult, Run, optimise
 
 CHECKPOINT = "checkpoint"  # the name of the file in the folder
 FILES = ("params.toml", "results.json", "results.md", "loss.csv", "loss.png", "config.toml")
@@ -188,7 +198,7 @@ def _fit_file(
 ) -> Fits:
     if out is None:
         raise InputError(f"{config}: out is missing; give the folder of the results")
-    plan = devices.in_step(lambda: read_plan(Path(config), recordings))
+    plan = devices.on_all_processes(lambda: read_plan(Path(config), recordings))
     return _fit(plan, Path(out), resume, progress, replace)
 
 
@@ -206,7 +216,8 @@ def _fit_objects(
         raise InputError(f"no method is given; give a recording and one, as {FORMS.example}")
     if isinstance(method, list | dict | type):
         raise InputError(
-            f"the method is {a_kind(method)}; give one Estimator, or its name, and fit others apart"
+            f"the method is {describe_type(method)}; give one Estimator, or its name, and fit "
+            "others apart"
         )
     given = settings_of(settings)
     entry = {"name": method, **{k: given.pop(k) for k in ENTRY if k in given}}
@@ -216,8 +227,8 @@ def _fit_objects(
             table[split] = recordings_of(settings[split])
     if resume and out is None:
         raise InputError("resume goes on from the checkpoint in out; give out")
-    text = CALLED + toml.dump(described(table))
-    plan = devices.in_step(lambda: plan_of(table, Path(), None, text.encode()))
+    text = CALLED + toml.dump(to_toml_table(table))
+    plan = devices.on_all_processes(lambda: plan_of(table, Path(), None, text.encode()))
     if out is None:
         return _fit(plan, None, resume, progress, replace)
     # By these lines `resume` knows the recordings of a run that had ended.
@@ -236,17 +247,17 @@ ENTRY = ("fit", "search", "params", "label", "prior")  # settings of a method, n
 
 def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, replace: bool) -> Fits:
     """Fit the methods of a plan; see `fit`."""
-    progress = progress if devices.first() else False
+    progress = progress if devices.is_process_zero() else False
     with contextlib.ExitStack() as held:
         if out is not None:
-            rows = devices.by_first(lambda: _ended_before(out, plan, resume, replace, held))
+            rows = devices.on_process_zero(lambda: _ended_before(out, plan, resume, replace, held))
             if rows is not None:
                 return _finished(rows, out, plan)
-        sources = devices.in_step(lambda: _sources(plan, progress))
+        sources = devices.on_all_processes(lambda: _sources(plan, progress))
         key = ""
         if out is not None or jax.process_count() > 1:
-            key = devices.in_step(plan.digest)
-        if len(set(devices.gathered(key))) > 1:
+            key = devices.on_all_processes(plan.digest)
+        if len(set(devices.allgather(key))) > 1:
             raise InputError(
                 f"{plan.where()}the processes see different configurations or recordings; give all "
                 "the same"
@@ -257,9 +268,9 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
             warnings.filterwarnings("ignore", ".*events contradict frames", InputWarning)
             rows = _score(plan, done, sources, progress)
         params = {t.label: one.params for t, one in zip(plan.tasks, done, strict=True)}
-        gained = findings.gains(plan.tasks, unseen(rows))
+        gained = compute_gains(plan.tasks, unseen(rows))
         fits = Fits(rows, params, found, gained, _text(plan.tasks, rows, found, gained))
-        if out is None or not devices.first():
+        if out is None or not devices.is_process_zero():
             return fits
         write("config.toml", plan.text)
         write("loss.csv", _losses(plan.tasks, done).encode())
@@ -275,7 +286,7 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
 
 def _text(tasks: Sequence[Task], rows: Any, found: Any, gained: Any) -> str:
     """results.md: the scores that no fit saw, what was found, and the gain."""
-    return _results(tasks, unseen(rows)) + findings.text(found, gained)
+    return _results(tasks, unseen(rows)) + format_findings(found, gained)
 
 
 def _finished(rows: list[dict[str, Any]], out: Path, plan: Plan) -> Fits:
@@ -296,7 +307,7 @@ def _ended_before(
     A folder that exists is held until the stack is closed.
     """
     if out.is_dir():
-        held.enter_context(alone(out))
+        held.enter_context(lock_folder(out))
     checkpoint = out / CHECKPOINT
     if checkpoint.exists() and not resume:
         raise InputError(
@@ -316,7 +327,7 @@ def _fit_tasks(
     out: Path | None,
     progress: bool | None,
     held: contextlib.ExitStack,
-) -> tuple[list[Fitted], list[dict[str, Any]], Any]:
+) -> tuple[list[FitResult], list[dict[str, Any]], Any]:
     """Fit all methods, from the checkpoint in the folder on, if there is a folder.
 
     Gives the fits, rows about what they found, and the function that writes to the folder.
@@ -325,7 +336,7 @@ def _fit_tasks(
     naming the method.
     """
     saved = -math.inf
-    done: list[Fitted] = []
+    done: list[FitResult] = []
     found: list[dict[str, Any]] = []
     run: Run | None = None
     write: Any = None
@@ -337,9 +348,9 @@ def _fit_tasks(
             # `results` removes a folder that it made if the block raises. At the first checkpoint
             # the block ends: from then on the folder stays.
             missing = not out.exists()
-            write = new.enter_context(results(out))
+            write = new.enter_context(open_results(out))
             if missing:
-                held.enter_context(alone(out))
+                held.enter_context(lock_folder(out))
             checkpoint = out / CHECKPOINT
             content = checkpoint.read_bytes() if checkpoint.exists() else None
             for remains in out.glob(".*.part"):  # of a write during which the run was killed
@@ -347,16 +358,16 @@ def _fit_tasks(
             return content
 
         if out is not None:
-            content = devices.by_first(lambda: open_folder(out))
+            content = devices.on_process_zero(lambda: open_folder(out))
             if content is not None:
-                done, run = restore(content, out / CHECKPOINT, key, plan)
+                done, run = restore_checkpoint(content, out / CHECKPOINT, key, plan)
 
         def keep(run: Run | None, certain: bool) -> None:
             nonlocal saved
             if out is None:
                 return
-            if devices.first() and (certain or time.monotonic() - saved > PERIOD):
-                save(out / CHECKPOINT, key, done, run)
+            if devices.is_process_zero() and (certain or time.monotonic() - saved > PERIOD):
+                save_checkpoint(out / CHECKPOINT, key, done, run)
                 saved = time.monotonic()
             new.close()
 
@@ -375,25 +386,25 @@ def _fit_tasks(
             except InputError as error:
                 raise InputError(f"{plan.where()}{task.label}: {error}") from None
             with stage(f"{task.label}: intervals", progress):
-                found += findings.find(task, done[number], problem)
+                found += find_intervals(task, done[number], problem)
         new.close()
     return done, found, write
 
 
 def _score(
-    plan: Plan, done: Sequence[Fitted], sources: Sources, progress: bool | None
+    plan: Plan, done: Sequence[FitResult], sources: Sources, progress: bool | None
 ) -> list[dict[str, Any]]:
     """Rows of all methods, before and after; several processes share them out."""
     scored: list[tuple[Task, str, Any, dict[str, str]]] = []
     for task, one in zip(plan.tasks, done, strict=True):
-        said = {"warning": DIVERGED.format(task.label)} if one.diverged else {}
+        warning = {"warning": DIVERGED.format(task.label)} if one.diverged else {}
         scored.append((task, f"{task.label}, before", task.params, {}))
-        scored.append((task, task.label, one.params, said))
+        scored.append((task, task.label, one.params, warning))
     mine = range(jax.process_index(), len(scored), jax.process_count())
-    found = devices.in_step(
-        lambda: {k: list(_rows(*scored[k], sources, plan, progress)) for k in mine}
+    found = devices.on_all_processes(
+        lambda: {k: list(_rows(*scored[k], sources, plan, progress=progress)) for k in mine}
     )
-    told = {k: some for each in devices.gathered(found) for k, some in each.items()}
+    told = {k: some for each in devices.allgather(found) for k, some in each.items()}
     return [row for k in range(len(scored)) for row in told[k]]
 
 
@@ -401,13 +412,14 @@ def _rows(
     task: Task,
     label: str,
     params: Any,
-    said: dict[str, str],
+    warning: dict[str, str],
     sources: Sources,
     plan: Plan,
+    *,
     progress: bool | None,
 ) -> Iterator[dict[str, Any]]:
     for row in task.goal.score(sources, plan.split, plan.window, params, progress):
-        yield {**row, "method": label, **said}
+        yield {**row, "method": label, **warning}
 
 
 def _results(tasks: Sequence[Task], rows: Sequence[dict[str, Any]]) -> str:
@@ -444,7 +456,7 @@ def _load(given: str, path: Path | Recording, plan: Plan, progress: bool | None)
     return dataclasses.replace(recording, name=str(path))  # for messages
 
 
-def _losses(tasks: Sequence[Task], done: Sequence[Fitted]) -> str:
+def _losses(tasks: Sequence[Task], done: Sequence[FitResult]) -> str:
     """loss.csv; empty where a loss was not computed."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -454,7 +466,7 @@ def _losses(tasks: Sequence[Task], done: Sequence[Fitted]) -> str:
     return text.getvalue()
 
 
-def _curves(tasks: Sequence[Task], done: Sequence[Fitted]) -> bytes:
+def _curves(tasks: Sequence[Task], done: Sequence[FitResult]) -> bytes:
     """loss.png: the losses of every method over iterations, a line for each start."""
     figure = plot_losses(done, [task.label for task in tasks])
     image = io.BytesIO()
@@ -462,7 +474,7 @@ def _curves(tasks: Sequence[Task], done: Sequence[Fitted]) -> bytes:
     return image.getvalue()
 
 
-def _tables(tasks: Sequence[Task], done: Sequence[Fitted]) -> str:
+def _tables(tasks: Sequence[Task], done: Sequence[FitResult]) -> str:
     """params.toml: a table for each method."""
     pairs = zip(tasks, done, strict=True)
     return "\n".join(

@@ -15,7 +15,7 @@ from jaxevent.io import toml
 from jaxevent.parameters import Parameters, read_toml
 from jaxevent.recording import Recording
 from jaxevent.runs import contents
-from jaxevent.runs.calls import described
+from jaxevent.runs.calls import to_toml_table
 from jaxevent.runs.config import (
     NAME,
     NATURAL,
@@ -25,18 +25,17 @@ from jaxevent.runs.config import (
     SIZE,
     STREAM,
     Check,
+    absolute_path,
     check,
+    files_named_in,
     find_recordings,
-    from_anywhere,
     is_number,
     is_text,
     is_texts,
-    named_files,
     read_params,
 )
-from jaxevent.runs.families import HOMES, family_of, find_family
-from jaxevent.runs.family import Goal, Shares
-from jaxevent.runs.own import Function, find_method
+from jaxevent.runs.family import HOMES, Goal, Shares, family_of, find_family
+from jaxevent.runs.own import MethodFunction, find_method
 from jaxevent.splits import SPLITS
 from jaxevent.tuning import Interval, Loss, Settings, begin, with_prior
 
@@ -73,7 +72,7 @@ class Plan:
 
     def inputs(self) -> list[Path]:
         """All files that are read, and can be."""
-        found = [] if self.config is None else [self.config, *named_files(self.config)]
+        found = [] if self.config is None else [self.config, *files_named_in(self.config)]
         for split in SPLITS:
             for name, path in self.recordings[split]:
                 if isinstance(path, Recording):
@@ -187,8 +186,8 @@ def read_plan(config: Path, recordings: Sequence[Any] | None = None) -> Plan:
     text = config.read_bytes()
     try:
         if recordings:
-            table = {**table, "recordings": [from_anywhere(one) for one in recordings]}
-            text = toml.dump(described(table)).encode()
+            table = {**table, "recordings": [absolute_path(one) for one in recordings]}
+            text = toml.dump(to_toml_table(table)).encode()
         return plan_of(table, config.parent, config, text)
     except InputError as error:
         raise InputError(f"{config}: {error}") from None
@@ -261,7 +260,7 @@ def _task(entry: Mapping[str, Any], table: Mapping[str, Any], folder: Path) -> T
     if name is None:
         raise InputError('a method has no name; give name = "akf"')
     method = find_method(name)
-    if isinstance(method, Function):
+    if isinstance(method, MethodFunction):
         raise InputError(
             f"the method {method.name!r} is a function and has no parameters to fit; make an "
             "Estimator"

@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 
 from jaxevent import methods
 from jaxevent.arrays import brief
+from jaxevent.display import describe_type
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator, imported
-from jaxevent.parameters import nearest
+from jaxevent.parameters import suggest_name
 from jaxevent.recording import Recording
-from jaxevent.shown import a_kind
 
 # Keys of rows that are no measures: no metric may have their names.
 RESERVED = (
@@ -43,27 +43,27 @@ RESERVED = (
 
 @dataclasses.dataclass(frozen=True)
 class Metric:
-    """A metric of a user's own, by the name that results give it."""
+    """A user's metric and its name in results."""
 
     name: str
     function: Callable[[Any, Any], Any]
 
     def __call__(self, estimate: NDArray, truth: NDArray, recording: str) -> float:
-        """The metric's number; raises `InputError` naming metric and recording where it has none.
+        """Compute the metric; raise `InputError` naming metric and recording if it gives no number.
 
-        The function gets copies, so that it cannot change what other metrics see.
+        The function gets copies, so that it cannot change the input of other metrics.
         """
         where = f"{recording}: the metric {self.name!r}"
         try:
             value = self.function(np.array(estimate), np.array(truth))
         except Exception as error:  # whatever the user's code raises
-            raise InputError(f"{where} raised {said(error)}; correct it") from error
+            raise InputError(f"{where} raised {describe_error(error)}; correct it") from error
         try:
             number = float(value) if np.size(value) == 1 else None
         except (TypeError, ValueError):
             number = None
         if number is None:
-            raise InputError(f"{where} returned {_shown(value)}; return one number")
+            raise InputError(f"{where} returned {_describe_value(value)}; return one number")
         if not np.isfinite(number):
             raise InputError(
                 f"{where} returned {number}, which has no mean; return a finite number"
@@ -72,15 +72,23 @@ class Metric:
 
 
 def find_metrics(given: Iterable[Any], known: Collection[str]) -> list[Metric]:
-    """The metrics of the user's own among those given; `known` are the protocol's by name.
+    """Find the user's metrics among those given.
 
-    Raises `InputError` for unknown names, for what is not callable and for a name given twice.
+    Args:
+        given: Metrics: names, "package.module:function", functions, or `Metric`s.
+        known: Names of the protocol's own metrics.
+
+    Returns:
+        The user's metrics.
+
+    Raises:
+        InputError: A name is unknown, an object is not callable, or a name is given twice.
     """
     found: dict[str, Metric] = {}
     for one in given:
         if isinstance(one, str) and ":" not in one:
             if one not in known:
-                raise InputError(f"there is no metric {one!r}; {nearest(one, known)}")
+                raise InputError(f"there is no metric {one!r}; {suggest_name(one, known)}")
             continue
         metric = one if isinstance(one, Metric) else _metric(one)
         if metric.name in known or metric.name in RESERVED:
@@ -100,28 +108,40 @@ def _metric(given: Any) -> Metric:
 
 
 def named_metric(given: Any, function: Any, name: str | None = None) -> Metric:
-    """A metric by its own name or another; raises `InputError` for what is none, naming `given`."""
+    """Make a metric from a function.
+
+    Args:
+        given: The metric as the user gave it, for messages.
+        function: A function of an estimate and the truth.
+        name: Name of the metric; None takes the function's.
+
+    Returns:
+        The metric.
+
+    Raises:
+        InputError: The function cannot be called or has no name.
+    """
     if not callable(function) or isinstance(function, type):
         raise InputError(
-            f"the metric {given!r} is {a_kind(function)}, which cannot be called; give a function "
-            "of an estimate and the truth"
+            f"the metric {given!r} is {describe_type(function)}, which cannot be called; give a "
+            "function of an estimate and the truth"
         )
     name = name or getattr(function, "__name__", None) or getattr(function, "name", None)
     if not isinstance(name, str) or name == "<lambda>":
         raise InputError(
-            f"the metric {_shown(given)} has no name; give metrics as a mapping from names, as "
-            '{"my_metric": function}'
+            f"the metric {_describe_value(given)} has no name; give metrics as a mapping from "
+            'names, as {"my_metric": function}'
         )
     return Metric(name, function)
 
 
 def own_names(metrics: Iterable[Metric]) -> dict[str, list[str]]:
-    """The entry of a row that names its own metrics; empty where there are none."""
+    """Return the entry of a row that names the user's metrics; empty without any."""
     names = [metric.name for metric in metrics]
     return {"own_metrics": names} if names else {}
 
 
-class Function(NamedTuple):
+class MethodFunction(NamedTuple):
     """A method that is a function: `estimate = function(recording, times)`."""
 
     name: str
@@ -130,24 +150,24 @@ class Function(NamedTuple):
     def estimate(
         self, recording: Recording, times: NDArray[np.int64], shapes: Sequence[tuple[int, ...]]
     ) -> Estimate:
-        """The estimate at `times` (T,), us, as NumPy arrays.
+        """Call the function and check its result.
 
         Args:
-            recording: What the method is given.
-            times: int64 us.
-            shapes: Of the mean, those possible without the axis of times; -1 is any number.
+            recording: The recording that the method is given.
+            times: (T,) int64, us.
+            shapes: Allowed shapes of the mean without the axis of times; -1 is any number.
 
         Returns:
-            Mean and covariance; the latter is None where the function returns none.
+            Mean and covariance; the latter is None if the function returns none.
 
         Raises:
-            InputError: The function raised something, or returned no array of such a shape.
+            InputError: The function raised an error, or returned no array of an allowed shape.
         """
         where = f"{recording.name}: the method {self.name!r}"
         try:
             found = self.function(recording, times)
         except Exception as error:  # whatever the user's code raises
-            raise InputError(f"{where} raised {said(error)}; correct it") from error
+            raise InputError(f"{where} raised {describe_error(error)}; correct it") from error
         parts = [*found] if isinstance(found, tuple | Estimate) else [found]
         try:
             arrays = [None if part is None else np.asarray(part) for part in parts[:2]]
@@ -156,7 +176,9 @@ class Function(NamedTuple):
         mean = arrays[0] if arrays else None
         wanted = " or ".join(_axes(shape) for shape in shapes)
         if mean is None or mean.dtype.kind not in "iufb" or not _fits(mean.shape, times, shapes):
-            raise InputError(f"{where} returned {_shown(parts[0])}; return an array {wanted}")
+            raise InputError(
+                f"{where} returned {_describe_value(parts[0])}; return an array {wanted}"
+            )
         covariance = arrays[1] if len(arrays) > 1 else None
         mean = mean.astype(np.float64) if mean.dtype.kind != "f" else mean
         return Estimate(mean, covariance, np.isfinite(mean))
@@ -177,10 +199,18 @@ def _axes(shape: tuple[int, ...]) -> str:
     return f"({', '.join(['times', *('targets' if n < 0 else str(n) for n in shape)])})"
 
 
-def find_method(given: Any, family: str | None = None) -> Estimator | Function:
-    """A method by name, "package.module:object" or itself.
+def find_method(given: Any, family: str | None = None) -> Estimator | MethodFunction:
+    """Find a method by name, "package.module:object", or the object itself.
 
-    Raises `InputError` for an unknown name, for one of another family and for what is no method.
+    Args:
+        given: Name, path or object.
+        family: Family that it must belong to; None allows all.
+
+    Returns:
+        The estimator or function.
+
+    Raises:
+        InputError: The name is unknown, the method is of another family, or is no method.
     """
     if isinstance(given, str):
         if ":" not in given:
@@ -188,26 +218,26 @@ def find_method(given: Any, family: str | None = None) -> Estimator | Function:
         found = imported(given, object, "method")
     else:
         found = given
-    if isinstance(found, Function):
+    if isinstance(found, MethodFunction):
         return found
     if isinstance(found, Estimator):
         methods.check_family(found, family, found.name)
         return found
-    what = repr(given) if isinstance(given, str) else _shown(given)
+    what = repr(given) if isinstance(given, str) else _describe_value(given)
     if isinstance(found, type):
         raise InputError(f"the method {what} is a class; give an object of it")
     if not callable(found):
         raise InputError(
-            f"the method {what} is {a_kind(found)}, not an Estimator; give a name, an Estimator or "
-            "a function of a recording and times"
+            f"the method {what} is {describe_type(found)}, not an Estimator; give a name, an "
+            "Estimator or a function of a recording and times"
         )
-    return Function(getattr(found, "__name__", type(found).__name__), found)
+    return MethodFunction(getattr(found, "__name__", type(found).__name__), found)
 
 
 def import_path(thing: Any) -> str | None:
-    """Return the text by which other processes find an object: a method's name, "module:object".
+    """Return the text by which other processes find an object: a method's name, or "module:object".
 
-    None where they cannot: it was made in a notebook or inside a function, or is in no module.
+    None if they cannot: it was made in a notebook or inside a function, or is in no module.
     """
     if isinstance(thing, Estimator):
         if thing.name in methods.names() and methods.find(thing.name) is thing:
@@ -225,21 +255,21 @@ def import_path(thing: Any) -> str | None:
     return None
 
 
-def code_of(path: str) -> str | None:
-    """A hash of the file of the module in "module:object"; None where there is no file."""
+def module_hash(path: str) -> str | None:
+    """Hash the file of the module in "module:object"; None without a file."""
     file = getattr(importlib.import_module(path.partition(":")[0]), "__file__", None)
     if file is None or not Path(file).is_file():
         return None
     return hashlib.blake2b(Path(file).read_bytes(), digest_size=16).hexdigest()
 
 
-def said(error: BaseException) -> str:
-    """An exception in words: its type, and its message in one line."""
+def describe_error(error: BaseException) -> str:
+    """Describe an exception: its type, and its message in one line."""
     reason = " ".join(str(error).split())
     return f"{type(error).__name__}{f' ({reason})' if reason else ''}"
 
 
-def _shown(thing: Any) -> str:
+def _describe_value(thing: Any) -> str:
     shape = getattr(thing, "shape", None)
     if shape is not None and shape != ():
         return f"{getattr(thing, 'dtype', type(thing).__name__)} of shape {tuple(shape)}"

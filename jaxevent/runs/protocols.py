@@ -1,4 +1,4 @@
-"""What of a recording a method of reconstruction is given, and which images it is asked for.
+"""Protocols of reconstruction: the input of a method, and the true images to compare with.
 
 "held-out" gives frames 0, 2, 4, ... and asks for images where frames 1, 3, 5, ... are, at their
 time stamps plus the method's `clock_offset`. With a `gap` g it gives every g-th frame, 0, g, 2 g,
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.events.clocks import check_clocks
-from jaxevent.parameters import nearest
+from jaxevent.parameters import suggest_name
 from jaxevent.recording import Frames, Recording, microseconds
 
 GAP = 2  # every second frame is given
@@ -35,13 +35,22 @@ A_GAP = "a whole number of frames from one that is kept to the next, 2 or more"
 
 
 def is_gap(value: Any) -> bool:
+    """Return true for a whole number of 2 or more."""
     return type(value) is int and value >= 2
 
 
 def held_out(recording: Recording, gap: int = GAP) -> tuple[Recording, Frames]:
-    """The recording with every `gap`-th frame, and the frames taken out of it.
+    """Split a recording into the frames to give and those to hide.
 
-    Raises `InputError` for a gap below 2, for fewer than gap + 1 frames and for no events.
+    Args:
+        recording: A recording with frames and events.
+        gap: Every `gap`-th frame is given.
+
+    Returns:
+        The recording with every `gap`-th frame, and the hidden frames.
+
+    Raises:
+        InputError: The gap is below 2, there are fewer than gap + 1 frames, or no events.
     """
     if not is_gap(gap):
         raise InputError(f"a gap of {gap!r} hides no frame; give {A_GAP}")
@@ -59,9 +68,15 @@ def held_out(recording: Recording, gap: int = GAP) -> tuple[Recording, Frames]:
 
 
 def frames_around(given: Frames, row: int, gap: int = GAP) -> tuple[int, int] | None:
-    """Which of the frames given lie before and after the hidden frame `row`; None after the last.
+    """Return the given frames before and after a hidden one.
 
-    `given` and the number `row` are those that `held_out` tells.
+    Args:
+        given: Frames of the recording that `held_out` returns.
+        row: Index of the hidden frame.
+        gap: As for `held_out`.
+
+    Returns:
+        Indices of the given frames before and after; None after the last.
     """
     before = row // (gap - 1)
     return (before, before + 1) if before + 1 < len(given) else None
@@ -77,11 +92,13 @@ def _need_events(recording: Recording) -> None:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Reference(Frames):
-    """HDR reference images, float intensities that may exceed 1; the exposure is not known.
+    """HDR reference images, float intensities that may exceed 1; the exposure is unknown.
 
-    `timed` says that t is on the events' clock. `clip` is what the frames record from and to.
-    `white` is the value of `images` that is intensity 1; None says so of 1, and NaN of pixels
-    without reference, which are 0 otherwise.
+    Attributes:
+        timed: True if t is on the events' clock.
+        clip: Intensities that the frames record from and to.
+        white: Value of `images` that is intensity 1; then 0 marks pixels without reference. None
+            means 1, and NaN marks them.
     """
 
     timed: bool
@@ -92,15 +109,15 @@ class Reference(Frames):
         """Take the images as they are: `reference` checks them, with limits of their own."""
 
     def truth(self, row: int) -> NDArray[np.float64]:
-        """One image (height, width) of intensity, NaN where there is no reference."""
+        """Return one image (height, width) of intensity, NaN where there is no reference."""
         image = np.asarray(self.images[row], np.float64)
         return image if self.white is None else np.where(image == 0, np.nan, image / self.white)
 
 
 def reference(recording: Recording) -> tuple[Recording, Reference]:
-    """The recording itself, and the HDR images in its `extra`; the text of this module has more.
+    """Return a recording and the HDR images in its `extra`, as this module describes them.
 
-    Raises `InputError` for no or unusable images and for no events.
+    Raises `InputError` for missing or unusable images and for missing events.
     """
     _need_events(recording)
     extra, name = recording.extra, recording.name
@@ -155,13 +172,22 @@ PROTOCOLS: dict[str, Callable[..., tuple[Recording, Frames]]] = {
 
 
 def divide(recording: Recording, protocol: str, gap: int = GAP) -> tuple[Recording, Frames]:
-    """What the protocol of that name gives of a recording, and the images that it asks for.
+    """Apply a protocol to a recording.
 
-    Raises `InputError` for recordings that it cannot use, for an unknown protocol, and for a gap
-    of one that hides no frames. Clocks that cannot be one are refused or warned of.
+    Args:
+        recording: The recording.
+        protocol: "held-out" or "reference".
+        gap: Every `gap`-th frame is given, of the protocol "held-out".
+
+    Returns:
+        The recording to give to methods, and the true images to compare with.
+
+    Raises:
+        InputError: The recording cannot be used, the protocol is unknown, or the gap hides no
+            frames.
     """
     if protocol not in PROTOCOLS:
-        raise InputError(f"there is no protocol {protocol!r}; {nearest(protocol, PROTOCOLS)}")
+        raise InputError(f"there is no protocol {protocol!r}; {suggest_name(protocol, PROTOCOLS)}")
     check_clocks(recording)
     if protocol == "held-out":
         return held_out(recording, gap)
@@ -171,9 +197,14 @@ def divide(recording: Recording, protocol: str, gap: int = GAP) -> tuple[Recordi
 
 
 def frame_times(frames: Frames, clock: Any) -> np.ndarray:
-    """When the frames were taken (us) on the events' clock: plus `clock.clock_offset` (s).
+    """Return the times of frames on the events' clock.
 
-    The times of a `Reference` on that clock as they are.
+    Args:
+        frames: Frames or references; a `Reference` may be on that clock already.
+        clock: An object with the attribute `clock_offset`, s.
+
+    Returns:
+        (frames,) times, us.
     """
     if isinstance(frames, Reference) and frames.timed:
         return frames.t

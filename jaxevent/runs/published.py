@@ -1,4 +1,4 @@
-"""Numbers that were published, shown beside those computed here.
+"""Published numbers, shown beside those computed here.
 
     [[method]]
     name = "published"
@@ -7,10 +7,10 @@
 
     [method.values]
     boxes_6dof = [0.0026, 0.80, 0.26]
-    "trees*1" = [0.0179, 0.82]          # any name that matches; what is left out is not known
+    "trees*1" = [0.0179, 0.82]          # any name that matches; missing numbers are unknown
 
-A row is that of the recording whose name matches, and needs no file of it. Measures are those that
-the tables of an evaluation have columns for, in the units of its rows: `mse` is not times 100.
+A row is that of the recording whose name matches, and needs no file. Measures are those that the
+tables of an evaluation have columns for, in the units of its rows: `mse` is not times 100.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxevent.errors import InputError
-from jaxevent.runs.config import check, is_number, is_texts, one_of
+from jaxevent.runs.config import check, check_choice, is_number, is_texts
 from jaxevent.runs.family import Source
 from jaxevent.show.report import COLUMNS
 
@@ -28,8 +28,8 @@ PLACES = [place for _, place, _, _ in COLUMNS if "." not in place]
 
 
 @dataclasses.dataclass(frozen=True)
-class Published(Source):
-    """Numbers by recording; the text of this module has more."""
+class PublishedResults(Source):
+    """Published numbers by recording; see the text of this module."""
 
     measures: Sequence[str]
     numbers: Mapping[str, Sequence[float | int]]  # by the recordings' names
@@ -37,15 +37,26 @@ class Published(Source):
     name = "published"
 
     @classmethod
-    def of(cls, table: Mapping[str, Any], folder: Path) -> "Published":
-        """From the settings of a configuration; raises `InputError` naming a bad one."""
+    def of(cls, table: Mapping[str, Any], folder: Path) -> "PublishedResults":
+        """Make them from the settings of a configuration.
+
+        Args:
+            table: Settings of a [[method]].
+            folder: Folder of the configuration.
+
+        Returns:
+            The numbers.
+
+        Raises:
+            InputError: A setting cannot be used; the message names it.
+        """
         is_table = (lambda value: isinstance(value, dict) and bool(value), "a table of lists")
         check(table, {"measures": (is_texts, 'names, as ["mse", "ssim"]'), "values": is_table})
         for name in ("measures", "values"):
             if name not in table:
                 raise InputError(f"{name} is missing; published numbers need measures and values")
         for measure in table["measures"]:
-            one_of(measure, "measure", PLACES)
+            check_choice(measure, "measure", PLACES)
         for name, numbers in table["values"].items():
             few = isinstance(numbers, list) and len(numbers) <= len(table["measures"])
             if not few or not all(map(is_number, numbers)):
@@ -56,14 +67,14 @@ class Published(Source):
         return cls(table["measures"], table["values"])
 
     def values(self) -> dict[str, Any]:
-        """The settings."""
+        """Return the settings."""
         return {"measures": list(self.measures), "values": dict(self.numbers)}
 
     def files(self, recording: str) -> Sequence[Path]:
         return ()
 
     def row(self, recording: str) -> dict[str, Any]:
-        """The numbers of that recording, None where none was published."""
+        """Return the numbers of a recording, None for those that are not published."""
         found: Sequence[float | int] = ()
         for name, numbers in self.numbers.items():
             if fnmatch.fnmatchcase(recording, name):

@@ -1,9 +1,9 @@
-"""How methods of reconstruction are scored and fitted.
+"""Fits and scores of reconstruction methods.
 
-They are fitted to images not given to the method, or to the likelihood of the frames that are.
-
-A recording is cut into time windows (or taken whole), each prepared once: a `Part`. `Problem` turns
-the parts of a method into the batches of `jaxevent.optimise`, `Objective` is its loss.
+They are fitted to images hidden from the method, or to the likelihood of the frames that it gets. A
+recording is cut into time windows (or taken whole), each prepared once: a `RecordingWindow`.
+`Problem` turns the windows of a method into the batches of `jaxevent.optimise`, `Objective` is its
+loss.
 """
 
 import dataclasses
@@ -19,16 +19,15 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.devices import ELSEWHERE
+from jaxevent.devices import REMOTE
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.clock import Timing
-from jaxevent.reconstruction.estimator import ImageEstimator
+from jaxevent.reconstruction.estimator import ImageEstimator, PreparedImages
 from jaxevent.reconstruction.features import Numeric, over_pixels, pixel_mesh
-from jaxevent.reconstruction.prepared import PreparedImages
+from jaxevent.reconstruction.frames import Timing
 from jaxevent.recording import Frames, Recording
-from jaxevent.runs.config import NAME, NOT_NEGATIVE, POSITIVE, is_number, one_of
+from jaxevent.runs.config import NAME, NOT_NEGATIVE, POSITIVE, check_choice, is_number
 from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources
 from jaxevent.runs.protocols import A_GAP, GAP, PROTOCOLS, Reference, divide, frame_times, is_gap
 from jaxevent.runs.scores import HeldOut, ImageProtocol, score, subset
@@ -40,8 +39,8 @@ ERRORS = ("linear", "log", "nll")
 REGIONS = ("dark", "well", "bright")
 
 
-class Images(eqx.Module):
-    """A batch: images as a function of parameters, the true ones, how much each value counts."""
+class ImageBatch(eqx.Module):
+    """A batch: images as a function of parameters, the true images, and the weights of values."""
 
     prepared: PreparedImages
     truth: Float[Numeric, "times pixels"]
@@ -49,25 +48,25 @@ class Images(eqx.Module):
     white: Float[Numeric, ""]  # the brightest intensity that the truth can show
     weight: Float[Numeric, ""]  # of this batch's mean among those of other batches
 
-    def over(self, devices: Sequence[Any]) -> "Images":
-        """The batch on several devices, pixels shared out."""
+    def over(self, devices: Sequence[Any]) -> "ImageBatch":
+        """Partition the batch over devices along pixels."""
         mesh = pixel_mesh(devices)
         if mesh is None:
             return self
         rest = (self.truth, self.weights, self.white, self.weight)
         placed = over_pixels(rest, mesh, self.truth.shape[1])
-        return Images(self.prepared.over(devices), *placed)
+        return ImageBatch(self.prepared.over(devices), *placed)
 
 
-class Window(eqx.Module):
+class LikelihoodBatch(eqx.Module):
     """A batch for the likelihood: features, and the number of measured frame pixels."""
 
     features: Any
     weight: Float[Numeric, ""]
 
-    def over(self, devices: Sequence[Any]) -> "Window":
-        """The batch on several devices, pixels shared out."""
-        return Window(self.features.over(devices), self.weight)
+    def over(self, devices: Sequence[Any]) -> "LikelihoodBatch":
+        """Partition the batch over devices along pixels."""
+        return LikelihoodBatch(self.features.over(devices), self.weight)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,24 +106,27 @@ class Objective:
 
     @property
     def likelihood(self) -> bool:
-        """Whether it is the mean of -ln p over what is measured."""
+        """True if it is the mean of -ln p over measurements."""
         return self.error in (None, "nll")
 
     def parts(
         self, params: FrameParams, batch: Any
     ) -> tuple[Float[Array, " parts"], Float[Array, " parts"]]:
-        """The loss of every image and its weight; of a likelihood, of all frames in one."""
+        """Compute the loss of every image and its weight.
+
+        For the likelihood of frames one part in all.
+        """
         if self.error is None:
             return self._of_frames(params, batch)[None], jnp.ones(1)
         counted, each = self._counted(params, batch)
         weights = batch.weights.sum(1) * each
         return counted.sum(1) / jnp.where(weights > 0, weights, 1), weights
 
-    def _of_frames(self, params: FrameParams, batch: Window) -> Array:
+    def _of_frames(self, params: FrameParams, batch: LikelihoodBatch) -> Array:
         """-ln p of the frames given, per frame and pixel."""
         return -self.method.log_likelihood(params, batch.features) / batch.weight  # ty: ignore[missing-attribute]
 
-    def _counted(self, params: FrameParams, batch: Images) -> tuple[Array, int]:
+    def _counted(self, params: FrameParams, batch: ImageBatch) -> tuple[Array, int]:
         """Weighted errors (times, pixels), and how many pixels share a weight."""
         surprising = self.error == "nll"
         image, variance, _ = batch.prepared(params, variance=surprising)
@@ -135,7 +137,7 @@ class Objective:
         counted = jnp.where(batch.weights > 0, batch.weights * errors, 0)
         return counted, batch.truth.shape[1] // batch.weights.shape[1]
 
-    def _difference(self, image: Array, batch: Images) -> Array:
+    def _difference(self, image: Array, batch: ImageBatch) -> Array:
         """Image minus truth, linear or logarithmic.
 
         Evaluation clips images to what the truth can show. Clipped, a pixel beyond white has no
@@ -179,8 +181,8 @@ class Objective:
 
 
 @dataclasses.dataclass(frozen=True)
-class Part:
-    """A window of a recording: what the method is given, and the true images in it."""
+class RecordingWindow:
+    """A window of a recording: the method's input, and the true images in it."""
 
     recording: Recording
     truth: Frames  # of the whole recording
@@ -188,14 +190,14 @@ class Part:
     split: NDArray[np.int64]  # (images,), the place in SPLITS of each; -1: not used
 
 
-def parts(
+def cut_windows(
     recording: Recording,
     protocol: str,
     split: Sequence[int] = (1, 0, 0),
     window: float | int | None = None,
     warm_up: float | int = 0.2,
     gap: int = GAP,
-) -> list[Part]:
+) -> list[RecordingWindow]:
     """Cut a recording into windows of `window` seconds (None: one part, the whole).
 
     The true images are those that the protocol hides (`jaxevent.runs.protocols`), shared out by
@@ -207,7 +209,7 @@ def parts(
     given, truth = divide(recording, protocol, gap)
     use = interleave(split, len(truth))
     if window is None:
-        return [Part(given, truth, np.arange(len(truth)), use)]
+        return [RecordingWindow(given, truth, np.arange(len(truth)), use)]
     length, margin = round(window * 1e6), round(warm_up * 1e6)
     found = []
     for t0 in range(recording.start, recording.stop + 1, length):
@@ -218,7 +220,7 @@ def parts(
         part = given[span]
         if part.frames is None and given.frames is not None:
             continue
-        found.append(Part(part, truth, rows, use[rows]))
+        found.append(RecordingWindow(part, truth, rows, use[rows]))
     return found
 
 
@@ -226,7 +228,7 @@ class Problem:
     """The batches of a method's fit and of its validation: `problem(params)`.
 
     Of several processes each prepares its own parts; in place of the others' batches are
-    `devices.ELSEWHERE`.
+    `devices.REMOTE`.
 
     They are prepared when first asked for and again for params that differ in what preparation
     fixes (`clock.Timing`). `weights` are those of dark, well exposed and bright pixels of HDR
@@ -236,8 +238,8 @@ class Problem:
     def __init__(
         self,
         objective: Objective,
-        fit: Iterable[Part],
-        validation: Iterable[Part] = (),
+        fit: Iterable[RecordingWindow],
+        validation: Iterable[RecordingWindow] = (),
         weights: Mapping[str, float | int] | None = None,
     ):
         self.objective, self.weights = objective, weights
@@ -262,19 +264,19 @@ class Problem:
             used = self._used(part, splits)
             mine = number % jax.process_count() == jax.process_index()
             made = self._batches(part, used, params) if mine and used else []
-            for s, batch in made if mine else [(s, ELSEWHERE) for s in used]:
+            for s, batch in made if mine else [(s, REMOTE) for s in used]:
                 batches[s].append(batch)
         return batches
 
-    def _used(self, part: Part, splits: Sequence[int]) -> Sequence[int]:
-        """Those of the splits that the part has a batch of."""
+    def _used(self, part: RecordingWindow, splits: Sequence[int]) -> Sequence[int]:
+        """Return the splits that have a batch of the window."""
         if self.objective.error is None:
             # Only the frames given are measured, whatever the hidden ones are for.
             return splits[: 1 if part.recording.frames else 0]
         return [s for s in splits if (part.split == s).any()]
 
     def _batches(
-        self, part: Part, splits: Sequence[int], params: FrameParams
+        self, part: RecordingWindow, splits: Sequence[int], params: FrameParams
     ) -> list[tuple[int, Any]]:
         method, dtype = self.objective.method, np.dtype(jnp.result_type(float))
         if self.objective.error is None:
@@ -282,7 +284,7 @@ class Problem:
             assert part.recording.frames is not None
             frames = len(part.recording.frames)
             count = np.asarray(frames * part.recording.width * part.recording.height, dtype)
-            return [(splits[0], Window(features, count))]
+            return [(splits[0], LikelihoodBatch(features, count))]
         times = frame_times(part.truth, params)[part.rows]
         prepared = method.prepare_images(part.recording, times, params, extrapolate=True)
         found = []
@@ -293,7 +295,7 @@ class Problem:
             weights = self._weigh(part, truth)
             white = max(1.0, float(np.nanmax(truth, initial=0)))
             spare = [(0, len(padded) - len(places)), (0, 0)]
-            batch = Images(
+            batch = ImageBatch(
                 prepared.take(padded),
                 np.pad(np.nan_to_num(truth), spare),
                 np.pad(weights, spare),
@@ -303,8 +305,8 @@ class Problem:
             found.append((s, jax.device_put(batch)))
         return found
 
-    def _weigh(self, part: Part, truth: NDArray) -> NDArray:
-        """1 for each image, or a weight for each pixel; 0 where there is no truth."""
+    def _weigh(self, part: RecordingWindow, truth: NDArray) -> NDArray:
+        """Return 1 for each image, or a weight for each pixel; 0 where there is no truth."""
         if not isinstance(part.truth, Reference):
             return np.ones((len(truth), 1), truth.dtype)
         low, high = part.truth.clip
@@ -314,7 +316,7 @@ class Problem:
 
 
 def _intensity(truth: Frames, rows: NDArray[np.int64]) -> NDArray:
-    """Some of the images, (images, pixels), NaN where there is no truth."""
+    """Return some of the images, (images, pixels), NaN where there is no truth."""
     if isinstance(truth, Reference):
         return np.stack([truth.truth(int(row)).ravel() for row in rows])
     return truth[rows].intensity.reshape(len(rows), -1)
@@ -332,7 +334,7 @@ class ImageGoal(Goal):
     gap: int = GAP
 
     @property
-    def part(self) -> str:
+    def part_name(self) -> str:
         return "window" if self.loss.error is None else "image"
 
     @property
@@ -341,7 +343,7 @@ class ImageGoal(Goal):
 
     def problem(self, sources: Sources, split: Shares, window: float | int | None) -> Problem:
         cut = functools.partial(
-            parts,
+            cut_windows,
             protocol=self.protocol,
             split=split or (1, 0, 0),
             window=window,
@@ -415,13 +417,15 @@ class Reconstruction(Family):
                 f"the method {method.name!r} has no gradients and cannot be fitted; fit another, "
                 "or compare its settings by a grid in an evaluation"
             )
-        loss = one_of(settings.get("loss", "held-out"), "loss", [*PROTOCOLS, "likelihood"])
+        loss = check_choice(settings.get("loss", "held-out"), "loss", [*PROTOCOLS, "likelihood"])
         protocol = loss
         if loss == "likelihood":
-            protocol = one_of(settings.get("protocol", "held-out"), "protocol", list(PROTOCOLS))
+            protocol = check_choice(
+                settings.get("protocol", "held-out"), "protocol", list(PROTOCOLS)
+            )
         elif settings.get("protocol", loss) != loss:
             raise InputError(f"the loss {loss!r} has the protocol of that name; omit protocol")
-        error = one_of(settings.get("error", "linear"), "error", ERRORS)
+        error = check_choice(settings.get("error", "linear"), "error", ERRORS)
         weights, gap = settings.get("weights"), settings.get("gap", GAP)
         if "gap" in settings and protocol != "held-out":
             raise InputError("gap is for frames that are hidden, the protocol 'held-out'; omit it")

@@ -1,4 +1,4 @@
-"""A folder of results: made or left as it was, files complete or not at all."""
+"""Results of evaluations and fits: rows, a folder that is complete or not made, checkpoints."""
 
 import contextlib
 import json
@@ -17,21 +17,37 @@ from jaxevent.show.report import flatten, markdown_table, means
 if TYPE_CHECKING:
     import pandas
 
+
+import io
+
+import equinox as eqx
+import numpy as np
+
+from jaxevent.confidence import ParameterInterval, confidence_intervals
+from jaxevent.io.output import finite
+from jaxevent.runs.fit_config import Plan, Task
+from jaxevent.show.report import lay_out
+from jaxevent.splits import SPLITS
+from jaxevent.tuning import Batches, FitResult, Run, begin
+
 Write = Callable[[str, bytes], None]
 
 
 class Rows(list[dict[str, Any]]):
-    """Rows of results: a list of dicts that shows itself as a table."""
+    """Rows of results: a list of dicts with a table as its text."""
 
     def __repr__(self) -> str:
         return self.table()
 
     def table(self) -> str:
-        """The rows as a Markdown table, aligned as plain text too."""
+        """Format the rows as a Markdown table, aligned as plain text too."""
         return markdown_table(self)
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """The rows as a pandas table; nested names are joined by dots, lists are left out."""
+        """Convert the rows to a pandas table.
+
+        Nested names are joined by dots, lists are left out.
+        """
         import pandas
 
         flat = [flatten(row) for row in self]
@@ -44,7 +60,7 @@ class Evaluation(Rows):
     """Rows of `evaluate`, with the means of each method over recordings."""
 
     def means(self) -> "pandas.DataFrame":
-        """The means over recordings: a line for each method, with the number of recordings.
+        """Average over recordings: a line for each method, with the number of recordings.
 
         NaN where no recording has the number.
         """
@@ -77,7 +93,7 @@ class Fits(Rows):
 
     @property
     def params(self) -> Any:
-        """The fitted `Params`; raises `InputError` where several methods were fitted."""
+        """The fitted `Params`; raises `InputError` if several methods were fitted."""
         if len(self.params_by_method) > 1:
             labels = ", ".join(map(repr, self.params_by_method))
             raise InputError(
@@ -86,7 +102,7 @@ class Fits(Rows):
         return next(iter(self.params_by_method.values()))
 
     def table(self) -> str:
-        """The scores of data that no fit saw, what was found and the gain, as Markdown."""
+        """Format the scores of unseen data, the parameters found, and the gain, as Markdown."""
         return self._text
 
 
@@ -98,10 +114,17 @@ def check_folder(
     replace: bool,
     own: bool = False,
 ) -> None:
-    """Raise `InputError` if writing files of these names into a folder would cost something.
+    """Raise `InputError` if files of these names cannot be written into a folder safely.
 
-    Inputs are never written over, existing files only if they are to be replaced or the folder is
-    of a run that goes on: the caller's own. See `jaxevent.io.places.check`.
+    Inputs are never overwritten. Existing files are only if they may be replaced, or if the folder
+    is of a run that continues: the caller's own. See `jaxevent.io.places.check`.
+
+    Args:
+        folder: The folder.
+        names: Names of the files.
+        inputs: Input files.
+        replace: Whether existing files may be replaced.
+        own: Whether the folder is of a run that continues.
     """
     files = [folder / name for name in names]
     check(files, inputs, force=replace, inside=files if own else ())
@@ -113,7 +136,14 @@ def write_rows(
     table: Callable[[list[dict[str, Any]]], str] = markdown_table,
     **more: Any,
 ) -> None:
-    """Write results.json, which holds `more` too, and results.md by a function of `results`."""
+    """Write results.json and results.md.
+
+    Args:
+        rows: Rows of results.
+        write: The function that `results` gives.
+        table: A function from rows to the text of results.md.
+        **more: Further entries of results.json.
+    """
     rows = list(rows)
     text = json.dumps({"rows": rows, **more}, indent=1, allow_nan=False) + "\n"
     write("results.json", text.encode())
@@ -121,8 +151,8 @@ def write_rows(
 
 
 @contextlib.contextmanager
-def alone(folder: Path) -> Iterator[None]:
-    """Keep others from an existing folder; raises `InputError` where one keeps it already."""
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Lock an existing folder; raise `InputError` if another process holds it."""
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(locked(folder))
@@ -134,7 +164,7 @@ def alone(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def results(folder: Path) -> Iterator[Write]:
+def open_results(folder: Path) -> Iterator[Write]:
     """Open a folder for results, made if missing; gives the function `write(name, content)`.
 
     A folder made here is removed again if the block raises, unless it holds finished tasks. Raises
@@ -161,3 +191,145 @@ def results(folder: Path) -> Iterator[Write]:
         if made and not any(folder.glob("tasks/*.json")):
             shutil.rmtree(folder, ignore_errors=True)
         raise
+
+
+TITLES = ("method", "parameter", "start", "found", "95 % interval", "unit", "")
+INDEPENDENT = "measurements, taken as independent"
+
+
+def find_intervals(
+    task: Task, one: FitResult, problem: Callable[[Any], Batches]
+) -> list[dict[str, Any]]:
+    """Return a row for each number that a fit found or searched, as results.json holds it.
+
+    `low` and `high` are the ends of the interval, None where it is open or there is none;
+    `interval` describes it in words, and `of` names the parts that it rests on.
+    """
+    told = confidence_intervals(
+        task.loss, task.params, one.params, task.names, problem, task.search,
+        task.settings.forward,
+    )  # fmt: skip
+    of = f"{told.parts} {task.goal.part_name}s" if told.parts else INDEPENDENT
+    return [_row(task, finding, of) for finding in told.intervals]
+
+
+def _row(task: Task, one: ParameterInterval, of: str) -> dict[str, Any]:
+    ends = {k: None if v is None else finite(v) for k, v in (("low", one.low), ("high", one.high))}
+    return {
+        "method": task.label,
+        "parameter": one.name,
+        "unit": one.unit,
+        "start": one.start,
+        "found": one.value,
+        **ends,
+        "interval": one.interval,
+        "of": "" if one.interval == "-" else of,
+        "remark": one.remark,
+    }
+
+
+def compute_gains(tasks: Sequence[Task], rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the error of each method before and after its fit, over the rows; None if unknown."""
+    found = []
+    for task in tasks:
+        name = task.goal.measure
+        before, after = (
+            _mean([row.get(name) for row in rows if row["method"] == label])
+            for label in (f"{task.label}, before", task.label)
+        )
+        split = next((row["split"] for row in rows if row["method"] == task.label), None)
+        found.append(
+            {"method": task.label, "measure": name, "split": split, "before": before,
+             "after": after}
+        )  # fmt: skip
+    return found
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    told = [value for value in values if value is not None]
+    return float(np.mean(told)) if told and len(told) == len(values) else None
+
+
+def format_findings(found: Sequence[Mapping[str, Any]], gained: Sequence[Mapping[str, Any]]) -> str:
+    """Format the table of the numbers found, and a line for each method's gain."""
+    table: list[list[str]] = [list(TITLES)]
+    for row in found:
+        cells = (row["method"], row["parameter"], f"{row['start']:.4g}", f"{row['found']:.4g}")
+        table.append([*cells, row["interval"], row["unit"], row["remark"]])
+    lines = ["\n" + lay_out(table, (0, 1, 5, 6))]
+    sources: dict[str, list[str]] = {}
+    for row in found:
+        if row["of"] and row["method"] not in sources.setdefault(row["of"], []):
+            sources[row["of"]].append(row["method"])
+    for of, methods in sources.items():
+        lines.append(f"\nIntervals of {', '.join(methods)}: from {of}.\n")
+    for one in gained:
+        if one["before"] is None or one["after"] is None:
+            continue
+        seen = {"test": "test data", "validation": "validation data"}.get(one["split"], "the fit")
+        change = ""
+        if one["measure"] != "nll" and one["before"] > 0:
+            change = f" ({100 * (one['after'] / one['before'] - 1):+.0f} %)"
+        pair = f"{one['before']:.4g} before, {one['after']:.4g} after"
+        lines.append(f"\nGain of {one['method']}: {one['measure']} of {seen} {pair}{change}.\n")
+    return "".join(lines)
+
+
+def save_checkpoint(path: Path, digest: str, done: Sequence[FitResult], run: Run | None) -> None:
+    """Write a checkpoint: a line of JSON, then the arrays as equinox stores them."""
+    header = {
+        "digest": digest,
+        "done": [[one.loss, one.history] for one in done],
+        "run": None if run is None else [run.stage, run.iteration, run.tried, run.history],
+    }
+    arrays = [one.params.raw for one in done], None if run is None else run.position
+    with complete(path) as partial, partial.open("wb") as file:
+        file.write(json.dumps(header).encode() + b"\n")
+        eqx.tree_serialise_leaves(file, arrays)
+
+
+def restore_checkpoint(
+    content: bytes, path: Path, digest: str, plan: Plan
+) -> tuple[list[FitResult], Run | None]:
+    """Read the finished methods of a checkpoint, and the unfinished one, if any."""
+    with io.BytesIO(content) as file:
+        try:
+            header = json.loads(file.readline())
+            if header["digest"] != digest:
+                raise InputError(
+                    f"{path}: is of another configuration, other recordings or another precision; "
+                    "go on with the same ones, or choose another folder"
+                )
+            ended, under_way = header["done"], header["run"]
+            tasks = plan.tasks[: len(ended)]
+            run = None
+            if under_way is not None:
+                task = plan.tasks[len(ended)]
+                run = begin(task.params, task.names, task.settings, task.search)
+            like = [task.params.raw for task in tasks], None if run is None else run.position
+            raws, position = eqx.tree_deserialise_leaves(file, like)
+        except (ValueError, KeyError, TypeError, RuntimeError, EOFError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{path}: is not a checkpoint; remove it to start anew") from error
+    done = [
+        FitResult(task.params.with_raw(raw), *rest)
+        for task, raw, rest in zip(tasks, raws, ended, strict=True)
+    ]
+    return done, None if under_way is None else Run(position, *under_way)
+
+
+def finished_rows(out: Path, plan: Plan) -> list[dict[str, Any]]:
+    """Read the rows of a run that had ended; raise `InputError` if it was another run."""
+    try:
+        same = (out / "config.toml").read_bytes() == plan.text
+        rows = json.loads((out / "results.json").read_bytes())["rows"] if same else []
+    except (OSError, ValueError, KeyError):
+        same, rows = False, []
+    given = {name for split in SPLITS for name, _ in plan.recordings[split]}
+    if not same or {row["recording"] for row in rows} != given:
+        raise InputError(
+            f"{out}: holds results of another run and no checkpoint; leave out --resume to replace "
+            "them, or choose another folder"
+        )
+    return rows

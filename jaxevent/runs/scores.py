@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxevent.devices import local
+from jaxevent.devices import local_devices
 from jaxevent.errors import InputError, require
 from jaxevent.io.output import finite, values_of
 from jaxevent.metrics import (
@@ -32,10 +32,10 @@ from jaxevent.metrics import (
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.recording import Frames, Recording
-from jaxevent.runs.config import METRICS, is_texts, known_as, one_of
-from jaxevent.runs.external import External, Normalise, check_normalise, fit_brightness
+from jaxevent.runs.config import METRICS, check_choice, external_name, is_texts
+from jaxevent.runs.external import ExternalImages, Normalise, check_normalise, fit_brightness
 from jaxevent.runs.family import Protocol
-from jaxevent.runs.own import Function, Metric, find_metrics, own_names
+from jaxevent.runs.own import MethodFunction, Metric, find_metrics, own_names
 from jaxevent.runs.protocols import (
     A_GAP,
     GAP,
@@ -45,7 +45,7 @@ from jaxevent.runs.protocols import (
     frames_around,
     is_gap,
 )
-from jaxevent.runs.published import Published
+from jaxevent.runs.published import PublishedResults
 
 # Further measures of an image and the truth, each a number per image; the first two need an extra.
 # Where an HDR reference has no value both images are 0, which is all that the authors' error needs.
@@ -74,7 +74,10 @@ class Measures(NamedTuple):
 
     @classmethod
     def of(cls, given: Iterable[str | Metric | Callable], protocol: str) -> "Measures":
-        """Those that are given; raises `InputError` for unknown ones and missing extras."""
+        """Find the measures that are given.
+
+        Raise `InputError` for unknown ones and missing extras.
+        """
         given, always = list(given), ALWAYS.get(protocol, ())
         own = find_metrics(given, [*MEASURES, *always])
         names = [one for one in given if isinstance(one, str) and one in MEASURES]
@@ -82,7 +85,7 @@ class Measures(NamedTuple):
         return cls(tuple(dict.fromkeys(names)), tuple(own))
 
     def of_own(self, image: NDArray, truth: NDArray, recording: str) -> dict[str, float]:
-        """The numbers of the user's own metrics."""
+        """Compute the user's own metrics."""
         return {metric.name: metric(image, truth, recording) for metric in self.own}
 
 
@@ -114,10 +117,10 @@ def hidden_scores(
     measures: Measures = NONE_FURTHER,
     recording: str = "",
 ) -> Scores:
-    """The scores of an image in the place of a hidden frame, a `Frames` of one; see `score`.
+    """Score an image in the place of a hidden frame, a `Frames` of one; see `score`.
 
-    `variance` is that of ln(I + I0), None where none is judged; `moving` is where something moves,
-    None where that is not asked; `recording` is the name for messages.
+    `variance` is that of ln(I + I0), None to leave it out; `moving` marks moving pixels, None to
+    leave them out; `recording` is the name for messages.
     """
     shown, true = np.clip(image, 0, 1), truth.intensity[0]
     known = {"mse": mse, "ssim": ssim, **{name: MEASURES[name] for name in measures.names}}
@@ -152,7 +155,7 @@ def _standardised(
     truth: NDArray[np.float64],
     I0: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Squared errors of ln(I + I0) in units of the variance, and where there is one.
+    """Compute squared errors of ln(I + I0) over the variance, and a mask of known variances.
 
     The variance is of the type that the image was computed in.
     """
@@ -177,7 +180,7 @@ def _hdr_measures(
     measures: Measures,
     recording: str,
 ) -> Scores:
-    """The scores of an image against an HDR reference, NaN where there is none."""
+    """Score an image against an HDR reference, NaN where there is none."""
     known = np.isfinite(truth)
     covered = np.where(known, truth, 0)
     masks = {name: mask & known for name, mask in regions(covered, *clip).items()}
@@ -225,8 +228,8 @@ def _hdr_measures(
     return {**scores, "regions": parts}
 
 
-def _listed(scores: list[Scores]) -> dict[str, Any]:
-    """One list per measure of the values of all images, None for what is not a number."""
+def _as_list(scores: list[Scores]) -> dict[str, Any]:
+    """Collect the values of all images, one list per measure; None where not a number."""
     if not scores:
         return {}
 
@@ -239,7 +242,7 @@ def _listed(scores: list[Scores]) -> dict[str, Any]:
 
 
 def _means(per_frame: Mapping[str, Any]) -> dict[str, Any]:
-    """The means over images of what `per_frame` lists; regions' over pixels."""
+    """Average the lists in `per_frame` over images; those of regions over pixels."""
 
     def mean(values: list[float | None], weights: list[Any] | None = None) -> float | None:
         numbers = np.array([math.nan if value is None else value for value in values])
@@ -297,7 +300,7 @@ def subset(row: Mapping[str, Any], frames: ArrayLike) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Sample:
-    """One of the images asked for, at `t` (us, as stamped), and the truth, NaN where unknown."""
+    """An image of those requested, at `t` (us, as stamped), and the truth, NaN where unknown."""
 
     t: int
     image: NDArray[np.floating]
@@ -317,7 +320,7 @@ def _frame_before(given: Recording, t: int) -> NDArray[np.float32] | None:
 
 def score(
     recording: Recording,
-    method: ImageEstimator | External | Function,
+    method: ImageEstimator | ExternalImages | MethodFunction,
     params: FrameParams | None = None,
     protocol: str = "held-out",
     *,
@@ -353,20 +356,20 @@ def score(
     ln(I + 0.003), clipped to the truth's range.
 
     With `normalise` "affine", which is then in the row, the brightness of each image is fitted to
-    the truth first (`external.fit_brightness`), and no variance is judged. Of `External` images,
-    taken for those of `recording.name`, `missing` is how many were asked for in vain, and `seconds`
-    is None.
+    the truth first (`external.fit_brightness`), and no variance is judged. Of `ExternalImages`
+    images, taken for those of `recording.name`, `missing` is how many were asked for in vain, and
+    `seconds` is None.
 
     Raises `InputError` for a recording that the protocol or the method cannot use, for unknown
     metrics and for those whose extra is missing.
     """
-    asked = Asked(protocol, tuple(metrics), normalise, gap, moving)
+    asked = ScoringOptions(protocol, tuple(metrics), normalise, gap, moving)
     return score_and_sample(recording, method, params, asked, progress)[0]
 
 
 @dataclasses.dataclass(frozen=True)
-class Asked:
-    """What is asked of a method, and how its images are scored; see `score`."""
+class ScoringOptions:
+    """The images requested from a method, and their scoring; see `score`."""
 
     protocol: str = "held-out"
     metrics: tuple[str | Metric | Callable, ...] = ()
@@ -390,7 +393,7 @@ class ImageProtocol(Protocol):
         "optional_metrics": (is_texts, 'a list of names, as ["lpips"]'),
     }
     own = {"normalise": (lambda value: value in get_args(Normalise), "'none' or 'affine'")}
-    sources = {External.name: External, Published.name: Published}
+    sources = {ExternalImages.name: ExternalImages, PublishedResults.name: PublishedResults}
 
     def __init__(self, name: str):
         self.name = name
@@ -398,7 +401,7 @@ class ImageProtocol(Protocol):
     def check(self, options: Mapping[str, Any]) -> None:
         Measures.of(options.get("metrics", ()), self.name)
         for name in options.get("optional_metrics", ()):
-            one_of(name, "metric", list(MEASURES))
+            check_choice(name, "metric", list(MEASURES))
 
     def available(self, options: Mapping[str, Any]) -> dict[str, Any]:
         found = dict(options)
@@ -418,7 +421,7 @@ class ImageProtocol(Protocol):
     def score(
         self,
         recording: Recording,
-        method: ImageEstimator | External | Function,
+        method: ImageEstimator | ExternalImages | MethodFunction,
         params: FrameParams | None,
         options: Mapping[str, Any],
         progress: bool | None = None,
@@ -427,7 +430,7 @@ class ImageProtocol(Protocol):
             recording,
             method,
             params,
-            Asked(
+            ScoringOptions(
                 self.name,
                 tuple(options.get("metrics", ())),
                 options.get("normalise", "none"),
@@ -435,7 +438,7 @@ class ImageProtocol(Protocol):
                 options.get("moving", False),
             ),
             progress,
-            known_as(Path(recording.name)),
+            external_name(Path(recording.name)),
         )
         return {**row, "sample": sample}
 
@@ -452,13 +455,16 @@ class HeldOut(ImageProtocol):
 
 def score_and_sample(
     recording: Recording,
-    method: ImageEstimator | External | Function,
+    method: ImageEstimator | ExternalImages | MethodFunction,
     params: FrameParams | None,
-    asked: Asked,
+    asked: ScoringOptions,
     progress: bool | None,
     name: str | None = None,
 ) -> tuple[dict[str, Any], Sample | None]:
-    """As `score`, with the middle one of the images; `name` is by which images are found."""
+    """Score a method as `score` does, and return the middle image too.
+
+    `name` finds external images.
+    """
     given, hidden = divide(recording, asked.protocol, asked.gap)
     measures, normalise = asked.measures, asked.normalise
     named: dict[str, Any] = {"measures": measures, "recording": recording.name}
@@ -466,10 +472,10 @@ def score_and_sample(
     clock = time.perf_counter()
     seconds, estimated = 0.0, False  # whether the method estimates a variance
     values: dict[str, Any]
-    if isinstance(method, External):
+    if isinstance(method, ExternalImages):
         estimates = _external(given, hidden, method, name or recording.name)
         values, I0 = method.values(), 0.0
-    elif isinstance(method, Function):
+    elif isinstance(method, MethodFunction):
         estimates = _of_function(given, hidden, method)
         values, I0 = {}, 0.0
     else:
@@ -501,8 +507,8 @@ def score_and_sample(
                     None if P is None else np.sqrt(P), _frame_before(given, t[-1]),
                 )  # fmt: skip
         clock = time.perf_counter()
-    external = isinstance(method, External)
-    per_frame = {"t": t, **_listed(scores)}
+    external = isinstance(method, ExternalImages)
+    per_frame = {"t": t, **_as_list(scores)}
     row = {
         "recording": recording.name,
         "method": method.name,
@@ -522,7 +528,7 @@ def score_and_sample(
 
 
 def moves(given: Recording, row: int, gap: int) -> NDArray[np.bool_]:
-    """Where the frames given before and after the hidden frame `row` differ."""
+    """Return a mask of pixels in which the given frames around the hidden frame `row` differ."""
     assert given.frames is not None
     around = frames_around(given.frames, row, gap)
     if around is None:
@@ -542,7 +548,7 @@ def _estimates(
     params: FrameParams,
     progress: bool | None,
 ) -> Estimates:
-    options = {"devices": local()} if "devices" in method.options else {}
+    options = {"devices": local_devices()} if "devices" in method.options else {}
     video = method.estimate(given, params, progress=progress, **options)
     first = 0
     for times, told in video.batches(frame_times(hidden, params), extrapolate=True):
@@ -550,7 +556,7 @@ def _estimates(
         first += len(times)
 
 
-def _of_function(given: Recording, hidden: Frames, method: Function) -> Estimates:
+def _of_function(given: Recording, hidden: Frames, method: MethodFunction) -> Estimates:
     shape = (given.height, given.width)
     found = method.estimate(given, hidden.t, [shape])
     variance = found.covariance
@@ -564,7 +570,7 @@ def _of_function(given: Recording, hidden: Frames, method: Function) -> Estimate
     yield 0, found.mean, variance
 
 
-def _external(given: Recording, hidden: Frames, method: External, name: str) -> Estimates:
+def _external(given: Recording, hidden: Frames, method: ExternalImages, name: str) -> Estimates:
     series = method.find(name)
     times = frame_times(hidden, method)
     shape = (given.height, given.width)

@@ -30,10 +30,10 @@ import jax
 import jax.numpy as jnp
 
 from jaxevent import cache
-from jaxevent.devices import double_precision, local
+from jaxevent.devices import double_precision, local_devices
+from jaxevent.display import describe_type
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.progress import bar
-from jaxevent.shown import a_kind
 
 CONNECT = 30  # s that a scheduler has to answer
 LEAVE = 5  # s that a process has to end
@@ -77,14 +77,14 @@ class Outcome:
 
 
 @dataclasses.dataclass(frozen=True)
-class Place:
-    """Where tasks run: in this process; in `workers` processes; on a Dask cluster.
+class ComputeResources:
+    """Processes or machines that run tasks: this process, `workers` processes, or a Dask cluster.
 
-    Of several devices of this process each has a task at a time; of too few tasks for that, each
-    may use all. Processes take one device each, in turn.
+    With several devices in this process, each runs one task at a time; with too few tasks for that,
+    each task may use all. Worker processes take one device each, in turn.
 
     `cluster` is the address of its scheduler, a `distributed.Client` or a cluster object;
-    `scheduler_file` is the file that tells the address. Raises `InputError` if more than one is
+    `scheduler_file` is the file that holds the address. Raises `InputError` if more than one is
     given, for less than one worker and without the extra.
     """
 
@@ -106,13 +106,13 @@ class Place:
             or isinstance(getattr(self.cluster, "scheduler_address", None), str)
         ):
             raise InputError(
-                f"the cluster is {a_kind(self.cluster)}; give the address of a Dask "
+                f"the cluster is {describe_type(self.cluster)}; give the address of a Dask "
                 "scheduler, as HOST:PORT, a distributed.Client or a cluster"
             )
 
     @property
     def remote(self) -> bool:
-        """Whether tasks run on a cluster."""
+        """True if tasks run on a cluster."""
         return self.cluster is not None or self.scheduler_file is not None
 
 
@@ -120,7 +120,7 @@ def run(
     function: Callable[..., Any],
     tasks: Sequence[Task],
     folder: Path | None = None,
-    place: Place | None = None,
+    place: ComputeResources | None = None,
     *,
     retries: int = 2,
     progress: bool | None = None,
@@ -145,7 +145,7 @@ def run(
     """
     if retries < 0:
         raise InputError(f"{retries} retries are not possible; give 0 or more")
-    place = place or Place()
+    place = place or ComputeResources()
     folder = None if folder is None else folder.absolute()
     if folder is not None:
         try:
@@ -168,7 +168,7 @@ def run(
         done = _in_processes(function, todo, folder, retries, place.workers)
     elif place.remote:
         done = _on_cluster(function, todo, folder, retries, place)
-    elif len(todo) >= len(devices := local()) > 1:
+    elif len(todo) >= len(devices := local_devices()) > 1:
         done = _on_devices(function, todo, folder, retries, devices)
     else:
         done = _here(function, todo, folder, retries)
@@ -393,7 +393,7 @@ def _cores() -> int:
 
 
 def _serve(connection: multiprocessing.connection.Connection, threads: int, number: int) -> None:
-    """What a worker process does: answer tasks by (record, whether to try again)."""
+    """Run a worker process: answer tasks by (record, whether to try again)."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started it ends it
     os.environ["NPROC"] = str(threads)  # of XLA on the CPU, when it starts
     parent = multiprocessing.parent_process()
@@ -404,7 +404,7 @@ def _serve(connection: multiprocessing.connection.Connection, threads: int, numb
             os._exit(1)
 
     threading.Thread(target=leave, daemon=True).start()
-    devices = local()
+    devices = local_devices()
     if len(devices) > 1:
         jax.config.update("jax_default_device", devices[number % len(devices)])
     while True:
@@ -423,7 +423,7 @@ def _on_cluster(
     tasks: Sequence[Task],
     folder: Path | None,
     retries: int,
-    place: Place,
+    place: ComputeResources,
 ) -> Records:
     distributed = require("distributed", "cluster")
     given = place.cluster

@@ -17,7 +17,7 @@ from jaxevent.recording import Events, EventSource, Recording, Times, microsecon
 from jaxevent.show.canvas import new_figure
 from jaxevent.show.motion_pictures import motion_figure
 from jaxevent.show.track_plots import draw_paths
-from jaxevent.tuning import Fitted
+from jaxevent.tuning import FitResult
 
 ON, OFF = "#c8401e", "#3a78b5"
 WIDE = 7.0  # inches of a figure
@@ -139,7 +139,7 @@ def plot_motion(
     return motion_figure(motion, np.unique(us), truth, centred=centred)
 
 
-def plot_losses(fitted: Fitted | Sequence[Fitted], names: Sequence[str] = ()) -> Any:
+def plot_losses(fitted: FitResult | Sequence[FitResult], names: Sequence[str] = ()) -> Any:
     """Draw the losses of fits over iterations, a line for each start; `names` are titles."""
     several = list(fitted) if isinstance(fitted, Sequence) else [fitted]
     titles = list(names) or [""] * len(several)

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from jaxevent.display import plural
 from jaxevent.egomotion import flow as event_flow
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.egomotion.motion import MotionEstimate, is_observable, table_columns
@@ -39,7 +40,6 @@ from jaxevent.show.motion_pictures import (
     span_of,
     window_of,
 )
-from jaxevent.shown import plural
 
 
 def write_motion_table(

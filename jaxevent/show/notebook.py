@@ -1,6 +1,6 @@
 """What notebooks show of a recording, a reconstruction, tracks and a motion: HTML.
 
-`import jaxevent` has `jaxevent.shown` use `as_html`, so that recordings need not know of pictures.
+`import jaxevent` hands `as_html` to `jaxevent.display`, so that recordings know no pictures.
 Pictures take at most `MOST` events' work; without the extra "plot" they are left out.
 """
 
@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from jaxevent.blob.tracks import Tracks
+from jaxevent.display import plural
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.errors import InputError
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Recording
 from jaxevent.show.figures import plot_events, plot_image, plot_motion, plot_tracks
-from jaxevent.shown import plural
 
 MOST = 1_000_000  # events that a reconstruction passes over for its picture
 LINES = 12  # of a table of tracks

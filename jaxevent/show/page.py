@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import jaxevent
+from jaxevent.display import plural
 from jaxevent.errors import install_command
 from jaxevent.metrics import LOG_OFFSET, MEANINGS
 from jaxevent.show.report import (
@@ -29,7 +30,6 @@ from jaxevent.show.report import (
     short_names,
     tone_map,
 )
-from jaxevent.shown import plural
 
 SIDE = 360  # pixels of the longer side of a picture
 STRIPS = 12  # recordings with pictures and plots over time; more would make the page slow to open

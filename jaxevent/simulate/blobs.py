@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.parameters import nearest
+from jaxevent.parameters import suggest_name
 from jaxevent.recording import Events, Recording, Times, microseconds
 
 Pair = tuple[float | int, float | int]
@@ -245,7 +245,7 @@ class Target:
     def __post_init__(self) -> None:
         if self.shape not in get_args(Shape):
             raise InputError(
-                f"a target's shape is {self.shape!r}; {nearest(self.shape, get_args(Shape))}"
+                f"a target's shape is {self.shape!r}; {suggest_name(self.shape, get_args(Shape))}"
             )
         if not (0 < self.rate < math.inf and 0 <= self.flicker < math.inf and self.burst >= 0):
             raise InputError(
@@ -539,6 +539,6 @@ def blob_scene(name: str, seed: int = 0, **settings: Any) -> tuple[Recording, Tr
     Raises `InputError` for an unknown name.
     """
     if name not in _SCENES:
-        raise InputError(f"there is no scene {name!r}; {nearest(name, BLOB_SCENES)}")
+        raise InputError(f"there is no scene {name!r}; {suggest_name(name, BLOB_SCENES)}")
     targets, size, duration, noise = _SCENES[name](**settings)
     return simulate_blobs(targets, size, duration, noise, seed, name)

@@ -22,7 +22,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.parameters import nearest
+from jaxevent.parameters import suggest_name
 from jaxevent.recording import Events, Poses, Recording, Times, microseconds
 from jaxevent.simulate.hybrid import SENSORS, Sensor, simulate
 
@@ -159,7 +159,7 @@ def texture_of(
     """
     kinds = ("noise", "shapes", "plain")
     if kind not in kinds:
-        raise InputError(f"there is no texture {kind!r}; {nearest(kind, kinds)}")
+        raise InputError(f"there is no texture {kind!r}; {suggest_name(kind, kinds)}")
     if not 0 < grain < math.inf:
         raise InputError(f"a texture's grain of {grain} m is not possible; give a positive length")
     rng = np.random.default_rng(seed)
@@ -503,9 +503,9 @@ def motion_scene(
     Raises `InputError` for an unknown name or motion, and where the camera leaves the world.
     """
     if name not in MOTION_SCENES:
-        raise InputError(f"there is no scene {name!r}; {nearest(name, MOTION_SCENES)}")
+        raise InputError(f"there is no scene {name!r}; {suggest_name(name, MOTION_SCENES)}")
     if motion not in get_args(Change):
-        raise InputError(f"there is no motion {motion!r}; {nearest(motion, get_args(Change))}")
+        raise InputError(f"there is no motion {motion!r}; {suggest_name(motion, get_args(Change))}")
     names = MOTION_SCENES.index(name)
     rng = np.random.default_rng([seed, names])
     texture_seed = int(rng.integers(1 << 30))

@@ -31,27 +31,31 @@ def files_of(folder: Path) -> list[Path]:
 
 
 CALLER = """
-from parts import RATE, third
+from parts import CONFIG, RATE, third
 def share(x):
-    return third(x) * RATE
+    return third(x) * RATE * CONFIG.gain
 """
 PARTS = """
+import typing
 import numba
 RATE = {rate}
+class Config(typing.NamedTuple):
+    gain: float
+CONFIG = Config({gain})
 @numba.njit
 def third(x):
     return x / {by}
 """
 
 
-@pytest.mark.parametrize("changed", [{"by": 6}, {"rate": 2}])
+@pytest.mark.parametrize("changed", [{"by": 6}, {"rate": 2}, {"gain": 2}])
 def test_what_a_function_calls_or_reads_may_change(changed, tmp_path, monkeypatch):
     monkeypatch.setenv("JAXEVENT_CACHE", str(tmp_path / "kept"))
     (tmp_path / "caller.py").write_text(CALLER)
     monkeypatch.syspath_prepend(tmp_path)
 
-    def fresh(by=3, rate=1):
-        (tmp_path / "parts.py").write_text(PARTS.format(by=by, rate=rate))
+    def fresh(by=3, rate=1, gain=1):
+        (tmp_path / "parts.py").write_text(PARTS.format(by=by, rate=rate, gain=gain))
         for name in ("caller", "parts"):
             monkeypatch.delitem(sys.modules, name, raising=False)
         monkeypatch.setattr(sys, "dont_write_bytecode", True)
@@ -62,7 +66,8 @@ def test_what_a_function_calls_or_reads_may_change(changed, tmp_path, monkeypatc
     assert fresh()(12.0) == 4
     again = fresh()
     assert again(12.0) == 4 and sum(again.stats.cache_hits.values()) == 1
-    assert fresh(**changed)(12.0) == 12.0 / changed.get("by", 3) * changed.get("rate", 1)
+    other = {"by": 3, "rate": 1, "gain": 1} | changed
+    assert fresh(**changed)(12.0) == 12.0 / other["by"] * other["rate"] * other["gain"]
 
 
 def test_signatures_compiled_at_the_same_time_keep_apart(half, tmp_path, monkeypatch):

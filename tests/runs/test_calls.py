@@ -318,10 +318,10 @@ def test_tracks_of_objects(dot, tmp_path):
     by_name = evaluate({"a": recording}, "moment", positions={"a": tmp_path / "dot.csv"})
     assert by_name[0]["rmse"] == rows[0]["rmse"]
     for positions, said in (
-        ({"b": table}, "a: no table of what is true has this name; known: b"),
+        ({"b": table}, "a: no table of the ground truth has this name; known: b"),
         (table.drop(columns="x"), "a: positions: has no column 'x'"),
         (table.assign(x="much"), "x is 'much' in row 0; give a number, or leave the row out"),
-        (3, "what is true is an int that is no table"),
+        (3, "the ground truth is an int that is no table"),
     ):
         with pytest.raises(InputError, match=said):
             evaluate({"a": recording}, "moment", positions=positions)

@@ -16,7 +16,7 @@ import jaxevent
 from jaxevent import cli
 from jaxevent.methods import METHODS
 from jaxevent.runs.evaluate import evaluate
-from jaxevent.runs.external import External, fit_brightness
+from jaxevent.runs.external import ExternalImages, fit_brightness
 from jaxevent.runs.scores import score, subset
 
 HIDDEN = STAMPS[1::2]
@@ -28,8 +28,8 @@ images = "e2vid/{recording}"
 """
 
 
-def external(folder: Path, **settings) -> External:
-    return External.of({"images": "e2vid/{recording}", **settings}, folder)
+def external(folder: Path, **settings) -> ExternalImages:
+    return ExternalImages.of({"images": "e2vid/{recording}", **settings}, folder)
 
 
 @pytest.fixture
@@ -270,7 +270,7 @@ def test_settings_that_cannot_be(settings, said, tmp_path):
         evaluate(write_config(tmp_path, text))
 
 
-def change(folder: Path, what: str) -> External:
+def change(folder: Path, what: str) -> ExternalImages:
     """Spoil the images in one way."""
     here = folder / "e2vid" / "small"
     settings = {}

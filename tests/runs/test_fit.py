@@ -32,13 +32,12 @@ from jaxevent import cli
 from jaxevent.estimator import Estimate
 from jaxevent.methods import HOMES, METHODS
 from jaxevent.parameters import Number, Parameters, Positive
-from jaxevent.reconstruction.estimator import PixelEstimator
+from jaxevent.reconstruction.estimator import PixelEstimator, ScannedImages
 from jaxevent.reconstruction.filtering import Filter
-from jaxevent.reconstruction.prepared import ScannedImages
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.runs.fit import fit
 from jaxevent.runs.protocols import Reference, held_out
-from jaxevent.runs.reconstruction import Images, Objective, Problem, parts
+from jaxevent.runs.reconstruction import ImageBatch, Objective, Problem, cut_windows
 from jaxevent.runs.scores import score
 from jaxevent.splits import interleave
 from jaxevent.tuning import Settings, begin, optimise
@@ -338,14 +337,14 @@ def test_images_are_shared_out_in_a_fixed_pattern():
 
 
 @dataclasses.dataclass(frozen=True)
-class Shown(PixelEstimator):
+class HtmlRepr(PixelEstimator):
     """A method whose images are what it is given to read, with the variance 0.3."""
 
     @property
-    def filters(self):
+    def is_event_driven(self):
         return False
 
-    def start(self, params, features):
+    def init_state(self, params, features):
         return None
 
     def run(self, params, features, state=None, future=None):
@@ -383,7 +382,7 @@ def test_errors_by_hand(error, clipped):
     weights = np.linspace(0.5, 2, len(truth))[None]
     weights[0, 3] = 0
     shown, true = jnp.asarray(image[None]), jnp.asarray(truth[None])
-    method = Shown("shown", jaxevent.akf.Params)
+    method = HtmlRepr("shown", jaxevent.akf.Params)
     objective = Objective(method, error, clipped)
     one = jnp.asarray(1.0)
 
@@ -391,7 +390,7 @@ def test_errors_by_hand(error, clipped):
     @jax.value_and_grad
     def loss(image, weights):
         given = ScannedImages(None, image, method)
-        batch = Images(given, true, weights, jnp.asarray(white), one)
+        batch = ImageBatch(given, true, weights, jnp.asarray(white), one)
         return objective(jaxevent.akf.Params(), batch)
 
     expected = [by_hand(error, i, t, clipped, white) for i, t in zip(image, truth, strict=True)]
@@ -411,14 +410,14 @@ def test_errors_by_hand(error, clipped):
 def test_the_loss_bounds_the_evaluated_error():
     """It equals what evaluation says of images within [0, 1], and is more for others."""
     recording = moving()
-    problem = Problem(Objective(METHODS["blend"]), parts(recording, "held-out"))
+    problem = Problem(Objective(METHODS["blend"]), cut_windows(recording, "held-out"))
     params = METHODS["blend"].Params(clock_offset=0.002)
     value = float(jax.jit(problem.objective)(params, problem(params)[0][0]))
     row = score(recording, METHODS["blend"], params)
     assert value == pytest.approx(row["mse"], rel=1e-6)
     edi = METHODS["edi"]
     params = edi.Params(c_on=0.5, c_off=0.3)
-    problem = Problem(Objective(edi), parts(recording, "held-out"))
+    problem = Problem(Objective(edi), cut_windows(recording, "held-out"))
     value = float(jax.jit(problem.objective)(params, problem(params)[0][0]))
     assert value > 1.01 * score(recording, edi, params)["mse"]
 
@@ -426,7 +425,7 @@ def test_the_loss_bounds_the_evaluated_error():
 @pytest.mark.parametrize("window", [0.1, 0.17, 2.0])
 def test_windows_use_every_image_once(window):
     recording = moving()
-    cut = parts(recording, "held-out", (2, 1, 1), window, 0.05)
+    cut = cut_windows(recording, "held-out", (2, 1, 1), window, 0.05)
     given, hidden = held_out(recording)
     assert sorted(np.concatenate([part.rows for part in cut])) == list(range(len(hidden)))
     split = np.concatenate([part.split for part in cut])
@@ -448,7 +447,7 @@ def test_batches_of_windows_weigh_their_images():
     row = score(recording, blend, params)
     use = interleave([2, 1, 1], row["frames"])
     # With a margin that holds the next frames, a blend does not see that it was cut.
-    problem = Problem(Objective(blend), parts(recording, "held-out", (2, 1, 1), 0.2, 0.1))
+    problem = Problem(Objective(blend), cut_windows(recording, "held-out", (2, 1, 1), 0.2, 0.1))
     objective = jax.jit(problem.objective)
     for split, batches in enumerate(problem(params)):
         assert len(batches) == 3 and len({batch.truth.shape for batch in batches}) == 1
@@ -469,7 +468,7 @@ def test_references_weigh_their_regions():
     extra = {"hdr": hdr, "hdr_t": np.arange(1, 6) * 90_000, "clip": np.array([0.01, 1.0])}
     recording = dataclasses.replace(recording, extra=extra)
     method, params = METHODS["last-frame"], METHODS["last-frame"].Params()
-    cut = parts(recording, "reference", (1, 0, 0))
+    cut = cut_windows(recording, "reference", (1, 0, 0))
     assert isinstance(cut[0].truth, Reference)
     values = {}
     for name in ("dark", "well", "bright"):
@@ -520,11 +519,13 @@ def test_thresholds_and_clock_are_recovered(fitted):
     # Events lag behind the intensity, by half a threshold where it rises or falls.
     assert LATE * 1e-6 < float(params.clock_offset) < LATE * 1e-6 + 0.002
     # Nowhere in a fine scan is the loss lower.
-    problem = Problem(Objective(edi), parts(moving(), "held-out", (2, 1, 1)))
+    problem = Problem(Objective(edi), cut_windows(moving(), "held-out", (2, 1, 1)))
 
     def loss(offset: float) -> float:
         shifted = edi.Params(**{**params.values(), "clock_offset": offset})
-        return float(jaxevent.tuning.loss_of(problem.objective, shifted, problem(shifted)[0][0]))
+        return float(
+            jaxevent.tuning.evaluate_loss(problem.objective, shifted, problem(shifted)[0][0])
+        )
 
     scan = [float(offset) for offset in np.arange(0.003, 0.008, 0.00025)]
     losses = [loss(offset) for offset in scan]
@@ -596,11 +597,11 @@ def test_what_a_fit_writes(fitted):
 def test_gradients_of_a_reconstruction_agree():
     """Forwards, in reverse, and by differences, of two starts."""
     edi = METHODS["edi"]
-    problem = Problem(Objective(edi), parts(moving(), "held-out", (2, 1, 1)))
+    problem = Problem(Objective(edi), cut_windows(moving(), "held-out", (2, 1, 1)))
     params = edi.Params(clock_offset=0.004)
     batch = problem(params)[0][0]
     raw = {name: params.raw[name] + jnp.array([0, 0.1]) for name in ("c_on", "I0")}
-    slopes = functools.partial(jaxevent.tuning.slopes, problem.objective)
+    slopes = functools.partial(jaxevent.tuning.loss_and_grad, problem.objective)
     forward, reverse = (slopes(mode, params, raw, batch) for mode in (True, False))
     np.testing.assert_allclose(forward[0], reverse[0], rtol=1e-12)
     for name in raw:
@@ -647,7 +648,7 @@ class Killed(BaseException):
 
 def interrupted(monkeypatch, after: int) -> None:
     """Let the next fit die between its n-th checkpoint and the one after."""
-    save, count = jaxevent.runs.fit.save, 0
+    save, count = jaxevent.runs.fit.save_checkpoint, 0
 
     def dying(*arguments):
         nonlocal count
@@ -656,7 +657,7 @@ def interrupted(monkeypatch, after: int) -> None:
         count += 1
         save(*arguments)
 
-    monkeypatch.setattr(jaxevent.runs.fit, "save", dying)
+    monkeypatch.setattr(jaxevent.runs.fit, "save_checkpoint", dying)
 
 
 def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):

@@ -13,7 +13,7 @@ from jaxevent.errors import InputError
 from jaxevent.methods import METHODS, names
 from jaxevent.runs.fit_config import Task, read_plan
 from jaxevent.simulate import Circle, Target, motion_scene, simulate_blobs
-from jaxevent.tuning import optimise, slopes
+from jaxevent.tuning import loss_and_grad, optimise
 
 # Of each method a number whose gradient is not 0 in its recording; by default c_on.
 FITTED = {"moving_moments": "tau_moments"}
@@ -96,7 +96,7 @@ def test_the_loss_has_a_slope(folder, name):
     (batch, *_), _ = problem(one.params)
     raw = {number: one.params.raw[number][None]}
     forward = one.settings.forward is not False
-    loss, slope = slopes(one.goal.loss, forward, one.params, raw, batch)
+    loss, slope = loss_and_grad(one.goal.loss, forward, one.params, raw, batch)
     assert np.isfinite(loss).all() and np.isfinite(slope[number]).all()
     acts = abs(float(slope[number][0])) > 1e-7 * abs(float(loss[0]))
     assert acts == (name not in IDLE)

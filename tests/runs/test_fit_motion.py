@@ -21,7 +21,7 @@ from jaxevent.egomotion.particle_filter import filtering
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Imu, Poses, Recording
 from jaxevent.runs import egomotion_scores
-from jaxevent.runs.egomotion import FAMILY, Loss
+from jaxevent.runs.egomotion import FAMILY, MotionLoss
 
 VELOCITIES = ((150.0, 80.0), (-90.0, 60.0), (40.0, -170.0))
 START = {"particles": 32, "batch": 16, "every": 4, "noise": 3.0, "tau_max": 0.06}
@@ -142,7 +142,7 @@ def test_bad_settings(tmp_path, capsys):
 def test_loss_of_a_perfect_filter_is_small():
     params = voting.Params.of({**START, "particles": 100, "noise": 0.1})
     goal = FAMILY.goal(voting, params, {"truth": "*.csv"})
-    assert goal.loss == Loss(False) and "tau_max" in params.without_gradient()
+    assert goal.loss == MotionLoss(False) and "tau_max" in params.without_gradient()
     with pytest.raises(InputError, match="true motion"):
         FAMILY.goal(voting, params, {})
 

@@ -16,7 +16,7 @@ from jaxevent.reconstruction.filtering import Filter
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.evaluate import evaluate
 from jaxevent.runs.protocols import held_out
-from jaxevent.runs.reconstruction import parts
+from jaxevent.runs.reconstruction import cut_windows
 from jaxevent.runs.scores import score, subset
 
 I0, VARIANCE = 0.5, 0.04
@@ -105,7 +105,7 @@ def test_a_method_that_breaks_has_no_numbers():
     def broken(params, state, dt, frame):
         return dataclasses.replace(state, L=jnp.full_like(frame.level, jnp.nan))
 
-    row = score(longer(), dataclasses.replace(certain(), advance=broken), params, moving=True)
+    row = score(longer(), dataclasses.replace(certain(), predict=broken), params, moving=True)
     for name in ("mse", "z2", "z2_median"):
         assert row[name] is None
     assert row["moving"]["mse"] is None and row["moving"]["share"] > 0
@@ -118,7 +118,7 @@ def test_a_gap_is_given_and_hidden_wholly():
     assert hidden.t.tolist() == recording.frames.t[[1, 2, 3, 5, 6, 7, 9]].tolist()
     usual, default = held_out(recording, 2), held_out(recording)
     assert usual[0].frames.t.tolist() == default[0].frames.t.tolist()
-    (part,) = parts(recording, "held-out", gap=4)
+    (part,) = cut_windows(recording, "held-out", gap=4)
     assert part.truth.t.tolist() == hidden.t.tolist()
 
 

@@ -13,7 +13,7 @@ import pytest
 from errands import errand, log
 
 from jaxevent.errors import InputError
-from jaxevent.runs.tasks import Outcome, Place, Task, attempt, run
+from jaxevent.runs.tasks import ComputeResources, Outcome, Task, attempt, run
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +30,10 @@ def address():
 
 
 @pytest.fixture(params=["here", "processes", "cluster"])
-def place(request) -> Place | None:
+def place(request) -> ComputeResources | None:
     if request.param == "cluster":
-        return Place(cluster=request.getfixturevalue("address"))
-    return Place(workers=2) if request.param == "processes" else None
+        return ComputeResources(cluster=request.getfixturevalue("address"))
+    return ComputeResources(workers=2) if request.param == "processes" else None
 
 
 def tasks_of(folder: Path, **then: str) -> list[Task]:
@@ -90,7 +90,7 @@ def test_a_task_that_another_run_has_finished_is_read(tmp_path):
 def test_a_dead_worker_loses_nothing_and_blames_only_its_task(tmp_path):
     some = tasks_of(tmp_path, a="", b="die", c="", d="die", e="")
     some[3].arguments["times"] = 9
-    outcomes = run(errand, some, None, Place(workers=2), retries=1)
+    outcomes = run(errand, some, None, ComputeResources(workers=2), retries=1)
     assert [outcome.error is None for outcome in outcomes] == [True, True, True, False, True]
     assert outcomes[3].error == "d: its process died (exit code -9)"
     assert calls(tmp_path) == {"a": 1, "b": 2, "c": 1, "d": 2, "e": 1}
@@ -129,19 +129,19 @@ if __name__ == "__main__":
 
 def test_places_that_cannot_be(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="exclude each other; give one"):
-        Place(workers=2, cluster="tcp://x:1")
+        ComputeResources(workers=2, cluster="tcp://x:1")
     with pytest.raises(InputError, match="0 workers cannot work"):
-        Place(workers=0)
+        ComputeResources(workers=0)
     with pytest.raises(InputError, match="-1 retries are not possible"):
         run(errand, [], retries=-1)
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="file/x: the folder cannot be made"):
         run(errand, [], tmp_path / "file" / "x")
     with pytest.raises(InputError, match="none.json: there is no such scheduler file"):
-        run(errand, [], None, Place(scheduler_file=tmp_path / "none.json"))
+        run(errand, [], None, ComputeResources(scheduler_file=tmp_path / "none.json"))
     monkeypatch.setattr("jaxevent.runs.tasks.CONNECT", 1)
     with pytest.raises(InputError, match="tcp://127.0.0.1:9: no Dask scheduler answers"):
-        run(errand, tasks_of(tmp_path, a=""), None, Place(cluster="tcp://127.0.0.1:9"))
+        run(errand, tasks_of(tmp_path, a=""), None, ComputeResources(cluster="tcp://127.0.0.1:9"))
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"\[cluster\]"):
-        Place(cluster="tcp://x:1")
+        ComputeResources(cluster="tcp://x:1")

@@ -16,7 +16,7 @@ from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Events
 from jaxevent.show import notebook
-from jaxevent.tuning import Fitted
+from jaxevent.tuning import FitResult
 
 
 class Tracks(jaxevent.blob.tracks.Tracks):
@@ -111,7 +111,7 @@ def test_a_motion_and_the_losses_of_a_fit():
     line = show.plot_motion(motion(), np.arange(5_000, 15_000, 1000)).axes[0].lines[0]
     np.testing.assert_allclose(line.get_ydata(), np.linspace(-5, 5, 20)[5:15])
     history = [[0, 0, 0, 3.0, None], [0, 0, 1, 2.0, 2.5], [0, 1, 0, 1.0, None], [1, 0, 0, 4.0, 5.0]]
-    fitted = Fitted(jaxevent.akf.Params(), 1.0, history)
+    fitted = FitResult(jaxevent.akf.Params(), 1.0, history)
     (axis,) = show.plot_losses(fitted).axes
     points = [list(zip(*line.get_data(), strict=True)) for line in axis.lines]
     assert points == [[(0, 3.0), (1, 2.0), (2, 1.0)], [(1, 2.5)], [(0, 4.0)], [(0, 5.0)]]

@@ -48,7 +48,7 @@ from jaxevent.egomotion.geometry import blur, splat
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import CovarianceCalibration, MotionEstimate
 from jaxevent.egomotion.patches import ImageSpeed
-from jaxevent.parameters import Choice, Count, Parameters, Positive, Share
+from jaxevent.parameters import Choice, Count, Parameters, Positive, UnitInterval
 from jaxevent.progress import bar
 from jaxevent.recording import Recording
 
@@ -87,7 +87,7 @@ class Params(Parameters):
     margin = Count(16, "px", "of the image around the sensor")
 
     duration = Positive(0.1, "s", "length of a window, in which the motion is constant")
-    overlap = Share(0.5, "", "fraction of a window that the next one has too")
+    overlap = UnitInterval(0.5, "", "fraction of a window that the next one has too")
     speed_max = Positive(4000.0, "px/s", "planar: largest component of motions of the search")
     omega_max = Positive(30.0, "rad/s", "rotation: largest component of motions of the search")
     contrast = Positive(1.2, "", "square of J, relative to chance, below which the motion is lost")
@@ -495,8 +495,8 @@ class WindowSequence:
     def search(self, part: EventRange) -> NDArray[np.float64]:
         """Search all motions for that of a window.
 
-        By grids of motions. Each has a window so short that its motions differ by
-        `GRID_SPACING_PX` at the end. The widest grid, of all motions, has the shortest window. Each further grid is
+        By grids of motions. Each has a window so short that its motions differ by `GRID_SPACING_PX`
+        at the end. The widest grid, of all motions, has the shortest window. Each further grid is
         `GRID_FACTOR` narrower, and its window as much longer, up to the whole one. The best of each
         grid, and of the windows before, are refined in the next window. So a motion is found at any
         speed, and where several explain a short window a longer one separates them.

@@ -41,7 +41,7 @@ from jaxevent.egomotion.models import General, Model
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.patches import ImageSpeed
 from jaxevent.errors import InputError, require
-from jaxevent.parameters import Count, Parameters, Positive, Share
+from jaxevent.parameters import Count, Parameters, Positive, UnitInterval
 from jaxevent.progress import bar
 from jaxevent.recording import Frames, Recording
 
@@ -62,7 +62,7 @@ class Params(Parameters):
     iterations = Count(30, "", "most iterations of a level")
     fewest = Count(5, "", "least number of points of an estimate")
 
-    quality = Share(0.01, "", "least strength of a corner, relative to the best one")
+    quality = UnitInterval(0.01, "", "least strength of a corner, relative to the best one")
     spacing = Positive(5.0, "px", "least distance of two corners")
     returns = Positive(0.5, "px", "largest distance from the start of a point tracked back")
     span = Positive(0.4, "s", "general motion: least time between the two frames")

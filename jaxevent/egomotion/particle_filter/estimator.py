@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from jaxevent import dispatch
 from jaxevent.camera import PinholeCamera
 from jaxevent.codegen.expressions import Untranslatable
-from jaxevent.deprecated import RenamedAttribute
-from jaxevent.devices import along, mesh
+from jaxevent.deprecated import renamed_methods
+from jaxevent.devices import make_mesh, shard
 from jaxevent.egomotion.candidates import Candidates, CandidateSampler, ExpectedFlow
 from jaxevent.egomotion.estimator import (
     COMMON_OPTIONS,
@@ -76,6 +76,7 @@ class ReadoutTimes(eqx.Module):
     inside: Bool[Array | np.ndarray, " times"]  # of the recording, from the first batch on
 
 
+@renamed_methods(gatherer="sampler")
 @dataclasses.dataclass(frozen=True, repr=False)
 class VotingEstimator(MotionEstimator[Params]):
     """Motion by voting, batch by batch, as events arrive.
@@ -84,8 +85,6 @@ class VotingEstimator(MotionEstimator[Params]):
     can need. `prepare` knows no motion and samples candidates for the whole range of a search; of
     more than `params.candidates` these many evenly.
     """
-
-    gatherer = RenamedAttribute("sampler")
 
     def initial_params(self, model: type[Model]) -> Params:
         return Params(preset=model.preset)
@@ -376,19 +375,19 @@ class WarmStartedRuns(TrainingRuns):
     def over(self, devices: Sequence[Any]) -> "WarmStartedRuns":
         # Runs are distributed, or particles if runs are too few.
         runs, particles = self.noise.normal.shape[0], self.start.shape[0]
-        chosen = mesh(devices, runs)
+        chosen = make_mesh(devices, runs)
         by_run = chosen is not None and chosen.size == len(devices)
         if not by_run:
-            chosen = mesh(devices, particles)
+            chosen = make_mesh(devices, particles)
         if chosen is None:
             return jax.device_put(self, devices[0])
         noise = self.noise
         axes = (0, 0, 0, None) if by_run else (2, None, 1, 0)
         arrays = (noise.normal, noise.uniform, noise.cloud, self.start)
-        placed = [along(chosen, v, axis) for v, axis in zip(arrays, axes, strict=True)]
+        placed = [shard(chosen, v, axis) for v, axis in zip(arrays, axes, strict=True)]
         return eqx.tree_at(
             lambda b: (b.noise.normal, b.noise.uniform, b.noise.cloud, b.start),
-            along(chosen, self),
+            shard(chosen, self),
             placed,
         )
 

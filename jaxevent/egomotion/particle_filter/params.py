@@ -1,6 +1,6 @@
 """Parameters of motion by voting."""
 
-from jaxevent.parameters import Choice, Count, Number, Parameters, Positive, Share
+from jaxevent.parameters import Choice, Count, Number, Parameters, Positive, UnitInterval
 
 
 class Params(Parameters):
@@ -56,7 +56,7 @@ class Params(Parameters):
     baseline = Positive(
         6.5, "px", "b: distance that a point moves within the range of ages", gradient=False
     )
-    youngest = Share(
+    youngest = UnitInterval(
         0.7, "", "least age of candidates, as a fraction of the largest", gradient=False
     )
     tau_max = Positive(0.1, "s", "oldest candidates; 2 b / (expected speed)", gradient=False)
@@ -90,7 +90,7 @@ class Params(Parameters):
     contrast = Positive(
         1.1, "", "votes, relative to chance, below which a search starts anew", gradient=False
     )
-    drop = Share(0.25, "", "votes, relative to their mean so far, for that", gradient=False)
+    drop = UnitInterval(0.25, "", "votes, relative to their mean so far, for that", gradient=False)
     off = Positive(
         0.03,
         "",

@@ -21,20 +21,20 @@ from numpy.typing import NDArray
 
 from jaxevent import dispatch
 from jaxevent.codegen.expressions import Untranslatable
-from jaxevent.devices import accelerated, full_precision
+from jaxevent.devices import full_precision, has_accelerator
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
-from jaxevent.reconstruction.clock import Timing
+from jaxevent.locks import TurnLock
 from jaxevent.reconstruction.engine.loop import Images
 from jaxevent.reconstruction.engine.passes import DividedRecording, Passes
 from jaxevent.reconstruction.engine.pixel import Directions
 from jaxevent.reconstruction.engine.video import wants_kernel, without_kernel
 from jaxevent.reconstruction.features import Numeric
+from jaxevent.reconstruction.frames import Timing
 from jaxevent.reconstruction.windows import sorted_times
 from jaxevent.recording import Recording, Times
-from jaxevent.sharing import Turns
 
-IN_TURN = dispatch.run_in_turn()  # whether kernels may be called from within programs
+IN_TURN = dispatch.use_synchronous_dispatch()  # whether kernels may be called from within programs
 
 _held: "weakref.WeakValueDictionary[int, Divided]" = weakref.WeakValueDictionary()
 _numbers = itertools.count()
@@ -49,13 +49,13 @@ class Divided(abc.ABC):
     """
 
     def __init__(self, method: Any, recording: Recording, times: NDArray[np.int64], params: Any):
-        self.recording = DividedRecording(recording, Timing.of(params), method.filters)
+        self.recording = DividedRecording(recording, Timing.of(params), method.is_event_driven)
         self.method, self.dtype = method, self.recording.dtype
         self.pixels = recording.width * recording.height
         self.clock_offset = np.asarray(params.clock_offset)
         self._times = times - self.recording.origin
         self._made_of = method, recording, times, params
-        self._turns = Turns(f"images of {recording.name}")
+        self._turns = TurnLock(f"images of {recording.name}")
         dead = params.without_gradient()
         numbers = [
             (leaf, k)
@@ -173,7 +173,7 @@ def prepared_by_kernel(
 
     See `Filter.prepare_images`. Raises `InputError` where numba is asked for what it cannot do.
     """
-    elsewhere = compiler is None and accelerated()
+    elsewhere = compiler is None and has_accelerator()
     if elsewhere or not (wants_kernel(compiler, jax.local_devices()) and IN_TURN):
         return None
     if "rho_ref" in params.followed:
