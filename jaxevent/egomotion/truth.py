@@ -134,9 +134,7 @@ def _is_rotation(R: NDArray[np.float64]) -> bool:
 
 
 def from_gyro(
-    imu: Imu,
-    bias: ArrayLike = (0.0, 0.0, 0.0),
-    rotation: ArrayLike | None = None,
+    imu: Imu, bias: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None
 ) -> Twists:
     """Convert a gyro's rates to twists without T: Omega = rotation (gyro - bias).
 

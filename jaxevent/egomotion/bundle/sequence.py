@@ -37,7 +37,7 @@ def estimate_motion(params: Params, given: HostInputs) -> MotionEstimate:
     Args:
         params: Parameters.
         given: Recording, camera, seed of the choice of events, and the option `gyro`
-            (`twists.from_gyro`), which gives Omega.
+            (`truth.from_gyro`), which gives Omega.
 
     Returns:
         The motion, lost at times that no window determines.

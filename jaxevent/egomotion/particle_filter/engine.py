@@ -399,11 +399,7 @@ class CompiledFilter:
         return int(self._nodes.counters[engine_loop.USED])
 
     def __call__(
-        self,
-        candidates: Candidates,
-        noise: RandomNumbers,
-        state: ParticleState,
-        n_cloud: int = 0,
+        self, candidates: Candidates, noise: RandomNumbers, state: ParticleState, n_cloud: int = 0
     ) -> tuple[ParticleState, BatchInfo]:
         """Run the filter over stacked batches, on the host.
 

@@ -29,11 +29,7 @@ from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import CovarianceCalibration, MotionEstimate
 from jaxevent.egomotion.particle_filter import filtering
 from jaxevent.egomotion.particle_filter.engine import CompiledFilter
-from jaxevent.egomotion.particle_filter.filtering import (
-    BatchInfo,
-    ParticleState,
-    RandomNumbers,
-)
+from jaxevent.egomotion.particle_filter.filtering import BatchInfo, ParticleState, RandomNumbers
 from jaxevent.egomotion.particle_filter.params import Params
 from jaxevent.egomotion.patches import ImageSpeed
 from jaxevent.errors import InputError

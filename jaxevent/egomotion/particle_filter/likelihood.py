@@ -446,10 +446,7 @@ def literal_distance(
 
 
 def is_along_edge(
-    params: Params,
-    d: Float[Array, "2 C"],
-    age: Float[Array, " C"],
-    last: Float[Array, ""],
+    params: Params, d: Float[Array, "2 C"], age: Float[Array, " C"], last: Float[Array, ""]
 ) -> Bool[Array, " C"]:
     """Return which candidates fired along one edge with the event, across the motion (6.6.5).
 
