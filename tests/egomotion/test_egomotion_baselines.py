@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from points import moved, recorded, turning
 from scipy.ndimage import gaussian_filter, map_coordinates, shift
 from scipy.spatial.transform import Rotation
 
@@ -16,50 +17,22 @@ from jaxevent.egomotion.baselines import fits, points
 from jaxevent.egomotion.baselines import planes as plane_fits
 from jaxevent.egomotion.baselines.points import fit_general
 from jaxevent.errors import InputError
-from jaxevent.recording import Events, Frames, Recording
+from jaxevent.recording import Events, Frames
 from jaxevent.simulate import motion_scene
 
 WIDTH, HEIGHT, F = 96, 72, 90.0
-CAMERA = PinholeCamera(F, F, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+SIZE = WIDTH, HEIGHT
+CENTRE = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
+CAMERA = PinholeCamera(F, F, *CENTRE)
+
+
+def turning_flow(omega):
+    return turning(np.array(omega), F, CENTRE)
+
+
 SMALL = contrast.Params.of(
     dict(events=4000, duration=0.06, speed_max=300.0, omega_max=3.0, starts=5, margin=8)
 )
-
-
-def recorded(t, x, y, p, camera=None, shape=(HEIGHT, WIDTH)):
-    order = np.argsort(t, kind="stable")
-    events = Events(
-        np.asarray(t, np.int64)[order], np.asarray(x, np.uint16)[order],
-        np.asarray(y, np.uint16)[order], np.asarray(p, bool)[order],
-    )  # fmt: skip
-    return Recording("made", shape[1], shape[0], events, camera=camera)
-
-
-def moved(flow, seconds, number, seed=0, camera=None):
-    """Points that follow flow(positions) in px/s, each an event at every pixel that it enters."""
-    rng = np.random.default_rng(seed)
-    size, dt, rows = np.array([WIDTH, HEIGHT]), 4e-4, []
-    at = rng.uniform(0, size, (number, 2))
-    sign, cell = rng.random(number) < 0.5, np.floor(at)
-    for k in range(int(seconds / dt)):
-        at = at + flow(at - 0.5) * dt
-        left = (at < 0).any(1) | (at >= size).any(1)
-        at = np.mod(at, size)
-        new = np.flatnonzero((np.floor(at) != cell).any(1) & ~left)
-        cell = np.floor(at)
-        rows.append(np.stack([1e6 * dt * (k + rng.random(len(new))), *cell[new].T, sign[new]], 1))
-    return recorded(*np.concatenate(rows).T, camera=camera)
-
-
-def turned(omega):
-    """The flow of a camera that turns, by the derivative of projected points: P' = -omega x P."""
-
-    def flow(at):
-        P = np.stack([(at[:, 0] - CAMERA.cx) / F, (at[:, 1] - CAMERA.cy) / F, np.ones(len(at))], 1)
-        V = -np.cross(omega, P)
-        return F * (V[:, :2] - P[:, :2] * V[:, 2:])
-
-    return flow
 
 
 def swept(normals, speeds, seconds=0.5):
@@ -74,7 +47,7 @@ def swept(normals, speeds, seconds=0.5):
         t[tile == k] -= t[tile == k].min()
     t = 1e6 * (t + 0.02 * (tile + 1))
     keep = t < 1e6 * seconds
-    return recorded(np.rint(t)[keep], x[keep], y[keep], np.ones(keep.sum()))
+    return recorded(np.rint(t)[keep], x[keep], y[keep], np.ones(keep.sum()), *SIZE)
 
 
 def texture(seed=0, shape=(HEIGHT, WIDTH)):
@@ -85,7 +58,7 @@ def texture(seed=0, shape=(HEIGHT, WIDTH)):
 def filmed(images, camera=None, step=40000):
     t = np.arange(len(images)) * step
     kept = Frames(t, np.clip(images, 0, 1).astype(np.float32), np.zeros(len(t), np.int64))
-    none = recorded([], [], [], [], camera, images[0].shape)
+    none = recorded([], [], [], [], *images[0].shape[::-1], camera)
     return dataclasses.replace(none, frames=kept)
 
 
@@ -116,7 +89,7 @@ def test_neighbours_off_the_plane_are_left_out():
     t = 1000 + x * 5000.0  # 200 px/s to the right
     outlier = (y % 4 == 0) & (x % 4 == 1)
     t[outlier] += 4000
-    recording = recorded(t, x, y, np.ones(81), shape=(9, 9))
+    recording = recorded(t, x, y, np.ones(81), 9, 9)
     flow = {}
     for tolerance in (1.5, 100.0):
         params = planes.Params.of(dict(radius=3, tolerance=tolerance, rough=1.0, oldest=0.1))
@@ -134,7 +107,7 @@ def test_bursts_count_once(rounds):
     first = 1000 + x * 5000.0
     t = np.concatenate([first + 700 * k * (1 + (x + y) % 3) for k in range(rounds)])
     x, y = np.tile(x, rounds), np.tile(y, rounds)
-    recording = recorded(t, x, y, np.ones(len(x)), shape=(9, 9))
+    recording = recorded(t, x, y, np.ones(len(x)), 9, 9)
     made = plane_fits.normal_flow(recording, planes.Params.of(dict(apart=0.02)))
     assert made.valid.sum() > 20
     np.testing.assert_allclose(made.flow[made.valid], [[200.0, 0]] * made.valid.sum(), atol=1e-6)
@@ -171,13 +144,13 @@ def test_without_outliers_the_fit_is_least_squares():
 @pytest.fixture(scope="module")
 def straight():
     velocity = np.array([120.0, -70.0])
-    return moved(lambda at: velocity, 0.15, 250), velocity
+    return moved(lambda at: velocity, 0.15, 250, size=SIZE), velocity
 
 
 @pytest.fixture(scope="module")
-def turning():
+def rotating():
     omega = np.array([0.8, -0.9, 1.2])
-    return moved(turned(omega), 0.15, 250, camera=CAMERA), omega
+    return moved(turning_flow(omega), 0.15, 250, camera=CAMERA, size=SIZE), omega
 
 
 def passing(model, truth):
@@ -211,10 +184,9 @@ def passing(model, truth):
         now = Rotation.from_rotvec(truth * t[:, None]).apply(X)
         t[abs((m[tile] * now).sum(1)) > 1e-6] = np.inf
     keep = (abs(speed)[tile] > 25) & (abs(t) < 0.2)
-    return recorded(
-        np.rint(1e6 * (t[keep] + 0.2)), x[keep], y[keep], np.ones(keep.sum()),
-        CAMERA if model == "rotation" else None,
-    )  # fmt: skip
+    camera = CAMERA if model == "rotation" else None
+    t = np.rint(1e6 * (t[keep] + 0.2))
+    return recorded(t, x[keep], y[keep], np.ones(keep.sum()), *SIZE, camera)
 
 
 @pytest.mark.parametrize(
@@ -332,7 +304,7 @@ def windowed(model, number=150, seed=0, **settings):
     rng = np.random.default_rng(seed)
     t = np.sort(rng.integers(0, 30000, number))
     x, y = rng.integers(8, WIDTH - 8, number), rng.integers(8, HEIGHT - 8, number)
-    recording = recorded(t, x, y, rng.random(number) < 0.5, CAMERA)
+    recording = recorded(t, x, y, rng.random(number) < 0.5, *SIZE, CAMERA)
     params = contrast.Params.of(dict(events=200, duration=0.03, **settings))
     windows = maximisation.WindowSequence(recording, params, model)
     motion = {"planar": [90.0, -40.0], "rotation": [0.7, -0.4, 0.9]}[model]
@@ -392,9 +364,9 @@ def test_in_view_is_what_the_sensor_sees_all_the_time():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["planar", "rotation"])
-def test_contrast_finds_the_motion(straight, turning, model):
+def test_contrast_finds_the_motion(straight, rotating, model):
     """From nothing; and the covariance tells the error."""
-    recording, truth = straight if model == "planar" else turning
+    recording, truth = straight if model == "planar" else rotating
     motion = contrast.estimate(recording, SMALL, model=model)
     assert len(motion) >= 3 and motion.valid.all() and (motion.contrast > 1.5).all()
     off = motion.mean - truth
@@ -407,7 +379,7 @@ def test_contrast_finds_the_motion(straight, turning, model):
 @pytest.mark.parametrize("omega", [[3.0, -9.0, 12.0], [14.0, 8.0, -6.0]])
 def test_a_search_finds_fast_rotations(omega):
     """Some ten times as fast as the window, at once, could be searched."""
-    recording = moved(turned(np.array(omega)), 0.024, 800, camera=CAMERA)
+    recording = moved(turning_flow(omega), 0.024, 800, camera=CAMERA, size=SIZE)
     params = contrast.Params.of(dict(events=4000, duration=0.02, margin=8, starts=5))
     windows = maximisation.WindowSequence(recording, params, "rotation")
     found = windows.search(next(iter(windows)))
@@ -442,7 +414,7 @@ def test_a_lone_window_tells_how_the_motion_changes():
     def faster(at):
         return np.tile([next(speeds), 0.0], (len(at), 1))
 
-    recording = moved(faster, 0.06, 800)
+    recording = moved(faster, 0.06, 800, size=SIZE)
     params = contrast.Params.of({**SMALL.values(), "duration": 1.0})
     motion = contrast.estimate(recording, params)
     assert list(motion.t) == pytest.approx([recording.start, 30_000, recording.stop], abs=500)
@@ -478,7 +450,7 @@ def test_silence_and_noise_are_lost_and_the_motion_found_again(straight, optimis
 @pytest.mark.parametrize("number", [0, 1, 50])
 @pytest.mark.parametrize("method", [planes, contrast])
 def test_few_events_are_lost(method, number):
-    few = recorded([5] * number, range(number), [3] * number, [1] * number)
+    few = recorded([5] * number, range(number), [3] * number, [1] * number, *SIZE)
     motion = method.estimate(few)
     assert not motion.valid.any() and len(motion) == (number > 0)
     assert np.isfinite(motion.mean).all() and np.isfinite(motion.covariance).all()

@@ -61,7 +61,7 @@ class AgeRange(eqx.Module):
 
 
 class Votes(eqx.Module):
-    """What a particle expects of the candidates of an event, or K, before they vote."""
+    """Expectations of particles for the candidates of an event, or K, before they vote."""
 
     U: Float[Array, "*K 2 N"]  # px/s
     line: Float[Array, "*K 2 N"] | None  # direction of the half-line
