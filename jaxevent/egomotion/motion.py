@@ -241,8 +241,11 @@ class MotionEstimate(HtmlRepr):
         Returns:
             The estimate with the larger covariance, and a warning; "" if nothing was added.
         """
-        from jaxevent.egomotion.model_selection import flow_consistency
-        from jaxevent.egomotion.patches import is_camera_static, measure_image_speed
+        from jaxevent.egomotion.patches import (
+            flow_consistency,
+            is_camera_static,
+            measure_image_speed,
+        )
 
         speed = measure_image_speed(recording) if recording.frames else None
         if self.valid.any() and is_camera_static(recording, speed):

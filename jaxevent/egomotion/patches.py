@@ -11,21 +11,31 @@ sharpest one whose displacement is within the grid determines the speed |d| / L 
 Frames show whether the camera is static. Where it moves, all edges across its motion make events;
 where it is static, those of the background make none. So `is_camera_static` counts the strongest
 edges of frames that have an event beside them while the image moves by a few pixels.
+
+    flow_consistency(recording)  # whether all parts of the image move as one
+
+Motion models are fitted to patches (`fit_planar`, `fit_rotation`, `fit_general`), each to one half
+of the pixels. On the other half, D_p is the log of a patch's sharpness under one model less that
+under another. Errors of patches are independent, so z = sum D_p / sqrt(sum D_p^2) is standard
+normal where both explain the events alike.
 """
 
 import contextlib
 import dataclasses
 import weakref
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, maximum_filter
+from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.codegen import njit_noalloc
 from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
 from jaxevent.egomotion.candidates import pixel_coordinates
+from jaxevent.egomotion.geometry import A, rotation_basis
+from jaxevent.egomotion.models import Model, Planar, Rotation
 from jaxevent.recording import Recording
 
 PATCH_PX = 24
@@ -44,6 +54,15 @@ FRAME_DISPLACEMENT_PX = 5.0  # of the image around a frame whose edges are count
 EDGE_FRACTION = 0.1  # of the pixels, those of the steepest log intensity
 DARK_LEVEL = 0.05  # of full scale, added before the logarithm: darker greys are noise
 MAX_STATIC_EDGES = 0.3  # fraction of edges with events, below which the camera is static
+
+FIT_TIMES = 4  # at which patches are evaluated for fits
+FIT_DISPLACEMENT_PX = 10  # of their grid, in x and y
+WINDOW_DISPLACEMENT_PX = 5.0  # median displacement of the image in a window of a fit
+HALF_LINE_PX = np.linspace(0, 1.4 * FIT_DISPLACEMENT_PX, 29)  # positions along a half-line
+N_HEADINGS = 6  # from which a general motion is refined
+MIN_Z = 3.0  # from which parts of the image move apart
+# Of the model's displacement; a roll moves half of the patches backwards.
+SPEED_FACTORS = np.concatenate([-np.geomspace(3.0, 0.3, 25), np.geomspace(0.3, 3.0, 25)])
 
 # Of `measure_image_speed`: the latest events, sensor and camera, and result.
 _latest: tuple[Any, Any, "ImageSpeed | None"] = (lambda: None, None, None)
@@ -334,6 +353,250 @@ def _find_edges(image: NDArray[np.float32]) -> NDArray[np.bool_]:
     smooth = gaussian_filter(np.log(image + DARK_LEVEL), 1.0)
     slope = np.hypot(np.gradient(smooth, axis=0), np.gradient(smooth, axis=1))
     return slope >= np.quantile(slope, 1 - EDGE_FRACTION)
+
+
+@renamed_fields(both="both_directions")
+@renamed_methods(several="is_inconsistent")
+@dataclasses.dataclass(frozen=True)
+class FlowConsistency:
+    """Differences between the motions of parts of the image, along the model's direction.
+
+    Attributes:
+        spread: Standard deviation of the speeds, relative to their median.
+        z: Test statistic of whether they differ.
+        slow: 10th percentile of the speeds, px/s.
+        fast: 90th percentile of the speeds, px/s.
+        both_directions: Whether some parts move backwards.
+    """
+
+    spread: float
+    z: float
+    slow: float
+    fast: float
+    both_directions: bool
+
+    @property
+    def is_inconsistent(self) -> bool:
+        """Return whether the image does not move as one."""
+        return self.z > MIN_Z
+
+
+def flow_consistency(
+    recording: Recording,
+    model: type[Model] = Planar,
+    camera: PinholeCamera | None = None,
+    speed: ImageSpeed | None = None,
+) -> FlowConsistency | None:
+    """Test whether the image moves as one, as planar motion or a rotation does.
+
+    Each patch may move by its own factor of the displacement that the model makes there.
+
+    Args:
+        recording: The recording.
+        model: `Planar` or `Rotation`.
+        camera: The camera; by default the recording's.
+        speed: The speed of the image; by default it is measured.
+
+    Returns:
+        The consistency, or None where nothing is seen to move, and for other models.
+    """
+    camera = camera or recording.camera
+    if model not in (Planar, Rotation):
+        return None
+    speed = speed or measure_image_speed(recording, camera)
+    if speed is None:
+        return None
+    _, f = pixel_coordinates(recording.width, recording.height, camera)
+    factors = np.append(SPEED_FACTORS, 1.0)
+    differences, best_factors, speeds = [], [], []
+    for window in measure_windows(recording, speed, camera):
+        d = fit_planar(window)
+        if float(np.hypot(*d)) < 1:
+            continue
+        displacements = np.tile(d, (len(window.xi), 1))
+        if model is Rotation:
+            turn = fit_rotation(window, f, d)
+            displacements = np.asarray(rotation_basis(window.xi, f)) @ turn
+        own = factors[:, None, None] * displacements
+        train = log_sharpness(window, 0, own)
+        best, rows = train.argmax(0), np.arange(len(window.xi))
+        differences.append(
+            log_sharpness(window, 1, own[best, rows]) - log_sharpness(window, 1, own[-1])
+        )
+        gain = train.max(0) - train[-1] + train.max(0) - np.median(train, 0)
+        is_sharp = gain > np.log(1.3)
+        factor = factors[best][is_sharp]
+        best_factors.append(factor)
+        speeds.append(np.abs(factor) * np.hypot(*displacements[is_sharp].T) / window.duration)
+    if not best_factors or not len(np.concatenate(best_factors)):
+        return None
+    factor = np.concatenate(best_factors)
+    low, high = np.percentile(factor, [16, 84])
+    slow, fast = np.percentile(np.concatenate(speeds), [10, 90])
+    median = float(np.median(np.abs(factor)))
+    spread = float((high - low) / 2 / max(median, 1e-9))
+    z = z_score(np.concatenate(differences))
+    return FlowConsistency(spread, z, float(slow), float(fast), bool(low < 0))
+
+
+def measure_windows(
+    recording: Recording, speed: ImageSpeed, camera: PinholeCamera | None = None
+) -> list[PatchSharpness]:
+    """Evaluate patches at some times, in windows in which the image moves by a few px.
+
+    Args:
+        recording: The recording.
+        speed: Speed of the image.
+        camera: The camera; by default the recording's.
+
+    Returns:
+        The windows that hold enough events.
+    """
+    windows = []
+    xi, _ = pixel_coordinates(recording.width, recording.height, camera or recording.camera)
+    for middle in spread_times(recording, FIT_TIMES):
+        near = [(abs(t - middle), v) for t, v in speed.by_time if np.isfinite(v)]
+        here = min(near)[1] if near else speed.median
+        duration = DURATIONS_S[np.abs(np.log(DURATIONS_S * here / WINDOW_DISPLACEMENT_PX)).argmin()]
+        window = measure_sharpness(recording, middle, float(duration), FIT_DISPLACEMENT_PX, xi)
+        if window is not None:
+            windows.append(window)
+    return windows
+
+
+def log_sharpness(
+    window: PatchSharpness, half: int, displacements: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Interpolate the log of the sharpness of patches.
+
+    Args:
+        window: The patches.
+        half: Half of the pixels, 0 or 1.
+        displacements: (..., patches, 2) displacements, px.
+
+    Returns:
+        (..., patches) values.
+    """
+    at = np.clip(displacements + FIT_DISPLACEMENT_PX, 0, 2 * FIT_DISPLACEMENT_PX)
+    patch = np.broadcast_to(np.arange(len(window.xi)), at.shape[:-1])
+    values = np.log(np.maximum(window.energy[half], 1e-6))
+    return map_coordinates(values, [patch, at[..., 1], at[..., 0]], order=1, mode="nearest")
+
+
+def _minimise(loss: Callable[[NDArray], float], starts: list[NDArray], size: float) -> NDArray:
+    """Minimise a loss from several starts by simplexes of a size."""
+    from scipy.optimize import minimize
+
+    options = {"maxiter": 250, "xatol": 1e-3 * size, "fatol": 1e-3}
+    found = []
+    for start in starts:
+        simplex = np.concatenate([start[None], start + size * np.eye(len(start))])
+        options["initial_simplex"] = simplex
+        found.append(minimize(loss, start, method="Nelder-Mead", options=options))
+    return min(found, key=lambda one: one.fun).x
+
+
+def fit_planar(window: PatchSharpness) -> NDArray[np.float64]:
+    """Fit one displacement (2,) in px to all patches."""
+    n = len(window.displacements)
+    sums = np.log(np.maximum(window.energy[0], 1e-6)).sum(0)
+    row, column = divmod(int(sums.argmax()), n)
+    start = window.displacements[[column, row]]
+
+    def loss(d: NDArray) -> float:
+        return -float(log_sharpness(window, 0, np.tile(d, (len(window.xi), 1))).sum())
+
+    return _minimise(loss, [start], 0.5)
+
+
+def fit_rotation(
+    window: PatchSharpness, f: float, planar: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Fit a rotation to the patches.
+
+    Args:
+        window: The patches.
+        f: Focal length, px.
+        planar: (2,) displacement of all patches, px, from which the fit starts.
+
+    Returns:
+        (3,) rotation vector over the window, rad.
+    """
+    basis = np.asarray(rotation_basis(window.xi, f))
+    first = np.array([planar[1] / f, -planar[0] / f, 0.0])
+    roll = 2.0 / max(float(np.hypot(*window.xi.T).mean()), 1.0)
+    starts = [first + np.array([0, 0, k * roll]) for k in (-2, 0, 2)]
+    starts.append(np.zeros(3))
+    unit = np.array([1 / f, 1 / f, roll / 2])
+
+    def loss(v: NDArray) -> float:
+        return -float(log_sharpness(window, 0, basis @ (v * unit)).sum())
+
+    return _minimise(loss, [one / unit for one in starts], 1.0) * unit
+
+
+def half_line_displacements(
+    window: PatchSharpness, f: float, T: NDArray, turn: NDArray
+) -> NDArray[np.float64]:
+    """Return displacements along the half-lines of a general motion.
+
+    Args:
+        window: The patches.
+        f: Focal length, px.
+        T: (3,) heading.
+        turn: (3,) rotation vector over the window, rad.
+
+    Returns:
+        (positions, patches, 2) displacements, px.
+    """
+    base = np.asarray(rotation_basis(window.xi, f)) @ turn
+    line = np.einsum("pij,j->pi", _translation_basis(window.xi, f), T)
+    line /= np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-9)
+    return base + HALF_LINE_PX[:, None, None] * line
+
+
+def _translation_basis(xi: NDArray[np.float64], f: float) -> NDArray[np.float64]:
+    """Return `geometry.A` at positions (n, 2), (n, 2, 3)."""
+    return np.stack([np.asarray(A(x, y, f)) for x, y in xi])
+
+
+def fit_general(window: PatchSharpness, f: float, turn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Fit a general motion, with the best position along its half-line for each patch.
+
+    Args:
+        window: The patches.
+        f: Focal length, px.
+        turn: (3,) rotation vector over the window from which the fit starts, rad.
+
+    Returns:
+        (6,) heading and rotation vector over the window, rad.
+    """
+    columns = _translation_basis(window.xi, f)
+    basis = np.asarray(rotation_basis(window.xi, f))
+
+    def displacements(v: NDArray) -> NDArray:
+        line = columns @ v[:3]
+        line = line / np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-9)
+        return basis @ (v[3:] / f) + HALF_LINE_PX[:, None, None] * line
+
+    def loss(v: NDArray) -> float:
+        size = float(np.linalg.norm(v[:3]))
+        best = log_sharpness(window, 0, displacements(v)).max(0)
+        return -float(best.sum()) + 10 * (size - 1) ** 2
+
+    headings = np.random.default_rng(0).normal(size=(40, 3))
+    headings /= np.linalg.norm(headings, axis=1, keepdims=True)
+    headings = np.concatenate([headings, np.eye(3), -np.eye(3)])
+    starts = [np.append(T, factor * f * turn) for T in headings for factor in (0.0, 0.5, 1.0)]
+    starts = sorted(starts, key=loss)[:N_HEADINGS]
+    found = _minimise(loss, starts, 0.3)
+    return np.append(found[:3] / np.linalg.norm(found[:3]), found[3:] / f)
+
+
+def z_score(D: NDArray[np.float64]) -> float:
+    """Return the sum of independent differences, relative to its standard deviation."""
+    size = float(np.sqrt((D**2).sum()))
+    return float(D.sum()) / size if size > 0 else 0.0
 
 
 __getattr__ = renamed_names(__name__)

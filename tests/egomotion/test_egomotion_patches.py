@@ -10,14 +10,19 @@ from jaxevent.egomotion import batch, contrast, find_model, truth, voting
 from jaxevent.egomotion.bundle.hypotheses import WindowTest, combine_z
 from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.geometry import A, B, rotation_basis
-from jaxevent.egomotion.model_selection import flow_consistency, select_by_z, select_model, z_score
+from jaxevent.egomotion.model_selection import select_by_z, select_model
 from jaxevent.egomotion.motion import (
     LENS_ERROR,
     CovarianceCalibration,
     MotionEstimate,
     is_observable,
 )
-from jaxevent.egomotion.patches import edge_event_fraction, measure_image_speed
+from jaxevent.egomotion.patches import (
+    edge_event_fraction,
+    flow_consistency,
+    measure_image_speed,
+    z_score,
+)
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Imu, Poses, Recording
 from jaxevent.show.motion import Written
