@@ -95,7 +95,7 @@ def test_kernel_finds_the_motion():
 def test_numba_without_a_kernel_is_refused():
     recording = moved(lambda at: np.array([130.0, -70.0]), 0.05, 120, seed=3)
     params = voting.Params.of({**SMALL, "likelihood": "literal"})
-    with pytest.raises(InputError, match="no kernel for voting.*literal"):
+    with pytest.raises(InputError, match="no kernel.*literal"):
         voting.estimate(recording, params, compiler="numba")
     with pytest.raises(InputError, match="no compiler 'gcc'"):
         voting.estimate(recording, params, compiler="gcc")

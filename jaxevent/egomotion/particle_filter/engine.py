@@ -18,20 +18,17 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen.expressions import Graph, Level, Node, Untranslatable
-from jaxevent.codegen.host import HostProgram
-from jaxevent.codegen.loops import (
-    MARK,
-    Function,
-    Kernels,
-    Loop,
-    LoopWriter,
-    Program,
-    leaves_of,
-    numbers_of,
-    translate,
+from jaxevent.codegen.graph import Graph, Level, Node, ParameterProgram, TranslationError
+from jaxevent.codegen.module import KernelCache
+from jaxevent.codegen.trace import (
+    ELEMENTS,
+    TracedFunction,
+    TracedProgram,
+    name_leaves,
+    name_numbers,
+    translate_function,
 )
-from jaxevent.codegen.text import Numbers, Place
+from jaxevent.codegen.write import Address, ElementLoop, ModuleText, Writer
 from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.particle_filter import engine_loop, filtering, likelihood
@@ -54,7 +51,7 @@ from jaxevent.egomotion.particle_filter.filtering import (
 from jaxevent.egomotion.particle_filter.likelihood import Event
 from jaxevent.egomotion.particle_filter.params import Params
 
-FUNCTION = """@callback(types.void(CELLS, CELLS, NUMBERS, I), **HOW)
+FUNCTION = """@cfunc(types.void(CELLS, CELLS, NUMBERS, I), **OPTIONS)
 def {name}(cells, work, numbers, count):
     zero = 0
 {body}
@@ -63,7 +60,7 @@ def {name}(cells, work, numbers, count):
 """
 # Candidates fill their entries from the first. Groups of `size` blocks of motions have one range of
 # ages.
-EVENT = """@callback(types.void(CELLS, CELLS, NUMBERS, CELLS, CELLS, WHOLE, I, I, I), **HOW)
+EVENT = """@cfunc(types.void(CELLS, CELLS, NUMBERS, CELLS, CELLS, WHOLE, I, I, I), **OPTIONS)
 def {name}(cells, work, numbers, d, ages, chosen, count, first, most):
     zero, begin, end = 0, 0, count
 {init}
@@ -94,8 +91,8 @@ def {name}(cells, work, numbers, d, ages, chosen, count, first, most):
 
 
 """
-PARTICLES = Loop("i", "count", ("work", "numbers", "count"))
-LANES = Loop("i", f"begin * {BLOCK}, end * {BLOCK}", ("work", "numbers", "begin", "end"))
+PARTICLES = ElementLoop("i", "count", ("work", "numbers", "count"))
+LANES = ElementLoop("i", f"begin * {BLOCK}, end * {BLOCK}", ("work", "numbers", "begin", "end"))
 MAX_OPERATIONS = 6000  # beyond, numba compiles longer than XLA's scan takes
 
 
@@ -108,7 +105,7 @@ class Layout:
     booleans: frozenset[str]
     row_size: int
 
-    def places(self) -> dict[str, Place]:
+    def places(self) -> dict[str, Address]:
         """Return from where each number is read."""
         places = {name: ("work", "i", row * self.row_size) for name, row in self.rows.items()}
         return places | {name: ("cells", "zero", at) for name, at in self.cells.items()}
@@ -141,13 +138,13 @@ class FunctionTracer:
 
     def __init__(self, params: Params, model: Model, dtype: np.dtype):
         self.params, self.model, self.dtype = params, model, dtype
-        self.graph, self.host = Graph(), HostProgram()
+        self.graph, self.host = Graph(), ParameterProgram()
         for leaf in jax.tree.leaves(params):
             self.host.add_input(np.asarray(leaf))
         self.cells = {name: at for at, name in enumerate(CELLS)}
         self.rows: dict[str, int] = {}
         self.booleans: set[str] = set()
-        self.functions: dict[str, Function] = {}
+        self.functions: dict[str, TracedFunction] = {}
         self.f = self.shape()
 
     def shape(self, *size: int, kind: Any = None) -> jax.ShapeDtypeStruct:
@@ -177,20 +174,20 @@ class FunctionTracer:
             trees.update(jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape, v.dtype), results))
             return results
 
-        translated = translate(call, self.params, inputs, self.graph, self.host)
+        translated = translate_function(call, self.params, inputs, self.graph, self.host)
         for key, tree in inputs.items():
             self._lay_out(key, tree)
         self.functions[name] = translated
         return {key: self._lay_out(key, tree, translated, alias) for key, tree in trees.items()}
 
     def _lay_out(
-        self, key: str, tree: Any, translated: Function | None = None, alias: bool = False
+        self, key: str, tree: Any, translated: TracedFunction | None = None, alias: bool = False
     ) -> Any:
         """Give each number of a tree a cell or a row, and return the tree's shapes."""
         leaves = []
-        for name, leaf in leaves_of(key, tree).items():
-            names = numbers_of(name, leaf)
-            of_all = MARK in leaf.shape
+        for name, leaf in name_leaves(key, tree).items():
+            names = name_numbers(name, leaf)
+            of_all = ELEMENTS in leaf.shape
             if translated is not None and of_all:
                 nodes = [translated.results[number] for number in names]
                 of_all = any(node.level == Level.ELEMENT for node in nodes)
@@ -205,7 +202,7 @@ class FunctionTracer:
                 where.setdefault(number, len(set(where.values())))
                 if leaf.dtype == bool:
                     self.booleans.add(number)
-            leaves.append(leaf if of_all or MARK not in leaf.shape else self.shape())
+            leaves.append(leaf if of_all or ELEMENTS not in leaf.shape else self.shape())
         return jax.tree.unflatten(jax.tree.structure(tree), leaves)
 
     def _of_all(self, node: Node) -> Node:
@@ -215,7 +212,7 @@ class FunctionTracer:
         return self.graph.node("max", (node, node), node.kind, Level.ELEMENT)
 
 
-def program_of(params: Params, model: Model, dtype: np.dtype) -> Program:
+def program_of(params: Params, model: Model, dtype: np.dtype) -> TracedProgram:
     """Translate the functions of the filter.
 
     Args:
@@ -227,13 +224,13 @@ def program_of(params: Params, model: Model, dtype: np.dtype) -> Program:
         The program.
 
     Raises:
-        Untranslatable: A function has no translation.
+        TranslationError: A function has no translation.
     """
     if params.likelihood == "literal":
-        raise Untranslatable('likelihood = "literal"')
+        raise TranslationError('likelihood = "literal"')
     tracer = FunctionTracer(params, model, dtype)
     shape, d = tracer.shape, model.dimension
-    cloud, each, flag = shape(MARK, d), shape(MARK), shape(kind=bool)
+    cloud, each, flag = shape(ELEMENTS, d), shape(ELEMENTS), shape(kind=bool)
     # Classes that check their fields take shapes in a trace.
     state, timing, event, of_batch = jax.eval_shape(
         lambda cloud, each, flag, one, two, four: (
@@ -268,7 +265,7 @@ def program_of(params: Params, model: Model, dtype: np.dtype) -> Program:
     tracer.add("restart", restart, {"cloud": cloud})
     row_size = BLOCK * -(-params.particles // BLOCK)
     layout = Layout(tracer.cells, tracer.rows, frozenset(tracer.booleans), row_size)
-    return Program(tracer.functions, tracer.host, layout, dtype)
+    return TracedProgram(tracer.functions, tracer.host, layout, dtype)
 
 
 def _add_event(
@@ -303,13 +300,13 @@ def _add_event(
     tracer.add(f"{name}_likelihood", finish, {**inputs, **votes})
 
 
-def write(program: Program) -> tuple[str, Numbers]:
+def write(program: TracedProgram) -> ModuleText:
     """Write the text of a program's module."""
     layout = program.layout
     places, stores = layout.places(), layout.stores()
-    writer, out = LoopWriter(places), []
+    writer, out = Writer(program, places), []
 
-    def body(name: str, indent: int = 4, loop: Loop = LANES) -> str:
+    def body(name: str, indent: int = 4, loop: ElementLoop = LANES) -> str:
         function = program.functions[name]
         changed = {
             key: stores[key]
@@ -339,10 +336,10 @@ def write(program: Program) -> tuple[str, Numbers]:
             )
         )
     about = "The functions of voting (`jaxevent.egomotion.particle_filter.engine`)."
-    return writer.module(about, program, out)
+    return writer.module(about, out, layout)
 
 
-_kernels = Kernels(ModelFunctions, write, most=MAX_OPERATIONS)
+_kernels = KernelCache(ModelFunctions, write, max_nodes=MAX_OPERATIONS)
 
 
 class CompiledFilter:
@@ -353,20 +350,18 @@ class CompiledFilter:
         model: Motion model.
 
     Raises:
-        Untranslatable: There is no kernel.
+        TranslationError: There is no kernel.
     """
 
     def __init__(self, params: Params, model: Model):
         self.dtype = np.dtype(jnp.result_type(float))
         fields, kind = jax.tree.flatten(_with_focal_length(model, 1.0))
         if fields:
-            raise Untranslatable("numbers that the model holds")
-        program, self._functions, self._numbers = _kernels.get(
-            (kind, jax.tree.structure(params), self.dtype),
-            params,
-            lambda: program_of(params, model, self.dtype),
-        )
-        self._layout, self._count, self._model = program.layout, params.particles, model
+            raise TranslationError("numbers that the model holds")
+        key = kind, jax.tree.structure(params), self.dtype
+        kernel = _kernels.get(key, params, lambda: program_of(params, model, self.dtype))
+        self._functions, self._numbers = kernel.functions, kernel.numbers
+        self._layout, self._count, self._model = kernel.places, params.particles, model
         of, rows, d = self._layout.rows_of, self._layout.rows, model.dimension
         self._rows = RowIndices(
             particles=of("state.particles"),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from jaxevent import dispatch
 from jaxevent.camera import PinholeCamera
-from jaxevent.codegen.expressions import Untranslatable
+from jaxevent.codegen.module import make_kernel
 from jaxevent.deprecated import renamed_methods
 from jaxevent.devices import make_mesh, shard
 from jaxevent.egomotion.candidates import Candidates, CandidateSampler, ExpectedFlow
@@ -255,20 +255,8 @@ class VotingEstimator(MotionEstimator[Params]):
         self, params: Params, model: Model, compiler: str | None, events: int
     ) -> CompiledFilter | None:
         """Return the filter as a kernel, or None where XLA compiles it."""
-        if compiler not in (None, "numba", "xla"):
-            raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
-        single = jnp.result_type(float) == np.float32
-        if compiler == "xla" or (compiler is None and not (single and events >= KERNEL_EVENTS)):
-            return None
-        try:
-            return CompiledFilter(params, model)
-        except Untranslatable as reason:
-            if compiler == "numba":
-                raise InputError(
-                    f"numba has no kernel for voting with these parameters ({reason}); leave out "
-                    "the compiler"
-                ) from reason
-            return None
+        is_faster = jnp.result_type(float) == np.float32 and events >= KERNEL_EVENTS
+        return make_kernel(self.name, compiler, is_faster, lambda: CompiledFilter(params, model))
 
     def training_runs(
         self,
