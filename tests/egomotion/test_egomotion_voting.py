@@ -397,33 +397,36 @@ FAST = voting.Params.of({"every": 2, "candidates": 48})
 
 def test_planar_motion_is_found():
     truth = np.array([130.0, -70.0])
-    recording = moved(lambda at: truth, 0.5, 120, seed=3)
-    motion = voting.estimate(recording, FAST, seed=1)
+    recording = moved(lambda at: truth, 0.45, 120, seed=3)
+    motion = voting.estimate(recording, FAST, seed=1, cloud=16)
     assert relative_error(motion, truth) < 0.03
+    # The particles that are asked for are drawn by weight, and change nothing else.
+    assert motion.cloud.shape == (len(motion), 16, 2)
+    apart = motion.cloud.mean(1) - motion.mean
+    spread = np.sqrt(np.trace(motion.covariance, axis1=1, axis2=2))
+    assert (np.linalg.norm(apart, axis=1) < 1.0 * spread)[motion.valid].all()
     again = voting.estimate(recording, FAST, seed=1)
+    assert again.cloud is None
     np.testing.assert_array_equal(motion.mean, again.mean)
-    truth = np.array([-40.0, -260.0])  # another speed
-    assert relative_error(voting.estimate(moved(lambda at: truth, 0.4, 120, 4), FAST), truth) < 0.03
 
 
 def test_rotation_is_found():
     truth = np.array([0.5, 1.5, -1.2])
-    recording = moved(turning(truth), 0.6, 150, seed=5, camera=CAMERA)
+    recording = moved(turning(truth), 0.45, 150, seed=5, camera=CAMERA)
     motion = voting.estimate(recording, FAST, model="rotation", seed=0)
     assert relative_error(motion, truth) < 0.05
 
 
 def test_single_precision(float32):
     truth = np.array([130.0, -70.0])
-    motion = voting.estimate(
-        moved(lambda at: truth, 0.5, 120, seed=3), voting.Params.of(FAST.values())
-    )
+    recording = moved(lambda at: truth, 0.45, 120, seed=3)
+    motion = voting.estimate(recording, voting.Params.of(FAST.values()))
     assert motion.mean.dtype == np.float32
     assert relative_error(motion, truth) < 0.03
 
 
-@pytest.mark.parametrize("before, truth", [((200, 0), (-40, -250)), ((300, 0), (60, 0))])
-def test_a_motion_that_changes_at_once_is_found_again(before, truth):
+def test_motion_is_found_again_after_a_sudden_change():
+    before, truth = (300, 0), (60, 0)
     first = moved(lambda at: np.array(before), 0.3, 120, seed=6).events
     second = moved(lambda at: np.array(truth), 0.4, 120, seed=7).events
     parts = [np.concatenate([getattr(first, n), getattr(second, n)]) for n in "xyp"]
@@ -556,18 +559,6 @@ def test_smoothing_equals_the_dense_posterior():
     )
     np.testing.assert_allclose(cut.mean[:20], first.mean)
     np.testing.assert_allclose(cut.mean[20], means[20])
-
-
-def test_cloud_is_drawn_by_weight():
-    recording = moved(lambda at: np.array([130.0, -70.0]), 0.25, 120, seed=3)
-    motion = voting.estimate(recording, FAST, cloud=16)
-    assert motion.cloud.shape == (len(motion), 16, 2)
-    apart = motion.cloud.mean(1) - motion.mean
-    spread = np.sqrt(np.trace(motion.covariance, axis1=1, axis2=2))
-    assert (np.linalg.norm(apart, axis=1) < 1.0 * spread)[motion.valid].all()
-    plain = voting.estimate(recording, FAST)
-    assert plain.cloud is None
-    np.testing.assert_array_equal(plain.mean, motion.mean)
 
 
 def test_general_particles():
