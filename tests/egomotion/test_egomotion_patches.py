@@ -1,9 +1,10 @@
-"""How fast patches move, which model explains them, and what errors are made of."""
+"""Speeds and models of patches, and the covariance of estimates."""
 
 import dataclasses
 
 import numpy as np
 import pytest
+from points import recorded
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import batch, contrast, find_model, truth, voting
@@ -21,7 +22,6 @@ from jaxevent.egomotion.patches import (
     edge_event_fraction,
     flow_consistency,
     measure_image_speed,
-    z_score,
 )
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Imu, Poses, Recording
@@ -33,7 +33,7 @@ CAMERA = PinholeCamera(F, F, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 
 
 def moving(flow, seconds: float, number: int = 700, every: float = 0.7, camera=CAMERA, seed=0):
-    """Events of points that follow `flow(places)`, constant along each way, one each `every` px."""
+    """Events of points that move by `flow(positions)`, constant for each, one each `every` px."""
     rng = np.random.default_rng(seed)
     place = rng.uniform([-20, -20], [WIDTH + 20, HEIGHT + 20], (number, 2))
     U = flow(place - [(WIDTH - 1) / 2, (HEIGHT - 1) / 2])
@@ -45,23 +45,31 @@ def moving(flow, seconds: float, number: int = 700, every: float = 0.7, camera=C
         at = np.rint(x + (t - seconds / 2)[:, None] * u).astype(int)
         inside = (at >= 0).all(1) & (at < [WIDTH, HEIGHT]).all(1)
         parts.append(np.c_[np.rint(1e6 * t), at, np.full(n, p)][inside])
-    rows = np.concatenate(parts).astype(np.int64)
-    rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    events = Events(
-        rows[:, 0], rows[:, 1].astype(np.uint16), rows[:, 2].astype(np.uint16), rows[:, 3] > 0
+    return recorded(*np.concatenate(parts).T, WIDTH, HEIGHT, camera)
+
+
+def uniformly(velocity):
+    """The flow of all points with one velocity, px/s."""
+    return lambda positions: np.tile(velocity, (len(positions), 1))
+
+
+def estimate_of(model, t, mean, variance=1.0):
+    """An estimate with the same variance of each component, and one or n means."""
+    n, d = len(t), np.shape(mean)[-1]
+    covariance = np.tile(variance * np.eye(d), (n, 1, 1))
+    return MotionEstimate.from_arrays(
+        model, np.asarray(t), np.broadcast_to(mean, (n, d)), covariance
     )
-    return Recording("moving", WIDTH, HEIGHT, events, camera=camera)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("speed", "seconds"), [(12.0, 2.0), (900.0, 0.1)])
 def test_image_speed(speed, seconds):
-    recording = moving(lambda x: np.tile([0.8 * speed, -0.6 * speed], (len(x), 1)), seconds)
+    recording = moving(uniformly([0.8 * speed, -0.6 * speed]), seconds)
     found = measure_image_speed(recording)
     assert found is not None and abs(found.median / speed - 1) < 0.2
-    assert (
-        measure_image_speed(recording) is found and measure_image_speed(recording, CAMERA) is found
-    )
+    for camera in (None, CAMERA):
+        assert measure_image_speed(recording, camera) is found
     suited = contrast.adapt_params(recording, contrast.Params())
     way = float(suited.params.duration) * speed
     assert 4 < way < 61 and "px/s" in suited.speed_message and suited.speed == found
@@ -77,13 +85,12 @@ def test_noise_has_no_speed():
     rng, n = np.random.default_rng(0), 6000
     t = np.sort(rng.integers(0, 300_000, n))
     x, y = (rng.integers(0, size, n).astype(np.uint16) for size in (WIDTH, HEIGHT))
-    noise = Recording("noise", WIDTH, HEIGHT, Events(t, x, y, rng.random(n) < 0.5), camera=CAMERA)
+    noise = recorded(t, x, y, rng.random(n) < 0.5, WIDTH, HEIGHT, CAMERA)
     assert measure_image_speed(noise) is None
     suited = voting.adapt_params(noise, voting.Params())
     # Of the lengths 1.6 ms 2^k the longest below the recording's 0.3 s is named.
-    assert suited.speed is None and "nothing was seen to move in windows of 1.6 ms to 0.2 s" in (
-        suited.message
-    )
+    assert suited.speed is None
+    assert "nothing was seen to move in windows of 1.6 ms to 0.2 s" in suited.message
     assert suited.params.values() == voting.Params().values()
     hasty = dataclasses.replace(noise, events=Events(t // 300, x, y, x % 2 == 0))
     said = "in windows of 1.6 ms", "in so few events", "in so short a recording"
@@ -93,72 +100,46 @@ def test_noise_has_no_speed():
 
 
 def rates(x, T, Omega, rho):
-    return np.array(
-        [
-            np.asarray(A(place[0], place[1], F)) @ T * r
-            + np.asarray(B(place[0], place[1], F)) @ Omega
-            for place, r in zip(x, rho, strict=True)
-        ]
-    )
+    parallax = np.array([np.asarray(A(*xi, F)) @ T for xi in x]) * rho[:, None]
+    return parallax + np.array([np.asarray(B(*xi, F)) @ Omega for xi in x])
 
 
 @pytest.mark.slow
 def test_models_are_distinguished():
     one = np.array([70.0, 20.0])
-    plane = moving(lambda x: np.tile(one, (len(x), 1)), 0.6)
+    plane, bare = moving(uniformly(one), 0.6), moving(uniformly(one), 0.6, camera=None)
 
     def turn(x):
         return rates(x, np.zeros(3), [0.2, -0.3, 1.5], np.ones(len(x)))
-
-    turning = moving(turn, 0.6)
 
     def deep(x):
         # Near and far stripes, across which the camera slides.
         rho = np.where((x[:, 1] // 24) % 2 == 0, 1.0, 0.5)
         return rates(x, np.array([-0.9, 0.0, 0.2]), np.zeros(3), rho)
 
-    sliding = moving(deep, 0.6, 900)
+    turning, sliding = moving(turn, 0.6), moving(deep, 0.6, 900)
     turns, slides = select_model(moving(turn, 0.4, 400)), select_model(sliding)
     assert turns.model.name == "rotation" and slides.model.name == "general"
     assert turns.z["rotation", "planar"] > 3 and "better than" in " ".join(turns.lines)
     assert "not sure" in turns.lines[-1] and "not sure" not in " ".join(slides.lines)
-    flat, several, rolling = (
-        flow_consistency(plane),
-        flow_consistency(sliding),
-        flow_consistency(turning),
-    )
-    assert (
-        measure_image_speed(turning) != measure_image_speed(sliding) != measure_image_speed(plane)
-    )
-    assert (
-        rolling is not None
-        and rolling.is_inconsistent
-        and rolling.spread > 0.5
-        and rolling.both_directions
-    )
+    flat, several, rolling = (flow_consistency(one) for one in (plane, sliding, turning))
+    speeds = [measure_image_speed(one) for one in (turning, sliding, plane)]
+    assert speeds[0] != speeds[1] != speeds[2]
+    assert rolling.is_inconsistent and rolling.spread > 0.5 and rolling.both_directions
     assert flat is None or not flat.is_inconsistent
-    assert (
-        several is not None
-        and several.is_inconsistent
-        and not several.both_directions
-        and 0.2 < several.spread < 0.9
-    )
+    assert several.is_inconsistent and not several.both_directions
+    assert 0.2 < several.spread < 0.9
     assert several.slow < 50 and several.fast > 75  # 45 and 90 px/s
-    bare = moving(lambda x: np.tile(one, (len(x), 1)), 0.6, camera=None)
     assert select_model(bare).model.name == "planar"
 
-    t = np.array([100_000, 500_000])
-    motion = MotionEstimate.from_arrays(
-        "planar", t, np.tile(one, (2, 1)), np.tile(np.eye(2), (2, 1, 1))
-    )
+    t = [100_000, 500_000]
+    motion = estimate_of("planar", t, one)
     wider, line = motion.with_flow_consistency(dataclasses.replace(sliding, camera=None))
     along = several.spread**2 * (1 + 0.1**2) * (one @ one)
     unit = one / np.linalg.norm(one)
     assert unit @ wider.covariance[0] @ unit == pytest.approx(1 + along)
     assert "depths" in line and "--model general --focal PX may explain it" in line
-    turn = MotionEstimate.from_arrays(
-        "rotation", t, np.tile([0.0, 2, 0], (2, 1)), np.tile(np.eye(3), (2, 1, 1))
-    )
+    turn = estimate_of("rotation", t, [0.0, 2, 0])
     same, line = turn.with_flow_consistency(turning)
     assert same is turn and not line
     wider, line = turn.with_flow_consistency(sliding)  # translation may have made all of it
@@ -173,12 +154,12 @@ def test_models_are_distinguished():
         ((0.0, 0.0, 0.0), 1.4, "rotation", False),
         ((0.0, 0.0, 0.0), 3.5, "general", True),
         ((0.0, 0.0, 0.0), None, "rotation", False),
-        ((0.0, 5.0, 5.0), -5.0, "general", True),  # longer windows are not asked
+        ((0.0, 5.0, 5.0), -5.0, "general", True),  # longer windows are not needed
         ((-4.0, 2.0, 5.0), 5.0, "planar", True),
         ((0.0, 3.5, 3.5), -2.8, "rotation", True),
     ],
 )
-def test_the_simplest_model_that_is_not_beaten_is_chosen(patches, windows, model, sure):
+def test_simplest_model_that_is_not_rejected_is_selected(patches, windows, model, sure):
     pairs = ("rotation", "planar"), ("general", "planar"), ("general", "rotation")
     found = select_by_z(dict(zip(pairs, patches, strict=True)), lambda: windows)
     assert found.model.name == model
@@ -188,7 +169,7 @@ def test_the_simplest_model_that_is_not_beaten_is_chosen(patches, windows, model
     assert not better or model == "general" or patches[0] < 0
 
 
-def test_windows_that_share_events_count_as_often_as_these():
+def test_windows_that_share_events_are_not_independent():
     """Of white noise of each event z of all windows has variance 1, whatever they share."""
     noise = np.random.default_rng(3).normal(size=(1500, 400))
     for spans in ([(0, 400), (0, 400)], [(0, 300), (100, 400)], [(0, 150), (250, 400)]):
@@ -221,15 +202,14 @@ def test_unobservable_heading_is_reported():
 
 def test_a_camera_that_stands_still_while_things_move():
     """Edges of frames on that side of the image where events are, or on the other."""
-    recording = moving(lambda x: np.tile([70.0, 20.0], (len(x), 1)), 0.6)
+    recording = moving(uniformly([70.0, 20.0]), 0.6)
     e = recording.events
     right = e.x >= WIDTH // 2
     events = Events(e.t[right], e.x[right], e.y[right], e.p[right])
     t = np.arange(100_000, 600_000, 100_000)
     light = np.random.default_rng(0).uniform(0.2, 1, (HEIGHT // 8, WIDTH // 8)).repeat(8, 0)
     image, shares = np.full((HEIGHT, WIDTH), 0.5, np.float32), []
-    mean, covariance = np.tile([70.0, 20.0], (2, 1)), np.tile(np.eye(2), (2, 1, 1))
-    motion = MotionEstimate.from_arrays("planar", np.array([100_000, 500_000]), mean, covariance)
+    motion = estimate_of("planar", [100_000, 500_000], [70.0, 20.0])
     for columns in (slice(0, 56), slice(64, WIDTH)):
         image[:], image[:, columns] = 0.5, light.repeat(8, 1)[:, columns]
         frames = Frames(t, np.tile(image, (len(t), 1, 1)), np.zeros(len(t), np.int64))
@@ -240,24 +220,17 @@ def test_a_camera_that_stands_still_while_things_move():
         assert still == (told.covariance[0, 0, 0] > 70**2) == (columns.start == 0)
     assert shares[0] < 0.1 and shares[1] > 0.5
     assert edge_event_fraction(recording) is None
-    heading = np.tile([0.0, 0, 1, 0.1, 0, 0], (2, 1))
-    general = MotionEstimate.from_arrays("general", motion.t, heading, np.zeros((2, 6, 6)))
+    general = estimate_of("general", motion.t, [0.0, 0, 1, 0.1, 0, 0], 0)
     unsure = general._with_full_uncertainty().covariance
     assert not is_observable("general", unsure)[:, :3].any() and unsure[0, 3, 3] > 0.1**2
-
-
-def test_standard():
-    assert z_score(np.array([1.0, 1, 1, 1])) == pytest.approx(2)
-    assert z_score(np.zeros(3)) == 0
 
 
 def test_calibrated_covariance():
     t = np.array([0, 100_000, 200_000])
     mean = np.array([[1.0, 0], [2, 0], [3, 0]])
-    motion = MotionEstimate.from_arrays("planar", t, mean, np.tile(np.eye(2), (3, 1, 1)))
-    told = motion.with_calibrated_covariance(
-        CovarianceCalibration(factor=4, share=0.5, change=0.2), 0.1
-    )
+    motion = estimate_of("planar", t, mean)
+    calibration = CovarianceCalibration(factor=4, share=0.5, change=0.2)
+    told = motion.with_calibrated_covariance(calibration, 0.1)
     expected = 4 + 0.25 * 4 + 0.04 * 1.0**2  # the motion changes by 1 in 0.1 s, and is straight
     np.testing.assert_allclose(told.covariance[1], np.diag([expected, 5]))
     # At the ends it is taken to change as it comes, and later it is known less and less.
@@ -267,23 +240,19 @@ def test_calibrated_covariance():
     later = told(np.array([200_000, 250_000, 300_000]), extrapolate=True)
     grown = later.covariance - told.covariance[2]
     np.testing.assert_allclose(grown, [[[v, 0], [0, 0]] for v in (0, 0.25, 1)], atol=1e-12)
-    fast = MotionEstimate.from_arrays("planar", t, mean + [0, 1], np.tile(np.eye(2), (3, 1, 1)))
+    fast = estimate_of("planar", t, mean + [0, 1])
     told = fast.with_calibrated_covariance(CovarianceCalibration(speed=0.5))
     np.testing.assert_allclose(told.covariance[1] - np.eye(2), [[1.0, 0.5], [0.5, 0.25]])
-    lost = MotionEstimate.from_arrays("planar", t, mean, np.full((3, 2, 2), np.nan))
+    lost = estimate_of("planar", t, mean, np.nan)
     assert not lost(t).valid.any()  # without a sigma
 
 
 def test_lone_estimate_is_extended():
-    t, mean = np.array([100_000]), np.array([[3.0, 0]])
-    motion = MotionEstimate.from_arrays("planar", t, mean, np.eye(2)[None])
-    assert (
-        motion.with_calibrated_covariance(CovarianceCalibration(change=0.5), 0.2).covariance
-        == np.eye(2)
-    ).all()
-    told = motion.with_calibrated_covariance(
-        CovarianceCalibration(change=0.5), 0.2, np.array([0.0, 4.0])
-    )
+    mean, calibration = np.array([[3.0, 0]]), CovarianceCalibration(change=0.5)
+    motion = estimate_of("planar", [100_000], mean)
+    same = motion.with_calibrated_covariance(calibration, 0.2)
+    assert (same.covariance == np.eye(2)).all()
+    told = motion.with_calibrated_covariance(calibration, 0.2, np.array([0.0, 4.0]))
     np.testing.assert_allclose(told.covariance[0], np.diag([1, 1 + 0.25 * 16]))
     rate = np.diag([0, 4.0**2]) / 2e5**2
     assert (told.n_extended, told.extended_to(0, 200_000).n_extended) == (0, 2)
@@ -293,7 +262,7 @@ def test_lone_estimate_is_extended():
     # In half a window it changes by half as much.
     np.testing.assert_allclose(whole.covariance[:, 1, 1], [9, 5, 9])
     assert whole(np.arange(5000, 195_000, 1000)).valid.all()
-    lost = MotionEstimate.from_arrays("planar", t, mean, np.eye(2)[None], np.array([False]))
+    lost = dataclasses.replace(motion, valid=np.array([False]))
     assert len(lost.extended_to(0, 200_000)) == 1
 
 
