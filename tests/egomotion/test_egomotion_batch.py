@@ -20,7 +20,7 @@ from jaxevent.egomotion.bundle.photometric_ba import FitReport, compute_covarian
 from jaxevent.egomotion.bundle.residuals import Scene, project_events, residuals
 from jaxevent.egomotion.bundle.warp import N_ROWS, Path, Points, normalise, predict_path, warp
 from jaxevent.egomotion.bundle.windows import DARK, Params, read_frame_pixels, stamp_offset
-from jaxevent.egomotion.twists import Twists
+from jaxevent.egomotion.truth import Twists
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Recording
 
