@@ -17,8 +17,16 @@ from jaxevent.egomotion.bundle import windows as data
 from jaxevent.egomotion.bundle.alignment import ImageScratch
 from jaxevent.egomotion.bundle.hypotheses import Stage, WindowFit, WindowFitter
 from jaxevent.egomotion.bundle.photometric_ba import FitReport, compute_covariance, search_depths
-from jaxevent.egomotion.bundle.residuals import Scene, project_events, residuals
-from jaxevent.egomotion.bundle.warp import N_ROWS, Path, Points, normalise, predict_path, warp
+from jaxevent.egomotion.bundle.residuals import PixelSeries, Scene, project_events, residuals
+from jaxevent.egomotion.bundle.warp import (
+    N_ROWS,
+    Path,
+    Points,
+    Prior,
+    normalise,
+    predict_path,
+    warp,
+)
 from jaxevent.egomotion.bundle.windows import DARK, Params, read_frame_pixels, stamp_offset
 from jaxevent.egomotion.twists import Twists
 from jaxevent.errors import InputError
@@ -94,7 +102,7 @@ GIVEN = {"events": 8192, "fewest": 500, "starts": 3, "rivals": 1, "flow_max": 12
 PARAMS = Params.of(GIVEN)
 
 
-def test_the_warp_is_the_rigid_scene():
+def test_warp_of_a_rigid_scene():
     """Points seen by a moving camera go where the camera at the reference time sees them."""
     rng = np.random.default_rng(1)
     O = rng.normal(size=(3, 3)) * [[1.0], [4], [20]]  # noqa: E741
@@ -116,19 +124,12 @@ def test_the_warp_is_the_rigid_scene():
     np.testing.assert_allclose(np.stack([x, y], 1), exact, atol=2e-4)
 
 
-def test_twists_of_a_path():
-    """Against differences of its poses; a constant twist stays one."""
-    path = Path.constant_twist(T, OMEGA, np.zeros(1))
+def test_prediction_of_a_path():
+    """Twists are the same where windows overlap, to a polynomial's accuracy; beyond they stay."""
+    path = true_path(np.zeros(1))
     heading, Omega = path.twist(np.array([-0.1, 0.0, 0.1]))
     np.testing.assert_allclose(Omega, np.broadcast_to(OMEGA, (3, 3)))
-    np.testing.assert_allclose(heading, np.broadcast_to(T / np.linalg.norm(T), (3, 3)), atol=2e-3)
-    later = predict_path(path, 0.05, 0.15)
-    np.testing.assert_allclose(later.D[0], T / np.linalg.norm(T), atol=1e-3)
-
-
-def test_a_path_goes_on_in_the_next_window():
-    """Where windows overlap twists are the same, to what a polynomial tells; beyond they stay."""
-    path = true_path(np.zeros(1))
+    np.testing.assert_allclose(heading, np.broadcast_to(path.D[0], (3, 3)), atol=2e-3)
     path.O[1], path.O[2], path.D[1] = 2.0, -10.0, [1.0, -2.0, 0.5]
     t = np.linspace(-0.15, 0.15, 31)
     for tau in (0.0, 0.05, -0.05):
@@ -152,16 +153,25 @@ def test_a_path_goes_on_in_the_next_window():
 
 
 @functools.cache
-def fitted() -> tuple[WindowFitter, WindowFit]:
-    windows = WindowFitter(seen(), PARAMS, CAMERA)
-    fit = windows.fit(150_000)
+def roof() -> WindowFitter:
+    return WindowFitter(seen(), PARAMS, CAMERA)
+
+
+@functools.cache
+def fitted() -> WindowFit:
+    fit = roof().fit(150_000)
     assert fit is not None
-    return windows, fit
+    return fit
+
+
+@functools.cache
+def data_of(most: int = 8192) -> tuple[PixelSeries, Prior]:
+    return roof().series(150_000, 0.15, most), roof().prior(150_000, 0.15)
 
 
 def test_the_motion_of_a_window_is_found():
     """As far as 96 x 72 pixels tell it: a heading beside a turn, and a turn beside a heading."""
-    _, fit = fitted()
+    fit = fitted()
     heading, Omega = (part[0] for part in fit.path.twist(0.0))
     assert np.degrees(np.arccos(heading @ T / np.linalg.norm(T))) < 15
     assert np.linalg.norm(Omega - OMEGA) < 0.35 * np.linalg.norm(OMEGA)
@@ -173,7 +183,7 @@ def test_the_motion_before_a_wall_is_found():
     """The homography has two, the true one costs less with a plane's depths."""
     recording = seen(ROOF[:1], 5.0)
     few = WindowFitter(recording, PARAMS, CAMERA)
-    windows = WindowFitter(recording, Params.of({**GIVEN, "events": 10_000}), CAMERA)
+    windows = WindowFitter(recording, Params.of({**GIVEN, "events": 8_000}), CAMERA)
     normal = np.array(ROOF[0][0]) / ROOF[0][1]
     exact = np.cross(np.eye(3), OMEGA) + np.outer(T, normal)
     exact -= np.trace(exact) / 3 * np.eye(3)
@@ -197,8 +207,7 @@ def test_the_motion_before_a_wall_is_found():
     n = np.linalg.lstsq(rays[ahead], rho[ahead])[0]
     np.testing.assert_allclose(rays[ahead] @ n, rho[ahead], rtol=1e-3)
     np.testing.assert_allclose(n, normal * np.linalg.norm(T), atol=0.01)
-    roof = WindowFitter(seen(), PARAMS, CAMERA)
-    assert roof.planar_hypotheses(150_000, made) == []
+    assert roof().planar_hypotheses(150_000, made) == []
 
 
 def adjust(series, scene, prior, sigma, map_steps, steps):
@@ -211,9 +220,8 @@ def scene_of(fit: WindowFit) -> Scene:
     return Scene(fit.path, fit.map, 0.0)
 
 
-def test_tracks_are_the_events_of_pixels():
-    windows, _ = fitted()
-    series = windows.series(150_000, 0.15, 3000)
+def test_series_are_the_events_of_pixels():
+    series, _ = data_of(3000)
     events = seen().events
     assert 2000 < len(series.x) <= 3000
     assert series.begin[0] == 0 and series.begin[-1] == len(series.x)
@@ -235,8 +243,7 @@ def true_path(log_rho: np.ndarray) -> Path:
 
 def test_events_are_placed_on_the_nearest_surface():
     """Against the largest of the inverse depths that a fine search finds on each ray."""
-    windows, _ = fitted()
-    series = windows.series(150_000, 0.15, 3000)
+    series, _ = data_of(3000)
     rows, columns = series.nodes
     # A near square before a far wall.
     depths = np.full((rows, columns), np.log(0.3))
@@ -269,10 +276,9 @@ def test_events_are_placed_on_the_nearest_surface():
     assert same.mean() > 0.97
 
 
-def test_contrast_changes_as_told():
+def test_gradient_of_contrast():
     """By each generator of a homography flow, against differences."""
-    windows, _ = fitted()
-    cut = windows.sample_events(150_000, 0.15, 3000)
+    cut = roof().sample_events(150_000, 0.15, 3000)
     basis = np.concatenate([initialise.ROTATION_GENERATORS, initialise.STRAIN_GENERATORS])
     terms = np.empty((3, initialise.EXPONENTIAL_ORDER + 1, 3))
     scratch, slope = ImageScratch.of(cut.shape, cut.x.dtype, terms), np.empty(len(basis))
@@ -304,8 +310,7 @@ def test_a_function_of_few_numbers_is_minimised():
 
 def test_depths_of_a_known_path():
     """The roof's, where events tell them, from a plane at half the distance."""
-    windows, _ = fitted()
-    series = windows.series(150_000, 0.15, 8192)
+    series, _ = data_of()
     rows, columns = series.nodes
     flat = true_path(np.full(rows * columns, np.log(1.2)))
     found = search_depths(flat, series).reshape(rows, columns)
@@ -348,9 +353,8 @@ def test_two_motions_before_a_plane_have_the_same_flow():
 
 def test_the_map_is_the_least_squares_one():
     """For a path held fixed, against a sparse solver on splines' weights written out."""
-    windows, fit = fitted()
-    series, prior = windows.series(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
-    scene = scene_of(fit)._replace(map=np.zeros(series.shape))
+    series, prior = data_of()
+    scene = scene_of(fitted())._replace(map=np.zeros(series.shape))
     # All events' weights are 1: sigma is so large that none costs anything beside it, and 4 times
     # as much counts where costs are small.
     prior = prior._replace(alike=4e-6, flat=0.02)
@@ -393,8 +397,7 @@ def test_the_map_is_the_least_squares_one():
 
 def test_the_photometric_fit_ends_at_the_truth():
     """From 6 degrees beside it, and depths of a plane that faces the camera."""
-    windows, _ = fitted()
-    series, prior = windows.series(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    series, prior = data_of()
     depths = np.full(series.nodes[0] * series.nodes[1], np.log(np.linalg.norm(T) / 1.5))
     path = true_path(depths)
     path.D[0] += np.array([0.1, 0, 0])
@@ -407,7 +410,7 @@ def test_the_photometric_fit_ends_at_the_truth():
     assert report.noise < 0.05 and report.inliers > 0.9
 
 
-def test_frames_tell_their_intensity_in_units_of_the_threshold():
+def test_levels_of_frames_are_in_units_of_the_threshold():
     recording = seen(frames=True)
     shown = read_frame_pixels(recording, 0, 300_000)
     assert shown is not None and len(shown.t) == 7 and (shown.precision > 0.5).mean() > 0.9
@@ -428,7 +431,7 @@ def stamped(late: int) -> Recording:
     return dataclasses.replace(recording, frames=frames)
 
 
-def test_frames_stamps_are_held_against_the_events():
+def test_offset_of_stamps():
     for late in (-6000, 0, 9000):
         assert abs(stamp_offset(stamped(late)) - late) < 1500  # in which the image moves by 0.07 px
     recording = stamped(9000)
@@ -440,14 +443,14 @@ def test_frames_stamps_are_held_against_the_events():
 @pytest.mark.parametrize(
     "told, expected", [((4000, 5500), 4000), ((4000, 6500), 0), ((4000, None), 0), ((None, 0), 0)]
 )
-def test_an_offset_that_depends_on_pixels_is_none(monkeypatch, told, expected):
+def test_an_offset_that_depends_on_the_method_is_none(monkeypatch, told, expected):
     monkeypatch.setattr(
         data, "_best_offset", lambda *given: told[data.OFFSET_METHODS.index(given[-1])]
     )
     assert stamp_offset(stamped(0)) == expected
 
 
-def test_frames_tell_motion_where_events_are_few():
+def test_frames_determine_motion_if_events_are_few():
     """From 6 degrees beside it, with a tenth of the events; frames are stamped 9 ms early."""
     off = []
     for given in (True, False):
@@ -457,7 +460,7 @@ def test_frames_tell_motion_where_events_are_few():
         assert (len(series.x) > series.n_events) == given
         path = true_path(np.full(math.prod(series.nodes), np.log(np.linalg.norm(T) / 1.5)))
         path.D[0] += np.array([0.1, 0, 0])
-        stages = tuple(Stage(sigma, 12) for sigma in (0.3, 0.2, 0.05))
+        stages = tuple(Stage(sigma, 12) for sigma in (0.3, 0.05))
         blank = hypotheses.blank_scene(series, normalise(path), prior)
         (scene, _) = hypotheses._settle_and_refine(series, blank, prior, stages)
         off.append(np.degrees(np.arccos(scene.path.D[0] @ T / np.linalg.norm(T))))
@@ -481,16 +484,15 @@ def test_a_lens_leaves_errors_across_the_heading():
 
 def test_the_covariance_is_that_of_repeated_fits():
     """Of the same events at times that are off by some ms, anew each time."""
-    windows, fit = fitted()
-    series, prior = windows.series(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    series, prior = data_of()
     rng = np.random.default_rng(0)
     rows, told = [], []
-    for _ in range(12):
+    for _ in range(8):
         tau = series.tau + 5e-3 * rng.normal(size=len(series.tau))
         noisy = series._replace(tau=tau)
-        scene, _ = adjust(noisy, scene_of(fit), prior, 0.2, 1, 8)
+        scene, _ = adjust(noisy, scene_of(fitted()), prior, 0.2, 1, 6)
         rows.append(np.concatenate([part[0] for part in scene.path.twist(0.0)]))
-        if len(told) < 3:  # they are alike
+        if len(told) < 2:  # they are alike
             told.append(np.diag(compute_covariance(noisy, scene, prior, sigma=0.2)))
     ratio = np.var(rows, 0, ddof=1).sum() / np.mean(told, 0).sum()
     assert 0.5**2 < ratio < 2**2, ratio
@@ -498,8 +500,7 @@ def test_the_covariance_is_that_of_repeated_fits():
 
 def test_steps_never_cost_more():
     """Beside true depths, with a sigma rather small for how far they are."""
-    windows, _ = fitted()
-    series, prior = windows.series(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    series, prior = data_of()
     rng = np.random.default_rng(0)
     depths = np.log(0.6) + 0.1 * rng.normal(size=series.nodes[0] * series.nodes[1])
     scene = Scene(true_path(depths), np.zeros(series.shape), 0.0)
@@ -510,11 +511,10 @@ def test_steps_never_cost_more():
 
 
 def test_priors_pull():
-    windows, fit = fitted()
-    series, prior = windows.series(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    series, prior = data_of()
     strong = prior._replace(omega=1e9)
-    scene, _ = adjust(series, scene_of(fit), strong, 0.1, 0, 8)
-    assert np.linalg.norm(scene.path.O[0]) < 0.1 * np.linalg.norm(fit.path.O[0])
+    scene, _ = adjust(series, scene_of(fitted()), strong, 0.1, 0, 8)
+    assert np.linalg.norm(scene.path.O[0]) < 0.1 * np.linalg.norm(fitted().path.O[0])
     t = np.array([0, 300_000])
     wrong = OMEGA + [0.0, 0.2, 0.0]
     windows = WindowFitter(
@@ -522,7 +522,7 @@ def test_priors_pull():
         Twists(t, np.stack([wrong, wrong]), None, 0, 300_000),
     )  # fmt: skip
     prior = windows.prior(150_000, 0.15)
-    scene, _ = adjust(series, scene_of(fit), prior, 0.1, 0, 8)
+    scene, _ = adjust(series, scene_of(fitted()), prior, 0.1, 0, 8)
     np.testing.assert_allclose(scene.path.twist(0.0)[1][0], wrong, atol=1e-2)
     covariance = compute_covariance(series, scene, prior, sigma=0.1)
     assert np.sqrt(np.diag(covariance)[3:]).max() < 1e-4
@@ -538,8 +538,6 @@ def test_a_recording_from_end_to_end(monkeypatch):
     assert valid[0] and covariance.shape == (1, 6, 6)
     assert np.linalg.norm(mean[0, :3]) == pytest.approx(1)
     assert np.degrees(np.arccos(mean[0, :3] @ T / np.linalg.norm(T))) < 15
-    again = sequence.batch.estimate(seen(), PARAMS)
-    np.testing.assert_array_equal(again.mean, motion.mean)
     few = sequence.batch.estimate(seen()[0.0:0.01], PARAMS)
     assert not few.valid.any() and np.isfinite(few.mean).all()
     at_once = seen().events[:3000]
