@@ -20,6 +20,8 @@ T = TypeVar("T")
 # The full name until this release, and the one from now on.
 RENAMED: dict[str, str] = {
     "jaxevent.blob.Found": "jaxevent.blob.TargetSearchResult",
+    "jaxevent.arrays.find": "jaxevent.arrays.find_fields",
+    "jaxevent.arrays.grey_of": "jaxevent.arrays.to_grey",
     "jaxevent.confidence.Finding": "jaxevent.confidence.ParameterInterval",
     "jaxevent.confidence.Findings": "jaxevent.confidence.FitIntervals",
     "jaxevent.confidence.Parted": "jaxevent.confidence.PartwiseLoss",
@@ -31,6 +33,26 @@ RENAMED: dict[str, str] = {
     "jaxevent.devices.local": "jaxevent.devices.local_devices",
     "jaxevent.devices.mesh": "jaxevent.devices.make_mesh",
     "jaxevent.estimator.Described": "jaxevent.estimator.ShortRepr",
+    "jaxevent.io.aedat2.read": "jaxevent.io.aedat.read_aedat2",
+    "jaxevent.io.aedat4.read": "jaxevent.io.aedat.read_aedat4",
+    "jaxevent.io.calibrated": "jaxevent.io.checks.make_supported_camera",
+    "jaxevent.io.check_unfolded": "jaxevent.io.checks.check_unfolded",
+    "jaxevent.io.columns.find": "jaxevent.io.columns.find_fields",
+    "jaxevent.io.columns.read_npy": "jaxevent.io.tables.read_npy",
+    "jaxevent.io.columns.read_text": "jaxevent.io.tables.read_text",
+    "jaxevent.io.ecf.MOST": "jaxevent.io.ecf.MAX_EVENTS",
+    "jaxevent.io.event_stream.read": "jaxevent.io.atis.read_event_stream",
+    "jaxevent.io.evimo.read": "jaxevent.io.folders.read_evimo",
+    "jaxevent.io.evreal.read": "jaxevent.io.folders.read_evreal",
+    "jaxevent.io.find_event_texts": "jaxevent.io.text.find_event_texts",
+    "jaxevent.io.most_unfolded": "jaxevent.io.checks.max_unfolded",
+    "jaxevent.io.n_caltech.read": "jaxevent.io.atis.read_n_caltech",
+    "jaxevent.io.npz.read": "jaxevent.io.tables.read_npz",
+    "jaxevent.io.parquet.read": "jaxevent.io.tables.read_parquet",
+    "jaxevent.io.pinhole": "jaxevent.io.checks.make_camera",
+    "jaxevent.io.ros_events.event_topic": "jaxevent.io.ros.open_event_topic",
+    "jaxevent.io.timelens.read": "jaxevent.io.folders.read_timelens",
+    "jaxevent.io.whole_number": "jaxevent.io.checks.whole_number",
     "jaxevent.parameters.Share": "jaxevent.parameters.UnitInterval",
     "jaxevent.parameters.nearest": "jaxevent.parameters.suggest_name",
     "jaxevent.parameters.shown": "jaxevent.parameters.format_value",
@@ -141,6 +163,11 @@ RENAMED: dict[str, str] = {
     "jaxevent.reconstruction.smoother.share_events": "jaxevent.reconstruction.smoother.redistribute_images",
     "jaxevent.reconstruction.smoother.shared": "jaxevent.reconstruction.smoother.redistribute_events",
     "jaxevent.reconstruction.smoother.step_between": "jaxevent.reconstruction.smoother.change_between",
+    "jaxevent.simulate.Motion": "jaxevent.simulate.TargetMotion",
+    "jaxevent.simulate.blobs.Motion": "jaxevent.simulate.blobs.TargetMotion",
+    "jaxevent.simulate.hybrid.response_of": "jaxevent.simulate.hybrid.sensor_response",
+    "jaxevent.simulate.motion.texture_of": "jaxevent.simulate.motion.make_texture",
+    "jaxevent.simulate.texture_of": "jaxevent.simulate.make_texture",
     "jaxevent.register.Warped": "jaxevent.register.ResampledImages",
     "jaxevent.register.by_triggers": "jaxevent.register.stamp_by_triggers",
     "jaxevent.register.registered": "jaxevent.register.apply_registration",
@@ -153,12 +180,23 @@ RENAMED: dict[str, str] = {
 }
 # Modules that have another name or are part of another one.
 MOVED_MODULES: dict[str, str] = {
+    "jaxevent.reconstruction.clock": "jaxevent.reconstruction.frames",
     "jaxevent.reconstruction.compensated.agreement": "jaxevent.reconstruction.compensated.robust_mean",
     "jaxevent.reconstruction.compensated.borders": "jaxevent.reconstruction.compensated.trajectories",
     "jaxevent.reconstruction.compensated.implicit": "jaxevent.reconstruction.compensated.normal_equations",
     "jaxevent.reconstruction.compensated.parameters": "jaxevent.reconstruction.compensated.params",
-    "jaxevent.reconstruction.clock": "jaxevent.reconstruction.frames",
     "jaxevent.reconstruction.prepared": "jaxevent.reconstruction.estimator",
+    "jaxevent.io.aedat2": "jaxevent.io.aedat",
+    "jaxevent.io.aedat4": "jaxevent.io.aedat",
+    "jaxevent.io.event_stream": "jaxevent.io.atis",
+    "jaxevent.io.evimo": "jaxevent.io.folders",
+    "jaxevent.io.evreal": "jaxevent.io.folders",
+    "jaxevent.io.exposures": "jaxevent.io.images",
+    "jaxevent.io.n_caltech": "jaxevent.io.atis",
+    "jaxevent.io.npz": "jaxevent.io.tables",
+    "jaxevent.io.parquet": "jaxevent.io.tables",
+    "jaxevent.io.ros_events": "jaxevent.io.ros",
+    "jaxevent.io.timelens": "jaxevent.io.folders",
     "jaxevent.sharing": "jaxevent.locks",
     "jaxevent.shown": "jaxevent.display",
 }
@@ -287,7 +325,14 @@ class RenamedModules(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         new = MOVED_MODULES[spec.name]
         warn_renamed(spec.name, new)
         module = types.ModuleType(spec.name, f"The old name of `{new}`.")
-        vars(module)["__getattr__"] = lambda name: getattr(importlib.import_module(new), name)
+        renamed = renamed_names(spec.name)
+
+        def __getattr__(name: str) -> Any:
+            if f"{spec.name}.{name}" in RENAMED:
+                return renamed(name)
+            return getattr(importlib.import_module(new), name)
+
+        vars(module)["__getattr__"] = __getattr__
         return module
 
     def exec_module(self, module: types.ModuleType) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.io import reading
+from jaxevent.io.checks import reading
 from jaxevent.recording import Recording
 
 Grid = NDArray[np.float64]

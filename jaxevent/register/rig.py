@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.io import calibration, pinhole
+from jaxevent.io import calibration
+from jaxevent.io.checks import make_camera
 from jaxevent.parameters import read_toml
 from jaxevent.register.geometry import Grid, check_camera, mask_outside, pixel_rays, project
 
@@ -116,7 +117,7 @@ class Rig:
             numbers = np.ravel(_check_numbers(values, f"{path}: [{name}] camera"))
             if len(numbers) == 4:
                 numbers = np.concatenate([numbers, np.zeros(5)])
-            return pinhole(numbers, f"{path}: [{name}] camera")
+            return make_camera(numbers, f"{path}: [{name}] camera")
 
         own, other = camera("events") or events, camera("frames")
         if own is None or other is None:

@@ -22,8 +22,7 @@ from jaxevent.egomotion.truth import Known, known
 from jaxevent.egomotion.twists import constant_between, from_poses, nearest_axes
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.estimator import Estimate
-from jaxevent.io.description import CLOCK
-from jaxevent.io.output import complete, complete_hdf5
+from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5
 from jaxevent.metrics import MEANINGS
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
@@ -74,10 +73,11 @@ def write_motion(
     what else the motion has.
 
     The attributes are recording, model, components, units, what `about` holds, of numbers and
-    texts, and what `jaxevent.io.description` lists.
+    texts, and what `jaxevent.io.output` lists.
     """
     units = {
-        "t": CLOCK, "mean": "units", "covariance": "units[i] units[j]", "lost": "1", "lag": "s",
+        "t": CLOCK_UNIT, "mean": "units", "covariance": "units[i] units[j]", "lost": "1",
+        "lag": "s",
         "contrast": "1", "evidence": "1, of a natural logarithm", "cloud": "units",
         "agreement": "1",
     }  # fmt: skip
@@ -406,7 +406,7 @@ def _write_flow(path: Path, recording: Recording, motion: Motion, progress: bool
             known_count += int(known.sum())
             over += int((part.residual[known] > float(params.limit)).sum())
             row = stop
-        units = {"t": CLOCK, "u": "px/s, undistorted", "v": "px/s, undistorted", "valid": "1"}
+        units = {"t": CLOCK_UNIT, "u": "px/s, undistorted", "v": "px/s, undistorted", "valid": "1"}
         for name, unit in units.items():
             stored[name].attrs["unit"] = unit
         outliers = 100 * over / known_count if known_count else 0.0
