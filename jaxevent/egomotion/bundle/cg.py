@@ -96,18 +96,12 @@ def _add_depth_priors(hold, across, down, begin, out):
                 bond = (down[j, i] if j else 0.0) if axis else (across[j, i] if i else 0.0)
                 if bond == 0:
                     continue
-                before = (j - 1, i) if axis else (j, i - 1)
+                above, left = (1, 0) if axis else (0, 1)
                 for p in range(8):
-                    k, a = (
-                        _coarse_node(j, i, p, wide) if p < 4 else _coarse_node(*before, p - 4, wide)
-                    )
+                    k, a = _coarse_node(j - above * (p // 4), i - left * (p // 4), p % 4, wide)
                     a = a if p < 4 else -a
                     for q in range(8):
-                        m, b = (
-                            _coarse_node(j, i, q, wide)
-                            if q < 4
-                            else _coarse_node(*before, q - 4, wide)
-                        )
+                        m, b = _coarse_node(j - above * (q // 4), i - left * (q // 4), q % 4, wide)
                         out[begin + k, begin + m] += bond * a * (b if q < 4 else -b)
 
 
