@@ -8,8 +8,9 @@ import pytest
 from jaxevent.errors import InputError
 
 
-def refuses(message: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> None:
-    """Check that a call raises an `InputError` of one line whose text matches `message`."""
+def refuses(message: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> str:
+    """Check that a call raises an `InputError` of one line that matches; return its text."""
     with pytest.raises(InputError, match=message) as error:
         function(*arguments, **options)
     assert "\n" not in str(error.value)
+    return str(error.value)

@@ -9,7 +9,6 @@ import pytest
 from refusals import refuses
 
 from jaxevent import cli, io
-from jaxevent.errors import InputError
 from jaxevent.io import hdf5_files
 
 NEEDS = {"bag": "rosbags", "aedat4": "aedat"}
@@ -67,9 +66,8 @@ def test_crafted_files_are_refused(build, tmp_path):
     whole = build.__name__.startswith(("text", "npz", "mat"))
     for in_memory in (True,) if whole else (True, False):
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        with pytest.raises(InputError, match=crafted.FILES[build]) as error:
-            io.load(path, crafted.SIZE, in_memory)
-        assert str(tmp_path) in str(error.value) and "\n" not in str(error.value)
+        said = refuses(crafted.FILES[build], io.load, path, crafted.SIZE, in_memory)
+        assert str(tmp_path) in said
         # A bag is unfolded up to the bound, 128 MB.
         grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1000
         assert grown < 300, f"{grown:.0f} MB"

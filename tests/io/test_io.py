@@ -179,7 +179,7 @@ def mat_arrays(recording, minus=True):
 
 
 def write_v73(path, arrays):
-    """Write a file as MATLAB's save -v7.3 does: a 512-byte header, then HDF5 with all axes reversed."""
+    """Write a file as MATLAB's -v7.3 does: a 512-byte header, then HDF5 with axes reversed."""
     with File(path, "w", userblock_size=512) as file:
         for name, value in arrays.items():
             value = np.asarray(value)
@@ -280,9 +280,7 @@ def test_text_images_become_grey_or_stay_16_bit(tmp_path):
 )
 def test_text_bad_events(tmp_path, lines, message):
     (tmp_path / "events.txt").write_bytes(lines.encode("latin-1"))
-    with pytest.raises(InputError, match=message) as error:
-        load(tmp_path, size=(9, 9))
-    assert str(tmp_path) in str(error.value) and "\n" not in str(error.value)
+    assert str(tmp_path) in refuses(message, load, tmp_path, size=(9, 9))
 
 
 @pytest.mark.parametrize(
@@ -507,9 +505,7 @@ def test_npz_size_from_frames_and_times_without_exposure(tmp_path):
 def test_npz_bad(tmp_path, changes, message):
     arrays = dict(t=[1, 2, 3], x=[0, 1, 2], y=[0, 1, 2], p=[0, 1, 1], width=4, height=3) | changes
     np.savez(tmp_path / "a.npz", **{k: v for k, v in arrays.items() if v is not None})
-    with pytest.raises(InputError, match=message) as error:
-        load(tmp_path / "a.npz")
-    assert str(tmp_path / "a.npz") in str(error.value) and "\n" not in str(error.value)
+    assert str(tmp_path / "a.npz") in refuses(message, load, tmp_path / "a.npz")
 
 
 # HDF5
@@ -776,9 +772,7 @@ def test_cut_files_are_refused(tmp_path, format):
     content = path.read_bytes()
     for part in (0.01, 0.1, 0.3, 0.5, 0.8, 0.99):
         path.write_bytes(content[: int(part * len(content))])
-        with pytest.raises(InputError) as error:
-            load(path)
-        assert str(path) in str(error.value) and "\n" not in str(error.value)
+        assert str(path) in refuses("", load, path)
 
 
 @pytest.mark.parametrize("format", ["zip", "npz", "v5"])
