@@ -29,11 +29,11 @@ from jaxevent.show.tracks import Output
 
 PARTS = {  # of finding: where they are
     "background": (search, "measure_background"),
-    "scale": (search, "choose_scale"),
+    "scale": (search, "select_scale"),
     "camera": (search, "find_moving_background"),
-    "links": (search.Links, "follow"),
-    "beginnings": (search, "_look_back"),
-    "parts": (search, "join_parts"),
+    "tracker": (search.WindowTracker, "run"),
+    "beginnings": (search, "_extend_backwards"),
+    "parts": (search, "merge_parts"),
     "taken away": (Stream, "without"),
     "polarity": (search, "prefer_sharper"),
 }

@@ -33,10 +33,10 @@ from blob_scenes import SCENES, VARIED
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from jaxevent.blob import Found, find, moment
+from jaxevent.blob import TargetSearchResult, find, moment
 from jaxevent.blob.scores import score_tracks
 from jaxevent.blob.search.background import measure_background
-from jaxevent.blob.search.detection import detect, measure_blobs
+from jaxevent.blob.search.detection import clutter_model, detect, measure_blobs
 from jaxevent.blob.search.stream import Stream
 from jaxevent.io import load
 from jaxevent.recording import Recording
@@ -54,7 +54,7 @@ class Answer(NamedTuple):
     positions: NDArray[np.float64]
 
 
-def found_paths(found: Found, times: NDArray[np.int64]) -> Answer:
+def found_paths(found: TargetSearchResult, times: NDArray[np.int64]) -> Answer:
     """Positions of what `find` gives, on straight lines between windows."""
     out = np.full((len(times), len(found), 2), np.nan)
     for k, path in enumerate(found.paths):
@@ -63,7 +63,9 @@ def found_paths(found: Found, times: NDArray[np.int64]) -> Answer:
     return Answer(out)
 
 
-def tracked(recording: Recording, found: Found, times: NDArray[np.int64]) -> tuple[Answer, Answer]:
+def tracked(
+    recording: Recording, found: TargetSearchResult, times: NDArray[np.int64]
+) -> tuple[Answer, Answer]:
     """Positions of what a new user gets, smoothed, and of the filter."""
     params = moment.Params(**found.settings())
     tracks = moment.estimate(recording, params, found=found, progress=False)
@@ -74,18 +76,18 @@ def tracked(recording: Recording, found: Found, times: NDArray[np.int64]) -> tup
     return smoothed, filtered
 
 
-def _centroids(recording: Recording, found: Found) -> Iterator[tuple[int, NDArray]]:
+def _centroids(recording: Recording, found: TargetSearchResult) -> Iterator[tuple[int, NDArray]]:
     """Time and centroids (n, 2) of the components of each event image."""
     if not found.passes:
         return
-    scale = found.passes[0].choice.scale
+    scale = found.passes[0].selection.scale
     stream = Stream(recording, int(recording.start), int(recording.stop) + 1)
     background = measure_background(stream)
-    size = recording.height, recording.width
     for k in range(int(stream.duration / scale.window)):
         begin = k * scale.window
         part = stream.window(begin, begin + scale.window)
-        labels, number = detect(part, background, scale, size, begin)
+        clutter = clutter_model(background, scale, stream.shape, begin)
+        labels, number = detect(part, clutter, stream.shape)
         blobs = measure_blobs(part, labels, number)
         yield stream.start + round(1e6 * (begin + scale.window / 2)), blobs.p[blobs.n >= 3]
 
@@ -95,7 +97,7 @@ class _Line(NamedTuple):
     p: list[NDArray]
 
 
-def clusters(recording: Recording, found: Found, times: NDArray[np.int64]) -> Answer:
+def clusters(recording: Recording, found: TargetSearchResult, times: NDArray[np.int64]) -> Answer:
     """Components linked to the nearest one of the image before, within 30 px."""
     live: list[_Line] = []
     done: list[_Line] = []
@@ -115,7 +117,7 @@ def clusters(recording: Recording, found: Found, times: NDArray[np.int64]) -> An
     return _of_lines([one for one in done + live if len(one.t) >= 3], times)
 
 
-def kalman(recording: Recording, found: Found, times: NDArray[np.int64]) -> Answer:
+def kalman(recording: Recording, found: TargetSearchResult, times: NDArray[np.int64]) -> Answer:
     """Constant velocity, optimal assignment within 3 standard deviations, 3 hits, 5 misses."""
     live: list[dict[str, Any]] = []
     done: list[_Line] = []
@@ -147,7 +149,7 @@ def kalman(recording: Recording, found: Found, times: NDArray[np.int64]) -> Answ
     return _of_lines([one for one in lines if len(one.t) >= 3], times)
 
 
-def norfair(recording: Recording, found: Found, times: NDArray[np.int64]) -> Answer:
+def norfair(recording: Recording, found: TargetSearchResult, times: NDArray[np.int64]) -> Answer:
     """The tracker of norfair with its own filter, 30 px, 3 hits, 5 misses."""
     library: Any = importlib.import_module("norfair")
     tracker = library.Tracker("euclidean", 30, hit_counter_max=5, initialization_delay=2)
@@ -160,12 +162,14 @@ def norfair(recording: Recording, found: Found, times: NDArray[np.int64]) -> Ans
     return _of_lines([one for one in lines.values() if len(one.t) > 1], times)
 
 
-def means(recording: Recording, found: Found, truth: Truth, times: NDArray[np.int64]) -> Answer:
+def means(
+    recording: Recording, found: TargetSearchResult, truth: Truth, times: NDArray[np.int64]
+) -> Answer:
     """A centred mean for each target, from where it is at the first time."""
     states = truth(times)
     states = states[:, (states[..., 4] > 0.5).any(0)]
     lines, events = [], recording.events
-    window = round(1e6 * found.passes[0].choice.scale.window) if found.passes else 10_000
+    window = round(1e6 * found.passes[0].selection.scale.window) if found.passes else 10_000
     for k in range(states.shape[1]):
         p, line = states[0, k, :2], _Line([], [])
         for t in range(int(times[0]), int(times[-1]), max(window // 2, 1)):

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from jaxevent.blob import Found, find
+from jaxevent.blob import TargetSearchResult, find
 from jaxevent.blob.scores import score_tracks
 from jaxevent.recording import Events, Recording
 
@@ -301,7 +301,7 @@ def record(scene: Scene, rng: np.random.Generator) -> Recording:
     return Recording("rendered", W, H, Events(us[order], x, y, p[order]))
 
 
-def score(found: Found, scene: Scene) -> str:
+def score(found: TargetSearchResult, scene: Scene) -> str:
     """Found of all targets, tracks, false ones, IDF1."""
     times = np.linspace(0, 1e6 * scene.duration - 1, TIMES + 2)[1:-1].astype(np.int64)
     truth = scene.places(1e-6 * times)

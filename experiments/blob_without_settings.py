@@ -34,7 +34,7 @@ from blob_real import (
 )
 from numpy.typing import NDArray
 
-from jaxevent.blob import Found, Tracks, find, moment
+from jaxevent.blob import TargetSearchResult, Tracks, find, moment
 from jaxevent.io import load
 from jaxevent.recording import Recording
 
@@ -137,7 +137,7 @@ KNOWN: dict[str, tuple[Callable, dict[str, Any]]] = {
 
 
 def by_means(
-    recording: Recording, found: Found, truth: Paths, times: NDArray, centred: bool
+    recording: Recording, found: TargetSearchResult, truth: Paths, times: NDArray, centred: bool
 ) -> Paths:
     out = np.full(truth.shape, np.nan)
     longest = max(found.paths, key=lambda path: path.n.sum())

@@ -137,16 +137,16 @@ MUTATIONS = (
     ),
     Mutation(
         "conjugate gradients forget the direction before",
-        "jaxevent/egomotion/bundle/solving.py",
+        "jaxevent/egomotion/bundle/cg.py",
         "share = new / max(size, 1e-30)",
         "share = 0.0",
         "tests/egomotion/test_photometric_equations.py -k gradients",
     ),
     Mutation(
         "a step that costs more is not damped",
-        "jaxevent/egomotion/bundle/gauss_newton.py",
-        "max(now.damping * HARDER, DAMP)",
-        "now.damping",
+        "jaxevent/egomotion/bundle/photometric_ba.py",
+        "max(damping * DAMPING_GROWTH, FIRST_DAMPING)",
+        "damping",
         "tests/egomotion/test_gauss_newton.py -k accepted",
     ),
     Mutation(
@@ -165,10 +165,10 @@ MUTATIONS = (
     ),
     Mutation(
         "a file of compiled code is unpickled whoever wrote it",
-        "jaxevent/codegen/kept.py",
+        "jaxevent/codegen/cache.py",
         "return pickle.loads(payload) if own else None",
         "return pickle.loads(payload)",
-        "tests/codegen/test_kept.py -k signed",
+        "tests/codegen/test_cache.py -k signed",
     ),
     Mutation(
         "a layer of the house imports upwards",

@@ -12,7 +12,7 @@ from together import in_child
 
 import jaxevent
 from jaxevent import codegen, progress
-from jaxevent.codegen import host
+from jaxevent.codegen import module as kernel_module
 from jaxevent.errors import InputError
 from jaxevent.io import decoded
 from jaxevent.locks import TurnLock
@@ -168,6 +168,6 @@ def test_locks_of_all_are_free():
     finally:
         end()
     # What is compiled when a process is forked is finished first.
-    end = busy(host._making)
+    end = busy(kernel_module._lock)
     threading.Timer(0.2, end).start()
-    assert in_child(lambda: host.once({}, "key", lambda: 5)) == 5
+    assert in_child(lambda: kernel_module.get_or_make({}, "key", lambda: 5)) == 5

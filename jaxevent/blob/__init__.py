@@ -12,7 +12,7 @@ from jaxevent.blob.filters.moment import moment
 from jaxevent.blob.filters.moving_moments import moving_moments
 from jaxevent.blob.losses import negative_log_likelihood, position_error, prepare_positions
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.search import Found, find
+from jaxevent.blob.search import TargetSearchResult, find
 from jaxevent.blob.states import TrackStates
 from jaxevent.blob.steps import Filter
 from jaxevent.blob.tracker import Tracker
@@ -21,7 +21,7 @@ from jaxevent.deprecated import renamed_names
 
 __all__ = [
     "Filter",
-    "Found",
+    "TargetSearchResult",
     "TrackStates",
     "Tracker",
     "TrackerParams",

@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.search.found import Found
-from jaxevent.blob.search.paths import NOBODY, candidates, join
+from jaxevent.blob.search import TargetSearchResult
+from jaxevent.blob.search.paths import NO_OWNER, owner_candidates, tabulate_paths
 from jaxevent.blob.seeds import read_seeds, span_of
 from jaxevent.codegen import njit_noalloc
 from jaxevent.errors import InputError
@@ -52,7 +52,7 @@ class Features(ShortRepr):
     seed: Int[Numeric, " seeds"]  # the chunk at whose start each seed begins; -1: not in these
     seed_xi: Float[Numeric, "seeds 2"]  # px
     seed_size: Float[Numeric, " seeds"]  # px; 0: lambda0
-    owner: Int[Numeric, "chunks steps M 2"] | None  # see `candidates`; None: anybody
+    owner: Int[Numeric, "chunks steps M 2"] | None  # see `owner_candidates`; None: anybody
     own: dict[str, Float[Numeric, " seeds"]]  # numbers (`raw`) that are a seed's own
     frame: Float[Numeric, " 2"]  # width and height, px
     detect: bool = eqx.field(static=True)
@@ -128,7 +128,7 @@ class Packing:
         stop: int | float | None = None,
         detect: bool | None = None,
         *,
-        found: Found | None = None,
+        found: TargetSearchResult | None = None,
         steps: int | None = None,
         chunks: int | None = None,
         as_stored: bool = False,
@@ -151,12 +151,12 @@ class Packing:
         self.joined = self.ends = None
         self.own: dict[str, Numeric] = {}
         if found is not None and len(found):
-            self.joined = join(found.paths)
+            self.joined = tabulate_paths(found.paths)
             # What is seen to the last but one window goes on to the end.
             self.ends = np.array(
                 [end if p.end >= end - p.window else p.end for p in found.paths], np.int64
             )
-            self.own |= found.own(params)
+            self.own |= found.per_target_values(params)
         self.seeds = read_seeds(recording, seeds, begin, end)
         # Without births and tentative tracks less is to be decided.
         self.period = max(1, round((1 if detect else 10) * 1e6 * float(params.cycle)))
@@ -198,7 +198,7 @@ class Packing:
             np.zeros(self.chunks, np.int32),
             np.zeros(self.chunks, bool),
             np.full(len(self.seeds.t), -1, np.int32),
-            np.full((*(shape if self.joined is not None else (0, 0, 0)), 2), NOBODY, np.int32),
+            np.full((*(shape if self.joined is not None else (0, 0, 0)), 2), NO_OWNER, np.int32),
         )
         stop = NEVER if more else self.stop
         bounds = _Bounds(self.start, stop, self.period, self.seeds.t)
@@ -238,8 +238,8 @@ class Packing:
         part = events[first:last]
         kept, owner = self._kept(part, first), np.empty((0, 2), np.int32)
         if self.joined is not None:
-            owner = candidates(part, self.joined, NEAR)
-            kept &= owner[:, 0] != NOBODY
+            owner = owner_candidates(part, self.joined, NEAR)
+            kept &= owner[:, 0] != NO_OWNER
         order = np.arange(len(part))
         _spread(part.t, len(part) if self._as_stored else TIES, order)
         order = order[at - first : upto - first]

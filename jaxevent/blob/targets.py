@@ -37,7 +37,7 @@ class Slots(eqx.Module):
     apart: Int[Array, "*targets"]  # last found more than a lambda from all older tracks
     id: Int[Array, "*targets"]  # serial number; -1: free
     confirmed: Bool[Array, "*targets"]
-    own: dict[str, Float[Array, "*targets"]]  # numbers (`raw`) that are a target's own, see `Found`
+    own: dict[str, Float[Array, "*targets"]]  # `raw` values, see `per_target_values`
     memory: Memory | None = None  # of `association = "authors"`
 
 

@@ -17,13 +17,13 @@ from jaxevent.blob.live import LiveTracks
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Packing, ReadOut
 from jaxevent.blob.run import run
-from jaxevent.blob.search import Found, find
+from jaxevent.blob.search import TargetSearchResult, find
 from jaxevent.blob.smoother import Smoothed, at_end, look_back, nothing_later, tell_smoothed
 from jaxevent.blob.states import TrackStates, is_alive, tell
 from jaxevent.blob.steps import Filter
 from jaxevent.blob.targets import Slots
 from jaxevent.blob.tracks import Tracks
-from jaxevent.codegen.expressions import Untranslatable
+from jaxevent.codegen.module import choose_backend, make_kernel
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator, OptionKind, of_class
 from jaxevent.recording import Recording, Times, microseconds
@@ -44,7 +44,7 @@ class Tracker(Estimator[P]):
     family: ClassVar[str] = "blob"
     option_kinds: ClassVar[Mapping[str, OptionKind]] = {
         **Estimator.option_kinds,
-        "found": of_class(Found),
+        "found": of_class(TargetSearchResult),
     }
     options: frozenset[str] = dataclasses.field(
         default=frozenset({"seeds", "start", "stop", "detect", "found", "smooth", "compiler"}),
@@ -61,7 +61,7 @@ class Tracker(Estimator[P]):
         start: int | float | None = None,
         stop: int | float | None = None,
         detect: bool | None = None,
-        found: Found | None = None,
+        found: TargetSearchResult | None = None,
         extrapolate: bool = False,
     ) -> tuple[Features, ReadOut]:
         """All events of a recording, or of a part of it, for `run`, and `times` for `read`.
@@ -157,7 +157,7 @@ class Tracker(Estimator[P]):
         start: int | float | None = None,
         stop: int | float | None = None,
         detect: bool | None = None,
-        found: Found | None = None,
+        found: TargetSearchResult | None = None,
         smooth: bool | None = None,
         compiler: str | None = None,
         progress: bool | None = None,
@@ -194,7 +194,7 @@ class Tracker(Estimator[P]):
         self.check_options(
             seeds=seeds, start=start, stop=stop, detect=detect, found=found, smooth=smooth
         )
-        self._check_compiler(compiler)
+        choose_backend(compiler, True)
         if smooth:
             self._check_smoothing()
         smooth = self.filter.transition is not None if smooth is None else smooth
@@ -235,7 +235,7 @@ class Tracker(Estimator[P]):
         Raises:
             InputError: A seed is outside the sensor, or numba is asked for and has no kernel.
         """
-        self._check_compiler(compiler)
+        choose_backend(compiler, True)
         self.check_options(seeds=seeds, start=start, detect=detect)
         params = self.Params() if params is None else params
         kernel = functools.partial(self._fused, params, compiler)
@@ -250,20 +250,7 @@ class Tracker(Estimator[P]):
                 "`transition`; leave out smooth"
             )
 
-    def _check_compiler(self, compiler: str | None) -> None:
-        if compiler not in (None, "numba", "xla"):
-            raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
-
     def _fused(self, params: P, compiler: str | None, packing: Packing) -> FusedRun | None:
         """The kernel that follows targets; None where XLA does."""
-        if compiler == "xla":
-            return None
-        try:
-            return FusedRun(self.filter, params, packing)
-        except Untranslatable as reason:
-            if compiler == "numba":
-                raise InputError(
-                    f"numba has no kernel for the method {self.name!r} ({reason}); leave out the "
-                    "compiler"
-                ) from reason
-            return None
+        make = functools.partial(FusedRun, self.filter, params, packing)
+        return make_kernel(self.name, compiler, True, make)

@@ -1,6 +1,5 @@
-"""Targets of a recording found without settings: see `find`."""
+"""Search for the targets of a recording without settings: see `find`."""
 
-from jaxevent.blob.search.found import Found
-from jaxevent.blob.search.search import find
+from jaxevent.blob.search.search import TargetSearchResult, find
 
-__all__ = ["Found", "find"]
+__all__ = ["TargetSearchResult", "find"]

@@ -1,4 +1,4 @@
-"""Blobs of events in one window that background does not make, at a stated false-alarm rate."""
+"""Blobs of events that clutter does not make, at a stated rate of false alarms."""
 
 import dataclasses
 import functools
@@ -7,120 +7,162 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.search.background import CELL, Background, Field, look_up, nats, value_at
-from jaxevent.blob.search.stream import Part, Pixels
+from jaxevent.blob.search.background import (
+    CELL_PX,
+    Background,
+    CellField,
+    look_up,
+    poisson_nats,
+    value_at,
+)
+from jaxevent.blob.search.config import CONFIG
+from jaxevent.blob.search.stream import PixelCounts, WindowEvents
 from jaxevent.codegen import ZeroedScratch, njit_noalloc, njit_noalloc_inlined
 
 _cells = ZeroedScratch(np.int32)
-FALSE_ALARMS = 0.1  # per recording
-MOST_FEW = 1000  # events that are looked at wherever they are
-CONTACT = 2.0  # what is nearer than this many times the sum of both sizes touches
+MAX_FEW_EVENTS = 1000  # so many events are compared with the clutter wherever they are
 
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
-    """How finely events are looked at."""
+    """Resolution of the search in time and space.
 
-    window: float | int  # s
-    cell: int  # px, a power of 2
-    dispersion: NDArray[np.float64]  # of the background's counts in such windows, in 16 px cells
+    Attributes:
+        window: Length of windows, s.
+        cell: Side of cells, px, a power of 2.
+        dispersion: (rows, columns) variance over mean of clutter counts in such windows, in cells
+            of 16 px.
+    """
+
+    window: float | int
+    cell: int
+    dispersion: NDArray[np.float64]
 
     def dispersion_at(self, x: Any, y: Any) -> Any:
-        """That of counts in 3x3 of the scale's cells, in which flicker adds up."""
-        return self.usual + (look_up(self.dispersion, CELL, x, y) - self.usual) * self.flicker
+        """Return the dispersion of counts in 3x3 cells, in which flicker adds up, at pixels."""
+        excess = look_up(self.dispersion, CELL_PX, x, y) - self.min_dispersion
+        return self.min_dispersion + excess * self.dispersion_gain
 
-    def as_long(self, window: float) -> "Scale":
-        """The same with another window, s."""
+    def with_window(self, window: float) -> "Scale":
+        """Return the scale with windows of another length, s."""
         return dataclasses.replace(self, window=window)
 
     @functools.cached_property
-    def usual(self) -> float:
-        """The least dispersion."""
+    def min_dispersion(self) -> float:
+        """Least dispersion of the sensor's cells."""
         return float(self.dispersion.min())
 
     @property
-    def flicker(self) -> float:
+    def dispersion_gain(self) -> float:
         """Cells of 16 px in 3x3 of the scale's cells, at least 1."""
-        return max(1.0, (3 * self.cell / CELL) ** 2)
+        return max(1.0, (3 * self.cell / CELL_PX) ** 2)
 
 
 class Blobs(NamedTuple):
-    """Number, mean and covariance of the events of some blobs."""
+    """Moments of the events of blobs."""
 
-    n: NDArray[np.float64]
-    p: NDArray[np.float64]  # (blobs, 2) px
-    C: NDArray[np.float64]  # (blobs, 2, 2) px^2
+    n: NDArray[np.float64]  # (blobs,) events
+    p: NDArray[np.float64]  # (blobs, 2) px, means
+    C: NDArray[np.float64]  # (blobs, 2, 2) px^2, covariances
 
     @classmethod
-    def of(cls, number: int) -> "Blobs":
-        """Room for so many."""
+    def empty(cls, number: int) -> "Blobs":
+        """Allocate the moments of so many blobs."""
         return cls(np.empty(number), np.empty((number, 2)), np.empty((number, 2, 2)))
 
 
-class Space(NamedTuple):
-    """Where kernels look for blobs of so many pixels; int64 but for `labels`."""
+class DetectionScratch(NamedTuple):
+    """Scratch memory of the detection; indices of cells are int64."""
 
-    place: NDArray[np.int64]  # the cell of each pixel
-    filled: NDArray[np.int64]  # cells that are not empty,
-    hit: NDArray[np.int64]  # those with more events than background,
-    waiting: NDArray[np.int64]  # and those of a blob that are still to be looked at
-    labels: NDArray[np.int32]  # the blob of each pixel, from 1 on; 0: none
+    cell: NDArray[np.int64]  # (pixels,) cell of each pixel
+    filled: NDArray[np.int64]  # (pixels,) cells that are not empty,
+    hit: NDArray[np.int64]  # those with more events than clutter,
+    waiting: NDArray[np.int64]  # and those of a blob whose neighbours are not yet visited
+    labels: NDArray[np.int32]  # (pixels,) blob of each pixel, from 1 on; 0: none
 
     @classmethod
-    def of(cls, pixels: int) -> "Space":
-        place, filled, hit, waiting = np.empty((4, pixels), np.int64)
-        return cls(place, filled, hit, waiting, np.empty(pixels, np.int32))
+    def empty(cls, pixels: int) -> "DetectionScratch":
+        """Allocate the scratch memory for so many pixels."""
+        return cls(*np.empty((4, pixels), np.int64), np.empty(pixels, np.int32))
 
 
-class Ground(NamedTuple):
-    """What tells blobs from background in a window, for kernels."""
+class ClutterModel(NamedTuple):
+    """Clutter of one window and the threshold of detection, for kernels."""
 
-    rates: Field
-    dispersion: Field
-    bits: int  # the cell is 2^bits px
-    wide: int  # cells of a row, with the border
-    usual: float | int  # s px^2, of 3x3 cells
-    more: float | int  # times the dispersion of 3x3 cells exceeds that of 16 px more than the least
-    least: float | int  # dispersion
-    darkest: float | int  # events of 3x3 cells where the background is darkest
-    enough: float | int  # nats against background
+    rates: CellField  # 1/(px s)
+    dispersion: CellField  # variance over mean of counts
+    cell_bits: int  # cells have 2^cell_bits px
+    row_cells: int  # cells of a row, with the border
+    exposure: float | int  # s px^2, of 3x3 cells
+    dispersion_gain: float | int  # of 3x3 cells, see `Scale`
+    min_dispersion: float | int
+    min_events: float | int  # expected events of 3x3 cells where the clutter is least
+    log_threshold: float | int  # nats
 
 
-def ground_of(
-    background: Background, scale: Scale, size: tuple[int, int], t: float | int
-) -> Ground:
-    """Of a window about t (s) on a sensor of `size`: rows and columns, px."""
+def clutter_model(
+    background: Background, scale: Scale, shape: tuple[int, int], t: float | int
+) -> ClutterModel:
+    """Return the clutter of a window.
+
+    Args:
+        background: Background of the stream.
+        scale: Window and cells.
+        shape: Rows and columns of the sensor.
+        t: Middle of the window, s.
+    """
     g = scale.cell
-    usual = scale.window * 9 * g * g
-    tests = -(-size[0] // g) * -(-size[1] // g) * background.duration / scale.window
-    rates, least = background.field(t, 3 * g), scale.usual
-    return Ground(
-        rates, background.field_of(scale.dispersion, CELL, t), g.bit_length() - 1,
-        -(-size[1] // g) + 2, float(usual), scale.flicker,
-        least, float(background.least * rates.factor * usual),
-        float(np.log(tests / FALSE_ALARMS)),
+    exposure = scale.window * 9 * g * g
+    tests = -(-shape[0] // g) * -(-shape[1] // g) * background.duration / scale.window
+    rates = background.rate_field(t, 3 * g)
+    return ClutterModel(
+        rates, background.field_of(scale.dispersion, CELL_PX, t), g.bit_length() - 1,
+        -(-shape[1] // g) + 2, float(exposure), scale.dispersion_gain, scale.min_dispersion,
+        float(background.min_rate * rates.factor * exposure),
+        float(np.log(tests / CONFIG.false_alarms)),
     )  # fmt: skip
 
 
+@njit_noalloc_inlined
+def clutter_at(clutter: Any, x: Any, y: Any) -> Any:
+    """Return the rate, 1/(px s), and the dispersion of the clutter at a pixel."""
+    excess = value_at(clutter.dispersion, x, y) - clutter.min_dispersion
+    dispersion = clutter.min_dispersion + excess * clutter.dispersion_gain
+    return value_at(clutter.rates, x, y), dispersion
+
+
 def detect(
-    part: Part | Pixels, background: Background, scale: Scale, size: tuple[int, int], t: float | int
+    events: WindowEvents | PixelCounts, clutter: ClutterModel, shape: tuple[int, int]
 ) -> tuple[NDArray[np.int32], int]:
-    """Which blob each event is of, from 1 on, 0: none; and how many there are.
+    """Detect blobs in one window.
 
-    A blob is made of neighbouring cells that are not empty and whose 3x3 surroundings hold more
-    events than background would give to one in 10 recordings. Blobs come in the order of their
-    cells' first events. `size`: rows and columns, px.
+    A blob consists of neighbouring cells that are not empty and whose 3x3 surroundings hold more
+    events than clutter gives to one in 10 recordings. Blobs are numbered by the first events of
+    their cells.
+
+    Args:
+        events: Events or pixels of the window.
+        clutter: Clutter of the window.
+        shape: Rows and columns of the sensor.
+
+    Returns:
+        Blob of each event, from 1 on, 0 for none; and the number of blobs.
     """
-    ground, space = ground_of(background, scale, size, t), Space.of(len(part))
-    cells = blank_cells(size, scale.cell)
-    number = _detect(part.x, part.y, _events_of(part), ground, cells, space)
-    return space.labels, number
+    scratch = DetectionScratch.empty(len(events))
+    cells = zeroed_cells(shape, 1 << clutter.cell_bits)
+    number = _find_blobs(events.x, events.y, _weights(events), clutter, cells, scratch)
+    return scratch.labels, number
 
 
-def blank_cells(size: tuple[int, int], cell: int) -> NDArray[np.int32]:
-    """Cells of a sensor and a border of one cell around them, to be counted in, row by row."""
-    rows, columns = (-(-n // cell) + 2 for n in size)
+def zeroed_cells(shape: tuple[int, int], cell: int) -> NDArray[np.int32]:
+    """Return counts of a sensor's cells and of a border of one cell, row by row, all zero."""
+    rows, columns = (-(-n // cell) + 2 for n in shape)
     return _cells(rows * columns)
+
+
+def _weights(events: WindowEvents | PixelCounts) -> NDArray[np.int32]:
+    """Return the events of each pixel, or 1 of each event."""
+    return events.n if isinstance(events, PixelCounts) else np.ones(len(events), np.int32)
 
 
 # Windows hold far fewer events than there are cells: only those that are not empty are touched, and
@@ -128,78 +170,78 @@ def blank_cells(size: tuple[int, int], cell: int) -> NDArray[np.int32]:
 
 
 @njit_noalloc
-def _detect(x: Any, y: Any, number: Any, ground: Any, cells: Any, space: Any) -> int:
-    return find_blobs(x, y, number, ground, cells, space)
+def _find_blobs(x: Any, y: Any, n: Any, clutter: Any, cells: Any, scratch: Any) -> int:
+    return find_blobs(x, y, n, clutter, cells, scratch)
 
 
 @njit_noalloc_inlined
-def find_blobs(x: Any, y: Any, number: Any, ground: Any, cells: Any, space: Any) -> int:
-    """How many blobs there are of pixels with so many events each, as `detect`.
+def find_blobs(x: Any, y: Any, n: Any, clutter: Any, cells: Any, scratch: Any) -> int:
+    """Label pixels with n events each in `scratch.labels`, and return the number of blobs.
 
-    `cells` are 0, and are again; the pixels' blobs are in `space.labels`.
+    `cells` are zero, and are again.
     """
-    filled = _count(x, y, number, ground, cells, space)
-    hits = _significant(filled, ground, cells, space)
+    filled = _count(x, y, n, clutter, cells, scratch)
+    hits = _find_hits(filled, clutter, cells, scratch)
     for i in range(filled):
-        cells[space.filled[i]] = 0
-    return _label(len(x), hits, ground.wide, cells, space)
+        cells[scratch.filled[i]] = 0
+    return _label(len(x), hits, clutter.row_cells, cells, scratch)
 
 
 @njit_noalloc_inlined
-def _count(x: Any, y: Any, number: Any, ground: Any, cells: Any, space: Any) -> int:
-    """The cell of each pixel, and all that are not empty: their number."""
-    n, wide, bits, count = cells, ground.wide, ground.bits, 0
+def _count(x: Any, y: Any, n: Any, clutter: Any, cells: Any, scratch: Any) -> int:
+    """Count events in cells, list the cells that are not empty, and return their number."""
+    wide, bits, count = clutter.row_cells, clutter.cell_bits, 0
     for i in range(len(x)):
         at = ((np.int64(y[i]) >> bits) + 1) * wide + (np.int64(x[i]) >> bits) + 1
-        space.place[i] = at
-        if n[at] == 0:
-            space.filled[count] = at
+        scratch.cell[i] = at
+        if cells[at] == 0:
+            scratch.filled[count] = at
             count += 1
-        n[at] += number[i]
+        cells[at] += n[i]
     return count
 
 
 @njit_noalloc_inlined
-def _significant(filled: int, ground: Any, cells: Any, space: Any) -> int:
-    """Cells that are not empty whose 3x3 hold more events than background gives: their number."""
-    n, wide, g = cells, ground.wide, 1 << ground.bits
-    # Fewer events are no evidence even where the background is darkest.
-    few = 1
-    while few < MOST_FEW and nats(few, ground.darkest) <= ground.enough * ground.least:
+def _find_hits(filled: int, clutter: Any, cells: Any, scratch: Any) -> int:
+    """List filled cells whose 3x3 hold more events than clutter, and return their number."""
+    wide, g, hit = clutter.row_cells, 1 << clutter.cell_bits, scratch.hit
+    # Fewer events are no evidence even where the clutter is least.
+    few, least = 1, clutter.log_threshold * clutter.min_dispersion
+    while few < MAX_FEW_EVENTS and poisson_nats(few, clutter.min_events) <= least:
         few += 1
-    many, some, count = space.hit, 0, 0
+    some = count = 0
     for i in range(filled):
-        if _sum_around(n, space.filled[i], wide) >= few:
-            many[some] = space.filled[i]
+        if _sum_around(cells, scratch.filled[i], wide) >= few:
+            hit[some] = scratch.filled[i]
             some += 1
     for i in range(some):
-        cell = many[i]
+        cell = hit[i]
         x, y = (cell % wide - 1) * g + g // 2, (cell // wide - 1) * g + g // 2
-        mu = value_at(ground.rates, x, y) * ground.usual
-        F = ground.least + (value_at(ground.dispersion, x, y) - ground.least) * ground.more
-        if nats(_sum_around(n, cell, wide), mu) > ground.enough * F:
-            many[count] = cell
+        rate, F = clutter_at(clutter, x, y)
+        nats = poisson_nats(_sum_around(cells, cell, wide), rate * clutter.exposure)
+        if nats > clutter.log_threshold * F:
+            hit[count] = cell
             count += 1
     return count
 
 
 @njit_noalloc_inlined
-def _sum_around(n: Any, cell: int, wide: int) -> Any:
+def _sum_around(cells: Any, cell: int, wide: int) -> Any:
     total = 0
     for row in (cell - wide, cell, cell + wide):
-        total += n[row - 1] + n[row] + n[row + 1]
+        total += cells[row - 1] + cells[row] + cells[row + 1]
     return total
 
 
 @njit_noalloc_inlined
-def _label(events: int, hits: int, wide: int, labels: Any, space: Any) -> int:
-    """The blob of each event, and how many there are: neighbours, also across corners."""
-    waiting = space.waiting
+def _label(pixels: int, hits: int, wide: int, labels: Any, scratch: Any) -> int:
+    """Label pixels by blobs of neighbouring hits, also across corners; return their number."""
+    waiting = scratch.waiting
     for i in range(hits):
-        labels[space.hit[i]] = -1
+        labels[scratch.hit[i]] = -1
     number = 0
     for i in range(hits):
-        cell = space.hit[i]
+        cell = scratch.hit[i]
         if labels[cell] > 0:
             continue
         number += 1
@@ -214,46 +256,51 @@ def _label(events: int, hits: int, wide: int, labels: Any, space: Any) -> int:
                         labels[near] = number
                         waiting[count] = near
                         count += 1
-    for i in range(events):
-        space.labels[i] = labels[space.place[i]]
+    for i in range(pixels):
+        scratch.labels[i] = labels[scratch.cell[i]]
     for i in range(hits):
-        labels[space.hit[i]] = 0
+        labels[scratch.hit[i]] = 0
     return number
 
 
-def measure_blobs(part: Part | Pixels, labels: NDArray[np.int32], number: int) -> Blobs:
-    """Moments of all blobs. A pixel's own extent is added to the covariance."""
-    blobs = Blobs.of(number)
-    _measure(part.x, part.y, _events_of(part), labels, number, blobs)
+def measure_blobs(
+    events: WindowEvents | PixelCounts, labels: NDArray[np.int32], number: int
+) -> Blobs:
+    """Compute the moments of all blobs; a pixel's own extent is added to the covariance.
+
+    Args:
+        events: Events or pixels of a window.
+        labels: Blob of each, from 1 on; 0 for none.
+        number: Number of blobs.
+    """
+    blobs = Blobs.empty(number)
+    _measure_blobs(events.x, events.y, _weights(events), labels, blobs)
     return blobs
 
 
-def _events_of(part: Part | Pixels) -> NDArray[np.int32]:
-    return part.n if isinstance(part, Pixels) else np.ones(len(part), np.int32)
-
-
 @njit_noalloc
-def _measure(x: Any, y: Any, events: Any, labels: Any, number: int, blobs: Any) -> None:
-    blob_moments(x, y, events, labels, number, blobs)
+def _measure_blobs(x: Any, y: Any, weights: Any, labels: Any, blobs: Any) -> None:
+    sum_blobs(x, y, weights, labels, len(blobs.n), blobs)
 
 
 @njit_noalloc_inlined
-def blob_moments(x: Any, y: Any, events: Any, labels: Any, number: int, blobs: Any) -> None:
-    """The first `number` of `blobs`, of pixels with so many events each, as `measure_blobs`."""
-    n, p, C = blobs
+def sum_blobs(x: Any, y: Any, weights: Any, labels: Any, number: int, blobs: Any) -> None:
+    """Fill in the first `number` of `blobs`, of pixels with so many events each."""
     for k in range(number):
-        n[k] = p[k, 0] = p[k, 1] = C[k, 0, 0] = C[k, 0, 1] = C[k, 1, 1] = 0.0
+        blobs.n[k] = blobs.p[k, 0] = blobs.p[k, 1] = 0.0
+        blobs.C[k, 0, 0] = blobs.C[k, 0, 1] = blobs.C[k, 1, 1] = 0.0
     # One pass: sums of whole numbers are exact.
     for i in range(len(x)):
         k = labels[i] - 1
         if k >= 0:
-            add_moments(n, p, C, k, float(events[i]), float(x[i]), float(y[i]))
-    finish_moments(n, p, C, number)
+            add_moments(blobs, k, float(weights[i]), float(x[i]), float(y[i]))
+    finish_moments(blobs, number)
 
 
 @njit_noalloc_inlined
-def add_moments(n: Any, p: Any, C: Any, k: int, weight: float, x: float, y: float) -> None:
-    """Add a place to the sums of one of several blobs."""
+def add_moments(blobs: Any, k: int, weight: float, x: float, y: float) -> None:
+    """Add a place to the sums of blob k."""
+    n, p, C = blobs
     n[k] += weight
     p[k, 0] += weight * x
     p[k, 1] += weight * y
@@ -263,8 +310,9 @@ def add_moments(n: Any, p: Any, C: Any, k: int, weight: float, x: float, y: floa
 
 
 @njit_noalloc_inlined
-def finish_moments(n: Any, p: Any, C: Any, number: int) -> None:
-    """Means and covariances, with that of a pixel, from the sums of the first `number`."""
+def finish_moments(blobs: Any, number: int) -> None:
+    """Turn the sums of the first `number` blobs to means and covariances, with a pixel's extent."""
+    n, p, C = blobs
     for k in range(number):
         over = 1 / max(n[k], 1e-9)
         p[k, 0] *= over
@@ -274,36 +322,46 @@ def finish_moments(n: Any, p: Any, C: Any, number: int) -> None:
         C[k, 1, 1] = C[k, 1, 1] * over - p[k, 1] * p[k, 1] + 1 / 12
 
 
-def part_blob(x: NDArray, y: NDArray, C: NDArray, valley: float) -> Blobs | None:
-    """The two halves of a blob of covariance C that has a gap across its longer axis; or None.
+def split_blob(x: NDArray, y: NDArray, C: NDArray) -> Blobs | None:
+    """Split a blob of covariance C at a gap across its longer axis.
 
-    A gap is where less than the share `valley` of its events lies within the halves' sizes of the
-    middle between them, and the halves do not touch. The half with more events comes first.
+    In a gap few of the events lie within the halves' sizes of the middle between them, and the
+    halves are not in contact.
+
+    Returns:
+        The two halves, the one with more events first; None if there is no gap.
     """
     if len(x) < 8:
         return None
     p = np.stack([x, y], 1).astype(float)
     along = p @ np.linalg.eigh(C)[1][:, 1]
     middle = along.mean()
-    for _ in range(4):  # of two means
+    for _ in range(4):  # iterations of two means
         upper = along > middle
         if upper.all() or not upper.any():
             return None
         middle = (along[upper].mean() + along[~upper].mean()) / 2
     halves = sorted((upper, ~upper), key=lambda half: -half.sum())
     between = sum(along[half].std() for half in halves) / 2
-    if (abs(along - middle) < between).mean() > valley:
+    if (abs(along - middle) < between).mean() > CONFIG.split_valley:
         return None
-    two = Blobs.of(2)
+    two = Blobs.empty(2)
     for k, half in enumerate(halves):
         two.n[k], two.p[k] = half.sum(), p[half].mean(0)
         two.C[k] = np.cov(p[half].T, ddof=0) + np.eye(2) / 12
-    apart = touching(two.p[0], two.C[0], two.p[1], two.C[1])
-    return two if apart >= CONTACT else None
+    apart = contact_distance(two.p[0], two.C[0], two.p[1], two.C[1])
+    return two if apart >= CONFIG.contact_distance else None
 
 
-def touching(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> Any:
-    """Distances over the sum of both ellipses' reach along the line between them."""
+def contact_distance(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> Any:
+    """Compute distances of ellipses over the sum of their standard deviations between them.
+
+    Args:
+        pa: (..., 2) px, centres.
+        Ca: (..., 2, 2) px^2, covariances.
+        pb: (..., 2) px, centres of the others.
+        Cb: (..., 2, 2) px^2, their covariances.
+    """
     d = pb - pa
     length = np.hypot(d[..., 0], d[..., 1])
     u = d / np.maximum(length, 1e-9)[..., None]
@@ -312,9 +370,22 @@ def touching(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> Any:
 
 
 @njit_noalloc_inlined
-def touch(p: Any, C: Any, j: int, k: int) -> bool:
-    """Whether two of some blobs touch: `touching` is below `CONTACT`."""
+def in_contact(p: Any, C: Any, j: int, k: int) -> bool:
+    """Return whether the `contact_distance` of two ellipses of a list is small."""
     x, y, reach = p[k, 0] - p[j, 0], p[k, 1] - p[j, 1], 0.0
     for i in (j, k):
         reach += np.sqrt(C[i, 0, 0] * x * x + 2 * C[i, 0, 1] * x * y + C[i, 1, 1] * y * y)
-    return x * x + y * y <= CONTACT * reach
+    return x * x + y * y <= CONFIG.contact_distance * reach
+
+
+def larger_variance(C: NDArray) -> NDArray[np.float64]:
+    """Return the larger eigenvalues of (..., 2, 2) covariances."""
+    half = (C[..., 0, 0] - C[..., 1, 1]) / 2
+    return (C[..., 0, 0] + C[..., 1, 1]) / 2 + np.hypot(half, C[..., 0, 1])
+
+
+@njit_noalloc_inlined
+def larger_variance_of(C: Any) -> Any:
+    """Return the larger eigenvalue of one covariance, for kernels."""
+    half, cross = (C[0, 0] - C[1, 1]) / 2, C[0, 1]
+    return (C[0, 0] + C[1, 1]) / 2 + np.sqrt(half * half + cross * cross)

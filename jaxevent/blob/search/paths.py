@@ -1,4 +1,4 @@
-"""Paths of targets through windows of events, and which events are near them."""
+"""Paths of targets, the events near them, and the noise of their velocity."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -7,27 +7,30 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.blob.search.config import CONFIG
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
+from jaxevent.deprecated import RenamedAttribute
 from jaxevent.recording import Events
 
-STILL = 2  # windows of silence after which a target stands still
-NOBODY = -1  # whose an event is: of no path
+NO_OWNER = -1  # index of the path of an event that is near none
+# Velocity noises that are tried, in (larger size)^2 / window^3.
+NOISE_GRID = 10.0 ** np.arange(-7, 2.01, 0.25)
 
 
 @dataclasses.dataclass(frozen=True)
-class Path:
-    """Where a target was in the windows in which it was seen.
+class TargetPath:
+    """Path of a target through the windows in which it was seen.
 
     Attributes:
         t: (rows,) us, the middle of each window.
-        p: (rows, 2) px.
-        v: (rows, 2) px/s.
-        C: (rows, 2, 2) px^2, covariance of the target's events.
+        p: (rows, 2) px, positions.
+        v: (rows, 2) px/s, velocities.
+        C: (rows, 2, 2) px^2, covariances of the target's events.
         n: (rows,) events in the window, smoothed.
-        window: us.
-        agility: px^2/s^3, noise of its velocity.
-        polarity: Of its events, 1 ON and 0 OFF; None: both. See `prefer_sharper`.
-        turn: rad/s at which it turns in its place, from x to y; None: not told. See `join_turning`.
+        window: us, length of a window.
+        velocity_noise: px^2/s^3, density of the white noise that drives the velocity.
+        polarity: Polarity of the target's events, 1 ON and 0 OFF; None for both.
+        turn_rate: rad/s at which it turns in place, from x to y; None if it is not known to turn.
     """
 
     t: NDArray[np.int64]
@@ -36,64 +39,75 @@ class Path:
     C: NDArray[np.float64]
     n: NDArray[np.float64]
     window: int
-    agility: float
+    velocity_noise: float
     polarity: int | None = None
-    turn: float | None = None
+    turn_rate: float | None = None
+
+    agility = RenamedAttribute("velocity_noise")
+    turn = RenamedAttribute("turn_rate")
 
     @property
     def begin(self) -> int:
-        """us."""
+        """Start of the first window, us."""
         return int(self.t[0]) - self.window // 2
 
     @property
     def end(self) -> int:
-        """us; the first moment that is no more of it."""
+        """End of the last window, us, which it does not include."""
         return int(self.t[-1]) + self.window // 2
 
     @property
     def size(self) -> NDArray[np.float64]:
-        """(rows, 2) px, standard deviations along the axes, the larger first."""
+        """(rows, 2) px, standard deviations along the principal axes, the larger first."""
         return np.sqrt(np.maximum(np.linalg.eigvalsh(self.C)[:, ::-1], 0))
 
     def at(self, t: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Positions (times, 2) at some times, on straight lines between rows."""
+        """Interpolate positions (times, 2) linearly at times (us)."""
         return np.stack([np.interp(t, self.t, self.p[:, i]) for i in range(2)], 1)
 
-    def seen(self, t: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether a window in which it was seen holds the times."""
-        after = np.clip(np.searchsorted(self.t, t), 0, len(self.t) - 1)
-        before = np.maximum(after - 1, 0)
-        return np.minimum(np.abs(self.t[after] - t), np.abs(self.t[before] - t)) <= self.window / 2
+    def take(self, rows: slice | NDArray) -> "TargetPath":
+        """Return the path of some rows."""
+        return dataclasses.replace(self, **{k: getattr(self, k)[rows] for k in "tpvCn"})
+
+    def followed_by(self, other: "TargetPath") -> "TargetPath":
+        """Return the path of this one's rows and then those of another one."""
+        rows = {k: np.concatenate([getattr(self, k), getattr(other, k)]) for k in "tpvCn"}
+        return dataclasses.replace(self, **rows)
+
+    def mean_velocity(self, rows: slice) -> NDArray[np.float64]:
+        """Fit the velocity (2,) px/s over some rows; zero for fewer than three."""
+        t, p = self.t[rows] * 1e-6, self.p[rows]
+        return np.polyfit(t - t[0], p, 1)[0] if len(t) > 2 else np.zeros(2)
 
 
-class Joined(NamedTuple):
-    """Rows of several paths, one after another: those of path k from first[k] to first[k + 1]."""
+class PathTable(NamedTuple):
+    """Rows of several paths, one after another; path k has rows first[k] to first[k + 1]."""
 
-    first: NDArray[np.int64]
-    window: NDArray[np.int64]
-    polarity: NDArray[np.int8]  # that an event of each path has; -1: either
-    t: NDArray[np.int64]
-    p: NDArray[np.float64]
-    S: NDArray[np.float64]  # (rows, 3): of events about p, xx, xy, yy
+    first: NDArray[np.int64]  # (paths + 1,)
+    window: NDArray[np.int64]  # (paths,) us
+    polarity: NDArray[np.int8]  # (paths,) polarity of the path's events; -1: either
+    t: NDArray[np.int64]  # (rows,) us
+    p: NDArray[np.float64]  # (rows, 2) px
+    S: NDArray[np.float64]  # (rows, 3) px^2, covariance of events about p: xx, xy, yy
 
     @property
     def begins(self) -> NDArray[np.int64]:
-        """(paths,) us, as `Path.begin`."""
+        """(paths,) us, starts of the paths."""
         return self.t[self.first[:-1]] - self.window // 2
 
     @property
     def ends(self) -> NDArray[np.int64]:
-        """(paths,) us, as `Path.end`."""
+        """(paths,) us, ends of the paths, which they do not include."""
         return self.t[self.first[1:] - 1] + self.window // 2
 
 
-def join(paths: Sequence[Path]) -> Joined:
-    """The paths' rows."""
+def tabulate_paths(paths: Sequence[TargetPath]) -> PathTable:
+    """Concatenate the rows of paths."""
     S = [
         path.C * (1 + 2 / np.maximum(path.n, 1))[:, None, None] + 0.1 * np.eye(2) for path in paths
     ]
     S = np.concatenate(S)
-    return Joined(
+    return PathTable(
         np.cumsum([0, *(len(path.t) for path in paths)]),
         np.array([path.window for path in paths]),
         np.array([-1 if p.polarity is None else p.polarity for p in paths], np.int8),
@@ -103,95 +117,142 @@ def join(paths: Sequence[Path]) -> Joined:
     )
 
 
-def candidates(events: Events, joined: Joined, sigmas: float | int) -> NDArray[np.int32]:
-    """Of which paths each event may be, (events, 2): `NOBODY`, or the likelier one first.
+class _Near(NamedTuple):
+    """Columns of events, and the likeliest paths of each, for kernels."""
 
-    Of a path are events of its polarity within `sigmas` standard deviations while it is seen; of
-    more than two paths an event is of the likeliest two.
+    t: NDArray[np.int64]
+    x: NDArray[np.integer]
+    y: NDArray[np.integer]
+    p: NDArray[np.bool_]
+    owner: NDArray[np.int32]  # (events, 2)
+    cost: NDArray[np.float64]  # (events, 2) -2 ln likelihood + constant; (0, 2) for a single path
+
+
+def owner_candidates(events: Events, table: PathTable, sigmas: float | int) -> NDArray[np.int32]:
+    """Find the two paths that each event may belong to.
+
+    An event may belong to a path if it has the path's polarity, lies within `sigmas` standard
+    deviations of it, and falls into a window in which the target is seen.
+
+    Args:
+        events: N events, sorted by time.
+        table: Rows of all paths.
+        sigmas: Radius of the gate, standard deviations.
+
+    Returns:
+        (N, 2) indices of the two likeliest paths, the likelier first; `NO_OWNER` for none.
     """
-    t, alone = events.t, len(joined.window) == 1
-    whose = np.full((len(events), 2), NOBODY, np.int32)
-    far = np.empty((0 if alone else len(events), 2))
-    rows = np.stack([np.searchsorted(t, us) for us in (joined.begins, joined.ends)])
-    _candidates(t, events.x, events.y, events.p, joined, rows, float(sigmas) ** 2, whose, far)
-    return whose
+    t, single = events.t, len(table.window) == 1
+    owner = np.full((len(events), 2), NO_OWNER, np.int32)
+    near = _Near(t, events.x, events.y, events.p, owner, np.empty((0 if single else len(t), 2)))
+    rows = np.stack([np.searchsorted(t, us) for us in (table.begins, table.ends)])
+    _find_owners(near, table, rows, float(sigmas) ** 2)
+    return owner
 
 
 @njit_noalloc
-def _candidates(
-    t: Any, x: Any, y: Any, p: Any, joined: Any, rows: Any, limit: float | int, whose: Any, far: Any
-) -> None:
-    """Fill in whose events are; `far` are minus twice their log likelihoods, up to a constant.
-
-    Of one path `far` is empty: nothing is compared.
-    """
-    for k in range(len(joined.window)):
-        row, last, i, end = joined.first[k], joined.first[k + 1] - 1, rows[0, k], rows[1, k]
+def _find_owners(near: Any, table: Any, rows: Any, limit: float | int) -> None:
+    """Fill in the owners of events; `rows` (2, paths) are the events of each path's life."""
+    for k in range(len(table.window)):
+        row, last, i, end = table.first[k], table.first[k + 1] - 1, rows[0, k], rows[1, k]
         while i < end:
-            while row < last and joined.t[row + 1] <= t[i]:
+            while row < last and table.t[row + 1] <= near.t[i]:
                 row += 1
             to = i
-            while to < end and (row == last or t[to] < joined.t[row + 1]):
+            while to < end and (row == last or near.t[to] < table.t[row + 1]):
                 to += 1
-            place = k, row, min(row + 1, last)
-            _between_rows(t, x, y, p, joined, place, (i, to), limit, whose, far)
+            _find_owners_between(near, table, (k, row, min(row + 1, last)), (i, to), limit)
             i = to
 
 
 @njit_noalloc_inlined
-def _between_rows(
-    t: Any, x: Any, y: Any, p: Any, joined: Any, place: Any, events: Any, limit: float | int,
-    whose: Any, far: Any,
-) -> None:  # fmt: skip
-    """The same of events (first, last) between two rows of a path: `place` is it and they."""
-    (k, row, following), w, wanted = place, joined.window[place[0]], joined.polarity[place[0]]
-    left, right, above, below = _box(joined, row, following, limit)
-    begin, span = joined.t[row], joined.t[following] - joined.t[row]
+def _find_owners_between(near: Any, table: Any, place: Any, events: Any, limit: float | int):
+    """Fill in the owners of events (first, end) between two rows of a path: (path, row, row)."""
+    (k, row, following), w, polarity = place, table.window[place[0]], table.polarity[place[0]]
+    x, y, p, S = near.x, near.y, table.p, table.S
+    wide = np.sqrt(limit * max(S[row, 0], S[following, 0]))
+    high = np.sqrt(limit * max(S[row, 2], S[following, 2]))
+    left = np.int64(np.floor(min(p[row, 0], p[following, 0]) - wide))
+    right = np.int64(np.ceil(max(p[row, 0], p[following, 0]) + wide))
+    top = np.int64(np.floor(min(p[row, 1], p[following, 1]) - high))
+    bottom = np.int64(np.ceil(max(p[row, 1], p[following, 1]) + high))
+    begin, span = table.t[row], table.t[following] - table.t[row]
     unseen = span > w + w // 2
     over = 1 / span if span > 0 else 0.0
-    x0, y0 = joined.p[row, 0], joined.p[row, 1]
-    vx, vy = joined.p[following, 0] - x0, joined.p[following, 1] - y0
-    a0, b0, c0 = joined.S[row, 0], joined.S[row, 1], joined.S[row, 2]
-    da, db, dc = (
-        joined.S[following, 0] - a0, joined.S[following, 1] - b0, joined.S[following, 2] - c0,
-    )  # fmt: skip
+    x0, y0 = p[row, 0], p[row, 1]
+    vx, vy = p[following, 0] - x0, p[following, 1] - y0
+    a0, b0, c0 = S[row, 0], S[row, 1], S[row, 2]
+    da, db, dc = S[following, 0] - a0, S[following, 1] - b0, S[following, 2] - c0
     for i in range(events[0], events[1]):
-        if x[i] < left or x[i] > right or y[i] < above or y[i] > below:
+        if x[i] < left or x[i] > right or y[i] < top or y[i] > bottom:
             continue
-        if wanted >= 0 and wanted != p[i]:
+        if polarity >= 0 and polarity != near.p[i]:
             continue
-        part = min(max((t[i] - begin) * over, 0.0), 1.0)
+        part = min(max((near.t[i] - begin) * over, 0.0), 1.0)
         if unseen and min(part, 1 - part) * span > w / 2:
             continue
         ex, ey = x[i] - x0 - part * vx, y[i] - y0 - part * vy
         a, b, c = a0 + part * da, b0 + part * db, c0 + part * dc
         squared, determinant = c * ex * ex - 2 * b * ex * ey + a * ey * ey, a * c - b * b
         if squared <= limit * determinant:
-            if len(far) == 0:
-                whose[i, 0] = k
+            if len(near.cost) == 0:
+                near.owner[i, 0] = k
             else:
-                _enter(whose[i], far[i], k, squared / determinant + np.log(determinant))
+                cost = squared / determinant + np.log(determinant)
+                _insert_owner(near.owner[i], near.cost[i], k, cost)
 
 
 @njit_noalloc_inlined
-def _enter(whose: Any, far: Any, k: int, distance: float) -> None:
-    """Path k is one of the likeliest two, or not."""
-    if whose[0] < 0 or distance < far[0]:
-        whose[1], far[1] = whose[0], far[0]
-        whose[0], far[0] = k, distance
-    elif whose[1] < 0 or distance < far[1]:
-        whose[1], far[1] = k, distance
+def _insert_owner(owner: Any, cost: Any, k: int, new: float) -> None:
+    """Insert a path among the likeliest two of an event."""
+    if owner[0] < 0 or new < cost[0]:
+        owner[1], cost[1] = owner[0], cost[0]
+        owner[0], cost[0] = k, new
+    elif owner[1] < 0 or new < cost[1]:
+        owner[1], cost[1] = k, new
 
 
-@njit_noalloc_inlined
-def _box(joined: Any, row: int, following: int, limit: Any) -> Any:
-    """Least and greatest x and y (px) of what is near a path between two of its rows."""
-    p, S = joined.p, joined.S
-    wide = np.sqrt(limit * max(S[row, 0], S[following, 0]))
-    high = np.sqrt(limit * max(S[row, 2], S[following, 2]))
-    return (
-        np.int64(np.floor(min(p[row, 0], p[following, 0]) - wide)),
-        np.int64(np.ceil(max(p[row, 0], p[following, 0]) + wide)),
-        np.int64(np.floor(min(p[row, 1], p[following, 1]) - high)),
-        np.int64(np.ceil(max(p[row, 1], p[following, 1]) + high)),
-    )
+def fit_velocity_noise(t: NDArray, m: NDArray, R: NDArray, unit: float | int) -> float:
+    """Fit the velocity noise of a path by maximum likelihood.
+
+    Constant-velocity Kalman filters with the noises of `NOISE_GRID` predict each mean from those
+    before.
+
+    Args:
+        t: (windows,) s, times.
+        m: (windows, 2) px, means of the windows' events.
+        R: (windows,) px^2, variances of the means.
+        unit: px^2/s^3, unit of the grid.
+
+    Returns:
+        The noise density of the largest likelihood, px^2/s^3; 0.01 units for fewer windows than
+        `SearchConfig.min_noise_windows`.
+    """
+    if len(t) < CONFIG.min_noise_windows:
+        return 0.01 * unit
+    scores = np.array([_log_likelihood(t, m, R, float(q)) for q in NOISE_GRID * unit])
+    return float(NOISE_GRID[np.argmax(scores)] * unit)
+
+
+@njit_noalloc
+def _log_likelihood(t: Any, m: Any, R: Any, q: float | int) -> float:
+    """Compute the log likelihood of means after the first two, for velocity noise q."""
+    total = 0.0
+    for axis in range(2):
+        dt = t[1] - t[0]
+        p, v = m[1, axis], (m[1, axis] - m[0, axis]) / dt
+        a, b, c = R[1], R[1] / dt, (R[0] + R[1]) / dt**2 + q * dt
+        for k in range(2, len(t)):
+            dt = t[k] - t[k - 1]
+            p += v * dt
+            a += 2 * b * dt + c * dt**2 + q * dt**3 / 3
+            b += c * dt + q * dt**2 / 2
+            c += q * dt
+            S = a + R[k]
+            z = m[k, axis] - p
+            total -= 0.5 * (min(z * z / S, CONFIG.max_squared_innovation) + np.log(S))
+            gain, turn = a / S, b / S
+            p, v = p + gain * z, v + turn * z
+            c -= turn * b
+            a, b = a - gain * a, b - gain * b
+    return total

@@ -1,7 +1,17 @@
-"""Targets whose events of one polarity lag: where these are is told by the other's.
+"""Tests of the polarities of a path's events: lamps on the mains, and a polarity that lags.
+
+Light from the mains brightens and fades twice in each of their periods, all over a lamp at once:
+its events are ON in one half of each hundredth or 120th of a second and OFF in the other. Of n
+events with signs s at times t (s) the coherence is, without the part of chance,
+
+    (|sum s exp(2 pi i f t)|^2 - n) / (n^2 - n),
+
+0 for events of any other kind. It is the median over pieces of time: the mains are not held to a
+hertz exactly, and targets pass before lamps. Of lamps whose light goes on and off within 0.5 and
+1 ms it is 0.9 and 0.7 to 0.5.
 
 A dim light makes ON events at its edge, and OFF events for long after it has gone on. Their mean
-lies in the tail, behind the light.
+lies in the tail, behind the light: the ON events alone show its position.
 """
 
 import dataclasses
@@ -10,49 +20,133 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.search.agility import fit_agility
-from jaxevent.blob.search.paths import Path, join
-from jaxevent.blob.search.stream import near_paths
-from jaxevent.blob.search.targets import GATE
+from jaxevent.blob.search.config import CONFIG
+from jaxevent.blob.search.paths import (
+    NO_OWNER,
+    TargetPath,
+    fit_velocity_noise,
+    tabulate_paths,
+)
+from jaxevent.blob.search.stream import batches_near_paths
 from jaxevent.codegen import njit_noalloc
 from jaxevent.recording import Recording
 
-LAGS = 1.8  # times the larger standard deviation of the sharper polarity's events
-SHARE = 0.2  # of the events are of the sharper polarity, at least
-FEWEST = 4  # windows in which it is seen, and
-FEW = 2  # events in each
-ENOUGH = 100  # events of a window
+MAINS_HZ = np.array([50.0, 60.0])
 
 
-def prefer_sharper(paths: list[Path], recording: Recording, hot: NDArray[np.bool_]) -> list[Path]:
-    """Paths of the sharper polarity's events, where the other's lag; the others as they are.
+def drop_lamps(
+    paths: list[TargetPath], recording: Recording, hot: NDArray[np.bool_]
+) -> tuple[list[TargetPath], int]:
+    """Drop the paths of lamps on the mains.
 
-    `hot` (rows, columns) are pixels that are left out.
+    Args:
+        paths: Paths of targets and lamps.
+        recording: Events.
+        hot: (rows, columns) pixels that are left out.
+
+    Returns:
+        The other paths, and the number of lamps.
+    """
+    some = []
+    for k, path in enumerate(paths):
+        quarters = np.array_split(np.arange(len(path.t)), CONFIG.lamp_quarters)
+        if any(_stays(path, rows) for rows in quarters):
+            some.append(k)
+    if not some:
+        return paths, 0
+    begin = min(paths[k].begin for k in some)
+    lamps = set()
+    each = _mains_coherence([paths[k] for k in some], recording, hot)
+    for k, coherence in zip(some, each, strict=True):
+        # A track that hops between a lamp and targets is that of the lamp if it is mostly there.
+        piece = (paths[k].t - begin) // CONFIG.lamp_piece_us
+        rows = np.flatnonzero(coherence[piece] > CONFIG.lamp_coherence)
+        if np.nanmedian(coherence) > CONFIG.lamp_coherence and _stays(paths[k], rows):
+            lamps.add(k)
+    return [path for k, path in enumerate(paths) if k not in lamps], len(lamps)
+
+
+def _stays(path: TargetPath, rows: NDArray[np.int64]) -> bool:
+    """Return whether a path is near one place in most of some rows."""
+    if not len(rows):
+        return False
+    p = path.p[rows]
+    away = np.hypot(*(p - np.median(p, 0)).T)
+    return bool(np.median(away) <= CONFIG.lamp_sizes * np.median(path.size[rows, 0]))
+
+
+def _mains_coherence(
+    paths: list[TargetPath], recording: Recording, hot: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Compute the coherence (paths, pieces) of events with the mains; NaN without events.
+
+    Pieces begin with the first of the paths. A path whose coherence may be chance has 0.
+    """
+    table, piece = tabulate_paths(paths), CONFIG.lamp_piece_us
+    begin = table.begins.min()
+    pieces = (table.ends.max() - begin) // piece + 1
+    faintest = min(float(np.median(path.n)) / path.window for path in paths)
+    every = max(1, int(faintest * piece / CONFIG.lamp_piece_events))
+    n = np.zeros((len(paths), pieces))
+    z = np.zeros((len(MAINS_HZ), len(paths) * pieces), complex)
+    for _, part, near in batches_near_paths(
+        recording.events, table, CONFIG.gate_sigmas, every=every
+    ):
+        owner = near[:, 0]
+        seen = (owner != NO_OWNER) & ~hot[part.y, part.x]
+        t = part.t[seen] - begin
+        place = owner[seen] * pieces + t // piece
+        n += np.bincount(place, minlength=n.size).reshape(n.shape)
+        for f, sums in zip(2 * MAINS_HZ, z, strict=True):
+            turned = np.exp(2e-6j * np.pi * f * t) * np.where(part.p[seen], 1, -1)
+            sums += np.bincount(place, turned.real, n.size)
+            sums += 1j * np.bincount(place, turned.imag, n.size)
+    power = np.abs(z.reshape(len(MAINS_HZ), *n.shape)) ** 2 - n
+    best = power.sum(2).argmax(0)
+    power = np.take_along_axis(power, best[None, :, None], 0)[0]
+    # Then some piece has more than one event.
+    sure = power.sum(1) > CONFIG.lamp_sigmas * np.sqrt((n**2).sum(1))
+    each = np.where(n > 1, power / np.maximum(n**2 - n, 1), np.nan)
+    return np.where(sure[:, None], each, 0.0)
+
+
+def prefer_sharper(
+    paths: list[TargetPath], recording: Recording, hot: NDArray[np.bool_]
+) -> list[TargetPath]:
+    """Replace paths by those of the sharper polarity's events, where the other polarity lags.
+
+    Args:
+        paths: Paths of targets.
+        recording: Events.
+        hot: (rows, columns) pixels that are left out.
     """
     if not paths:
         return paths
-    # Most events of bright targets are not needed to tell that no polarity lags.
-    every = max(1, int(min(float(np.median(path.n)) for path in paths) / ENOUGH))
-    told = _told(paths, recording, hot, every)
-    lags = any(one is not path for one, path in zip(told, paths, strict=True))
-    return _told(paths, recording, hot, 1) if lags and every > 1 else told
+    # Few of the events of bright targets suffice to find that no polarity lags.
+    least = min(float(np.median(path.n)) for path in paths)
+    every = max(1, int(least / CONFIG.lag_test_events))
+    sharper = _prefer_sharper(paths, recording, hot, every)
+    lags = any(one is not path for one, path in zip(sharper, paths, strict=True))
+    return _prefer_sharper(paths, recording, hot, 1) if lags and every > 1 else sharper
 
 
-def _told(
-    paths: list[Path], recording: Recording, hot: NDArray[np.bool_], every: int
-) -> list[Path]:
-    """The same, told by one event of `every`."""
-    joined = join(paths)
-    sums = np.zeros((len(joined.t), 2, 6))
-    for _, part, near in near_paths(recording.events, joined, GATE, every=every):
-        now = joined.first[:-1].copy()
-        _add(part.t, part.x, part.y, part.p, near, joined, hot, now, sums)
-    ends = zip(joined.first[:-1], joined.first[1:], strict=True)
-    return [_sharper(path, sums[a:b]) for path, (a, b) in zip(paths, ends, strict=True)]
+def _prefer_sharper(
+    paths: list[TargetPath], recording: Recording, hot: NDArray[np.bool_], every: int
+) -> list[TargetPath]:
+    """Compute `prefer_sharper` from one event of `every`."""
+    table = tabulate_paths(paths)
+    sums = np.zeros((len(table.t), 2, 6))
+    for _, part, near in batches_near_paths(
+        recording.events, table, CONFIG.gate_sigmas, every=every
+    ):
+        events = part.t, part.x, part.y, part.p
+        _add_residuals(events, near, table, hot, table.first[:-1].copy(), sums)
+    ends = zip(table.first[:-1], table.first[1:], strict=True)
+    return [_sharper_path(path, sums[a:b]) for path, (a, b) in zip(paths, ends, strict=True)]
 
 
-def _sharper(path: Path, sums: NDArray[np.float64]) -> Path:
-    """A path, or that of its sharper events, by sums of its windows' residuals."""
+def _sharper_path(path: TargetPath, sums: NDArray[np.float64]) -> TargetPath:
+    """Return the path of its sharper events, or the path itself, by sums of its residuals."""
     n, S = sums[..., 0], sums[..., 1:]
     mean = S[..., :2] / np.maximum(n, 1)[..., None]
     spread = np.empty((2, 2, 2))
@@ -62,43 +156,46 @@ def _sharper(path: Path, sums: NDArray[np.float64]) -> Path:
     spread += np.eye(2) / 12
     size = np.sqrt(np.linalg.eigvalsh(spread)[:, 1])
     sharp = int(size[1] <= size[0])
-    enough = (n[:, sharp] >= FEW).sum() >= FEWEST and n[:, sharp].sum() >= SHARE * n.sum()
-    if not enough or (n[:, 1 - sharp] > 1).sum() < FEWEST or size[1 - sharp] < LAGS * size[sharp]:
+    seen = n[:, sharp] >= CONFIG.min_sharp_events
+    enough = seen.sum() >= CONFIG.min_sharp_windows
+    enough &= n[:, sharp].sum() >= CONFIG.min_sharp_share * n.sum()
+    enough &= (n[:, 1 - sharp] > 1).sum() >= CONFIG.min_sharp_windows
+    if not enough or size[1 - sharp] < CONFIG.lag_ratio * size[sharp]:
         return path
-    seen = n[:, sharp] >= FEW
     t = path.t * 1e-6
     m = (path.p + mean[:, sharp])[seen]
     p = np.stack([np.interp(t, t[seen], m[:, i]) for i in range(2)], 1)
     R = size[sharp] ** 2 / 2 / n[seen, sharp]
-    agility = fit_agility(t[seen], m, R, size[sharp] ** 2 / (path.window * 1e-6) ** 3)
-    C = np.broadcast_to(spread[sharp], path.C.shape)
-    share = n[:, sharp].sum() / n.sum()
-    return dataclasses.replace(path, p=p, C=C, n=share * path.n, agility=agility, polarity=sharp)
+    noise = fit_velocity_noise(t[seen], m, R, size[sharp] ** 2 / (path.window * 1e-6) ** 3)
+    C, share = np.broadcast_to(spread[sharp], path.C.shape), n[:, sharp].sum() / n.sum()
+    return dataclasses.replace(
+        path, p=p, C=C, n=share * path.n, velocity_noise=noise, polarity=sharp
+    )
 
 
 @njit_noalloc
-def _add(
-    t: Any, x: Any, y: Any, p: Any, whose: Any, joined: Any, hot: Any, rows: Any, sums: Any
-) -> None:
+def _add_residuals(events: Any, owner: Any, table: Any, hot: Any, rows: Any, sums: Any) -> None:
     """Add events' residuals to the sums of their paths' windows, by polarity.
 
-    `rows` are those at which the search in each path begins.
+    Events (t, x, y, p) that may belong to two paths are left out. `rows` are those of the paths
+    where the search for a window begins.
     """
+    t, x, y, p = events
     for i in range(len(t)):
-        k = whose[i, 0]
-        if k < 0 or whose[i, 1] >= 0 or hot[y[i], x[i]]:
+        k = owner[i, 0]
+        if k < 0 or owner[i, 1] >= 0 or hot[y[i], x[i]]:
             continue
-        last, half = joined.first[k + 1] - 1, joined.window[k] / 2
-        while rows[k] < last and joined.t[rows[k]] + half <= t[i]:
+        last, half = table.first[k + 1] - 1, table.window[k] / 2
+        while rows[k] < last and table.t[rows[k]] + half <= t[i]:
             rows[k] += 1
         row = rows[k]
-        if abs(t[i] - joined.t[row]) > half:
+        if abs(t[i] - table.t[row]) > half:
             continue
-        before, after = max(row - 1, joined.first[k]), min(row + 1, last)
-        span = max(joined.t[after] - joined.t[before], 1)
-        late = (t[i] - joined.t[row]) / span
-        ex = x[i] - joined.p[row, 0] - late * (joined.p[after, 0] - joined.p[before, 0])
-        ey = y[i] - joined.p[row, 1] - late * (joined.p[after, 1] - joined.p[before, 1])
+        before, after = max(row - 1, table.first[k]), min(row + 1, last)
+        span = max(table.t[after] - table.t[before], 1)
+        late = (t[i] - table.t[row]) / span
+        ex = x[i] - table.p[row, 0] - late * (table.p[after, 0] - table.p[before, 0])
+        ey = y[i] - table.p[row, 1] - late * (table.p[after, 1] - table.p[before, 1])
         sign = np.int64(p[i])
         sums[row, sign, 0] += 1
         sums[row, sign, 1] += ex

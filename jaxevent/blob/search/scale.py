@@ -1,13 +1,13 @@
-"""How long the windows and how large the cells are: those that best predict the next events.
+"""Selection of the windows and cells that best predict the next events.
 
-In some stretches of the recording blobs are detected in two windows, and the third is predicted:
-each blob goes on as it went. What is compared is the likelihood of the third's events, a Poisson
-process of the blobs and the background. Windows that are too short find nothing, those that are too
-long smear; between them the maximum is flat.
+At some times of the recording blobs are detected in two windows, and the third is predicted: each
+blob goes on as it went. The criterion is the likelihood of the third's events, a Poisson process of
+the blobs and the background. Windows that are too short find nothing, those that are too long
+smear; between them the maximum is flat.
 
-Where in a blob its events are is told by its second window, in kernels of several widths, as much
-as by its ellipse: an outline as one blob predicts as well as its pieces do. Of scales that predict
-equally well the coarsest is taken in whose blobs smaller cells see no gaps.
+The density inside a blob is that of its second window, in kernels of several widths, as much as its
+ellipse: an outline as one blob predicts as well as its pieces do. Of scales that predict equally
+well the coarsest is taken in whose blobs smaller cells see no gaps.
 """
 
 import dataclasses
@@ -16,163 +16,185 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob.search.background import Background, measure_dispersions
-from jaxevent.blob.search.detection import CONTACT, Scale, detect, measure_blobs, touching
-from jaxevent.blob.search.prediction import LARGE, Told, choose_scored, predict, score
-from jaxevent.blob.search.stream import Pixels, Stream
+from jaxevent.blob.search.config import CONFIG
+from jaxevent.blob.search.detection import (
+    Scale,
+    clutter_model,
+    contact_distance,
+    detect,
+    measure_blobs,
+)
+from jaxevent.blob.search.prediction import ScalePrediction, predict, sample_scored, score
+from jaxevent.blob.search.stream import PixelCounts, Stream
 
-WINDOWS = 500 * 2 ** np.arange(12)  # us
-CELLS = (2, 4, 8, 16)  # px
-LEAST_WINDOWS = 8  # in a recording
-STRETCHES, FEWER = 24, 12  # in which scales are compared, and of what remains after a pass
-FIRST = 4  # every fourth one tells the worse scales:
-WORSE, SIGMAS = 0.85, 2.0  # of the best one's nats, and standard deviations of their difference
-PLATEAU, TIE = 0.03, 0.005  # shares of the score that scales may lose as equally good
-MERGED = 0.3  # share of events in blobs in which smaller cells see a larger blob apart
-SHARP = 0.9  # share of the most that a cell's blobs tell in windows in which they are sharp
-MOST = 200  # blobs of a window in which gaps are looked for
+WINDOWS_US = 500 * 2 ** np.arange(12)
+CELLS_PX = (2, 4, 8, 16)
 
 
 @dataclasses.dataclass(frozen=True)
-class Choice:
-    """A scale, and by how much it predicts events better than the background: nats per event."""
+class ScaleSelection:
+    """A scale, and the gain of its predictions over the background in nats per event."""
 
     scale: Scale
     score: float
 
 
-def choose_scale(
-    stream: Stream, background: Background, worth: float | None = None
-) -> Choice | None:
-    """The scale that predicts best; None if the recording is too short or nothing is found.
+def select_scale(
+    stream: Stream, background: Background, min_gain: float | None = None
+) -> ScaleSelection | None:
+    """Select the scale that predicts best.
 
-    None too if some of the stretches tell that no scale is `worth` it, nats per event.
+    Args:
+        stream: Events.
+        background: Their background.
+        min_gain: Gain (nats per event) that a scale must come to in some trials; None for a first
+            pass, which compares the scales in more trials.
+
+    Returns:
+        The scale; None if the recording is too short or nothing is gained.
     """
-    longest = min(stream.duration / LEAST_WINDOWS, background.sharp)
-    windows = np.asarray(WINDOWS[WINDOWS * 1e-6 <= longest] * 1e-6, np.float64)
+    longest = min(stream.duration / CONFIG.min_windows, background.max_window)
+    windows = np.asarray(WINDOWS_US[WINDOWS_US * 1e-6 <= longest] * 1e-6, np.float64)
     if not len(windows):
         return None
-    number = STRETCHES if worth is None else FEWER
-    trial = _Trial(stream, background, windows, number)
-    first = np.arange(FIRST // 2, number, FIRST)
-    trial.look(first)
-    most = trial.drop()
-    if worth is not None and most < worth:
+    number = CONFIG.scale_trials if min_gain is None else CONFIG.later_scale_trials
+    trial = _ScaleTrial(stream, background, windows, number)
+    first = np.arange(CONFIG.first_trial_step // 2, number, CONFIG.first_trial_step)
+    trial.evaluate(first)
+    most = trial.drop_worse()
+    if min_gain is not None and most < min_gain:
         return None
-    trial.look(np.setdiff1d(np.arange(number), first))
+    trial.evaluate(np.setdiff1d(np.arange(number), first))
     raw, scores = trial.scores()
     best = scores.max()
     if best <= 0:
         return None
     # Of what is equally good the coarsest cells, and with them the longest windows.
-    good = scores >= best - PLATEAU * best
+    good = scores >= best - CONFIG.equal_score_loss * best
     most = raw.max(0)
-    sharp = raw >= most - (1 - SHARP) * abs(most)
-    longest = [trial.scales[np.flatnonzero(sharp[:, j]).max()][j] for j in range(len(CELLS))]
-    gaps, some = _Gaps(stream, background), trial.begins[::2]
-    for j in range(len(CELLS))[::-1]:
+    sharp = raw >= most - (1 - CONFIG.sharp_score) * abs(most)
+    cells = range(len(CELLS_PX))
+    longest = [trial.scales[np.flatnonzero(sharp[:, j]).max()][j] for j in cells]
+    gaps, some = _GapTest(stream, background), trial.begins[::2]
+    for j in cells[::-1]:
         for i in np.flatnonzero(good[:, j]):
-            split = gaps.split(trial.scales[i][j], some[:, i], longest[:j])
-            good[i, j] = split <= MERGED
+            merged = gaps.merged_share(trial.scales[i][j], some[:, i], longest[:j])
+            good[i, j] = merged <= CONFIG.max_merged_share
         if good[:, j].any():
             column = np.where(good[:, j], scores[:, j], -np.inf)
-            i = np.flatnonzero(column >= column.max() - TIE * best).max()
+            i = np.flatnonzero(column >= column.max() - CONFIG.equal_window_loss * best).max()
             break
     else:
         i, j = np.unravel_index(scores.argmax(), scores.shape)
-    return Choice(trial.scales[i][j], float(scores[i, j]))
+    return ScaleSelection(trial.scales[i][j], float(scores[i, j]))
 
 
-class _Trial:
-    """What the scales of some windows (s) and all cells predict in stretches of the recording."""
+class _ScaleTrial:
+    """Predictions of the scales of some windows (s) and all cells, at times of the recording."""
 
     def __init__(
         self, stream: Stream, background: Background, windows: NDArray[np.float64], number: int
     ):
         self.stream, self.background, self.windows = stream, background, windows
-        self.begins = np.clip(stream.times(number)[:, None], 2 * windows, stream.duration - windows)
+        last = stream.duration - windows
+        self.begins = np.clip(stream.quantile_times(number)[:, None], 2 * windows, last)
         dispersions = measure_dispersions(stream, background, windows)
         self.scales = [
-            [Scale(float(w), cell, dispersion) for cell in CELLS]
+            [Scale(float(w), cell, dispersion) for cell in CELLS_PX]
             for w, dispersion in zip(windows, dispersions, strict=True)
         ]
-        self.tried = np.ones((len(windows), len(CELLS)), bool)
-        self.told: list[list[list[Told]]] = [[[] for _ in CELLS] for _ in windows]
+        self.tried = np.ones((len(windows), len(CELLS_PX)), bool)
+        self.predictions: list[list[list[ScalePrediction]]] = [
+            [[] for _ in CELLS_PX] for _ in windows
+        ]
 
-    def look(self, stretches: NDArray[np.int64]) -> None:
-        """Let all scales that are tried predict in some stretches."""
+    def evaluate(self, trials: NDArray[np.int64]) -> None:
+        """Predict events at some of the times, at all scales that are tried."""
         stream, background = self.stream, self.background
-        size = stream.height, stream.width
         for i in np.flatnonzero(self.tried.any(1)).tolist():
             w, cells = float(self.windows[i]), np.flatnonzero(self.tried[i]).tolist()
-            scales = [self.scales[i][j] for j in cells]
-            for t in self.begins[stretches, i].tolist():
-                before, last = (stream.pixels(t + k * w, t + (k + 1) * w) for k in (-2, -1))
-                scored = choose_scored(stream, background, t, w)
-                told = predict(before, last, scored, background, scales, size, t)
-                for j, one in zip(cells, told, strict=True):
-                    self.told[i][j].append(one)
+            for t in self.begins[trials, i].tolist():
+                before = stream.pixel_counts(t - 2 * w, t - w), stream.pixel_counts(t - w, t)
+                scored = sample_scored(stream, background, t, w)
+                clutters = [
+                    clutter_model(background, self.scales[i][j], stream.shape, t) for j in cells
+                ]
+                predictions = predict(before, scored, clutters, stream.shape)
+                for j, one in zip(cells, predictions, strict=True):
+                    self.predictions[i][j].append(one)
 
-    def drop(self) -> float:
-        """Try no more the scales that are clearly worse than the best ones of equal cells.
+    def drop_worse(self) -> float:
+        """Drop the scales that are clearly worse than the best one of equal cells.
 
-        The most, in nats per event, that one of them may come to.
+        Returns:
+            The most that one of the scales may gain, nats per event.
         """
         most = -np.inf
-        for j in range(len(CELLS)):
-            told = [score(one[j]) for one in self.told]
-            best = max(told, key=lambda one: one.raw)
-            for i, one in enumerate(told):
-                most = max(most, _most(one.parts))
-                self.tried[i, j] = one is best or _most(one.parts - WORSE * best.parts) >= 0
+        for j in range(len(CELLS_PX)):
+            scores = [score(one[j]) for one in self.predictions]
+            best = max(scores, key=lambda one: one.raw)
+            for i, one in enumerate(scores):
+                most = max(most, _upper_bound(one.parts))
+                excess = _upper_bound(one.parts - CONFIG.dropped_score * best.parts)
+                self.tried[i, j] = one is best or excess >= 0
         return most
 
     def scores(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(windows, cells) nats per event, and less what is split; -inf: not tried to the end."""
+        """Score the scales (windows, cells), without and with penalty; -inf for dropped ones."""
         out = np.full((2, *self.tried.shape), -np.inf)
         for i, j in zip(*np.nonzero(self.tried), strict=True):
-            out[:, i, j] = score(self.told[i][j])[:2]
+            out[:, i, j] = score(self.predictions[i][j])[:2]
         return out[0], out[1]
 
 
-def _most(parts: NDArray[np.float64]) -> float:
-    """The sum of some parts, and `SIGMAS` standard deviations more."""
-    return float(parts.sum() + SIGMAS * np.sqrt(len(parts)) * parts.std(ddof=1))
+def _upper_bound(parts: NDArray[np.float64]) -> float:
+    """Return the sum of some parts, and standard deviations more."""
+    return float(parts.sum() + CONFIG.dropped_sigmas * np.sqrt(len(parts)) * parts.std(ddof=1))
 
 
-class _Gaps:
-    """Where smaller cells see a blob apart in what larger ones take for one: `split(scale)`."""
+class _GapTest:
+    """Test whether smaller cells see gaps in blobs of larger ones."""
 
     def __init__(self, stream: Stream, background: Background):
         self.stream, self.background = stream, background
-        self.size = stream.height, stream.width
-        self.clusters: dict[tuple[float, float, int], tuple[Pixels, NDArray, int]] = {}
-        self.image = np.full(self.size, -1, np.int32)  # of clusters, filled where it is looked at
+        self.clusters: dict[tuple[float, float, int], tuple[PixelCounts, NDArray, int]] = {}
+        self.image = np.full(stream.shape, -1, np.int32)  # of clusters, filled where needed
 
-    def split(self, scale: Scale, begins: NDArray[np.float64], smaller: list[Scale]) -> float:
-        """Share of events in blobs in which smaller cells see another blob, larger and apart.
+    def merged_share(
+        self, scale: Scale, begins: NDArray[np.float64], smaller: list[Scale]
+    ) -> float:
+        """Compute the share of events in blobs that smaller cells separate from a larger blob.
 
-        Of `smaller` cells in the longest windows in which their blobs are sharp: in shorter ones an
-        outline has gaps by chance.
+        Args:
+            scale: Scale of the blobs.
+            begins: Ends of the windows in which they are detected, s.
+            smaller: Scales of smaller cells in the longest windows in which their blobs are sharp:
+                in shorter ones an outline has gaps by chance.
         """
-        told, w = np.zeros(2), scale.window
+        sums, w = np.zeros(2), scale.window
         for t in begins.tolist():
-            pixels = self.stream.pixels(t - w, t)
-            labels, _ = detect(pixels, self.background, scale, self.size, t)
-            shares = [
-                self._apart(t, one.as_long(max(w, min(one.window, t))), pixels, labels)
+            pixels, labels, _ = self._detect(t, scale)
+            counts = [
+                self._count_apart(t, one.with_window(max(w, min(one.window, t))), pixels, labels)
                 for one in smaller
             ]
-            told += max(shares, key=lambda one: one[0], default=np.zeros(2))
-        return float(told[0] / max(told[1], 1.0))
+            sums += max(counts, key=lambda one: one[0], default=np.zeros(2))
+        return float(sums[0] / max(sums[1], 1.0))
 
-    def _apart(self, t: float, scale: Scale, pixels: Pixels, labels: NDArray) -> NDArray:
-        """Events apart from the largest cluster in what `labels` has as one; all.
+    def _detect(self, t: float, scale: Scale) -> tuple[PixelCounts, NDArray[np.int32], int]:
+        """Detect blobs in the window before t."""
+        pixels = self.stream.pixel_counts(t - scale.window, t)
+        clutter = clutter_model(self.background, scale, self.stream.shape, t)
+        return pixels, *detect(pixels, clutter, self.stream.shape)
 
-        Labels are those of the last events of the scale's window, in some of its pixels.
+    def _count_apart(self, t: float, scale: Scale, pixels: PixelCounts, labels: NDArray) -> NDArray:
+        """Count events of labelled blobs that are not in the blob's largest cluster, and all.
+
+        `labels` are those of the last events of the scale's window, in some of its pixels.
         """
         key = t, scale.window, scale.cell
         if key not in self.clusters:
-            self.clusters[key] = self._clusters(t, scale)
+            self.clusters[key] = self._find_clusters(t, scale)
         wide, cluster_of, clusters = self.clusters[key]
         self.image[wide.y, wide.x] = cluster_of
         cluster = self.image[pixels.y, pixels.x]
@@ -183,26 +205,27 @@ class _Gaps:
         table = table.reshape(-1, clusters) if clusters else np.zeros((1, 1))
         return np.array([(table.sum(1) - table.max(1)).sum(), table.sum()])
 
-    def _clusters(self, t: float, scale: Scale) -> tuple[Pixels, NDArray[np.int32], int]:
-        """Pixels of the window before t, which cluster of touching blobs each is of; how many.
+    def _find_clusters(self, t: float, scale: Scale) -> tuple[PixelCounts, NDArray[np.int32], int]:
+        """Find clusters of blobs in contact, among the largest of the window before t.
 
-        Of the largest blobs; -1: of none.
+        Returns:
+            The pixels of the window, the cluster of each or -1, and the number of clusters.
         """
-        pixels = self.stream.pixels(t - scale.window, t)
-        labels, number = detect(pixels, self.background, scale, self.size, t)
+        pixels, labels, number = self._detect(t, scale)
         blobs = measure_blobs(pixels, labels, number)
-        large = np.argsort(-blobs.n, kind="stable")[:MOST]
-        large = large[blobs.n[large] >= LARGE]
+        large = np.argsort(-blobs.n, kind="stable")[: CONFIG.max_gap_blobs]
+        large = large[blobs.n[large] >= CONFIG.min_split_events]
         p, C = blobs.p[large], blobs.C[large]
         cluster = np.full(number + 1, -1, np.int32)
-        clusters, cluster[large + 1] = _components(touching(p[:, None], C[:, None], p, C) < CONTACT)
+        near = contact_distance(p[:, None], C[:, None], p, C) < CONFIG.contact_distance
+        clusters, cluster[large + 1] = _connected_components(near)
         return pixels, cluster[labels], clusters
 
 
-def _components(near: NDArray[np.bool_]) -> tuple[int, NDArray[np.int32]]:
-    """How many sets of things there are that are near each other (n, n), and whose each (n,) is.
+def _connected_components(near: NDArray[np.bool_]) -> tuple[int, NDArray[np.int32]]:
+    """Return the number of components of a graph (n, n), and the component (n,) of each node.
 
-    The search of SciPy checks its input for longer than it takes here.
+    SciPy's function checks its input for longer than it takes here.
     """
     first = np.arange(len(near))
     while True:
@@ -210,5 +233,5 @@ def _components(near: NDArray[np.bool_]) -> tuple[int, NDArray[np.int32]]:
         if (least == first).all():
             break
         first = least
-    sets, whose = np.unique(first, return_inverse=True)
-    return len(sets), whose.astype(np.int32)
+    components, component_of = np.unique(first, return_inverse=True)
+    return len(components), component_of.astype(np.int32)

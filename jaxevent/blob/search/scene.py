@@ -1,8 +1,12 @@
-"""How the whole scene moves past a moving camera.
+"""Motion of a scene past a moving camera, and the background as a map that moves along.
 
-An image of events is aligned to what was seen before by a shift and a turn, from coarse to fine
-(Lucas and Kanade), with little weight where they differ. Chained, these motions tell where places
-of the scene are on the sensor.
+An image of events is aligned to those before by a shift and a turn, from coarse to fine (Lucas and
+Kanade), with little weight where they differ. Chained, these motions give the places of the scene
+on the sensor.
+
+The moving background is taken only where a scene covers the sensor, dense with edges or textured,
+and where its map, moved along, predicts events better than one at rest. Targets that go together,
+as stars do, are no scene.
 """
 
 import dataclasses
@@ -12,97 +16,67 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from jaxevent.blob.search.stream import Part, Stream
+from jaxevent.blob.search.background import (
+    AT_REST,
+    CELL_PX,
+    FINE_CELL_PX,
+    SLICES,
+    Background,
+    SceneMotion,
+    count_in_slices,
+    pool,
+)
+from jaxevent.blob.search.config import CONFIG
+from jaxevent.blob.search.detection import clutter_model, detect
+from jaxevent.blob.search.paths import TargetPath
+from jaxevent.blob.search.scale import WINDOWS_US, ScaleSelection
+from jaxevent.blob.search.stream import Stream, WindowEvents
 from jaxevent.codegen import njit, njit_inlined
 
-REFERENCE = np.array([[60.0, 60], [180, 60], [60, 180], [180, 180]])  # px
-STEPS = 128  # motions of a recording, at most
-LITTLE = 0.5  # px
-WIDE = 240  # bins of a pixel and more, so that no more of them lie side by side
-ODD = 1.5  # of the usual difference: pixels that differ so much have half the weight
-NEWEST = 0.07  # share of the newest window in what was seen
-BLURS = (4, 2, 1)  # bins
-ROUNDS, SMALL = 8, 0.02  # of Gauss and Newton, at most; bins at which they end
-
-
-@dataclasses.dataclass(frozen=True)
-class SceneMotion:
-    """Where points of the scene are: at t (n,) s in `maps` (n, 2, 3), px from px at the start."""
-
-    t: NDArray[np.float64]
-    maps: NDArray[np.float64]
-
-    @property
-    def travel(self) -> float:
-        """px, how far `REFERENCE` is from where it was at the start, at most."""
-        return float(np.hypot(*(self._reference() - REFERENCE[:, None]).T).max())
-
-    @property
-    def speed(self) -> float:
-        """px/s, the median over time of that of `REFERENCE`."""
-        moved = np.diff(self._reference(), axis=1)
-        return float(np.median(np.hypot(*moved.T).mean(1) / np.diff(self.t)))
-
-    def _reference(self) -> NDArray[np.float64]:
-        """(4, n, 2)."""
-        moved = np.einsum("nij,kj->kni", self.maps[:, :, :2], REFERENCE)
-        return moved + self.maps[:, :, 2]
-
-    def at(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Maps at some times, on straight lines between those known."""
-        k = np.clip(np.searchsorted(self.t, t) - 1, 0, len(self.t) - 2)
-        part = np.asarray((t - self.t[k]) / (self.t[k + 1] - self.t[k]))
-        return self.maps[k] + part[..., None, None] * (self.maps[k + 1] - self.maps[k])
-
-    def in_scene(self, x: Any, y: Any, t: Any) -> tuple[Any, Any]:
-        """Where in the scene pixels of the sensor are at times (s)."""
-        (a, b, e), (c, d, f) = np.moveaxis(self.at(np.asarray(t, float)), (-2, -1), (0, 1))
-        x, y, over = x - e, y - f, a * d - b * c
-        return (d * x - b * y) / over, (a * y - c * x) / over
-
-    def steps(self, begin: float | int, end: float | int) -> NDArray[np.float64]:
-        """Times (s) between two, `begin` and `end` too, between which the scene moves little."""
-        number = 1 + int(self.speed * (end - begin) / LITTLE)
-        return np.linspace(begin, end, number + 1)
-
-    def on_sensor(self, x: Any, y: Any, t: Any) -> tuple[Any, Any]:
-        """Where on the sensor places of the scene are at times (s)."""
-        (a, b, e), (c, d, f) = np.moveaxis(self.at(np.asarray(t, float)), (-2, -1), (0, 1))
-        return a * x + b * y + e, c * x + d * y + f
+BLURS_BINS = (4, 2, 1)  # standard deviations of blurs, from coarse to fine
+MAX_STEPS, MIN_STEP_BINS = 8, 0.02  # Gauss-Newton steps, and the step at which they end
+TILES = 4  # along each side of the sensor
+# Windows in those of blobs: of a shaking scene any of them may be suitable.
+WINDOW_RATIOS = (1, 1 / 4, 1 / 16, 4)
+VELOCITY_STEP_S = 0.01  # s before and after, between which the scene's velocity is measured
 
 
 def measure_scene_motion(stream: Stream, window: float | int) -> SceneMotion:
-    """The shift and turn of all that is seen in a stream, from windows (s) aligned to those before.
+    """Measure the shift and turn of the whole scene, from windows aligned to those before.
 
-    What was seen before is a mean of earlier windows, each carried on as the scene went.
+    The reference is a mean of earlier windows, each moved along with the scene.
+
+    Args:
+        stream: Events.
+        window: Length of the windows, s.
     """
-    steps = int(min(STEPS, stream.duration / window))
+    steps = int(min(CONFIG.max_scene_steps, stream.duration / window))
     begins = np.linspace(0, stream.duration - window, steps)
-    bins = -(-max(stream.width, stream.height) // WIDE)
-    maps, motion, seen = [np.eye(2, 3)], None, None
+    bins = -(-max(stream.width, stream.height) // CONFIG.max_image_bins)
+    maps, motion, reference = [AT_REST], None, None
     for number, begin in enumerate(begins):
-        image = _image(stream.window(begin, begin + window), stream, bins)
-        if seen is None:
-            seen = image
+        image = _event_image(stream.window(begin, begin + window), stream, bins)
+        if reference is None:
+            reference = image
             continue
-        motion = _align(seen, image, _shift(seen, image) if motion is None else motion)
-        step = _px(motion, image.shape, bins)
-        maps.append(np.concatenate([step[:, :2] @ maps[-1][:, :2],
-            step[:, :2] @ maps[-1][:, 2:] + step[:, 2:]], 1))  # fmt: skip
-        new = max(NEWEST, 1 / (number + 1))
-        seen = _carry(seen, motion, image, new)
+        motion = _align(reference, image, _shift(reference, image) if motion is None else motion)
+        step, last = _as_map(motion, image.shape, bins), maps[-1]
+        turned = step[:, :2] @ last[:, :2], step[:, :2] @ last[:, 2:] + step[:, 2:]
+        maps.append(np.concatenate(turned, 1))
+        gain = max(CONFIG.reference_gain, 1 / (number + 1))
+        reference = _update_reference(reference, motion, image, gain)
     return SceneMotion(begins + window / 2, np.array(maps))
 
 
-def _image(part: Part, stream: Stream, bins: int) -> NDArray[np.float64]:
-    """Roots of counts: their noise is everywhere the same."""
+def _event_image(events: WindowEvents, stream: Stream, bins: int) -> NDArray[np.float64]:
+    """Return roots of counts in bins of so many px, whose noise is the same everywhere."""
     rows, columns = -(-stream.height // bins), -(-stream.width // bins)
-    place = part.y // bins * columns + part.x // bins
+    place = events.y // bins * columns + events.x // bins
     return np.sqrt(np.bincount(place, minlength=rows * columns).reshape(rows, columns))
 
 
-def _px(motion: NDArray, shape: tuple[int, ...], bins: int) -> NDArray[np.float64]:
-    """A motion of bins as one of px: p + displacement = A p + b, (2, 3)."""
+def _as_map(motion: NDArray, shape: tuple[int, ...], bins: int) -> NDArray[np.float64]:
+    """Convert a motion of bins to a map (2, 3) of px."""
     turn = motion[0] / (sum(shape) / 4)
     A = np.array([[0, -turn], [turn, 0]])
     middle = (np.array(shape[::-1]) - 1) / 2
@@ -111,31 +85,31 @@ def _px(motion: NDArray, shape: tuple[int, ...], bins: int) -> NDArray[np.float6
 
 
 def _shift(one: NDArray, other: NDArray) -> NDArray[np.float64]:
-    """The shift at which two images are most alike."""
+    """Return the motion (3,) without turn at which two images correlate most."""
     a, b = (np.fft.rfft2(ndimage.gaussian_filter(i, 3) - i.mean()) for i in (one, other))
-    alike = np.fft.irfft2(b * a.conj(), one.shape)
-    at = np.unravel_index(alike.argmax(), alike.shape)
+    correlation = np.fft.irfft2(b * a.conj(), one.shape)
+    at = np.unravel_index(correlation.argmax(), correlation.shape)
     y, x = (int(k) if k < n / 2 else int(k) - n for k, n in zip(at, one.shape, strict=True))
     return np.array([0.0, x, y])
 
 
 def _align(one: NDArray, other: NDArray, motion: NDArray) -> NDArray[np.float64]:
-    """The motion (3,), in bins as `_normal_equations` has it, that takes one image to the other."""
-    for blur in BLURS:
+    """Estimate the motion (3,), see `_normal_equations`, that takes one image to the other."""
+    for blur in BLURS_BINS:
         a, b = (ndimage.gaussian_filter(image, blur, mode="constant") for image in (one, other))
-        for _ in range(ROUNDS):
-            H, slope = _normal_equations(a, b, motion, ODD)
+        for _ in range(MAX_STEPS):
+            H, gradient = _normal_equations(a, b, motion)
             H += np.eye(3) * (1e-4 * np.trace(H) / 3 + 1e-12)
-            step = np.linalg.solve(H, slope)
+            step = np.linalg.solve(H, gradient)
             motion = motion - step
-            if abs(step).max() < SMALL:
+            if abs(step).max() < MIN_STEP_BINS:
                 break
     return motion
 
 
 @njit
-def _carry(image: Any, motion: Any, now: Any, new: Any) -> Any:
-    """An image after a motion, with a share of what is seen now, or that where it was not seen."""
+def _update_reference(image: Any, motion: Any, now: Any, gain: Any) -> Any:
+    """Move an image, and blend it with a new one, which is taken alone where it was not seen."""
     (rows, columns), out = image.shape, np.empty(image.shape)
     quarter = (rows + columns) / 4
     for row in range(rows):
@@ -143,21 +117,20 @@ def _carry(image: Any, motion: Any, now: Any, new: Any) -> Any:
         for column in range(columns):
             x = (column - (columns - 1) / 2) / quarter
             dx, dy = motion[1] - motion[0] * y, motion[2] + motion[0] * x
-            before = _value(image, row - dy, column - dx)
+            before = _interpolate(image, row - dy, column - dx)
             if before == before:
-                out[row, column] = (1 - new) * before + new * now[row, column]
+                out[row, column] = (1 - gain) * before + gain * now[row, column]
             else:
                 out[row, column] = now[row, column]
     return out
 
 
 @njit
-def _normal_equations(a: Any, b: Any, motion: Any, odd: float | int) -> Any:
-    """Of Gauss and Newton: J^T W J and J^T W e of two images, each moved half the way.
+def _normal_equations(a: Any, b: Any, motion: Any) -> Any:
+    """Return J^T W J and J^T W e of Gauss and Newton, of two images each moved half the way.
 
-    Motions are a turn about the middle, one unit of which moves what is a quarter of the sides' sum
-    away by one bin, and shifts right and down. Bins that differ by `odd` times the usual have half
-    the weight.
+    A motion is a turn about the middle, of which one unit moves what is a quarter of the sides'
+    sum away by one bin, and shifts right and down.
     """
     rows, columns = a.shape
     quarter = (rows + columns) / 4
@@ -168,15 +141,15 @@ def _normal_equations(a: Any, b: Any, motion: Any, odd: float | int) -> Any:
         for column in range(columns):
             x = (column - (columns - 1) / 2) / quarter
             half_x, half_y = (motion[1] - motion[0] * y) / 2, (motion[2] + motion[0] * x) / 2
-            before = _value(a, row - half_y, column - half_x)
-            after = _value(b, row + half_y, column + half_x)
+            before = _interpolate(a, row - half_y, column - half_x)
+            after = _interpolate(b, row + half_y, column + half_x)
             difference = after - before
             e[row, column] = difference  # NaN where one was not seen
             if difference == difference:
                 mean[row, column] = (after + before) / 2
                 total += difference * difference
                 number += 1
-    scale = 1 / (odd * (np.sqrt(total / max(number, 1)) + 1e-12))
+    scale = 1 / (CONFIG.outlier_scale * (np.sqrt(total / max(number, 1)) + 1e-12))
     tt = tx = ty = xx = xy = yy = st = sx = sy = 0.0
     for row in range(rows):
         y = (row - (rows - 1) / 2) / quarter
@@ -200,8 +173,8 @@ def _normal_equations(a: Any, b: Any, motion: Any, odd: float | int) -> Any:
 
 
 @njit_inlined
-def _value(image: Any, y: float, x: float) -> float:
-    """Between bins on straight lines; NaN outside."""
+def _interpolate(image: Any, y: float, x: float) -> float:
+    """Interpolate an image linearly; NaN outside."""
     rows, columns = image.shape
     if not (0 <= y <= rows - 1 and 0 <= x <= columns - 1):
         return np.nan
@@ -209,3 +182,219 @@ def _value(image: Any, y: float, x: float) -> float:
     v, u = y - row, x - column
     top = (1 - u) * image[row, column] + u * image[row, column + 1]
     return (1 - v) * top + v * ((1 - u) * image[row + 1, column] + u * image[row + 1, column + 1])
+
+
+def is_dense(background: Background) -> bool:
+    """Return whether most of the sensor has events in a full slice."""
+    return float(np.quantile(background.level, CONFIG.filled_quantile)) > CONFIG.dense_level
+
+
+def split_at_pauses(background: Background) -> list[tuple[float, float]]:
+    """Split the recording into spans (s) in which most of a scene is quiet, and those between.
+
+    Shorter spans than `SearchConfig.min_pause_slices` join those about them. Without pauses the
+    whole is one span.
+    """
+    full = float(np.quantile(background.level, CONFIG.filled_quantile))
+    long = np.ones(CONFIG.min_pause_slices)
+    quiet = ndimage.binary_opening(background.level < CONFIG.pause_level * full, long)
+    moves = ndimage.binary_opening(~quiet, long)
+    first = np.flatnonzero(np.diff(moves)) + 1 if is_dense(background) else []
+    edges = np.array([0, *first, SLICES]) / SLICES * background.duration
+    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+
+
+def find_moving_background(
+    stream: Stream, background: Background, selection: ScaleSelection
+) -> Background | None:
+    """Measure the background as a map that moves.
+
+    Args:
+        stream: Events.
+        background: Background at rest.
+        selection: Scale of its blobs.
+
+    Returns:
+        The moving background; None if the camera does not seem to move.
+    """
+    if _count_filled_tiles(stream, background, selection) < CONFIG.filled_tiles:
+        return None
+    for ratio in WINDOW_RATIOS:
+        window = ratio * selection.scale.window
+        if not WINDOWS_US[0] * 1e-6 <= window <= stream.duration / CONFIG.min_windows:
+            continue
+        scene = measure_scene_motion(stream, window)
+        moving = measure_moving_background(stream, scene)
+        gain = _required_gain(moving)
+        if gain is None:  # whatever the window
+            return None
+        if scene.travel >= CONFIG.min_travel_px and map_gain(stream, moving, window) >= gain:
+            return moving
+    return None
+
+
+def _required_gain(moving: Background) -> float | None:
+    """Return the nats per event that a scene's map must gain by moving; None if it is no scene.
+
+    A scene consists of edges, or of a texture of which much is bright, by more than chance makes
+    of few events.
+    """
+    visible = moving.visible
+    events = moving.mean_rate * FINE_CELL_PX**2 * moving.duration
+    edges = _edge_share(np.where(visible, moving.rate, 0), moving.mean_rate)
+    few = events < CONFIG.few_scene_events
+    if edges >= (CONFIG.scene_edge_share_few if few else CONFIG.scene_edge_share):
+        return 0.0
+    bright = float((moving.rate[visible] > CONFIG.edge_rate * moving.mean_rate).mean())
+    texture = events >= CONFIG.min_texture_events and bright > CONFIG.texture_share
+    return CONFIG.texture_gain if texture else None
+
+
+def map_gain(stream: Stream, moving: Background, w: float | int) -> float:
+    """Compute the nats per event that a map gains by moving, in most windows of w s."""
+    scene = moving.scene
+    assert scene is not None
+    rest = dataclasses.replace(scene, maps=np.broadcast_to(AT_REST, scene.maps.shape))
+    still, gains = measure_moving_background(stream, rest), []
+    for t in np.maximum(stream.quantile_times(CONFIG.scale_trials), w):
+        part = stream.window(t - w, t)
+        one, other = (b.rate_at(part.x, part.y, part.t) for b in (moving, still))
+        gains.append(float(np.log(one / other).mean()) if len(part) else 0.0)
+    return float(np.quantile(gains, CONFIG.gain_quantile))
+
+
+def _count_filled_tiles(stream: Stream, background: Background, selection: ScaleSelection) -> float:
+    """Count the tiles of the sensor that hold blobs, in the median window.
+
+    It is 0 if blobs seldom reach three of the sensor's sides: an object may be large, but it is
+    seen whole. Blobs stand out from the sensor's dark places here: in a short recording a scene
+    hardly leaves its place, and most of it is in the background.
+    """
+    w, (rows, columns) = selection.scale.window, stream.shape
+    dark = np.full_like(background.rate, np.quantile(background.rate, CONFIG.dark_quantile))
+    background = dataclasses.replace(background, rate=dark)
+    tiles, sides, few, width = [], [], CONFIG.tile_events, CONFIG.side_width
+    for t in np.maximum(stream.quantile_times(CONFIG.scale_trials), w):
+        part = stream.window(t - w, t)
+        clutter = clutter_model(background, selection.scale, stream.shape, t)
+        labels, _ = detect(part, clutter, stream.shape)
+        y, x = part.y[labels > 0], part.x[labels > 0]
+        place = y * TILES // rows * TILES + x * TILES // columns
+        tiles.append((np.bincount(place, minlength=TILES**2) >= few).sum())
+        strips = [width * v < n for v, n in ((x, columns), (y, rows))]
+        strips += [width * (n - 1 - v) < n for v, n in ((x, columns), (y, rows))]
+        sides.append(sum(strip.sum() >= few for strip in strips))
+    wide = np.mean(np.array(sides) >= CONFIG.min_sides) >= CONFIG.min_side_share
+    return float(np.median(tiles)) if wide else 0.0
+
+
+def _edge_share(rate: NDArray[np.float64], mean: float) -> float:
+    """Compute the share of the bright that is long or large: edges, and not possible targets."""
+    excess = np.where(rate > CONFIG.edge_rate * mean, rate - mean, 0)
+    labels = np.zeros(rate.shape, np.int32)
+    ndimage.label(excess > 0, np.ones((3, 3)), labels)
+    number = int(labels.max())
+    y, x = np.nonzero(excess)
+    part, n = labels[y, x] - 1, excess[y, x]
+
+    def average(values: NDArray) -> NDArray:
+        return np.bincount(part, n * values, number) / mass
+
+    mass = np.bincount(part, n, number)
+    mx, my = average(x), average(y)
+    xx, yy, xy = average(x * x) - mx**2, average(y * y) - my**2, average(x * y) - mx * my
+    half, cross = (xx + yy) / 2 + 1 / 12, np.hypot((xx - yy) / 2, xy)
+    size = np.sqrt(half + cross)
+    long = size > CONFIG.edge_length * np.sqrt(half - cross)
+    long &= size > CONFIG.edge_min_size_cells
+    large = size > CONFIG.large_share * min(rate.shape)
+    return float(mass[long | large].sum() / max(mass.sum(), 1e-300))
+
+
+def has_own_motion(path: TargetPath, scene: SceneMotion, start: int) -> bool:
+    """Return whether a target goes farther than its size, and a cell, on a way of its own.
+
+    What is nearer or farther than most of the scene goes the scene's way, faster or slower. So the
+    path across the scene's motion counts, and along it only what goes against it. What goes another
+    way in every window is no target, but parts of the scene that are seen by turns.
+
+    Args:
+        path: Path of the target.
+        scene: Motion of the scene.
+        start: Start of the stream, us.
+    """
+    window, size = path.window * 1e-6, float(np.median(path.size[:, 0]))
+    if path.velocity_noise * window**3 / 3 > (CONFIG.own_way_erratic_sizes * size) ** 2:
+        return False
+    t = np.asarray((path.t - start) * 1e-6, np.float64)
+    if len(t) < 2:
+        return False
+    flow = _scene_flow(path, scene, t)
+    along = flow / np.maximum(np.hypot(*flow.T), 1e-9)[:, None]
+    moved = np.diff(path.p, axis=0)
+    with_scene = (moved * along[1:]).sum(1)
+    own = moved - np.maximum(with_scene, 0)[:, None] * along[1:]
+    way = np.cov(np.concatenate([[[0, 0]], np.cumsum(own, 0)]).T)
+    ratio = np.linalg.solve(np.median(path.C, 0) + FINE_CELL_PX**2 * np.eye(2), way)
+    return bool(np.linalg.eigvals(ratio).real.max() > CONFIG.own_way_sizes**2)
+
+
+def _scene_flow(
+    path: TargetPath, scene: SceneMotion, t: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Compute velocities (rows, 2) px/s of the scene at a path's places."""
+    now = np.clip(t[:, None] + [-VELOCITY_STEP_S, VELOCITY_STEP_S], scene.t[0], scene.t[-1])
+    x, y = scene.to_scene(path.p[:, 0], path.p[:, 1], t)
+    x, y = scene.to_sensor(x[:, None], y[:, None], now)
+    flow = np.stack([x[:, 1] - x[:, 0], y[:, 1] - y[:, 0]], 1)
+    return flow / np.maximum(now[:, 1] - now[:, 0], 1e-9)[:, None]
+
+
+def measure_moving_background(stream: Stream, scene: SceneMotion) -> Background:
+    """Measure rates of a scene's places while they are seen, from the calmer slices.
+
+    What goes its own way is nowhere in the scene for long.
+
+    Args:
+        stream: Events.
+        scene: Motion of the scene.
+    """
+    size = np.array([stream.width, stream.height])
+    middles = (np.arange(SLICES) + 0.5) / SLICES * stream.duration
+    x, y = (np.array([[0, 1, 0, 1], [0, 0, 1, 1]]) * (size[:, None] - 1))[..., None]
+    places = np.stack(scene.to_scene(x, y, middles))
+    low = np.floor(places.min((1, 2)))
+    columns, rows = ((places.max((1, 2)) - low) // CELL_PX + 1).astype(int).tolist()
+    corner = int(low[0]), int(low[1])
+
+    y, x = np.mgrid[:rows, :columns] * CELL_PX + CELL_PX / 2
+    x, y = scene.to_sensor(x[..., None] + low[0], y[..., None] + low[1], middles)
+    seen = np.moveaxis((x >= 0) & (x < size[0]) & (y >= 0) & (y < size[1]), 2, 0)
+    by = CELL_PX // FINE_CELL_PX
+    cells = count_in_slices(stream, (rows * by, columns * by), scene, corner)
+
+    N = np.where(seen, pool(cells, by), np.inf)
+    rank = np.ceil(CONFIG.calm_share * seen.sum(0)).astype(int) - 1
+    most = np.take_along_axis(np.sort(N, 0), np.maximum(rank, 0)[None], 0)[0]
+    calm = seen & (N <= most)
+    activity = _slice_activity(N, calm, seen)
+    there = np.kron(calm, np.ones((1, by, by))) > 0
+    expected = (there * activity[:, None, None]).sum(0)
+    rate = (cells * there).sum(0) / np.maximum(expected, 1) / FINE_CELL_PX**2
+    known = expected > 0
+    usual = max(float(rate[known].mean()), 0.02 / CELL_PX**2)
+    rate = np.where(known, np.maximum(rate, CONFIG.min_rate_share * usual), usual)
+    rate = rate * SLICES / stream.duration
+    bright = np.ones((rows, columns), bool)
+    return Background(rate, calm, bright, activity, stream.duration, scene, corner)
+
+
+def _slice_activity(N: NDArray, calm: NDArray, seen: NDArray) -> NDArray[np.float64]:
+    """Compute the activity of each slice: the median ratio of its counts to calm ones."""
+    mean = np.where(calm, N, 0).sum(0) / np.maximum(calm.sum(0), 1)
+    full = mean >= CONFIG.min_dispersion_events
+    ratios = np.array([
+        np.median(n[s & full] / mean[s & full]) if (s & full).any() else 1.0
+        for n, s in zip(N, seen, strict=True)
+    ])  # fmt: skip
+    return np.clip(ratios / max(float(np.median(ratios)), 1e-9), 0.1, 10)

@@ -1,48 +1,260 @@
-"""Targets of a recording, found without settings.
+"""Search for the targets of a recording, without settings.
 
-The background is measured, then the scale at which blobs predict the next events best is chosen and
-targets are followed at that scale. What is near them is taken away, and all is done again for what
-remains, so that slow and fast targets are found in one recording.
+The background is measured, then the scale at which blobs predict the next events best is selected
+and targets are tracked at that scale. The events near them are removed, and all is done again for
+what remains, so that slow and fast targets are found in one recording.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.search.background import Background, evidence, measure_background
-from jaxevent.blob.search.detection import CONTACT, Scale, touching
-from jaxevent.blob.search.found import Found, Pass
-from jaxevent.blob.search.lamps import without_lamps
-from jaxevent.blob.search.links import Links
-from jaxevent.blob.search.moving import find_moving_background, goes_own_way, is_full, pauses
-from jaxevent.blob.search.parts import join_parts
-from jaxevent.blob.search.paths import Path
-from jaxevent.blob.search.polarity import prefer_sharper
-from jaxevent.blob.search.scale import Choice, choose_scale
+from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.search.background import Background, clutter_evidence, measure_background
+from jaxevent.blob.search.config import CONFIG
+from jaxevent.blob.search.detection import Scale, contact_distance, larger_variance
+from jaxevent.blob.search.merge import merge_parts, merge_turning, stitch_paths
+from jaxevent.blob.search.paths import TargetPath
+from jaxevent.blob.search.polarity import drop_lamps, prefer_sharper
+from jaxevent.blob.search.scale import ScaleSelection, select_scale
+from jaxevent.blob.search.scene import (
+    find_moving_background,
+    has_own_motion,
+    is_dense,
+    split_at_pauses,
+)
 from jaxevent.blob.search.stream import Stream
-from jaxevent.blob.search.targets import FAINT, GATE, HOLD, REACH, SEEN, larger
-from jaxevent.blob.search.turning import join_turning
+from jaxevent.blob.search.window_tracker import WindowTracker
 from jaxevent.blob.seeds import span_of
+from jaxevent.deprecated import RenamedAttribute
+from jaxevent.display import plural
+from jaxevent.errors import InputError
 from jaxevent.progress import stage
 from jaxevent.recording import Recording
 
-PASSES = 4
-WORTH = 0.05  # nats per event from which a pass is worth it
-WORTH_MOVING = 0.1  # and before a scene that moves, whose map is less exact
-FEWEST = 100  # events of a recording that is looked at
-ONE_PIXEL = 0.5  # px: what is smaller is a pixel, no blob
-SHORT, ERRATIC = 16, 0.4  # windows, and sizes by which what is seen in fewer leaves its way in one
-FILL = 0.5  # share of its windows in which a target was seen
-JOINS = 1.5  # ellipses' distances, as `touching`, of a target's end and its new beginning
-PAUSE = 4 * HOLD  # windows between them at most; or, at rest,
-LAST = 8  # windows that tell how fast it went
-REST = 2.0  # times the life of the shorter of both
-LEAP = 2 * GATE * REACH  # sizes: what is farther from its way is not the target
-PART = 0.8  # of its usual size and events: a target that is seen whole has more
-EDGE = 2.0  # sizes from the sensor's edge, where others come and go
-SAME = 0.5  # share of a target's life near one of an earlier pass that makes it a part of that
+# Coefficients of x^3, x^2 and x in 1 + sqrt(2) x + x^2 + x^3 / (3 sqrt(2)), see
+# `max_events_per_step`.
+VARIANCE_GROWTH = (1 / (3 * 2**0.5), 1.0, 2**0.5)
+START_WINDOWS = 4  # windows that give a target's size at its start
+FOREVER_S, ANYWHERE_PX = 1e3, 1e9  # the search decides when targets end
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchPass:
+    """The scale that one pass over the recording selected, and the number of its targets."""
+
+    selection: ScaleSelection
+    targets: int
+
+    choice = RenamedAttribute("selection")
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class TargetSearchResult:
+    """Targets of a recording, found by `find`.
+
+    Attributes:
+        paths: Paths of the targets, by their beginning.
+        passes: Selected scales, and the number of targets of each.
+        hot_pixels: Number of hot pixels, which are left out.
+        background: Events of no target, per s, of the whole sensor.
+        recording: The recording.
+        camera_moves: Whether the background is a scene that moves past the camera.
+        lamps: Number of lamps on the mains, which are left out.
+        full: Whether most of the sensor has events most of the time, of whatever source.
+    """
+
+    paths: tuple[TargetPath, ...]
+    passes: tuple[SearchPass, ...]
+    hot_pixels: int
+    background: float
+    recording: Recording
+    camera_moves: bool = False
+    lamps: int = 0
+    full: bool = False
+
+    own = RenamedAttribute("per_target_values")
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __repr__(self) -> str:
+        return f"<{self.summary()}>"
+
+    def summary(self) -> str:
+        """Summarise the result in one line."""
+        text = f"{len(self)} {plural('target', len(self))}, "
+        text += f"background of {self.background:,.0f} events/s"
+        if self.hot_pixels:
+            text += f", {self.hot_pixels} {plural('hot pixel', self.hot_pixels)} left out"
+        if self.lamps:
+            text += f", {self.lamps} {plural('lamp', self.lamps)} left out"
+        if self.camera_moves:
+            text += ", the camera moves"
+        turns = [f"{path.turn_rate:.3g}" for path in self.paths if path.turn_rate is not None]
+        if turns:
+            verb = "turns" if len(turns) == 1 else "turn"
+            text += f", {len(turns)} {verb} in place at {' and '.join(turns)} rad/s"
+        if not len(self):
+            return text
+        size, speed, rate = (self._quantile(values) for values in self._numbers())
+        windows = [f"{p.selection.scale.window * 1e3:g}" for p in self.passes if p.targets]
+        return (
+            f"{text}; size {size:.3g} px, speed {speed:.3g} px/s, {rate:,.0f} events/s each; "
+            f"seen in windows of {' and '.join(windows)} ms"
+        )
+
+    def seeds(self, start: int, stop: int) -> list[tuple[float, float, float, int]]:
+        """Return a seed for each target, where it is first seen.
+
+        Args:
+            start: Earliest time of a seed, us.
+            stop: Latest time, us, which is excluded.
+
+        Returns:
+            Position x and y (px), size (px) and time (us) of each target.
+        """
+        width, height = self.recording.width, self.recording.height
+        out = []
+        for path in self.paths:
+            x, y = path.p[0]
+            at = int(np.clip(path.begin, start, stop - 1))
+            x, y = np.clip(x, -0.5, width - 0.5), np.clip(y, -0.5, height - 0.5)
+            size = np.median(path.size[:START_WINDOWS].mean(1))
+            out.append((float(x), float(y), float(size), at))
+        return out
+
+    def settings(self, accuracy: float | int | None = None) -> dict[str, Any]:
+        """Return values of a tracker's parameters that suit the targets.
+
+        Values that differ between targets are medians, weighted by events.
+
+        Args:
+            accuracy: Share by which the standard deviation of positions may be larger than event
+                by event, which sets `events_per_step`; None for about 32 steps in a window.
+
+        Raises:
+            InputError: `accuracy` is not positive.
+        """
+        check_accuracy(accuracy)
+        if not len(self):
+            return {}
+        sizes, _, rates = self._numbers()
+        windows = np.array([path.window * 1e-6 for path in self.paths])
+        largest, smallest = self._quantile(sizes, 0.95), self._quantile(sizes, 0.05)
+        W = self._quantile(windows)
+        events, rounded = self._quantile(rates) * self._most_at_once() * W / 32, np.round
+        if accuracy is not None:
+            events = self._quantile(self._max_events(float(accuracy)), 0.05)
+            rounded = np.floor
+        events = int(2 ** np.clip(rounded(np.log2(max(events, 1e-9))), 0, 5))
+        return {name: self._quantile(values) for name, values in self._target_values().items()} | {
+            "events_per_step": events,
+            "lambda_min": min(0.5, smallest / 3),
+            "lambda_max": 6 * largest,
+            "t_coast": FOREVER_S,
+            "t_merge": FOREVER_S,
+            "aspect_max": 1e3,
+            "sigma_max": ANYWHERE_PX,
+            "cycle": W,
+        }
+
+    def per_target_values(self, params: TrackerParams) -> dict[str, NDArray]:
+        """Return per-target values of parameters, in unconstrained form.
+
+        Parameters that differ from `settings`, as the user changed them, are left out.
+        """
+        usual, out = self.settings(), {}
+        for name, values in self._target_values().items():
+            if np.isclose(float(getattr(params, name)), usual[name], rtol=1e-5):
+                stored = jnp.asarray(values, params.raw[name].dtype)
+                out[name] = np.asarray(getattr(type(params), name).unconstrained(stored))
+        return out
+
+    def _target_values(self) -> dict[str, NDArray[np.float64]]:
+        """Values of parameters for each target."""
+        L, v, _ = self._numbers()
+        W = np.array([path.window * 1e-6 for path in self.paths])
+        return {
+            "Q_p": 1e-4 * L**2 / W,
+            "Q_v": np.array([path.velocity_noise for path in self.paths]),
+            "Q_lambda": (0.05 * L) ** 2 / W,
+            "Q_theta": 0.01 / W,
+            "Q_q": 0.01 / W**3,
+            "P0_p": L**2 / 4,
+            "P0_v": 4 * v**2 + (L / W) ** 2,
+            "P0_lambda": (0.5 * L) ** 2,
+            "P0_q": (0.1 / W) ** 2,
+            "lambda0": L,
+            "gate_decay": 1 / W,
+            "gate_min": np.maximum(2.0, 3 * L / 2),
+            "gate_max": 24 * L,
+            "t_still": CONFIG.still_windows * W,
+        }
+
+    def _max_events(self, accuracy: float) -> NDArray[np.float64]:
+        """Events per step that each target allows, of all targets that live as long as it does."""
+        begin, end = (np.array([getattr(p, name) for p in self.paths]) for name in ("begin", "end"))
+        rate = np.array([np.quantile(p.n, 0.25) / (p.window * 1e-6) for p in self.paths])
+        along = (begin <= begin[:, None]) & (end >= end[:, None])
+        size = np.array([np.median(path.size[:, 1]) for path in self.paths])
+        noise = np.array([path.velocity_noise for path in self.paths])
+        return max_events_per_step(accuracy, size, rate, noise) * (along @ rate) / rate
+
+    def _numbers(self) -> tuple[NDArray, NDArray, NDArray]:
+        """Size of the longer axis (px), speed (px/s) and rate (events/s) of each target."""
+        paths = self.paths
+        return (
+            np.array([np.median(path.size[:, 0]) for path in paths]),
+            np.array([np.median(np.hypot(*path.v.T)) for path in paths]),
+            np.array([np.median(path.n) / (path.window * 1e-6) for path in paths]),
+        )
+
+    def _quantile(self, values: NDArray, part: float | int = 0.5) -> float:
+        """Compute a quantile of values of targets, weighted by their events."""
+        events = np.array([path.n.sum() for path in self.paths])
+        order = np.argsort(values)
+        total = np.cumsum(events[order])
+        return float(values[order][np.searchsorted(total, part * total[-1])])
+
+    def _most_at_once(self) -> int:
+        """Largest number of targets at a time."""
+        times = np.sort([path.begin for path in self.paths])
+        ends = np.sort([path.end for path in self.paths])
+        return int((np.arange(1, len(times) + 1) - np.searchsorted(ends, times, "right")).max())
+
+
+def check_accuracy(accuracy: float | int | None) -> None:
+    """Raise `InputError` for an accuracy that is not positive."""
+    if accuracy is not None and not 0 < accuracy < np.inf:
+        raise InputError(f"an accuracy of {accuracy:g} is not possible; give a share above 0")
+
+
+def max_events_per_step(
+    accuracy: float, size: NDArray, rate: NDArray, noise: NDArray
+) -> NDArray[np.float64]:
+    """Compute the largest number of events per step that keeps positions accurate.
+
+    In its steady state a filter of constant velocity has the variances sqrt(2) q s^3 of position
+    and sqrt(2) q s of velocity and their covariance q s^2, with q the velocity noise and
+    s = (size^2 / rate / q)^(1/4) its time constant. Before the next step, x s later, the variance
+    of position is 1 + sqrt(2) x + x^2 + x^3 / (3 sqrt(2)) times as large.
+
+    Args:
+        accuracy: Share by which the standard deviation of positions may grow.
+        size: (targets,) px, sizes.
+        rate: (targets,) events/s.
+        noise: (targets,) px^2/s^3, velocity noises.
+
+    Returns:
+        (targets,) events per step.
+    """
+    roots = np.roots([*VARIANCE_GROWTH, 1 - (1 + accuracy) ** 2])
+    x = float(roots[abs(roots.imag) < 1e-9].real.max())
+    return x * rate * (size**2 / rate / noise) ** 0.25
 
 
 def find(
@@ -51,153 +263,169 @@ def find(
     stop: int | float | None = None,
     *,
     progress: bool | None = None,
-) -> Found:
+) -> TargetSearchResult:
     """Find the targets of a recording, without settings.
 
     Args:
         recording: Events; frames are not needed.
-        start: Events are used from there, by default all. Integers are us, floats s.
-        stop: And before this.
-        progress: Whether a bar is shown; None: where somebody looks on.
+        start: First time of the events that are used, by default that of the first. An integer is
+            us, a float s.
+        stop: Time before which events are used, by default all.
+        progress: Whether a bar is shown; None: in a terminal or notebook.
+
+    Returns:
+        Paths of the targets, and the scales at which they were found.
 
     Raises:
         InputError: There is no time between `start` and `stop`.
     """
     stream = Stream(recording, *span_of(recording, start, stop))
-    if len(stream) < FEWEST:
-        return Found((), (), 0, 0.0, recording)
-    found: list[Path] = []
-    passes: list[Pass] = []
-    hot, events = np.zeros((stream.height, stream.width), bool), 0.0
+    if len(stream) < CONFIG.min_recording_events:
+        return TargetSearchResult((), (), 0, 0.0, recording)
+    found: list[TargetPath] = []
+    passes: list[SearchPass] = []
+    hot, events = np.zeros(stream.shape, bool), 0.0
     moves = full = False
-    parts = _parts(stream, progress)
-    for one in parts:
-        new, done = _search(one, progress)
+    sections = _split_recording(stream, progress)
+    for one in sections:
+        new, done = _search_section(one, progress)
         found += new
         passes += done
         hot |= one.stream.hot
-        events += one.background.mean * stream.width * stream.height * one.stream.duration
+        rate = one.background.mean_rate
+        events += rate * stream.width * stream.height * one.stream.duration
         moves |= one.background.scene is not None
-        full |= is_full(one.background)
-    if len(parts) > 1:
-        found = _stitch(found, (stream.width, stream.height))
-    found, lamps = without_lamps(found, recording, hot)
+        full |= is_dense(one.background)
+    if len(sections) > 1:
+        found = stitch_paths(found, (stream.width, stream.height))
+    found, lamps = drop_lamps(found, recording, hot)
     found = prefer_sharper(found, recording, hot)
     found.sort(key=lambda path: (path.begin, path.p[0].tolist()))
-    rate = events / stream.duration
-    number = int(hot.sum())
-    return Found(tuple(found), tuple(passes), number, rate, recording, moves, lamps, full)
+    rate, number = events / stream.duration, int(hot.sum())
+    return TargetSearchResult(
+        tuple(found), tuple(passes), number, rate, recording, moves, lamps, full
+    )
 
 
-class _Part(NamedTuple):
-    """Events that are searched at once, and what the search begins with."""
+class _Section(NamedTuple):
+    """Events that are searched together, their background, and the first scale."""
 
     stream: Stream
     background: Background
-    choice: Choice | None
+    selection: ScaleSelection | None
 
 
-def _parts(stream: Stream, progress: bool | None) -> list[_Part]:
-    """The whole; or, of a camera that moves at times, each of its pauses and what is between."""
+def _split_recording(stream: Stream, progress: bool | None) -> list[_Section]:
+    """Return the whole, or each pause of a camera that moves at times and each span between."""
     with stage("find: background", progress):
         background = measure_background(stream)
-    spans = pauses(background)
+    spans = split_at_pauses(background)
     if len(spans) > 1:
-        parts = [stream.part(*span) for span in spans]
-        parts = [
-            _prepared(one, measure_background(one), progress) for one in parts if len(one) >= FEWEST
+        streams = [stream.between(*span) for span in spans]
+        sections = [
+            _prepare_section(one, measure_background(one), progress)
+            for one in streams
+            if len(one) >= CONFIG.min_recording_events
         ]
-        if any(one.background.scene is not None for one in parts):
-            return parts
-    return [_prepared(stream, background, progress)]
+        if any(one.background.scene is not None for one in sections):
+            return sections
+    return [_prepare_section(stream, background, progress)]
 
 
-def _prepared(stream: Stream, background: Background, progress: bool | None) -> _Part:
+def _prepare_section(stream: Stream, background: Background, progress: bool | None) -> _Section:
     with stage("find: scale", progress):
-        choice = choose_scale(stream, background)
-    if choice is not None:
+        selection = select_scale(stream, background)
+    if selection is not None:
         with stage("find: the scene's motion", progress):
-            moving = find_moving_background(stream, background, choice)
+            moving = find_moving_background(stream, background, selection)
         if moving is not None:
-            background, choice = moving, choose_scale(stream, moving)
-    return _Part(stream, background, choice)
+            background, selection = moving, select_scale(stream, moving)
+    return _Section(stream, background, selection)
 
 
-def _search(part: _Part, progress: bool | None) -> tuple[list[Path], list[Pass]]:
-    """Paths and passes against a background; the choice is that of the first pass."""
-    stream, background, choice = part
-    found: list[Path] = []
-    passes: list[Pass] = []
-    worth = WORTH if background.scene is None else WORTH_MOVING
-    for number in range(PASSES):
+def _search_section(
+    section: _Section, progress: bool | None
+) -> tuple[list[TargetPath], list[SearchPass]]:
+    """Search a section in passes, of which the first one uses the section's scale."""
+    stream, background, selection = section
+    found: list[TargetPath] = []
+    passes: list[SearchPass] = []
+    size, gate = (stream.width, stream.height), CONFIG.gate_sigmas
+    min_gain = CONFIG.min_gain if background.scene is None else CONFIG.min_moving_gain
+    for number in range(CONFIG.max_passes):
+        name = f"find, pass {number + 1}"
         if number:
-            with stage(f"find, pass {number + 1}: scale", progress):
-                choice = choose_scale(stream, background, worth)
-        if choice is None or choice.score < worth:
+            with stage(f"{name}: scale", progress):
+                selection = select_scale(stream, background, min_gain)
+        if selection is None or selection.score < min_gain:
             break
-        confirmed = Links(stream, background, choice.scale).follow(
-            f"find, pass {number + 1}", progress
-        )
+        confirmed = WindowTracker(stream, background, selection.scale).run(name, progress)
         if not confirmed:
-            passes.append(Pass(choice, 0))
+            passes.append(SearchPass(selection, 0))
             break
-        with stage(f"find, pass {number + 1}: beginnings", progress):
-            settled = [_settled(path) for path in confirmed]
-            rest = stream.without(confirmed, GATE, max(path.begin for path in settled))
-            whole = [_look_back(path, rest, background, choice.scale) for path in settled]
-        near = whole = join_parts(whole)
+        with stage(f"{name}: beginnings", progress):
+            settled = [_drop_unsettled_start(path) for path in confirmed]
+            rest = stream.without(confirmed, gate, max(path.begin for path in settled))
+            whole = [_extend_backwards(one, rest, background, selection.scale) for one in settled]
+        near = whole = merge_parts(whole)
         if background.scene is not None:
-            whole = [one for one in whole if goes_own_way(one, background.scene, stream.start)]
-        lasting = [one for one in whole if _lasting(one, stream.duration)]
-        new = _stitch(lasting, (stream.width, stream.height))
-        new = [one for one in new if not _left_over(one, found)]
-        passes.append(Pass(choice, len(new)))
+            whole = [one for one in whole if has_own_motion(one, background.scene, stream.start)]
+        lasting = [one for one in whole if _is_persistent(one, stream.duration)]
+        new = stitch_paths(lasting, size)
+        new = [one for one in new if not _is_duplicate(one, found)]
+        passes.append(SearchPass(selection, len(new)))
         found += new
         stitched = [one for one in new if all(one is not other for other in near)]
-        stream = stream.without([*near, *stitched], 2 * GATE)
+        stream = stream.without([*near, *stitched], 2 * gate)
     with stage("find: what turns in its place", progress):
-        return join_turning(found, part.stream, background), passes
+        return merge_turning(found, section.stream, background), passes
 
 
-def _lasting(path: Path, duration: float | int) -> bool:
-    """Whether it is larger than a pixel and was seen in enough of its windows.
+def _is_persistent(path: TargetPath, duration: float | int) -> bool:
+    """Return whether a target is larger than a pixel and was seen in enough of its windows.
 
-    What is seen in few of those of the recording, of `duration` s, goes on as it goes: parts of a
-    flicker are here and there.
+    A target seen in few windows of the recording, of `duration` s, must go on as it goes: parts of
+    a flicker are here and there.
     """
     window, seen = path.window * 1e-6, len(path.t)
     size = np.median(np.trace(path.C, axis1=1, axis2=2))
-    leaves = path.agility * window**3 / 3
-    short = seen < min(SHORT, FILL * duration / window)
-    if short and leaves > (ERRATIC * np.median(path.size[:, 0])) ** 2:
+    leaves = path.velocity_noise * window**3 / 3
+    short = seen < min(CONFIG.short_windows, CONFIG.persistent_share * duration / window)
+    if short and leaves > (CONFIG.erratic_sizes * np.median(path.size[:, 0])) ** 2:
         return False
     windows = (path.t[-1] - path.t[0]) / path.window + 1
-    return bool(size > 2 * ONE_PIXEL**2 and seen >= FILL * windows)
+    enough = seen >= CONFIG.persistent_share * windows
+    return bool(size > 2 * CONFIG.min_size_px**2 and enough)
 
 
-def _settled(path: Path) -> Path:
-    """The path from where it leaps no more: a new target may be where it is not yet known.
+def _drop_unsettled_start(path: TargetPath) -> TargetPath:
+    """Drop the first rows of a path, up to the last that lies far from the rows after it.
 
-    What comes after tells where each row was expected.
+    A new track's first positions are unreliable.
     """
-    for k in range(min(LAST, len(path.t) - 2))[::-1]:
-        later = slice(k + 1, k + 1 + LAST)
-        before = path.p[k + 1] - _speed(path, later) * (path.t[k + 1] - path.t[k]) * 1e-6
-        if np.hypot(*(path.p[k] - before)) > LEAP * np.median(path.size[later, 0]):
-            return _rows(path, slice(k + 1, None))
+    rows = CONFIG.velocity_windows
+    for k in range(min(rows, len(path.t) - 2))[::-1]:
+        later = slice(k + 1, k + 1 + rows)
+        step = path.mean_velocity(later) * (path.t[k + 1] - path.t[k]) * 1e-6
+        apart = np.hypot(*(path.p[k] - (path.p[k + 1] - step)))
+        if apart > CONFIG.max_leap_sizes * np.median(path.size[later, 0]):
+            return path.take(slice(k + 1, None))
     return path
 
 
-def _rows(path: Path, which: slice | NDArray) -> Path:
-    """Some rows of a path."""
-    cut = {name: getattr(path, name)[which] for name in ("t", "p", "v", "C", "n")}
-    return dataclasses.replace(path, **cut)
+def _extend_backwards(
+    path: TargetPath, rest: Stream, background: Background, scale: Scale
+) -> TargetPath:
+    """Extend a path backwards in time.
 
+    The path's initial velocity predicts each window before. The unassigned events in the gate are
+    accepted if they exceed the clutter.
 
-def _look_back(path: Path, rest: Stream, background: Background, scale: Scale) -> Path:
-    """The path with what was before its beginning: the same look at one place, backwards in time.
-
-    `rest` are the events that belong to nobody.
+    Args:
+        path: Path of a target.
+        rest: Events that belong to no target.
+        background: Background of the stream.
+        scale: Windows and cells.
     """
     first = min(8, len(path.t))
     if first < 3:
@@ -206,27 +434,30 @@ def _look_back(path: Path, rest: Stream, background: Background, scale: Scale) -
     v, p = np.polyfit(times - times[0], path.p[:first], 1)
     C, usual = path.C[:first].mean(0), float(np.median(path.n[:first]))
     spread = C + np.eye(2) * (0.1 + np.trace(C) / 2 / max(usual, 1))
-    t, silent, rows, farthest = float(times[0]), 0, [], (GATE * REACH) ** 2 * larger(C[None])[0]
-    while silent < HOLD and t - 1.5 * w > 0:
+    gate, threshold = CONFIG.gate_sigmas, -np.log(CONFIG.false_alarm_known)
+    farthest = (gate * CONFIG.max_turn_sizes) ** 2 * larger_variance(C[None])[0]
+    t, misses, rows = float(times[0]), 0, []
+    while misses < CONFIG.max_coast_windows and t - 1.5 * w > 0:
         t, p = t - w, p - v * w
         if not (0 <= p[0] < rest.width and 0 <= p[1] < rest.height):
             break
         part = rest.window(t - w / 2, t + w / 2)
         e = np.stack([part.x - p[0], part.y - p[1]], 1) - v * (part.t - t)[:, None]
-        S = spread * (1 + 0.2 * silent)
-        near = np.einsum("ni,ij,nj->n", e, np.linalg.inv(S), e) < GATE**2
+        S = spread * (1 + 0.2 * misses)
+        near = np.einsum("ni,ij,nj->n", e, np.linalg.inv(S), e) < gate**2
         n = int(near.sum())
-        area = np.pi * GATE**2 * np.sqrt(np.linalg.det(S))
-        mu = max(float(background.at(p[0], p[1], t, 3 * scale.cell)) * w * area, 1e-3)
-        F = scale.dispersion_at(*background.place(p[0], p[1], t))
-        if n < 2 or n < FAINT * usual or evidence(n, mu, F) < -np.log(SEEN):
-            silent += 1
+        area = np.pi * gate**2 * np.sqrt(np.linalg.det(S))
+        mu = max(float(background.rate_at(p[0], p[1], t, 3 * scale.cell)) * w * area, 1e-3)
+        F = scale.dispersion_at(*background.to_scene(p[0], p[1], t))
+        enough = n >= 2 and n >= CONFIG.min_event_share * usual
+        if not enough or clutter_evidence(n, mu, F) < threshold:
+            misses += 1
             continue
         z = e[near].mean(0)
         if z @ z > farthest:
-            silent += 1
+            misses += 1
             continue
-        p, v, silent = p + 0.5 * z, v - 0.15 * z / w / (1 + silent), 0
+        p, v, misses = p + 0.5 * z, v - 0.15 * z / w / (1 + misses), 0
         rows.append((t, p, v, n))
     if not rows:
         return path
@@ -234,87 +465,16 @@ def _look_back(path: Path, rest: Stream, background: Background, scale: Scale) -
     us = rest.start + np.rint(t * 1e6).astype(np.int64)
     C = np.broadcast_to(C, (len(rows), 2, 2))
     before = dataclasses.replace(path, t=us, p=p, v=v, C=C, n=n.astype(float))
-    return _after(before, path)
+    return before.followed_by(path)
 
 
-def _after(one: Path, other: Path) -> Path:
-    """Two paths, one after the other, as one."""
-    pairs = {name: (getattr(one, name), getattr(other, name)) for name in ("t", "p", "v", "C", "n")}
-    return dataclasses.replace(one, **{name: np.concatenate(pair) for name, pair in pairs.items()})
-
-
-def _stitch(paths: list[Path], size: tuple[int, int]) -> list[Path]:
-    """Join a path to a later one that begins where it ended: at rest or carried on."""
-    paths, done = sorted(paths, key=lambda path: path.begin), []
-    while paths:
-        one = paths.pop(0)
-        while True:
-            following = [(_gap(one, other, size), k) for k, other in enumerate(paths)]
-            distance, k = min(following, default=(np.inf, -1))
-            if distance >= JOINS:
-                break
-            one = _after(one, _later(one, paths.pop(k)))
-        done.append(one)
-    return done
-
-
-def _gap(one: Path, other: Path, size: tuple[int, int]) -> float:
-    """How far a path's beginning is from another's end, as `touching`; inf: not in time."""
-    other = _later(one, other)
-    pause = int(other.t[0] - one.t[-1])
-    shorter = min(one.end - one.begin, other.end - other.begin)
-    if one.window != other.window or not 0 < pause <= max(
-        min(PAUSE * one.window, 2 * REST * shorter), REST * shorter
-    ):
-        return np.inf
-    margin = EDGE * max(one.size[-1, 0], other.size[0, 0])
-    at_edge = (one.p[-1] < margin) | (one.p[-1] > np.array(size) - 1 - margin)
-    if at_edge.any() and pause > 2 * one.window:
-        return np.inf
-    ends = [(one.p[-1], other.p[0])]
-    if pause <= PAUSE * one.window:
-        # In the middle between both: so a bend does not matter.
-        half = pause * 0.5e-6
-        before, after = _speed(one, slice(-LAST, None)), _speed(other, slice(0, LAST))
-        ends += [(one.p[-1] + 2 * half * before, other.p[0])]
-        ends += [(one.p[-1] + half * before, other.p[0] - half * after)]
-        # Where it goes behind something and comes out it is seen in part.
-        last, first = _whole(one)[-1], _whole(other)[0]
-        half = (other.t[first] - one.t[last]) * 0.5e-6
-        before = _speed(one, slice(max(last - LAST, 0), last + 1))
-        after = _speed(other, slice(first, first + LAST + 1))
-        ends += [(one.p[last] + half * before, other.p[first] - half * after)]
-    C = [np.median(path.C, 0) for path in (one, other)]
-    return min(float(touching(p, C[0], q, C[1])) for p, q in ends)
-
-
-def _whole(path: Path) -> NDArray[np.int64]:
-    """Rows in which it has most of its usual size and events; all, where none has both."""
-    size = path.size[:, 0]
-    told = (path.n >= PART * np.median(path.n)) & (size >= PART * np.median(size))
-    return np.flatnonzero(told) if told.any() else np.arange(len(size))
-
-
-def _later(one: Path, other: Path) -> Path:
-    """Another path without rows before one's end, where a look back may have gone; if most stay."""
-    rest = other.t > one.t[-1]
-    if rest.mean() < FILL:
-        return other
-    return _rows(other, rest)
-
-
-def _speed(path: Path, rows: slice) -> NDArray[np.float64]:
-    """px/s over some rows."""
-    t, p = path.t[rows] * 1e-6, path.p[rows]
-    return np.polyfit(t - t[0], p, 1)[0] if len(t) > 2 else np.zeros(2)
-
-
-def _left_over(path: Path, found: list[Path]) -> bool:
-    """Whether it was for long near a target of an earlier pass."""
+def _is_duplicate(path: TargetPath, found: list[TargetPath]) -> bool:
+    """Return whether a path was near one of an earlier pass for long."""
     for other in found:
         inside = (path.t > other.begin - 2 * other.window) & (path.t < other.end + 2 * other.window)
         row = np.clip(np.searchsorted(other.t, path.t), 0, len(other.t) - 1)
-        apart = touching(path.p, path.C, other.at(path.t), other.C[row])
-        if (inside & (apart < 1.5 * CONTACT)).mean() >= SAME:
+        apart = contact_distance(path.p, path.C, other.at(path.t), other.C[row])
+        near = inside & (apart < 1.5 * CONFIG.contact_distance)
+        if near.mean() >= CONFIG.duplicate_share:
             return True
     return False

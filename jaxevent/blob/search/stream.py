@@ -1,4 +1,4 @@
-"""The events that the search for targets looks at, window by window."""
+"""The events that the search uses, window by window."""
 
 import copy
 from collections.abc import Iterator, Sequence
@@ -7,43 +7,67 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.search.paths import NOBODY, Joined, Path, candidates, join
+from jaxevent.blob.search.paths import (
+    NO_OWNER,
+    PathTable,
+    TargetPath,
+    owner_candidates,
+    tabulate_paths,
+)
 from jaxevent.codegen import ZeroedScratch, njit_noalloc, njit_noalloc_inlined
 from jaxevent.recording import Events, EventSource, Recording
 
 _counts = ZeroedScratch(np.int32)
-BATCH = 1 << 20  # events read at a time
-HELD = 1 << 22  # events: so many and fewer are read once
+BATCH_EVENTS = 1 << 20  # events read at a time
+MAX_HELD_EVENTS = 1 << 22  # a stream of so many events is held in memory
 ALL, COLD = np.ones(0, bool), np.zeros((0, 0), bool)  # all events are kept, no pixel is hot
 
 
-class Part(NamedTuple):
-    """Consecutive events: t in s since the stream's start, x and y in px."""
+class WindowEvents(NamedTuple):
+    """Consecutive events of a stream."""
 
-    t: NDArray[np.float64]
-    x: NDArray[np.int32]
-    y: NDArray[np.int32]
+    t: NDArray[np.float64]  # (N,) s since the stream's start
+    x: NDArray[np.int32]  # (N,) px
+    y: NDArray[np.int32]  # (N,) px
 
     def __len__(self) -> int:
         return len(self.t)
 
 
-class Pixels(NamedTuple):
-    """Distinct pixels, int32, and how many events each has, n."""
+class PixelCounts(NamedTuple):
+    """Distinct pixels of some events, and the events of each."""
 
-    x: NDArray[np.int32]
-    y: NDArray[np.int32]
-    n: NDArray[np.int32]
+    x: NDArray[np.int32]  # (pixels,) px
+    y: NDArray[np.int32]  # (pixels,) px
+    n: NDArray[np.int32]  # (pixels,) events
 
     def __len__(self) -> int:
         return len(self.n)
 
 
-class Stream:
-    """Events of a recording from `start` to before `stop` (us), without those that are left out.
+class CountedSpans(NamedTuple):
+    """Spans of time, the map of their events' pixels, and the image they are counted in."""
 
-    Left out are `hot` pixels, once they are known, and what is near the paths given to `without`.
-    More than `HELD` events are read where they are needed; `without` takes a byte for each.
+    t: NDArray[np.float64]  # (n, 2) s, begin and end
+    maps: NDArray[np.float64]  # (n, 2, 3) from pixels to px of the image
+    image: NDArray[np.int64]  # (n,) index of the image
+
+
+class _Rows(NamedTuple):
+    """Consecutive events of the recording, and the masks of those left out, for kernels."""
+
+    t: NDArray[np.int64]  # us
+    x: NDArray[np.integer]
+    y: NDArray[np.integer]
+    hot: NDArray[np.bool_]  # (rows, columns) pixels that are left out, or `COLD`
+    kept: NDArray[np.bool_]  # events that are kept, or `ALL`
+
+
+class Stream:
+    """Events of a recording from `start` to before `stop` (us), without those left out.
+
+    Hot pixels are left out once `hot` is set, and events near paths by `without`. More events than
+    `MAX_HELD_EVENTS` are read when needed; `without` then takes a byte for each.
     """
 
     def __init__(self, recording: Recording, start: int, stop: int):
@@ -53,14 +77,19 @@ class Stream:
         self._any_hot = False
         self._first, self._last = (recording.events.index(t) for t in (start, stop))
         self._kept: NDArray[np.bool_] | None = None  # of all these rows
-        few = len(self) <= HELD
-        # What is held is without what is left out.
-        self._held = recording.events[self._first : self._last] if few else None
+        # Held events are those that are not left out.
+        held = len(self) <= MAX_HELD_EVENTS
+        self._held = recording.events[self._first : self._last] if held else None
 
     @property
     def duration(self) -> float:
-        """s."""
+        """Length of the stream, s."""
         return (self.stop - self.start) * 1e-6
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the sensor."""
+        return self.height, self.width
 
     @property
     def hot(self) -> NDArray[np.bool_]:
@@ -74,108 +103,122 @@ class Stream:
             self._held = self._held[~hot[self._held.y, self._held.x]]
 
     def __len__(self) -> int:
-        """Events in all, those left out included."""
         return self._last - self._first
 
-    def part(self, begin: float | int, end: float | int) -> "Stream":
-        """The events of begin <= t < end (s since the start), those left out included."""
+    def between(self, begin: float | int, end: float | int) -> "Stream":
+        """Return the stream of all events from `begin` to before `end` (s since the start)."""
         return Stream(self.recording, *(self.start + round(1e6 * t) for t in (begin, end)))
 
     def without(
-        self, paths: Sequence[Path], sigmas: float | int, until: int | None = None
+        self, paths: Sequence[TargetPath], sigmas: float | int, until: int | None = None
     ) -> "Stream":
-        """The same without events within `sigmas` standard deviations of some paths.
+        """Return the stream without the events near some paths.
 
-        Before `until` (us), if it is given; what is held ends there. If few events are left they
-        are held.
+        Args:
+            paths: Paths whose events are left out.
+            sigmas: Distance from a path within which events are left out, standard deviations.
+            until: Time (us) up to which the new stream is used; None for all of it.
         """
-        stream, joined = copy.copy(self), join(paths)
+        stream, table = copy.copy(self), tabulate_paths(paths)
         if self._held is not None:
             events = self._held if until is None else self._held[: self._index(until)]
-            stream._held = events[candidates(events, joined, sigmas)[:, 0] == NOBODY]
+            stream._held = events[owner_candidates(events, table, sigmas)[:, 0] == NO_OWNER]
             return stream
         kept = np.ones(len(self), bool) if self._kept is None else self._kept.copy()
         rows = self._first, self._last if until is None else self._index(until)
         left, number = [Events.empty()], 0
-        for row, part, whose in near_paths(self.recording.events, joined, sigmas, rows):
+        for row, part, owner in batches_near_paths(self.recording.events, table, sigmas, rows):
             stays = kept[row - self._first :][: len(part)]
-            stays &= whose[:, 0] == NOBODY
-            if number <= HELD:
+            stays &= owner[:, 0] == NO_OWNER
+            if number <= MAX_HELD_EVENTS:
                 left.append(part[stays & ~self.hot[part.y, part.x] if self._any_hot else stays])
                 number += len(left[-1])
-        if number <= HELD:
+        if number <= MAX_HELD_EVENTS:
             columns = zip(*((one.t, one.x, one.y, one.p) for one in left), strict=True)
             stream._held, stream._kept = Events.of_checked(*map(np.concatenate, columns)), None
         else:
             stream._kept = kept
         return stream
 
-    def window(self, begin: float | int, end: float | int) -> Part:
-        """The events of begin <= t < end (s since the start)."""
-        return self._rows(*self._span(begin, end))
+    def window(self, begin: float | int, end: float | int) -> WindowEvents:
+        """Return the events from `begin` to before `end` (s since the start)."""
+        rows = self._rows(*self._span(begin, end))
+        t, (x, y) = np.empty(len(rows.t)), np.empty((2, len(rows.t)), np.int32)
+        number = _select(rows, self.start, WindowEvents(t, x, y))
+        return WindowEvents(t[:number], x[:number], y[:number])
 
-    def pixels(self, begin: float | int, end: float | int) -> Pixels:
-        """The pixels of these events, by their first event."""
+    def pixel_counts(self, begin: float | int, end: float | int) -> PixelCounts:
+        """Count the events of a span (s) in their pixels, ordered by their first events."""
         return self.sample(begin, end, len(self))[0]
 
-    def sample(self, begin: float | int, end: float | int, most: int) -> tuple[Pixels, int]:
-        """The pixels of at most so many of these events, at equal steps; how many are in all."""
-        events, hot, kept = self._of_rows(*self._span(begin, end))
-        counts = _counts(self.height, self.width)
-        x, y, n = np.empty((3, min(len(events), most)), np.int32)
-        pixels, number = _count(events.x, events.y, hot, kept, most, counts, x, y, n)
-        return Pixels(x[:pixels], y[:pixels], n[:pixels]), number
+    def sample(
+        self, begin: float | int, end: float | int, max_events: int
+    ) -> tuple[PixelCounts, int]:
+        """Count some events of a span in their pixels, taken at equal steps.
 
-    def add_cells(
-        self,
-        spans: NDArray[np.float64],
-        places: NDArray[np.float64],
-        cell: int,
-        counts: NDArray[np.int32],
-        into: NDArray[np.int64],
-    ) -> None:
-        """Count the events of some spans (n, 2) s in cells: counts (spans or fewer, rows, columns).
+        Args:
+            begin: Start of the span, s.
+            end: End of the span, s, which it does not include.
+            max_events: Number of events that are taken at most.
 
-        Cells are those of the px to which a span's map (n, 2, 3) takes events; what is beyond them
-        is counted at their edge. `into` says which counts a span is added to.
+        Returns:
+            The pixels, and the number of events of the span.
         """
-        us = self.start + np.rint(1e6 * spans).astype(np.int64)
+        rows = self._rows(*self._span(begin, end))
+        counts = _counts(self.height, self.width)
+        out = PixelCounts(*np.empty((3, min(len(rows.t), max_events)), np.int32))
+        pixels, number = _sample(rows, max_events, counts, out)
+        return PixelCounts(*(column[:pixels] for column in out)), number
+
+    def count_in_cells(self, spans: CountedSpans, cell: int, counts: NDArray[np.int32]) -> None:
+        """Add the events of spans to counts of cells.
+
+        Events beyond the cells are counted at their edge.
+
+        Args:
+            spans: Spans of time and their maps.
+            cell: Side of a cell, px.
+            counts: (images, rows, columns) to which events are added.
+        """
+        us = self.start + np.rint(1e6 * spans.t).astype(np.int64)
         us = np.clip(us, self.start, self.stop)
         if self._held is not None:
-            rows, (x, y) = np.searchsorted(self._held.t, us), (self._held.x, self._held.y)
-            _add_cells(x, y, COLD, ALL, rows, places, cell, counts, into)
+            rows = self._rows(0, len(self._held))
+            _add_to_cells(rows, np.searchsorted(self._held.t, us), spans, cell, counts)
             return
         for k, (begin, end) in enumerate(us.tolist()):
-            one, first, last = slice(k, k + 1), self._index(begin), self._index(end)
-            for row in range(first, last, BATCH):
-                events, hot, kept = self._of_rows(row, min(row + BATCH, last))
-                rows = np.array([[0, len(events)]])
-                at = places[one], cell, counts, into[one]
-                _add_cells(events.x, events.y, hot, kept, rows, *at)
+            one, last = CountedSpans._make(v[k : k + 1] for v in spans), self._index(end)
+            for row in range(self._index(begin), last, BATCH_EVENTS):
+                rows = self._rows(row, min(row + BATCH_EVENTS, last))
+                _add_to_cells(rows, np.array([[0, len(rows.t)]]), one, cell, counts)
 
-    def count_spans(self, spans: NDArray[np.float64], cell: int, counts: NDArray[np.int32]) -> None:
-        """Add to counts (n, rows, columns) the events of spans (n, 2) s, which may overlap.
+    def count_in_spans(
+        self, spans: NDArray[np.float64], cell: int, counts: NDArray[np.int32]
+    ) -> None:
+        """Add the events of spans that may overlap to counts of cells at rest.
 
-        As `add_cells` does of cells that stand still, but each event is looked at once.
+        Each event is read once, unlike in `count_in_cells`.
+
+        Args:
+            spans: (n, 2) s, begin and end.
+            cell: Side of a cell, px.
+            counts: (n, rows, columns) to which events are added.
         """
         us = self.start + np.rint(1e6 * spans.ravel()).astype(np.int64)
         us = np.clip(us, self.start, self.stop)
         edges = np.argsort(us, kind="stable")
-        us, columns, done = us[edges], counts.shape[2], 0
-        counts = counts.reshape(len(counts), -1)
-        before = np.zeros(counts.shape[1], np.int32)
+        us, done, before = us[edges], 0, np.zeros(counts.shape[1:], np.int32)
         first, last = self._index(int(us[0])), self._index(int(us[-1]))
-        for row in range(first, last, BATCH):
-            end = min(row + BATCH, last)
-            events, hot, kept = self._of_rows(row, end)
-            rows = np.searchsorted(events.t, us[done:])
-            some = len(rows) if end == last else int(np.searchsorted(rows, len(events)))
-            place = rows[:some], edges[done : done + some]
-            _count_spans(events.x, events.y, hot, kept, *place, cell, columns, before, counts)
+        for row in range(first, last, BATCH_EVENTS):
+            end = min(row + BATCH_EVENTS, last)
+            rows = self._rows(row, end)
+            limits = np.searchsorted(rows.t, us[done:])
+            some = len(limits) if end == last else int(np.searchsorted(limits, len(rows.t)))
+            _add_between_edges(rows, limits[:some], edges[done : done + some], cell, before, counts)
             done += some
 
-    def times(self, number: int) -> NDArray[np.float64]:
-        """Times (s) of some events that are equally many events apart."""
+    def quantile_times(self, number: int) -> NDArray[np.float64]:
+        """Return times (number,) s of events that are equally many events apart."""
         share = (np.arange(number) + 0.5) / number
         rows = self._first + (share * len(self)).astype(np.int64)
         us = [int(self.recording.events[row : row + 1].t[0]) for row in rows]
@@ -187,126 +230,125 @@ class Stream:
         return first, last
 
     def _index(self, us: int) -> int:
-        """The first row, of those held or of the recording, that is not before a time (us)."""
+        """Return the first row, of those held or of the recording, that is not before a time."""
         if self._held is None:
             return self.recording.events.index(us)
         return int(np.searchsorted(self._held.t, us))
 
-    def _of_rows(
-        self, first: int, last: int
-    ) -> tuple[Events, NDArray[np.bool_], NDArray[np.bool_]]:
-        """Some events, pixels that are left out, or `COLD`, and which are kept, or `ALL`."""
+    def _rows(self, first: int, last: int) -> _Rows:
         if self._held is not None:
-            return self._held[first:last], COLD, ALL
-        some = slice(first - self._first, last - self._first)
-        kept = ALL if self._kept is None else self._kept[some]
-        hot = self.hot if self._any_hot else COLD
-        return self.recording.events[first:last], hot, kept
+            events, hot, kept = self._held[first:last], COLD, ALL
+        else:
+            events, hot = self.recording.events[first:last], self.hot if self._any_hot else COLD
+            some = slice(first - self._first, last - self._first)
+            kept = ALL if self._kept is None else self._kept[some]
+        return _Rows(events.t, events.x, events.y, hot, kept)
 
-    def _rows(self, first: int, last: int) -> Part:
-        events, hot, kept = self._of_rows(first, last)
-        t, (x, y) = np.empty(len(events)), np.empty((2, len(events)), np.int32)
-        number = _keep(events.t, events.x, events.y, self.start, hot, kept, t, x, y)
-        return Part(t[:number], x[:number], y[:number])
+
+def batches_near_paths(
+    events: EventSource,
+    table: PathTable,
+    sigmas: float | int,
+    rows: tuple[int, int] | None = None,
+    *,
+    every: int = 1,
+) -> Iterator[tuple[int, Events, NDArray[np.int32]]]:
+    """Yield events in batches, with the paths that they may belong to.
+
+    Args:
+        events: Events of a recording.
+        table: Rows of the paths.
+        sigmas: Radius of the gate, standard deviations.
+        rows: First and last row of the events; None for those in the paths' lives.
+        every: Step between the events that are taken.
+
+    Yields:
+        The first row of a batch, its events, and their `owner_candidates`.
+    """
+    if rows is None:
+        rows = events.index(int(table.begins.min())), events.index(int(table.ends.max()))
+    for row in range(*rows, BATCH_EVENTS):
+        part = events[row : min(row + BATCH_EVENTS, rows[1])]
+        part = part if every == 1 else part[::every]
+        yield row, part, owner_candidates(part, table, sigmas)
 
 
 @njit_noalloc_inlined
-def _stays(i: int, x: Any, y: Any, hot: Any, kept: Any) -> bool:
-    """Whether an event is not left out."""
-    return (len(kept) == 0 or kept[i]) and (len(hot) == 0 or not hot[y[i], x[i]])
+def _is_kept(rows: Any, i: int) -> bool:
+    """Return whether an event is not left out."""
+    return (len(rows.kept) == 0 or rows.kept[i]) and (
+        len(rows.hot) == 0 or not rows.hot[rows.y[i], rows.x[i]]
+    )
 
 
 @njit_noalloc
-def _keep(
-    t: Any, x: Any, y: Any, start: int, hot: Any, kept: Any, to_t: Any, to_x: Any, to_y: Any
-) -> int:
-    """Times (s), x and y of the events that are not left out: how many they are."""
+def _select(rows: Any, start: int, out: Any) -> int:
+    """Fill in the events that are kept, and return their number."""
     n = 0
-    for i in range(len(x)):
-        if _stays(i, x, y, hot, kept):
-            to_t[n], to_x[n], to_y[n] = (t[i] - start) * 1e-6, x[i], y[i]
+    for i in range(len(rows.t)):
+        if _is_kept(rows, i):
+            out.t[n], out.x[n], out.y[n] = (rows.t[i] - start) * 1e-6, rows.x[i], rows.y[i]
             n += 1
     return n
 
 
 @njit_noalloc
-def _count(
-    x: Any, y: Any, hot: Any, kept: Any, most: int, counts: Any, px: Any, py: Any, n: Any
-) -> tuple[int, int]:
-    """Pixels of at most so many of the events that are not left out, and how many each has.
+def _sample(rows: Any, most: int, counts: Any, out: Any) -> tuple[int, int]:
+    """Fill in the pixels of at most so many kept events; return the numbers of both.
 
-    How many pixels there are, and how many events in all.
+    `counts` (rows, columns) are zero, and are again.
     """
-    events, m = len(x), 0
+    events, pixels = len(rows.t), 0
     if events > most:
-        if len(hot) == 0 and len(kept) == 0:
+        if len(rows.hot) == 0 and len(rows.kept) == 0:
             for k in range(most):
-                m += _enter(x, y, k * (events - 1) // (most - 1), counts, px, py, m)
-            _empty(m, counts, px, py, n)
-            return m, events
+                pixels += _count_event(rows, k * (events - 1) // (most - 1), counts, out, pixels)
+            _take_counts(pixels, counts, out)
+            return pixels, events
         events = 0
-        for i in range(len(x)):
-            events += _stays(i, x, y, hot, kept)
+        for i in range(len(rows.t)):
+            events += _is_kept(rows, i)
     number = following = taken = 0
-    for i in range(len(x)):
-        if _stays(i, x, y, hot, kept):
+    for i in range(len(rows.t)):
+        if _is_kept(rows, i):
             if number == following:
-                m += _enter(x, y, i, counts, px, py, m)
+                pixels += _count_event(rows, i, counts, out, pixels)
                 taken += 1
                 following = taken * (events - 1) // (most - 1) if events > most else taken
             number += 1
-    _empty(m, counts, px, py, n)
-    return m, number
+    _take_counts(pixels, counts, out)
+    return pixels, number
 
 
 @njit_noalloc_inlined
-def _enter(x: Any, y: Any, i: int, counts: Any, px: Any, py: Any, m: int) -> int:
-    """Count an event in its pixel, the m-th if it is new: whether it is, 0 or 1."""
-    counts[y[i], x[i]] += 1
-    if counts[y[i], x[i]] > 1:
+def _count_event(rows: Any, i: int, counts: Any, out: Any, pixels: int) -> int:
+    """Count an event in its pixel; return 1 if the pixel is new, else 0."""
+    x, y = rows.x[i], rows.y[i]
+    counts[y, x] += 1
+    if counts[y, x] > 1:
         return 0
-    px[m], py[m] = x[i], y[i]
+    out.x[pixels], out.y[pixels] = x, y
     return 1
 
 
 @njit_noalloc_inlined
-def _empty(m: int, counts: Any, px: Any, py: Any, n: Any) -> None:
-    """Take over the counts of m pixels."""
-    for k in range(m):
-        n[k] = counts[py[k], px[k]]
-        counts[py[k], px[k]] = 0
+def _take_counts(pixels: int, counts: Any, out: Any) -> None:
+    """Move the counts of pixels from the image to the list."""
+    for k in range(pixels):
+        out.n[k] = counts[out.y[k], out.x[k]]
+        counts[out.y[k], out.x[k]] = 0
 
 
 @njit_noalloc_inlined
 def cell_at(A: Any, x: Any, y: Any, cell: int, shape: Any) -> tuple[int, int]:
-    """The cell (row, column) of the px to which a map (2, 3) takes a pixel, or the nearest one."""
+    """Return the cell (row, column) to which a map (2, 3) takes a pixel, or the nearest one."""
     row = int(A[1, 0] * x + A[1, 1] * y + A[1, 2]) // cell
     column = int(A[0, 0] * x + A[0, 1] * y + A[0, 2]) // cell
     return min(max(row, 0), shape[0] - 1), min(max(column, 0), shape[1] - 1)
 
 
-def near_paths(
-    events: EventSource,
-    joined: Joined,
-    sigmas: float | int,
-    rows: tuple[int, int] | None = None,
-    every: int = 1,
-) -> Iterator[tuple[int, Events, NDArray[np.int32]]]:
-    """Events of some rows, by default while some path is, a part after another; one of `every`.
-
-    The first row of each part, its events, and whose they are (`candidates`).
-    """
-    if rows is None:
-        rows = events.index(int(joined.begins.min())), events.index(int(joined.ends.max()))
-    for row in range(*rows, BATCH):
-        part = events[row : min(row + BATCH, rows[1])]
-        part = part if every == 1 else part[::every]
-        yield row, part, candidates(part, joined, sigmas)
-
-
 @njit_noalloc_inlined
-def _bits(cell: int) -> int:
-    """By how many a place (px) is shifted to tell its cell."""
+def _log2(cell: int) -> int:
     bits = 0
     while 1 << bits < cell:
         bits += 1
@@ -314,45 +356,39 @@ def _bits(cell: int) -> int:
 
 
 @njit_noalloc
-def _add_cells(
-    x: Any, y: Any, hot: Any, kept: Any, rows: Any, places: Any, cell: int, counts: Any, into: Any
-) -> None:
-    bits = _bits(cell)
-    for k in range(len(rows)):
-        own, A = counts[into[k]], places[k]
+def _add_to_cells(rows: Any, limits: Any, spans: Any, cell: int, counts: Any) -> None:
+    """Add the events between `limits` (n, 2) to their images."""
+    bits = _log2(cell)
+    for k in range(len(limits)):
+        own, A = counts[spans.image[k]], spans.maps[k]
         moved = A[0, 0] != 1 or A[1, 1] != 1 or A[0, 1] != 0 or A[1, 0] != 0
         moved |= A[0, 2] != 0 or A[1, 2] != 0
-        for i in range(rows[k, 0], rows[k, 1]):
-            if not _stays(i, x, y, hot, kept):
+        for i in range(limits[k, 0], limits[k, 1]):
+            if not _is_kept(rows, i):
                 continue
             if moved:
-                own[cell_at(A, x[i], y[i], cell, own.shape)] += 1
+                own[cell_at(A, rows.x[i], rows.y[i], cell, own.shape)] += 1
             else:
-                own[y[i] >> bits, x[i] >> bits] += 1
+                own[rows.y[i] >> bits, rows.x[i] >> bits] += 1
 
 
 @njit_noalloc
-def _count_spans(
-    x: Any, y: Any, hot: Any, kept: Any, rows: Any, edges: Any, cell: int, columns: int,
-    before: Any, counts: Any,
-) -> None:  # fmt: skip
-    """Add to counts of spans those `before` their ends, less those before their beginnings.
+def _add_between_edges(
+    rows: Any, limits: Any, edges: Any, cell: int, before: Any, counts: Any
+) -> None:
+    """Add counts `before` the ends of spans, and subtract those before their beginnings.
 
-    Edges, at `rows` of the events, are numbered: twice that of the span, and 1 more at its end.
+    Edges, at `limits` of the events, are numbered: twice that of the span, and 1 more at its end.
     """
-    bits = _bits(cell)
-    i = 0
-    for k in range(len(rows) + 1):
-        until = rows[k] if k < len(rows) else len(x)
+    bits, i = _log2(cell), 0
+    for k in range(len(limits) + 1):
+        until = limits[k] if k < len(limits) else len(rows.t)
         while i < until:
-            if _stays(i, x, y, hot, kept):
-                before[(y[i] >> bits) * columns + (x[i] >> bits)] += 1
+            if _is_kept(rows, i):
+                before[rows.y[i] >> bits, rows.x[i] >> bits] += 1
             i += 1
-        if k < len(rows):
-            own = counts[edges[k] >> 1]
-            if edges[k] & 1:
-                for j in range(len(before)):
-                    own[j] += before[j]
-            else:
-                for j in range(len(before)):
-                    own[j] -= before[j]
+        if k < len(limits):
+            own, sign = counts[edges[k] >> 1], 2 * (edges[k] & 1) - 1
+            for row in range(before.shape[0]):
+                for column in range(before.shape[1]):
+                    own[row, column] += sign * before[row, column]

@@ -1,0 +1,382 @@
+"""Paths that belong to one object: parts of it, its life before and after a pause, turning pieces.
+
+What is in contact with an object all its life and goes along with it is a part of it. Targets that
+meet or cross come from apart, and those that stand side by side do not go anywhere. What turns
+about each other by a whole turn at one distance, as blades of a propeller do, is rigid.
+
+An object that turns in its place fills a place that is never dark, and all its events show about
+which point it turns. Velocities of its pieces give roughly the rate: pieces slide along edges, and
+the rate comes out up to twice too small. Events aligned window by window in polar coordinates give
+it to 0.1 %. It is one object if a map that turns so predicts its events better than one at rest,
+and if what is bright in that map is connected: birds that circle alike turn as well, but are apart.
+"""
+
+import copy
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from jaxevent.blob.search.background import (
+    FINE_CELL_PX,
+    Background,
+    SceneMotion,
+    clutter_evidence,
+    look_up,
+)
+from jaxevent.blob.search.config import CONFIG
+from jaxevent.blob.search.detection import contact_distance, larger_variance
+from jaxevent.blob.search.paths import TargetPath, fit_velocity_noise
+from jaxevent.blob.search.scene import map_gain, measure_moving_background
+from jaxevent.blob.search.stream import Stream
+
+ANGLES, RING_PX = 256, FINE_CELL_PX  # bins of a turn, and px of a ring
+BLUR_BINS = 1.5
+
+
+def merge_parts(paths: list[TargetPath]) -> list[TargetPath]:
+    """Merge paths that are parts of one object; all are seen in the same windows."""
+    paths, k = sorted(paths, key=lambda path: path.n.sum(), reverse=True), 0
+    while k < len(paths):
+        later = range(k + 1, len(paths))
+        part = next((i for i in later if _are_one_object(paths[k], paths[i])), None)
+        if part is None:
+            k += 1
+        else:
+            # The whole may now be in contact with what none of its parts was.
+            paths[k], k = merge_paths(paths[k], paths.pop(part)), 0
+    return paths
+
+
+def _are_one_object(one: TargetPath, other: TargetPath) -> bool:
+    """Return whether two paths are those of parts of one object."""
+    share = CONFIG.common_share
+    begin, end = max(one.begin, other.begin), min(one.end, other.end)
+    if end - begin < share * min(one.end - one.begin, other.end - other.begin):
+        return False
+    t = np.union1d(one.t, other.t)
+    t = t[(t >= begin) & (t < end)]
+    p, q = one.at(t), other.at(t)
+    apart = np.hypot(*(p - q).T)
+    sizes = np.stack([np.interp(t, path.t, path.size[:, 0]) for path in (one, other)])
+    edge = _is_edge(one, other) or _is_edge(other, one)
+    small, large = np.sort(np.median(sizes, 1))
+    # What an object lacks when a piece of it is a target of its own makes it smaller than it is.
+    contact = CONFIG.edge_contact if edge else CONFIG.contact_distance
+    near = np.quantile(apart / sizes.sum(0), share) < contact
+    piece = large > CONFIG.min_wide_size_px and np.quantile(apart, share) < (
+        CONFIG.piece_distance * large
+    )
+    piece = piece and CONFIG.point_size_px < small < CONFIG.piece_size * large
+    if not (near or piece):
+        return _turn_together(p, q, CONFIG.turning_contact * float(np.median(sizes.sum(0))))
+    # Pieces slide along an edge, but less far than they go with it.
+    far = min(float(np.ptp(path, axis=0).max()) for path in (p, q))
+    changed, way = np.ptp(np.quantile(apart, (0.02, 0.98))), CONFIG.common_way_sizes
+    if not near:
+        return bool(far > way * large and changed < CONFIG.rigid_change * far)
+    return bool(far > way * small and changed < max(large, far if edge else far / 2))
+
+
+def _is_edge(one: TargetPath, other: TargetPath) -> bool:
+    """Return whether one is long across its way, or along it with far more events than the other.
+
+    Edges along the motion send few events: two that are long along it may follow each other.
+    """
+    size = np.median(one.size[:, 0])
+    way = one.p[-1] - one.p[0]
+    along = way @ np.median(one.C, 0) @ way / max(float(way @ way), 1e-9)
+    across = along < CONFIG.edge_along_share * size**2
+    across |= np.median(other.n) < CONFIG.edge_event_share * np.median(one.n)
+    return bool(np.median(one.size[:, 0] / one.size[:, 1]) > CONFIG.edge_aspect and across)
+
+
+def _turn_together(p: NDArray, q: NDArray, reach: float | int) -> bool:
+    """Return whether two ways (rows, 2) px turn about each other by a whole turn, rigidly."""
+    apart = np.hypot(*(p - q).T)
+    share = CONFIG.common_share
+    low, middle, high = np.quantile(apart, (1 - share, 0.5, share))
+    if high > reach or high - low > CONFIG.turning_change * middle:
+        return False
+    turned = np.unwrap(np.arctan2(*(p - q).T))
+    return bool(abs(turned[-1] - turned[0]) > CONFIG.turning_angle)
+
+
+def merge_paths(one: TargetPath, other: TargetPath) -> TargetPath:
+    """Merge the paths of two parts: the moments of the events of both, of each while it is seen."""
+    t = np.union1d(one.t, other.t)
+    rows = [_interpolate(path, t) for path in (one, other)]
+    n = rows[0].n + rows[1].n
+    share = rows[1].n / n
+    d = rows[1].p - rows[0].p
+    C = (1 - share)[:, None, None] * rows[0].C + share[:, None, None] * rows[1].C
+    C += (share * (1 - share))[:, None, None] * np.einsum("ti,tj->tij", d, d)
+    p = rows[0].p + share[:, None] * d
+    v = rows[0].v + share[:, None] * (rows[1].v - rows[0].v)
+    noise = min(one.velocity_noise, other.velocity_noise)
+    return TargetPath(t, p, v, C, n, one.window, noise)
+
+
+def _interpolate(path: TargetPath, t: NDArray[np.int64]) -> TargetPath:
+    """Interpolate a path linearly at times (us), without events before and after its life."""
+
+    def at(values: NDArray) -> NDArray[np.float64]:
+        flat = values.reshape(len(path.t), -1)
+        columns = np.stack([np.interp(t, path.t, column) for column in flat.T], 1)
+        return columns.reshape(len(t), *values.shape[1:])
+
+    alive = (t >= path.t[0]) & (t <= path.t[-1])
+    return dataclasses.replace(
+        path, t=t, p=at(path.p), v=at(path.v), C=at(path.C), n=np.where(alive, at(path.n), 0)
+    )
+
+
+def stitch_paths(paths: list[TargetPath], size: tuple[int, int]) -> list[TargetPath]:
+    """Join each path to a later one that begins where it ended, at rest or carried on.
+
+    Args:
+        paths: Paths of targets.
+        size: Width and height of the sensor, px.
+    """
+    paths, done = sorted(paths, key=lambda path: path.begin), []
+    while paths:
+        one = paths.pop(0)
+        while True:
+            following = [(_stitch_distance(one, other, size), k) for k, other in enumerate(paths)]
+            distance, k = min(following, default=(np.inf, -1))
+            if distance >= CONFIG.stitch_distance:
+                break
+            one = one.followed_by(_without_overlap(one, paths.pop(k)))
+        done.append(one)
+    return done
+
+
+def _stitch_distance(one: TargetPath, other: TargetPath, size: tuple[int, int]) -> float:
+    """Return the contact distance of a path's beginning from another's end; inf: not in time."""
+    other = _without_overlap(one, other)
+    pause, longest = int(other.t[0] - one.t[-1]), CONFIG.stitch_windows * one.window
+    lives = CONFIG.stitch_lives * min(one.end - one.begin, other.end - other.begin)
+    if one.window != other.window or not 0 < pause <= max(min(longest, 2 * lives), lives):
+        return np.inf
+    margin = CONFIG.edge_sizes * max(one.size[-1, 0], other.size[0, 0])
+    at_edge = (one.p[-1] < margin) | (one.p[-1] > np.array(size) - 1 - margin)
+    if at_edge.any() and pause > 2 * one.window:
+        return np.inf
+    ends = [(one.p[-1], other.p[0])]
+    if pause <= longest:
+        rows = CONFIG.velocity_windows
+        # In the middle between both: so a bend does not matter.
+        half = pause * 0.5e-6
+        before, after = one.mean_velocity(slice(-rows, None)), other.mean_velocity(slice(0, rows))
+        ends += [(one.p[-1] + 2 * half * before, other.p[0])]
+        ends += [(one.p[-1] + half * before, other.p[0] - half * after)]
+        # Where it goes behind something and comes out it is seen in part.
+        last, first = _whole_rows(one)[-1], _whole_rows(other)[0]
+        half = (other.t[first] - one.t[last]) * 0.5e-6
+        before = one.mean_velocity(slice(max(last - rows, 0), last + 1))
+        after = other.mean_velocity(slice(first, first + rows + 1))
+        ends += [(one.p[last] + half * before, other.p[first] - half * after)]
+    C = [np.median(path.C, 0) for path in (one, other)]
+    return min(float(contact_distance(p, C[0], q, C[1])) for p, q in ends)
+
+
+def _whole_rows(path: TargetPath) -> NDArray[np.int64]:
+    """Return rows with most of the usual size and events; all, where none has both."""
+    size, share = path.size[:, 0], CONFIG.whole_share
+    whole = (path.n >= share * np.median(path.n)) & (size >= share * np.median(size))
+    return np.flatnonzero(whole) if whole.any() else np.arange(len(size))
+
+
+def _without_overlap(one: TargetPath, other: TargetPath) -> TargetPath:
+    """Drop rows of another path before one's end, if most rows stay."""
+    rest = other.t > one.t[-1]
+    return other if rest.mean() < CONFIG.persistent_share else other.take(rest)
+
+
+class Turn(NamedTuple):
+    """A rotation in the image: rad/s, from x to y, about a point (px)."""
+
+    rate: float
+    centre: NDArray[np.float64]
+
+
+def merge_turning(
+    paths: list[TargetPath], stream: Stream, background: Background
+) -> list[TargetPath]:
+    """Merge the paths of pieces of each object that turns in its place.
+
+    Args:
+        paths: Paths of targets.
+        stream: All events.
+        background: Background of the stream; before a moving scene nothing is merged.
+    """
+    if not paths or background.scene is not None:
+        return paths
+    bright = background.rate > CONFIG.bright_ratio * np.median(background.rate)
+    places = np.zeros(bright.shape, np.int32)
+    ndimage.label(bright, np.ones((3, 3)), places)
+    out = list(paths)
+    for place in range(1, int(places.max()) + 1):
+        there = places == place
+        pieces = [
+            path
+            for path in out
+            if look_up(there, FINE_CELL_PX, *path.p.T).mean() >= CONFIG.inside_share
+        ]
+        # An object is seen whole, not at many sides of the sensor.
+        sides = sum(bool(s.any()) for s in (there[0], there[-1], there[:, 0], there[:, -1]))
+        if not pieces or sides >= CONFIG.min_sides:
+            continue
+        whole = _turning_path(pieces, _events_within(stream, there), background)
+        if whole is not None:
+            out = [path for path in out if all(path is not piece for piece in pieces)]
+            out.append(whole)
+    return out
+
+
+def _events_within(stream: Stream, there: NDArray[np.bool_]) -> Stream:
+    """Return the events inside some fine cells."""
+    own, fine = copy.copy(stream), np.ones((FINE_CELL_PX, FINE_CELL_PX), bool)
+    own.hot = stream.hot | ~np.kron(there, fine)[: stream.height, : stream.width]
+    return own
+
+
+def _turning_path(
+    pieces: list[TargetPath], own: Stream, background: Background
+) -> TargetPath | None:
+    """Return the path of the object of some pieces; None if it is not one that turns."""
+    centre = _centre_of_turn(own)
+    turn = Turn(_rate_of_pieces(pieces, centre), centre)
+    window = max(pieces, key=lambda path: path.n.sum()).window
+    scene = _measure_turn(own, turn, window * 1e-6)
+    moving = measure_moving_background(own, scene)
+    if not _is_connected(moving, turn.centre):
+        return None
+    if map_gain(own, moving, window * 1e-6) < CONFIG.texture_gain:
+        return None
+    angles = np.unwrap(np.arctan2(scene.maps[:, 1, 0], scene.maps[:, 0, 0]))
+    rate = float((angles[-1] - angles[0]) / (scene.t[-1] - scene.t[0]))
+    return _path_of_all(own, Turn(rate, centre), window, background)
+
+
+def _centre_of_turn(own: Stream) -> NDArray[np.float64]:
+    """Return the point (px) about which the events are most symmetric.
+
+    What turns in its place leaves equal events on both sides of its centre. The centre is half of
+    where the convolution of the roots of counts with themselves is largest.
+    """
+    pixels = own.pixel_counts(0, own.duration)
+    image = np.zeros((2 * own.height, 2 * own.width))
+    image[pixels.y, pixels.x] = np.sqrt(pixels.n)
+    convolved = np.fft.irfft2(np.fft.rfft2(image) ** 2, image.shape)
+    y, x = np.unravel_index(convolved.argmax(), convolved.shape)
+    return np.array([x, y]) / 2
+
+
+def _rate_of_pieces(pieces: list[TargetPath], centre: NDArray[np.float64]) -> float:
+    """Return the rate (rad/s) of pieces about a point, their median by squared distance."""
+    (x, y), v = (np.concatenate([getattr(path, name) for path in pieces]).T for name in "pv")
+    x, y = x - centre[0], y - centre[1]
+    square = np.maximum(x * x + y * y, 1e-9)
+    rate = (x * v[1] - y * v[0]) / square
+    order = np.argsort(rate)
+    total = np.cumsum(square[order])
+    return float(rate[order][np.searchsorted(total, total[-1] / 2)])
+
+
+def _measure_turn(own: Stream, turn: Turn, window: float) -> SceneMotion:
+    """Measure the turn window by window (s), where events correlate most with those before.
+
+    Angles are sought about those of `turn`.
+    """
+    number = int(own.duration / window)
+    polar = _PolarImages(own, turn, window)
+    order = 1j * np.arange(ANGLES // 2 + 1)
+    step = turn.rate * window
+    reach = max(2, int(CONFIG.turn_search * abs(step) / (2 * np.pi) * ANGLES))
+    reach = min(reach, ANGLES // 2 - 1)
+    near = np.arange(-reach, reach + 1)
+    angles, seen = [0.0], polar.spectrum(0)
+    for k in range(1, number):
+        now = polar.spectrum(k)
+        expected = angles[-1] + step
+        correlation = np.fft.irfft((now * seen.conj()).sum(0) * np.exp(order * expected), ANGLES)
+        best = int(near[np.argmax(correlation[near])])
+        before, peak, after = (correlation[i % ANGLES] for i in (best - 1, best, best + 1))
+        bend = before - 2 * peak + after
+        top = best + (0.5 * (before - after) / bend if bend < 0 else 0.0)
+        angles.append(expected + top * 2 * np.pi / ANGLES)
+        gain = max(CONFIG.reference_gain, 1 / (k + 1))
+        seen = (1 - gain) * seen + gain * now * np.exp(order * angles[-1])
+    c, s = np.cos(angles), np.sin(angles)
+    A = np.stack([np.stack([c, -s], 1), np.stack([s, c], 1)], 1)
+    maps = np.concatenate([A, (turn.centre - A @ turn.centre)[..., None]], 2)
+    t = np.asarray((np.arange(number) + 0.5) * window, np.float64)
+    return SceneMotion(t, maps)
+
+
+class _PolarImages:
+    """Roots of counts of a stream's windows (s), in rings and angles about a point."""
+
+    def __init__(self, own: Stream, turn: Turn, window: float):
+        self.own, self.turn, self.window = own, turn, window
+        whole = own.pixel_counts(0, own.duration)
+        far = np.sort(np.hypot(whole.x - turn.centre[0], whole.y - turn.centre[1]))
+        self.rings = int(far[int(CONFIG.rim_share * (len(far) - 1))] / RING_PX) + 1
+
+    def spectrum(self, k: int) -> NDArray[np.complex128]:
+        """Transform window k to (rings, frequencies), its events carried to its middle."""
+        part = self.own.window(k * self.window, (k + 1) * self.window)
+        dx, dy = part.x - self.turn.centre[0], part.y - self.turn.centre[1]
+        late = part.t - (k + 0.5) * self.window
+        angle = (np.arctan2(dy, dx) - self.turn.rate * late) / (2 * np.pi) % 1
+        ring = (np.hypot(dx, dy) / RING_PX).astype(np.int64)
+        place = ring * ANGLES + (angle * ANGLES).astype(np.int64) % ANGLES
+        size = self.rings * ANGLES
+        counts = np.bincount(place[place < size], minlength=size).reshape(-1, ANGLES)
+        image = ndimage.gaussian_filter1d(np.sqrt(counts), BLUR_BINS, axis=1, mode="wrap")
+        return np.fft.rfft(image - image.mean(1, keepdims=True))
+
+
+def _is_connected(moving: Background, centre: NDArray[np.float64]) -> bool:
+    """Return whether what is bright in a turning map is connected, about the point of the turn."""
+    rate = np.where(moving.visible, moving.rate - moving.rate.min(), 0)
+    total = float(rate.sum())
+    labels = np.zeros(rate.shape, np.int32)
+    bright = rate * total > CONFIG.connected_rate * (rate**2).sum()
+    ndimage.label(bright, np.ones((3, 3)), labels)
+    mass = np.bincount(labels.ravel(), rate.ravel())
+    if len(mass) < 2 or mass[1:].max() < CONFIG.connected_share * total:
+        return False
+    y, x = np.nonzero(labels == 1 + mass[1:].argmax())
+    places = (np.stack([x, y], 1) + 0.5) * FINE_CELL_PX + moving.corner
+    n = rate[y, x]
+    away = np.average(places, 0, n) - centre
+    C = np.cov(places.T, aweights=n) + np.eye(2)
+    return bool(away @ np.linalg.solve(C, away) < 1)
+
+
+def _path_of_all(own: Stream, turn: Turn, window: int, background: Background) -> TargetPath | None:
+    """Return the path of all events of a place that turns.
+
+    It has the windows (us) with more events than the darkest background gives; None if none has.
+    """
+    w, rows = window * 1e-6, []
+    area = own.width * own.height - int(own.hot.sum())
+    for k in range(int(own.duration / w)):
+        part = own.window(k * w, (k + 1) * w)
+        nats = clutter_evidence(len(part), background.min_rate * area * w, 1)
+        if nats > -np.log(CONFIG.false_alarm_known):
+            e = np.stack([part.x, part.y], 1) - turn.centre
+            rows.append(((k + 0.5) * w, e.mean(0), e.T @ e / len(e) + np.eye(2) / 12, len(e)))
+    if not rows:
+        return None
+    t, m, C, n = (np.array(values) for values in zip(*rows, strict=True))
+    R = larger_variance(C) / 2 / n
+    us = own.start + np.rint(t * 1e6).astype(np.int64)
+    noise = fit_velocity_noise(t, m, R, float(np.median(larger_variance(C))) / w**3)
+    p = np.tile(turn.centre, (len(t), 1))
+    n = n.astype(float)
+    return TargetPath(us, p, np.zeros_like(p), C, n, window, noise, turn_rate=turn.rate)

@@ -1,0 +1,644 @@
+"""Multi-target tracker on windows of events.
+
+Each track is a Kalman filter of constant velocity in windows of one length; its size follows that
+of its events. A window without events is a measurement too: where no more events come than clutter
+gives, size and position hold, and a target that has been silent for two windows stands still, for
+events need motion.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.blob.search.background import Background, poisson_nats
+from jaxevent.blob.search.config import CONFIG
+from jaxevent.blob.search.detection import (
+    Blobs,
+    ClutterModel,
+    Scale,
+    add_moments,
+    clutter_at,
+    clutter_model,
+    detect,
+    finish_moments,
+    in_contact,
+    larger_variance,
+    larger_variance_of,
+    measure_blobs,
+    split_blob,
+)
+from jaxevent.blob.search.merge import merge_paths
+from jaxevent.blob.search.paths import TargetPath, fit_velocity_noise
+from jaxevent.blob.search.stream import Stream, WindowEvents
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
+from jaxevent.progress import bar
+
+
+class TrackTable(NamedTuple):
+    """Tracks of one moment; arrays begin with the number of tracks."""
+
+    id: NDArray[np.int64]  # serial number
+    t: NDArray[np.float64]  # s, time of the last detection
+    p: NDArray[np.float64]  # (n, 2) px
+    v: NDArray[np.float64]  # (n, 2) px/s
+    P: NDArray[np.float64]  # (n, 3) of each axis: variance of p, covariance, variance of v
+    C: NDArray[np.float64]  # (n, 2, 2) px^2, covariance of events
+    n: NDArray[np.float64]  # events per window,
+    max_n: NDArray[np.float64]  # and the most of them, slowly forgotten
+    q: NDArray[np.float64]  # px^2/s^3, velocity noise
+    nis: NDArray[np.float64]  # mean normalised innovation squared
+    born: NDArray[np.float64]  # s
+    hits: NDArray[np.int64]  # windows with a detection
+    misses: NDArray[np.int64]  # windows without, since the last detection
+    travel: NDArray[np.float64]  # px, length of the way
+    nats: NDArray[np.float64]  # evidence against clutter
+    confirmed: NDArray[np.bool_]
+    merged: NDArray[np.bool_]  # whether the target is a part of another one
+
+    def take(self, rows: NDArray) -> "TrackTable":
+        """Return some of the tracks."""
+        return TrackTable._make(value[rows] for value in self)
+
+    def append(self, other: "TrackTable") -> "TrackTable":
+        """Return these tracks and others."""
+        return TrackTable._make(np.concatenate(pair) for pair in zip(self, other, strict=True))
+
+    @property
+    def size(self) -> NDArray[np.float64]:
+        """(n,) px, standard deviations along the longer axes."""
+        return np.sqrt(larger_variance(self.C))
+
+
+class TrackGates(NamedTuple):
+    """Predictions of tracks for a window, and their gates."""
+
+    t: float  # s, middle of the window
+    window: float  # s
+    p: NDArray[np.float64]  # (n, 2) px, predicted positions
+    P: NDArray[np.float64]  # (n, 3), predicted variances, see `TrackTable`
+    v: NDArray[np.float64]  # (n, 2) px/s
+    inverse: NDArray[np.float64]  # (n, 4), inverse innovation covariance xx, xy, yy; ln determinant
+    penalty: NDArray[np.float64]  # (n,) added to the squared distance of an event
+    events: NDArray[np.float64]  # (n,) expected events
+    shared: NDArray[np.bool_]  # (n,) whether events are shared with a track in contact
+
+
+class Assignments(NamedTuple):
+    """Assignment of a window's events and blobs to tracks, and the moments of their residuals."""
+
+    owner: NDArray[np.int64]  # (events,) track of each event, -1: none
+    table: NDArray[np.int64]  # (blobs, tracks) events of a blob in a track's gate
+    counts: NDArray[np.int64]  # (blobs,) events of a blob,
+    free: NDArray[np.int64]  # (blobs,) and those without track
+    owns: NDArray[np.bool_]  # (blobs, tracks) whether a track may own the rest of a blob
+    owned: NDArray[np.bool_]  # (blobs,) whether a blob has such a track
+    in_blobs: Blobs  # residuals of the tracks' events in blobs
+    gated: Blobs  # those of all their events, if some track has fewer than two in blobs
+
+
+class TrackMeasurements(NamedTuple):
+    """Measurements of tracks in a window."""
+
+    detected: NDArray[np.bool_]  # (n,) whether the track has a measurement
+    n: NDArray[np.float64]  # (n,) events
+    z: NDArray[np.float64]  # (n, 2) px, innovation: mean of the residuals
+    R: NDArray[np.float64]  # (n,) px^2, its variance
+
+
+class _WindowRows(NamedTuple):
+    """States of the detected tracks after windows."""
+
+    t: NDArray[np.float64]
+    id: NDArray[np.int64]
+    p: NDArray[np.float64]
+    v: NDArray[np.float64]
+    C: NDArray[np.float64]
+    n: NDArray[np.float64]
+    m: NDArray[np.float64]  # (n, 2) px, means of the windows' events
+    R: NDArray[np.float64]  # (n,) px^2, their variances
+
+
+class WindowTracker:
+    """Tracker of all targets in a stream: `WindowTracker(stream, background, scale).run(name)`."""
+
+    def __init__(self, stream: Stream, background: Background, scale: Scale):
+        self.stream, self.background, self.scale = stream, background, scale
+        self.tracks = init_tracks(np.zeros(0, np.int64), 0.0, Blobs.empty(0), scale.window)
+        self.next_id = 0
+        self.rows: list[_WindowRows] = []
+        # Of two tracks in contact: since when, their difference then, and the shorter travel.
+        self.contacts: dict[tuple[int, int], tuple[float, NDArray, float]] = {}
+        self.min_sizes: dict[int, float] = {}
+        # Of a track whose blob has a gap: first and last distance of its halves, and windows.
+        self.gaps: dict[int, tuple[float, float, int]] = {}
+        self.confirmed: set[int] = set()
+        self.parts: dict[int, int] = {}  # the track of the whole, by that of a part
+        tests = stream.width * stream.height * stream.duration / scale.window
+        self.log_threshold = np.log(tests / CONFIG.false_alarms)
+
+    def run(self, name: str, progress: bool | None = None) -> list[TargetPath]:
+        """Track through the stream.
+
+        Args:
+            name: Text before the bar of progress.
+            progress: Whether a bar is shown; None: in a terminal or notebook.
+
+        Returns:
+            Paths of all tracks that were confirmed and are no part of another.
+        """
+        w = self.scale.window
+        windows = int(self.stream.duration / w)
+        with bar(total=windows, unit="window", desc=name, progress=progress) as shown:
+            for k in range(windows):
+                self._step(k * w)
+                shown.update(1)
+        self._remove(np.ones(len(self.tracks.id), bool))
+        if not self.rows:
+            return []
+        rows = _WindowRows._make(np.concatenate(column) for column in zip(*self.rows, strict=True))
+        us = self.stream.start + np.rint(rows.t * 1e6).astype(np.int64)
+        paths = {}
+        for one in sorted(self.confirmed | set(self.parts)):
+            at = np.flatnonzero(rows.id == one)
+            own = _WindowRows._make(column[at] for column in rows)
+            unit = np.median(larger_variance(own.C)) / w**3
+            noise = fit_velocity_noise(own.t, own.m, own.R, unit)
+            paths[one] = TargetPath(
+                us[at], own.p, own.v, own.C, own.n, round(1e6 * w), velocity_noise=noise
+            )
+        for part, whole in self.parts.items():  # in order of time: a whole may become a part
+            if whole in paths:
+                both, noise = merge_paths(paths[whole], paths[part]), paths[whole].velocity_noise
+                paths[whole] = dataclasses.replace(both, velocity_noise=noise)
+        return [paths[one] for one in sorted(self.confirmed - set(self.parts))]
+
+    def _step(self, begin: float | int) -> None:
+        w, shape = self.scale.window, self.stream.shape
+        t = begin + w / 2
+        events = self.stream.window(begin, begin + w)
+        clutter = clutter_model(self.background, self.scale, shape, t)
+        labels, blobs = detect(events, clutter, shape)
+        gates = predict_gates(self.tracks, t, w)
+        assignments = assign(gates, events, labels, blobs)
+        if len(self.tracks.id):
+            self._update(gates, clutter, assignments)
+            self._split_tracks(events, t, assignments.owner, labels)
+            self._merge_parts(t)
+            self._remove(self._find_ended())
+        new = (assignments.free >= 3) & (assignments.free >= CONFIG.free_share * assignments.counts)
+        if new.any():
+            free = assignments.owner < 0
+            rest = WindowEvents(events.t[free], events.x[free], events.y[free])
+            moments = measure_blobs(rest, labels[free], blobs)
+            self._start_tracks(t, Blobs._make(value[new] for value in moments))
+
+    def _update(self, gates: TrackGates, clutter: ClutterModel, assignments: Assignments) -> None:
+        """Update all tracks with a window's events, and confirm some."""
+        tracks = self.tracks
+        measured = update_tracks(tracks, gates, clutter, assignments.in_blobs, assignments.gated)
+        now = measured.detected
+        if not tracks.confirmed.all():
+            age = np.rint((gates.t - tracks.born) / self.scale.window) + 1
+            enough = tracks.hits >= CONFIG.min_confirm_windows
+            enough &= tracks.hits >= CONFIG.min_confirm_share * age
+            enough &= tracks.nats > self.log_threshold
+            enough &= ~np.isin(tracks.id, [newer for newer, _ in self.contacts])
+            tracks.confirmed[now & enough] = True
+        t, m = np.full(len(now), gates.t), gates.p + measured.z
+        columns = (t, tracks.id, tracks.p, tracks.v, tracks.C, measured.n, m, measured.R)
+        self.rows.append(_WindowRows._make(value[now] for value in columns))
+
+    def _split_tracks(
+        self, events: WindowEvents, t: float | int, owner: NDArray, labels: NDArray
+    ) -> None:
+        """Split a track of which two halves go their own ways.
+
+        The distance of parts of one object, such as both sides of an outline, stays. The distance
+        is measured along the longer axis, since coarse cells see no gap.
+        """
+        tracks, square = self.tracks, larger_variance(self.tracks.C)
+        long = square > CONFIG.split_aspect**2 * np.linalg.det(tracks.C) / square
+        before, self.gaps, others = self.gaps, {}, []
+        for i in np.flatnonzero(long & tracks.confirmed & (tracks.misses == 0)):
+            key, size = int(tracks.id[i]), float(np.sqrt(square[i]))
+            self.min_sizes[key] = min(self.min_sizes.get(key, size), size)
+            if size < CONFIG.split_growth * self.min_sizes[key]:
+                continue
+            at = (owner == i) & (labels > 0)
+            two = split_blob(events.x[at], events.y[at], tracks.C[i])
+            if two is None or two.n[1] < CONFIG.split_min_share * at.sum():
+                continue
+            distance = float(np.hypot(*(two.p[0] - two.p[1])))
+            wide = float(np.sqrt(larger_variance(two.C)).sum())
+            first, last, windows = before.get(key, (distance, distance, 0))
+            if abs(distance - last) > 0.5 * wide:
+                first, windows = distance, 0
+            apart = max(first + wide, CONFIG.split_separation * first)
+            if windows < CONFIG.part_windows or distance < apart:
+                self.gaps[key] = first, distance, windows + 1
+                continue
+            tracks.p[i], tracks.C[i], tracks.n[i] = two.p[0], two.C[0], two.n[0]
+            del self.min_sizes[key]
+            others.append(Blobs(two.n[1:], two.p[1:], two.C[1:]))
+        for other in others:
+            self._start_tracks(t, other)
+
+    def _merge_parts(self, t: float | int) -> None:
+        """Merge two tracks that are in contact and move together."""
+        if len(self.tracks.id) < 2:
+            self.contacts = {}
+            return
+        tracks, w = self.tracks, self.scale.window
+        size = tracks.size
+        reach = size[:, None] + size
+        apart = tracks.p[:, None] - tracks.p
+        near = np.hypot(apart[..., 0], apart[..., 1]) < CONFIG.contact_distance * reach
+        detected = (tracks.misses == 0) & ~tracks.merged
+        now: dict[tuple[int, int], tuple[float, NDArray, float]] = {}
+        young = t - tracks.born < (CONFIG.young_windows - 0.5) * w
+        for newer, older in zip(*np.nonzero(np.tril(near, -1)), strict=True):
+            key = int(tracks.id[newer]), int(tracks.id[older])
+            shorter = float(min(tracks.travel[newer], tracks.travel[older]))
+            if key not in self.contacts and not young[newer]:
+                continue  # they came from apart
+            if not (detected[newer] and detected[older]):
+                if key in self.contacts:
+                    now[key] = self.contacts[key]
+                continue
+            since, then, travel = self.contacts.get(key, (t, apart[newer, older], shorter))
+            changed = abs(np.hypot(*apart[newer, older]) - np.hypot(*then))
+            if changed >= 0.5 * reach[newer, older]:
+                since, then, travel = t, apart[newer, older], shorter
+            now[key] = since, then, travel
+            long = (t - since) / w >= CONFIG.part_windows - 0.5
+            # Slow neighbours look rigid for a few windows; those that went their own size do not.
+            if long and shorter - travel > 2 * reach[newer, older]:
+                self._merge_pair(int(newer), int(older))
+                detected = detected & ~tracks.merged
+        self.contacts = now
+
+    def _merge_pair(self, one: int, other: int) -> None:
+        tracks = self.tracks
+
+        def weight(i: int) -> tuple[bool, float]:
+            return bool(tracks.confirmed[i]), float(tracks.n[i] * tracks.hits[i])
+
+        big, small = (one, other) if weight(one) >= weight(other) else (other, one)
+        share = tracks.n[big] / (tracks.n[big] + tracks.n[small])
+        p = share * tracks.p[big] + (1 - share) * tracks.p[small]
+        C = np.zeros((2, 2))
+        for i, part in ((big, share), (small, 1 - share)):
+            C += part * (tracks.C[i] + np.outer(tracks.p[i] - p, tracks.p[i] - p))
+        tracks.p[big], tracks.C[big] = p, C
+        tracks.n[big] += tracks.n[small]
+        tracks.hits[big] = max(tracks.hits[big], tracks.hits[small])
+        tracks.merged[small] = True
+        self.parts[int(tracks.id[small])] = int(tracks.id[big])
+
+    def _find_ended(self) -> NDArray[np.bool_]:
+        """Find tracks that are merged, outside, or without events for too long."""
+        tracks, (rows, columns) = self.tracks, self.stream.shape
+        x, y = tracks.p.T
+        outside = (x <= -1) | (x >= columns) | (y <= -1) | (y >= rows)
+        longest = CONFIG.max_coast_windows
+        if self.background.scene is not None:
+            longest = CONFIG.max_moving_coast_windows
+        coast = np.minimum(longest, 2 * tracks.hits)
+        coast = np.where(tracks.confirmed, coast, CONFIG.max_new_coast_windows)
+        return tracks.merged | outside | (tracks.misses > coast)
+
+    def _remove(self, ended: NDArray) -> None:
+        if not ended.any():
+            return
+        over, self.tracks = self.tracks.take(ended), self.tracks.take(~ended)
+        self.confirmed |= set(over.id[over.confirmed].tolist())
+        for one in over.id.tolist():
+            self.min_sizes.pop(one, None)
+
+    def _start_tracks(self, t: float | int, blobs: Blobs) -> None:
+        n, p, C = blobs
+        ids = np.arange(self.next_id, self.next_id + len(n))
+        self.next_id += len(n)
+        self.tracks = self.tracks.append(init_tracks(ids, t, blobs, self.scale.window))
+        R, at = larger_variance(C) / 2 / n, np.full(len(n), t)
+        self.rows.append(_WindowRows(at, ids, p, np.zeros_like(p), C, n, p, R))
+
+
+def init_tracks(ids: NDArray, t: float | int, blobs: Blobs, window: float | int) -> TrackTable:
+    """Start a tentative track at each blob.
+
+    Args:
+        ids: Serial numbers of the tracks.
+        t: Time of the blobs, s.
+        blobs: Moments of the blobs.
+        window: Length of windows, s.
+    """
+    n, p, C = blobs
+    number, square = len(ids), larger_variance(C)
+    zero, none = np.zeros(number), np.zeros(number, np.int64)
+    variance = square / np.maximum(n, 1) + CONFIG.mean_error_sizes * square
+    P = np.stack([variance, zero, 9 * (square + 1) / window**2], 1)
+    # An error of 0.3 sizes after one window.
+    q = 0.3**2 * (square + 0.5) * 3 / window**3
+    return TrackTable(
+        ids, zero + t, p, np.zeros((number, 2)), P, C, n, n.copy(), q, zero + 1, zero + t,
+        none + 1, none, zero, zero.copy(), np.zeros(number, bool), np.zeros(number, bool),
+    )  # fmt: skip
+
+
+def predict_gates(tracks: TrackTable, t: float | int, window: float | int) -> TrackGates:
+    """Predict all tracks to the middle t (s) of a window, and compute their gates.
+
+    A known target leaves its way by about its size in a window: what is farther is another one.
+    Known targets in contact share the events between them.
+    """
+    n = len(tracks.n)
+    gates = TrackGates(
+        float(t), float(window), np.empty((n, 2)), np.empty((n, 3)), tracks.v, np.empty((n, 4)),
+        np.empty(n), tracks.n, np.zeros(n, bool),
+    )  # fmt: skip
+    _predict_gates(tracks, gates)
+    return gates
+
+
+@njit_noalloc
+def _predict_gates(tracks: Any, gates: Any) -> None:
+    turn = CONFIG.max_turn_sizes
+    for k in range(len(tracks.n)):
+        C, known = tracks.C[k], tracks.confirmed[k]
+        _predict_track(tracks, k, gates)
+        variance = gates.P[k, 0]
+        if known:
+            variance = min(variance, turn * turn * larger_variance_of(C))
+        more = 1 + 2 / tracks.n[k]
+        a, b, c = C[0, 0] * more + variance + 0.1, C[0, 1] * more, C[1, 1] * more + variance + 0.1
+        determinant = a * c - b * b
+        inverse = gates.inverse[k]
+        inverse[0], inverse[1], inverse[2] = c / determinant, -b / determinant, a / determinant
+        inverse[3], gates.penalty[k] = np.log(determinant), 0.0 if known else 2.0
+        for j in range(k):
+            if known and tracks.confirmed[j] and in_contact(gates.p, tracks.C, j, k):
+                gates.shared[j] = gates.shared[k] = True
+
+
+@njit_noalloc_inlined
+def _predict_track(tracks: Any, k: int, gates: Any) -> None:
+    """Predict one track; no noise drives a target that stands still."""
+    dt, q, P = gates.t - tracks.t[k], 0.0, gates.P
+    if tracks.misses[k] < CONFIG.still_windows:
+        q = tracks.q[k] * min(max(tracks.nis[k], 0.05), 50.0)
+    a, b, c = tracks.P[k, 0], tracks.P[k, 1], tracks.P[k, 2]
+    P[k, 0] = a + 2 * b * dt + c * dt**2 + q * dt**3 / 3
+    P[k, 1], P[k, 2] = b + c * dt + q * dt**2 / 2, c + q * dt
+    for i in range(2):
+        gates.p[k, i] = tracks.p[k, i] + tracks.v[k, i] * dt
+
+
+def assign(gates: TrackGates, events: WindowEvents, labels: NDArray, blobs: int) -> Assignments:
+    """Assign each event of the window to at most one track.
+
+    Args:
+        gates: Predictions of all tracks.
+        events: Events of the window.
+        labels: (events,) blob of each event, from 1 on; 0 for none.
+        blobs: Number of blobs.
+    """
+    tracks, shared = len(gates.p), np.flatnonzero(gates.shared)
+    out = Assignments(
+        np.full(len(events), -1), np.zeros((blobs, tracks), np.int64),
+        np.zeros(blobs, np.int64), np.zeros(blobs, np.int64),
+        np.zeros((blobs, tracks), bool), np.zeros(blobs, bool),
+        Blobs(np.zeros(tracks), np.zeros((tracks, 2)), np.zeros((tracks, 2, 2))),
+        Blobs(np.zeros(tracks), np.zeros((tracks, 2)), np.zeros((tracks, 2, 2))),
+    )  # fmt: skip
+    _assign(events, labels, gates, (shared, np.zeros(len(shared))), out)
+    return out
+
+
+@njit_noalloc
+def _assign(events: Any, labels: Any, gates: Any, scratch: Any, out: Any) -> None:
+    """Fill in assignments; `scratch` is the tracks that share events, and a number for each."""
+    _assign_owners(events, labels, gates, out)
+    for i in range(len(labels)):
+        if labels[i] > 0 and out.owner[i] < 0:
+            out.free[labels[i] - 1] += 1
+    _sum_residuals(events, labels, True, gates, scratch, out)
+    for k in range(len(gates.p)):
+        if out.in_blobs.n[k] < 2:
+            _sum_residuals(events, labels, False, gates, scratch, out)
+            break
+
+
+@njit_noalloc_inlined
+def _residual(gates: Any, k: int, events: Any, i: int) -> tuple[float, float, float]:
+    """Return the distance of an event from a track's place at that time, px, and its square."""
+    late, inverse = events.t[i] - gates.t, gates.inverse[k]
+    ex = events.x[i] - gates.p[k, 0] - gates.v[k, 0] * late
+    ey = events.y[i] - gates.p[k, 1] - gates.v[k, 1] * late
+    return ex, ey, inverse[0] * ex * ex + 2 * inverse[1] * ex * ey + inverse[2] * ey * ey
+
+
+@njit_noalloc_inlined
+def _assign_owners(events: Any, labels: Any, gates: Any, out: Any) -> None:
+    """Assign events to tracks, and the rest of a blob to the tracks that own most of it.
+
+    A target may grow at once or leave its gate.
+    """
+    owner, table, counts, owns, owned = out.owner, out.table, out.counts, out.owns, out.owned
+    tracks, inverse, gate = len(gates.p), gates.inverse, CONFIG.gate_sigmas
+    for i in range(len(labels)):
+        least = np.inf
+        for k in range(tracks):
+            _, _, squared = _residual(gates, k, events, i)
+            distance = squared + inverse[k, 3] + gates.penalty[k]
+            if squared < gate * gate and distance < least:
+                least, owner[i] = distance, k
+        if labels[i] > 0:
+            counts[labels[i] - 1] += 1
+            if owner[i] >= 0:
+                table[labels[i] - 1, owner[i]] += 1
+    for k in range(len(counts)):
+        claimed, most = 0, 0
+        for j in range(tracks):
+            claimed += table[k, j]
+            most = max(most, table[k, j])
+        if claimed >= CONFIG.claimed_share * counts[k]:
+            for j in range(tracks):
+                enough = min(CONFIG.owner_share * counts[k], most)
+                owns[k, j] = table[k, j] >= enough and table[k, j] > 0
+                owned[k] |= owns[k, j]
+    for i in range(len(labels)):
+        blob, k = labels[i] - 1, owner[i]
+        if blob < 0 or not owned[blob]:
+            continue
+        if k >= 0 and (owns[blob, k] or gates.penalty[k] == 0):
+            continue
+        least = np.inf
+        for k in range(tracks):
+            if owns[blob, k]:
+                _, _, squared = _residual(gates, k, events, i)
+                distance = squared + inverse[k, 3] + gates.penalty[k]
+                if distance < least:
+                    least, owner[i] = distance, k
+
+
+@njit_noalloc_inlined
+def _sum_residuals(
+    events: Any, labels: Any, in_blobs: bool, gates: Any, scratch: Any, out: Any
+) -> None:
+    """Compute the moments of residuals; tracks in contact share events in both gates."""
+    blobs, gate = out.in_blobs if in_blobs else out.gated, CONFIG.gate_sigmas
+    shared, share = scratch
+    for i in range(len(labels)):
+        if in_blobs and labels[i] <= 0:
+            continue
+        sharing = 0
+        for j in range(len(shared)):
+            k = shared[j]
+            _, _, squared = _residual(gates, k, events, i)
+            share[j] = 0.0
+            if squared < gate * gate:
+                sharing += 1
+                share[j] = np.exp(-0.5 * (squared + gates.inverse[k, 3])) * gates.events[k]
+        if sharing > 1:
+            total = 0.0
+            for j in range(len(shared)):
+                total += share[j]
+            for j in range(len(shared)):
+                if share[j] > 0:
+                    ex, ey, _ = _residual(gates, shared[j], events, i)
+                    add_moments(blobs, shared[j], share[j] / total, ex, ey)
+        elif out.owner[i] >= 0:
+            ex, ey, _ = _residual(gates, out.owner[i], events, i)
+            add_moments(blobs, out.owner[i], 1.0, ex, ey)
+    finish_moments(blobs, len(blobs.n))
+
+
+def update_tracks(
+    tracks: TrackTable, gates: TrackGates, clutter: ClutterModel, in_blobs: Blobs, gated: Blobs
+) -> TrackMeasurements:
+    """Update all tracks with one window's events, in place.
+
+    Args:
+        tracks: Tracks before the window.
+        gates: Their predictions.
+        clutter: Clutter of the window.
+        in_blobs: Moments of the residuals of events in blobs.
+        gated: Moments of those of all events. In a known place fewer events are a detection; they
+            move a track but do not change its size.
+
+    Returns:
+        Measurements of the tracks.
+    """
+    n = len(tracks.n)
+    out = TrackMeasurements(np.zeros(n, bool), np.zeros(n), np.zeros((n, 2)), np.zeros(n))
+    _update_tracks(tracks, gates, clutter, in_blobs, gated, out)
+    return out
+
+
+@njit_noalloc_inlined
+def _gate_clutter(gates: Any, clutter: Any, x: float, y: float, determinant: float) -> Any:
+    """Return the expected clutter events in a gate, and their dispersion."""
+    gate = CONFIG.gate_sigmas
+    area = np.pi * gate * gate * np.sqrt(max(determinant, 0.0))
+    rate, dispersion = clutter_at(clutter, x, y)
+    return max(rate * area * gates.window, 1e-3), dispersion
+
+
+@njit_noalloc
+def _update_tracks(
+    tracks: Any, gates: Any, clutter: Any, in_blobs: Any, gated: Any, out: Any
+) -> None:
+    for k in range(len(tracks.n)):
+        (n, z, D), in_blob = (in_blobs.n[k], in_blobs.p[k], in_blobs.C[k]), True
+        C, variance = tracks.C[k], gates.P[k, 0]
+        if n < 2:
+            in_blob, more = False, variance + 0.1
+            determinant = (C[0, 0] + more) * (C[1, 1] + more) - C[0, 1] * C[0, 1]
+            mu, F = _gate_clutter(gates, clutter, gates.p[k, 0], gates.p[k, 1], determinant)
+            known = tracks.confirmed[k]
+            threshold = -np.log(CONFIG.false_alarm_known if known else CONFIG.false_alarm_new)
+            n = 0.0
+            if gated.n[k] >= 2 and poisson_nats(gated.n[k], mu) / F >= threshold:
+                n, z, D = gated.n[k], gated.p[k], gated.C[k]
+        if n >= 2:
+            tracks.max_n[k] = max(0.99 * tracks.max_n[k], n)
+        known_n = CONFIG.prior_size_events
+        square = (n * larger_variance_of(D) + known_n * larger_variance_of(C)) / (n + known_n)
+        out.z[k, 0], out.z[k, 1], out.R[k], out.n[k] = z[0], z[1], square / 2 / max(n, 1.0), n
+        detected = n >= 2 and n >= CONFIG.min_event_share * tracks.max_n[k]
+        out.detected[k] = detected and _passes_gate(tracks, k, n, z, variance + out.R[k])
+        if out.detected[k]:
+            _update_detected(tracks, gates, clutter, k, (n, z, D, square, in_blob))
+        else:
+            _update_missed(tracks, gates, k)
+
+
+@njit_noalloc_inlined
+def _passes_gate(tracks: Any, k: int, n: float, z: Any, variance: float) -> bool:
+    """Return whether n events with innovation z may be those of a track.
+
+    A known target is not where few events are that its motion does not lead to, except for parts of
+    it that are seen by turns. Most of its events may follow a turn, but no farther than it allows.
+    """
+    turn, offset = CONFIG.max_turn_sizes, CONFIG.part_offset_sizes
+    square = (turn * turn) * larger_variance_of(tracks.C[k])
+    if n >= CONFIG.turn_event_share * tracks.n[k]:
+        variance = max(variance, square)
+    gate = CONFIG.gate_sigmas
+    most = gate * gate * min(variance + offset * offset * square, 2 * square)
+    return tracks.hits[k] < CONFIG.min_motion_windows or z[0] * z[0] + z[1] * z[1] <= most
+
+
+@njit_noalloc_inlined
+def _update_missed(tracks: Any, gates: Any, k: int) -> None:
+    """Update a track without detection.
+
+    A target that stands still goes on, if at all, no faster than before.
+    """
+    tracks.misses[k] += 1
+    if tracks.misses[k] == CONFIG.still_windows:
+        # Or by its size in the time that it is held.
+        fast = tracks.v[k, 0] ** 2 + tracks.v[k, 1] ** 2
+        held = CONFIG.max_coast_windows * gates.window
+        fast += larger_variance_of(tracks.C[k]) / held**2
+        tracks.P[k, 2] = min(tracks.P[k, 2], fast)
+        tracks.v[k, 0] = tracks.v[k, 1] = tracks.P[k, 1] = 0
+
+
+@njit_noalloc_inlined
+def _update_detected(tracks: Any, gates: Any, clutter: Any, k: int, measurement: Any) -> None:
+    """Update a track with a measurement.
+
+    The measurement is the number of events, their mean and covariance about the prediction, the
+    variance of one event, and whether the events are in blobs.
+    """
+    (n, z, D, square, in_blob), P, alone = measurement, gates.P[k], not gates.shared[k]
+    error = CONFIG.mean_error_sizes
+    total = P[0] + square / 2 / max(n, 1.0) + square * error**2 + 1e-3
+    if alone:
+        nis = min((z[0] * z[0] + z[1] * z[1]) / 2 / total, 30.0)
+        tracks.nis[k] += 0.15 * (nis - tracks.nis[k])
+    moved, a, b = 0.0, P[0] / total, P[1] / total
+    for i in range(2):
+        p = gates.p[k, i] + a * z[i]
+        moved += (p - tracks.p[k, i]) ** 2
+        tracks.p[k, i] = p
+        tracks.v[k, i] += b * z[i]
+    tracks.travel[k] += np.sqrt(moved)
+    tracks.P[k, 0], tracks.P[k, 1] = (1 - a) * P[0], (1 - a) * P[1]
+    tracks.P[k, 2] = P[2] - b * P[1]
+    tracks.t[k], tracks.misses[k] = gates.t, 0
+    newer, C = 1 / (tracks.hits[k] + 1), tracks.C[k]
+    if alone and in_blob:
+        gain = max(CONFIG.update_gain * min(1.0, n / tracks.n[k]), newer)
+        for i in range(2):
+            for j in range(2):
+                C[i, j] += gain * (D[i, j] - C[i, j])
+    tracks.n[k] += max(CONFIG.update_gain, newer) * (n - tracks.n[k])
+    tracks.hits[k] += 1
+    determinant = C[0, 0] * C[1, 1] - C[0, 1] * C[0, 1]
+    mu, F = _gate_clutter(gates, clutter, tracks.p[k, 0], tracks.p[k, 1], determinant)
+    tracks.nats[k] += poisson_nats(n, mu) / F

@@ -1,0 +1,602 @@
+"""Targets found without settings, on small sensors and against slow, obvious computations."""
+
+import dataclasses
+import os
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from jaxevent import blob
+from jaxevent.blob.search.background import (
+    clutter_evidence,
+    find_hot_lines,
+    find_hot_pixels,
+    measure_background,
+)
+from jaxevent.blob.search.merge import merge_parts, stitch_paths
+from jaxevent.blob.search.paths import (
+    NO_OWNER,
+    NOISE_GRID,
+    TargetPath,
+    _log_likelihood,
+    fit_velocity_noise,
+    owner_candidates,
+    tabulate_paths,
+)
+from jaxevent.blob.search.polarity import drop_lamps
+from jaxevent.blob.search.search import (
+    TargetSearchResult,
+    _drop_unsettled_start,
+    _is_persistent,
+    max_events_per_step,
+)
+from jaxevent.blob.search.stream import Stream
+from jaxevent.blob.steps import Batch
+from jaxevent.blob.targets import Slots, look_ahead
+from jaxevent.errors import InputError
+from jaxevent.io import load
+from jaxevent.recording import Events, Recording
+from jaxevent.simulate.blobs import Circle, Line, Target, simulate_blobs
+
+SMALL = (128, 96)
+
+
+def scene(targets, duration=0.4, noise=2e3, seed=0):
+    return simulate_blobs(targets, SMALL, duration, noise, seed)
+
+
+def crossing():
+    """Two that pass through each other, and their paths."""
+    targets = [
+        Target(Line((64 - s * 40, 48.0), (s * 200.0, 0.0), size=(4.0, 3.0)), 2e4) for s in (1, -1)
+    ]
+    return scene(targets)
+
+
+@pytest.fixture(scope="module")
+def crossed():
+    recording, truth = crossing()
+    return recording, truth, blob.find(recording, progress=False)
+
+
+@pytest.mark.slow
+def test_two_that_cross_keep_their_identities(crossed):
+    recording, truth, found = crossed
+    assert len(found) == 2 and found.summary().startswith("2 targets")
+    tracks = blob.moment.estimate(recording, progress=False)
+    times = np.arange(20_000, 390_000, 5000)
+    states, true = tracks(times), truth(times)
+    assert len(tracks) == 2 and states.valid.all()
+    apart = np.linalg.norm(states.mean[:, :, None, :2] - true[:, None, :, :2], axis=-1)
+    straight = apart[:, [0, 1], [0, 1]], apart[:, [0, 1], [1, 0]]
+    assert min(np.sqrt((d**2).mean()) for d in straight) < 0.7
+    # What is prepared and run by hand is the same.
+    params = blob.moment.Params(**found.settings())
+    features, out = blob.moment.prepare(recording, times, params, found=found)
+    again = jax.jit(lambda p: blob.moment.read(p, blob.moment.run(p, features)[0], out))(params)
+    filtered = tracks.filtered(times)
+    np.testing.assert_allclose(again.mean, filtered.mean, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_what_the_user_sets_wins_over_what_is_found(crossed):
+    _, _, found = crossed
+    settings = found.settings()
+    params = blob.moment.Params(**settings)
+    assert (
+        set(found.per_target_values(params))
+        == set(settings) & set(found.per_target_values(params))
+        != set()
+    )
+    assert "Q_v" in found.per_target_values(params)
+    assert "Q_v" not in found.per_target_values(params.replace(Q_v=12.0))
+    with pytest.raises(InputError, match="take no seeds"):
+        blob.moment.estimate(crossed[0], found=found, seeds=[(10.0, 10.0, 3.0)])
+
+
+@pytest.mark.slow
+def test_noise_and_hot_pixels_are_no_targets():
+    hot = [Target(Line((x, 40.0), size=(0.01, 0.01)), 2e3) for x in (20.0, 90.0)]
+    recording, _ = scene(hot, noise=2e4, seed=3)
+    found = blob.find(recording, progress=False)
+    assert len(found) == 0 and found.hot_pixels == 2
+    assert 0.8 * 2e4 < found.background < 1.4 * 2e4
+    tracks = blob.moment.estimate(recording, found=found, progress=False)
+    assert len(tracks) == 0 and tracks([0.1]).mean.shape == (1, 0, 8)
+
+
+@pytest.mark.slow
+def test_a_ring_and_a_pair_of_edges_are_one_target_each():
+    ring = [Target(Line((44, 48), (100.0, 0.0), size=(25, 25)), 2e4, "ring")]
+    edges = [
+        Target(Line((x, 48), (120.0, 0.0), size=(9.0, 0.6), theta=np.pi / 2), 1e4) for x in (20, 40)
+    ]
+    for targets, middle, size, duration in ((ring, 44, 25, 0.4), (edges, 30, 10, 0.5)):
+        recording, truth = scene(targets, duration)
+        found = blob.find(recording, progress=False)
+        assert len(found) == 1
+        (path,) = found.paths
+        speed = truth(np.array([0]))[0, 0, 2]
+        apart = path.p - np.stack([middle + speed * path.t * 1e-6, np.full(len(path.t), 48)], 1)
+        assert np.sqrt((apart**2).sum(1).mean()) < 0.2 * size
+        assert np.median(path.size[:, 0]) == pytest.approx(size, rel=0.1)
+
+
+def _path(t, x, y, size, n):
+    t = np.asarray(t, np.int64)
+    p = np.stack([np.broadcast_to(np.asarray(value, float), t.shape) for value in (x, y)], 1)
+    C = np.broadcast_to(size**2 * np.eye(2), (len(t), 2, 2))
+    return TargetPath(t, p, np.zeros_like(p), C, np.full(len(t), float(n)), 1000, 1.0)
+
+
+def test_paths_in_contact_all_their_lives_are_one():
+    t = np.arange(0, 50_000, 1000)
+    x = 20 + 1e-3 * t
+    one, other = _path(t, x, 30.0, 3.0, 30), _path(t, x, 39.0, 3.0, 10)
+    far, crossing = _path(t, x, 45.0, 3.0, 10), _path(t, x[::-1], 39.0, 3.0, 10)
+    resting = [_path(t, 20.0, y, 3.0, 10) for y in (30.0, 39.0)]
+    for pair in ([one, far], [one, crossing], resting):
+        assert len(merge_parts(pair)) == 2
+    (both,) = merge_parts([other, one])
+    np.testing.assert_allclose(both.p, np.stack([x, np.full(len(t), 32.25)], 1))
+    weight = np.array([0.75, 0.25])
+    spread = np.cov([30.0, 39.0], aweights=weight, ddof=0)  # and that of each part
+    np.testing.assert_allclose(
+        both.C, np.broadcast_to(np.diag([9.0, 9 + float(spread)]), both.C.shape)
+    )
+
+
+def test_a_small_piece_that_goes_along_is_of_the_larger_one():
+    t = np.arange(0, 50_000, 1000)
+    x = 20 + 1.2e-3 * t
+    whole = _path(t, x, 30.0, 6.0, 30)
+    for y, slides, size, joined in (
+        (52.0, 0, 2.0, True),
+        (62.0, 0, 2.0, False),  # farther than twice what the two halves of the larger one are
+        (52.0, 24, 2.0, False),  # goes its own way
+        (52.0, 0, 4.0, False),  # not much smaller
+        (52.0, 0, 1.2, False),  # a star beside a diffuse light
+    ):
+        piece = _path(t, x, y + slides * np.linspace(0, 1, len(t)), size, 10)
+        assert len(merge_parts([whole, piece])) == (1 if joined else 2)
+    stars = _path(t, x, 30.0, 1.5, 30), _path(t, x, 35.5, 0.7, 10)
+    assert len(merge_parts(list(stars))) == 2
+
+
+def test_two_that_begin_together_and_part_are_two():
+    """Where cells are coarse, they are one blob until they are far apart."""
+    starts = [((60.0, 40.0), (-90.0, 0.0)), ((70.0, 44.0), (90.0, 5.0))]
+    targets = [Target(Line(p, v, size=(4.0, 3.0)), 2e4) for p, v in starts]
+    recording, truth = scene(targets, 0.6)
+    found = blob.find(recording, progress=False)
+    assert len(found) == 2
+    t = np.array([350_000, 550_000])
+    ends = np.stack([path.at(t) for path in found.paths], 1)
+    apart = ends[:, :, None] - truth(t)[:, None, :, :2]
+    near = np.hypot(apart[..., 0], apart[..., 1]).min(1)
+    assert (near < 2).all()
+
+
+def test_beginnings_from_which_a_target_leaps_are_left_out():
+    t = np.arange(0, 30_000, 1000)
+    x = 20 + 5e-3 * t
+    path = _path(t, x, 30.0, 3.0, 30)
+    assert _drop_unsettled_start(path) is path
+    leaping = _path(t, np.where(np.arange(30) == 2, x + 25, x), 30.0, 3.0, 30)
+    np.testing.assert_array_equal(_drop_unsettled_start(leaping).t, t[3:])
+
+
+@pytest.mark.parametrize(
+    ("rows", "leaves", "duration", "lasts"),
+    [(15, 0.3, 1, True), (15, 0.5, 1, False), (16, 0.5, 1, True), (15, 0.5, 0.02, True)],
+)
+def test_what_is_seen_shortly_and_goes_no_way_is_left_out(rows, leaves, duration, lasts):
+    path = _path(np.arange(0, 1000 * rows, 1000), 20.0, 30.0, 3.0, 30)
+    # In a window the noise q of the velocity makes a deviation of sqrt(q w^3 / 3).
+    path = dataclasses.replace(path, velocity_noise=3 * (leaves * 3.0) ** 2 / 1e-9)
+    assert _is_persistent(path, duration) == lasts
+
+
+def test_pieces_of_an_edge_are_one_while_each_is_seen():
+    t = np.arange(0, 50_000, 1000)
+    x = 20 + 1e-3 * t
+    ends = slice(0, 50), slice(10, 50), slice(12, 40)
+    pieces = [
+        dataclasses.replace(
+            _path(t[k], x[k], y, 1.0, 10), C=np.tile(np.diag([0.25, 16.0]), (len(t[k]), 1, 1))
+        )
+        for k, y in zip(ends, (0.0, 18.0, 36.0), strict=True)  # 2.25 sizes apart
+    ]
+    (edge,) = merge_parts(pieces)
+    seen = np.stack([(t >= t[k][0]) & (t <= t[k][-1]) for k in ends])
+    y = (seen * [[0.0], [18.0], [36.0]]).sum(0) / seen.sum(0)
+    np.testing.assert_array_equal(edge.t, t)
+    np.testing.assert_allclose(edge.p, np.stack([x, y], 1))
+    np.testing.assert_allclose(edge.n, 10 * seen.sum(0))
+    spread = (seen * ([[0.0], [18.0], [36.0]] - y) ** 2).sum(0) / seen.sum(0)
+    np.testing.assert_allclose(edge.C[:, 1, 1], 16 + spread)
+    round_ones = [dataclasses.replace(one, C=16 * np.tile(np.eye(2), (len(one.t), 1, 1)))
+        for one in pieces]  # fmt: skip
+    assert len(merge_parts(round_ones)) == 3  # as far apart, but no edges
+    for n, number in ((10, 2), (50, 1)):  # one that follows another, or is a piece of it
+        follow = [_path(t, x, 0.0, 1.0, n), _path(t, x - 18, 0.0, 1.0, 10)]
+        C = np.tile(np.diag([16.0, 0.25]), (len(t), 1, 1))
+        assert len(merge_parts([dataclasses.replace(one, C=C) for one in follow])) == number
+
+
+@pytest.mark.parametrize(
+    ("radius", "turns", "wobble", "joined"),
+    [(13, 1.5, 0, True), (13, 0.8, 0, False), (13, 1.5, 0.2, False), (30, 1.5, 0, False)],
+)
+def test_what_turns_rigidly_by_a_whole_turn_is_one(radius, turns, wobble, joined):
+    t = np.arange(0, 200_000, 1000)
+    angle = 2 * np.pi * turns * t / t[-1]
+    reach = radius * (1 + wobble * np.sin(5 * angle))
+    blades = [
+        _path(t, 60 + reach * np.cos(a), 50 + reach * np.sin(a), 3.0, 10)
+        for a in (angle, angle + 2 * np.pi / 3, angle + 4 * np.pi / 3)
+    ]
+    paths = merge_parts(blades)
+    assert len(paths) == (1 if joined else 3)
+    if joined:
+        np.testing.assert_allclose(paths[0].p, np.tile([60.0, 50.0], (len(t), 1)), atol=1e-9)
+
+
+def test_what_passes_behind_something_goes_on():
+    """It is seen in part before it is hidden, and after."""
+    t = np.arange(0, 30_000, 1000)
+    one, other = _path(t, 20 + 2e-3 * t, 50.0, 6.0, 30), _path(t, 164 + 2e-3 * t, 50.0, 6.0, 30)
+    in_part = np.linspace(1, 0.1, 6)
+    back = np.where(np.arange(30) < 24, 0, 9 * (1 - np.r_[np.ones(24), in_part]))
+    share = np.r_[np.ones(24), in_part]
+    C = one.C * share[:, None, None] ** 2
+    one = dataclasses.replace(one, p=one.p - back[:, None] * [1, 0], C=C, n=30 * share)
+    other = dataclasses.replace(
+        other, t=t + 72_000, p=other.p + back[::-1, None] * [1, 0], C=C[::-1], n=30 * share[::-1]
+    )
+    assert len(stitch_paths([one, other], (400, 100))) == 1
+    aside = dataclasses.replace(other, p=other.p + [0.0, 30.0])
+    assert len(stitch_paths([one, aside], (400, 100))) == 2
+    # Never of its usual size and events at once.
+    odd = np.arange(30) % 2 > 0
+    C = np.where(odd[:, None, None], 1.0, 36.0) * np.eye(2)
+    one = dataclasses.replace(_path(t, 20 + 2e-3 * t, 50.0, 6.0, 30), C=C, n=np.where(odd, 30.0, 1))
+    assert (
+        len(stitch_paths([one, _path(t + 31_000, 82 + 2e-3 * t, 50.0, 6.0, 30)], (400, 100))) == 1
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [0, 1, 99])
+def test_recordings_of_few_events_have_no_targets(count):
+    t = np.arange(count, dtype=np.int64)
+    none = np.zeros(count, np.uint16)
+    recording = Recording("few", *SMALL, Events(t, none, none, none.astype(bool)))
+    assert len(blob.find(recording, progress=False)) == 0
+    assert len(blob.moment.estimate(recording, progress=False)) == 0
+
+
+class Stopping:
+    """At rest and without events from 0.3 to 0.6 s, then back."""
+
+    def state(self, t):
+        out = np.zeros((len(t), 8))
+        out[:, 0] = 30 + 150 * np.minimum(t, 0.3) - 100 * np.maximum(t - 0.6, 0)
+        out[:, 1], out[:, 4:6] = 50, (4.0, 3.0)
+        return out
+
+
+@pytest.fixture(scope="module")
+def stopped():
+    recording, truth = scene([Target(Stopping(), 1e4, dropouts=((0.3, 0.6),))], 0.9)
+    return recording, truth, blob.find(recording, progress=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["moment", "constant_velocity"])
+def test_a_silent_target_stands_still(method, stopped):
+    recording, truth, found = stopped
+    assert len(found) == 1
+    tracker = getattr(blob, method)
+    tracks = tracker.estimate(
+        recording, tracker.Params(**found.settings()), found=found, progress=False
+    )
+    times = np.array([0.2, 0.35, 0.45, 0.58, 0.75])
+    states, true = tracks(times), truth(times)[:, 0]
+    assert states.valid.all()
+    spread = tracks.filtered(times).covariance[:, 0, 0, 0]
+    assert np.abs(states.mean[:, 0, :2] - true[:, :2]).max() < 1.5
+    assert (states.covariance[:, 0, 0, 0] < spread + 1e-6).all()
+    np.testing.assert_array_equal(states.mean[1:4, 0, 2:4], 0)
+    # The filter's size holds; the smoothed one goes over to that of the events that follow.
+    sizes = tracks.filtered(times).mean[1:4, 0, 4:6]
+    np.testing.assert_allclose(sizes, np.broadcast_to(sizes[0], sizes.shape), rtol=1e-6)
+    assert spread[1] < spread[2] < spread[3] and spread[4] < spread[3]
+
+
+def test_evidence_bounds_the_tail_of_poisson():
+    n, mu = np.meshgrid(np.arange(1, 60), [0.01, 0.3, 2.0, 20.0])
+    bound = np.exp(-clutter_evidence(n, mu, 1.0))
+    assert (bound * (1 + 1e-9) >= stats.poisson.sf(n - 1, mu)).all()
+    assert (clutter_evidence(n, mu, 2.0) * 2 == clutter_evidence(n, mu, 1.0)).all()
+    assert (clutter_evidence(n, mu, 1.0)[n <= mu] == 0).all()
+
+
+def test_hot_pixels_stand_alone():
+    rng = np.random.default_rng(0)
+    counts = rng.poisson(3.0, (40, 50))
+    counts[10, 20] = counts[0, 7] = counts[39, 49] = 200
+    counts[30:33, 30:33] = 300  # something that rests
+    expected = np.zeros(counts.shape, bool)
+    expected[10, 20] = expected[0, 7] = expected[39, 49] = True
+    np.testing.assert_array_equal(find_hot_pixels(counts), expected)
+
+
+def test_hot_lines_are_hot_along_the_whole_sensor():
+    rng = np.random.default_rng(0)
+    counts = rng.poisson(1.0, (40, 50))
+    counts[:, [0, 12, 13, 49]] += rng.poisson(30, (40, 4))
+    counts[21] += rng.poisson(20, 50)
+    counts[5:20, 30] = 60  # part of a line
+    counts[:, 36:40] += 30  # something wide
+    expected = np.zeros(counts.shape, bool)
+    expected[:, [0, 12, 13, 49]] = expected[21] = True
+    np.testing.assert_array_equal(find_hot_lines(counts), expected)
+    assert not find_hot_lines(rng.poisson(100.0, (40, 50))).any()
+
+
+def lamp(rng, at, hertz, seconds, number, late=1e-3):
+    """Events of a square of 12 px: ON as its light begins, OFF as it ends, exponentially late."""
+    half = rng.integers(0, int(2 * hertz * seconds), number)
+    t = half / (2 * hertz) + rng.exponential(late, number)
+    return t, at + rng.uniform(-6, 6, (number, 2)), half % 2 == 0
+
+
+@pytest.mark.parametrize(
+    ("hertz", "way", "late", "left_out"),
+    [
+        (100.0, 0, 1e-3, True),
+        (119.6, 0, 1e-3, True),  # of a weak net
+        (100.0, 60, 1e-3, False),  # it travels: a lamp that is carried
+        (110.0, 0, 1e-3, False),  # of no mains
+        (100.0, 0, 5e-3, False),  # hardly in time: its share is .09
+    ],
+)
+def test_lamps_are_told_by_their_flicker(hertz, way, late, left_out):
+    """Beside a light that stands still too, and sends as many events whenever it likes."""
+    rng, seconds, number = np.random.default_rng(3), 2.0, 1500
+    t, xi, on = lamp(rng, [40.0, 40.0], hertz, seconds, number, late)
+    xi[:, 0] += way * t / seconds
+    t, on = np.r_[t, rng.uniform(0, seconds, number)], np.r_[on, rng.random(number) < 0.5]
+    x, y = np.rint(np.r_[xi, [100.0, 60.0] + rng.normal(size=(number, 2)) * 4]).T.astype(np.uint16)
+    order = np.argsort(t)
+    us = np.rint(1e6 * t).astype(np.int64)
+    events = Events(us[order], x[order], y[order], on[order])
+    recording = Recording("lamps", *SMALL, events)
+    at = np.arange(10_000, 2_000_000, 20_000)
+    paths = [
+        TargetPath(
+            at,
+            place + np.c_[moves * at / 2e6, 0 * at],
+            np.zeros((len(at), 2)),
+            np.tile(12.0 * np.eye(2), (len(at), 1, 1)),
+            np.full(len(at), 15.0),
+            20_000,
+            1.0,
+        )
+        for place, moves in (([40.0, 40.0], way), ([100.0, 60.0], 0))
+    ]
+    kept, number = drop_lamps(paths, recording, np.zeros(SMALL[::-1], bool))
+    assert number == left_out and kept == paths[left_out:]
+
+
+@pytest.mark.parametrize(("leaves", "left_out"), [(1.4, 1), (0.6, 0)])
+def test_a_track_that_hops_from_a_lamp_is_the_lamp_s_if_it_is_mostly_there(leaves, left_out):
+    """Of 2 s; what it goes on with then travels and sends events whenever it likes."""
+    rng = np.random.default_rng(4)
+    t, xi, on = lamp(rng, [40.0, 40.0], 100.0, 2.0, 3000)
+    away = np.flatnonzero(t > leaves)
+    t[away], on[away] = rng.uniform(leaves, 2, len(away)), rng.random(len(away)) < 0.5
+    xi[away] = np.c_[40 + 60 * (t[away] - leaves), 0 * away + 40] + 2 * rng.normal(
+        size=(len(away), 2)
+    )
+    order = np.argsort(t)
+    x, y = np.rint(xi[order]).T.astype(np.uint16)
+    us = np.rint(1e6 * t[order]).astype(np.int64)
+    seen = x < SMALL[0]
+    recording = Recording("lamps", *SMALL, Events(us, x, y, on[order])[seen])
+    at = np.arange(10_000, 2_000_000, 20_000)
+    path = _path(at, 40 + 60 * np.maximum(at * 1e-6 - leaves, 0), 40, 3.5, 30)
+    kept, number = drop_lamps([path], recording, np.zeros(SMALL[::-1], bool))
+    assert number == left_out and len(kept) == 1 - left_out
+
+
+@pytest.mark.slow
+def test_a_lamp_behind_a_target_is_no_target():
+    recording, truth = scene([Target(Circle((64, 48), 30, 5.0, 0.0, size=(3.0, 2.5)), 1e4)], 1.0)
+    t, xi, on = lamp(np.random.default_rng(1), [94.0, 48.0], 100.0, 1.0, 4000)
+    x, y = np.rint(xi).T.astype(np.uint16)
+    e, us = recording.events, np.rint(1e6 * t).astype(np.int64)
+    parts = (e.t, us), (e.x, x), (e.y, y), (e.p, on)
+    us, x, y, p = (np.concatenate(part) for part in parts)
+    order = np.argsort(us, kind="stable")
+    both = dataclasses.replace(recording, events=Events(*(a[order] for a in (us, x, y, p))))
+    found = blob.find(both[0.0:1.0], progress=False)
+    assert len(found) == 1 and found.lamps == 1 and "1 lamp left out" in found.summary()
+    apart = np.linalg.norm(found.paths[0].p - truth(found.paths[0].t)[:, 0, :2], axis=1)
+    assert np.median(apart) < 1.5
+
+
+def test_background_is_that_without_the_targets():
+    swinging = Target(Circle((64, 48), 25, 12.0, size=(3.0, 3.0)), 2e4)
+    recording, _ = scene([swinging], 1.0, noise=2e4)
+    stream = Stream(recording, 0, 1_000_000)
+    rate = measure_background(stream).rate
+    assert rate.shape == (24, 32)
+    true = 2e4 / (SMALL[0] * SMALL[1])
+    assert 0.8 * true < np.median(rate) < 1.3 * true
+    assert rate.max() < 4 * true  # the target alone makes 20 times as many where it passes
+
+
+@pytest.mark.slow
+def test_candidates_are_those_of_a_slow_loop():
+    rng = np.random.default_rng(1)
+    paths = []
+    for k in range(4):
+        t = np.sort(rng.choice(np.arange(5, 95), 50, replace=False)) * 1000
+        C = np.stack([np.diag(rng.uniform(2, 9, 2)) + 1.0 for _ in t])
+        n = rng.uniform(5, 50, len(t))
+        p = np.stack([30 + 0.5e-3 * t, np.full(len(t), 40.0 + 4 * k)], 1)
+        polarity = 1 if k == 3 else None
+        paths.append(TargetPath(t, p, np.zeros_like(p), C, n, 1000, 1.0, polarity))
+    t = 2 * np.sort(rng.integers(0, 50_000, 1000)) + 1  # never half a window from a row
+    x, y = rng.integers(20, 90, 1000), rng.integers(25, 65, 1000)
+    on = rng.random(1000) < 0.5
+    events = Events(t, x.astype(np.uint16), y.astype(np.uint16), on)
+    told = owner_candidates(events, tabulate_paths(paths), 3.0)
+
+    def distance(path, i):
+        """Minus twice the log likelihood, up to a constant; inf: it is not near."""
+        seen = np.abs(path.t - t[i]).min() <= path.window / 2
+        if not seen or path.polarity not in (None, on[i]):
+            return np.inf
+        S = path.C * (1 + 2 / path.n)[:, None, None] + 0.1 * np.eye(2)
+        S = np.array([[np.interp(t[i], path.t, S[:, a, b]) for b in (0, 1)] for a in (0, 1)])
+        e = np.array([x[i], y[i]]) - path.at(t[i : i + 1])[0]
+        squared = e @ np.linalg.solve(S, e)
+        return squared + np.log(np.linalg.det(S)) if squared <= 9 else np.inf
+
+    several = 0
+    for i in range(1000):
+        far = np.array([distance(path, i) for path in paths])
+        mine = np.argsort(far)[: min(np.isfinite(far).sum(), 2)]
+        assert told[i].tolist() == [*mine, NO_OWNER, NO_OWNER][:2]
+        several += np.isfinite(far).sum() > 2
+    assert several > 2
+
+
+@pytest.mark.slow
+def test_events_near_two_paths_are_taken_by_no_third_target():
+    params, filter = blob.moment.Params(), blob.moment.filter
+    xi = jnp.array([[20.0, 20], [20, 21], [21, 20], [90, 90], [90, 90]])
+    owner = jnp.array([[0, 1], [1, 2], [2, NO_OWNER], [0, NO_OWNER], [0, 1]])
+    batch = Batch(xi, jnp.zeros(5), jnp.ones(5))
+    state = filter.start(params, jnp.array([20.0, 20]), jnp.array(5.0))
+    zero = jnp.zeros((), jnp.int32)
+    inside = []
+    for k in range(3):
+        slot = Slots(
+            state, jnp.array(20.0), jnp.array(0.0), zero, zero, zero, zero, zero + k, zero == 0, {}
+        )
+        ahead = look_ahead(filter, params, slot, zero + 1, zero, batch, jnp.ones(5, bool), owner)
+        inside.append(ahead.inside)
+    # Of one path alone even what its filter does not expect there; of two only what it does.
+    assert np.array_equal(inside, [[1, 0, 0, 1, 0], [1, 1, 0, 0, 0], [0, 1, 1, 0, 0]])
+
+
+def test_agility_is_the_most_likely():
+    rng = np.random.default_rng(2)
+    dt, q, R = 0.01, 3e4, 0.5
+    Q = q * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+    steps = rng.multivariate_normal([0, 0], Q, (400, 2))
+    state, m = np.zeros((2, 2)), []
+    for step in steps:
+        state = np.stack([state[:, 0] + dt * state[:, 1], state[:, 1]], 1) + step
+        m.append(state[:, 0] + rng.normal(0, np.sqrt(R), 2))
+    m, t = np.array(m), dt * np.arange(400)
+    found = fit_velocity_noise(t, m, np.full(400, R), 1e6)
+    assert q / 2.5 < found < 2.5 * q and np.isclose(NOISE_GRID * 1e6, found).any()
+
+    # The density of 12 means, given the first two, written out.
+    n = 12
+    F = np.array([[1, dt], [0, 1]])
+    P = np.array([[R, R / dt], [R / dt, 2 * R / dt**2 + q * dt]])
+    S = np.zeros((n - 2, n - 2))
+    blocks = []
+    for _ in range(n - 2):
+        P = F @ P @ F.T + Q
+        blocks.append(P)
+    for i in range(n - 2):
+        for j in range(n - 2):
+            low, high = min(i, j), max(i, j)
+            S[i, j] = (np.linalg.matrix_power(F, high - low) @ blocks[low])[0, 0] + R * (i == j)
+    total = 0.0
+    for axis in range(2):
+        v = (m[1, axis] - m[0, axis]) / dt
+        mean = m[1, axis] + v * dt * np.arange(1, n - 1)
+        total += stats.multivariate_normal(mean, S).logpdf(m[2:n, axis])
+    constant = (n - 2) * np.log(2 * np.pi)
+    ours = _log_likelihood(t[:n], m[:n], np.full(n, R), q)
+    assert ours == pytest.approx(total + constant, rel=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("accuracy", [0.02, 0.1, 0.5])
+def test_steps_of_several_events_keep_the_accuracy_asked_for(accuracy):
+    size, rate, velocity_noise = 6.0, 5e4, 2e6
+    M = float(
+        max_events_per_step(
+            accuracy, np.array([size]), np.array([rate]), np.array([velocity_noise])
+        )[0]
+    )
+
+    def sigma(M):
+        """Of the position just before an update, by Riccati's equation step by step."""
+        dt, P = M / rate, np.diag([size**2, 1e6])
+        F = np.array([[1, dt], [0, 1]])
+        Q = velocity_noise * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        for _ in range(round(5e3 / M)):
+            P = F @ P @ F.T + Q
+            before, K = P[0, 0], P[:, 0] / (P[0, 0] + size**2 / M)
+            P = P - np.outer(K, P[0])
+        return np.sqrt(before)
+
+    told = sigma(M) / sigma(1) - 1
+    assert 0.3 * accuracy < told <= accuracy
+
+
+def test_steps_follow_the_accuracy():
+    t = np.arange(0, 1_000_000, 10_000)
+    path = dataclasses.replace(_path(t, 50 + 1e-5 * t, 60 + 0 * t, 5.0, 3.0), velocity_noise=1e3)
+    recording = Recording("none", 100, 100, Events.empty())
+    one = TargetSearchResult((path,), (), 0, 0.0, recording)
+    two = TargetSearchResult((path, path), (), 0, 0.0, recording)
+    told = [one.settings(a)["events_per_step"] for a in (1e-4, 0.02, 0.1, 1.0)]
+    # The time constant is that of 161 events.
+    assert told == [1, 4, 16, 32]
+    assert two.settings(0.02)["events_per_step"] == 8
+    for bad in (0.0, -1.0, np.nan):
+        with pytest.raises(InputError, match="accuracy"):
+            one.settings(bad)
+
+
+@pytest.mark.slow
+def test_targets_do_not_depend_on_the_clock(crossed):
+    recording, _, found = crossed
+    events = recording.events[:]
+    late = dataclasses.replace(events, t=events.t + 7_000_000_000)
+    again = blob.find(dataclasses.replace(recording, events=late), progress=False)
+    for one, other in zip(found.paths, again.paths, strict=True):
+        np.testing.assert_array_equal(other.t - one.t, 7_000_000_000)
+        np.testing.assert_allclose(other.p, one.p, atol=1e-4)
+
+
+@pytest.mark.skipif("JAXEVENT_DATA" not in os.environ, reason="JAXEVENT_DATA is not set")
+@pytest.mark.slow
+def test_cars_on_a_street_and_a_spinning_dot_are_found():
+    data = Path(os.environ["JAXEVENT_DATA"]) / "data"
+    street = blob.find(load(data / "davis346_street.npz"), progress=False)
+    lives = [(path.end - path.begin) * 1e-6 for path in street.paths]
+    assert sum(life > 1.5 for life in lives) == 3 and all(x < 0.2 for x in lives if x < 1.5)
+    dot = load(data / "spinning_dot.npz")
+    tracks = blob.moment.estimate(dot, progress=False)
+    assert len(tracks) == 1 and tracks.death[0] - tracks.birth[0] > 0.9 * 50_000
+    t = np.linspace(0.003, 0.0495, 400)
+    states = tracks(t).mean[:, 0]
+    radius = np.hypot(states[:, 0] - 314.29, states[:, 1] - 202.35)
+    speed = np.hypot(states[:, 2], states[:, 3])
+    assert abs(radius.mean() - 107.66) < 1.5 and abs(np.median(speed) / 13117 - 1) < 0.03
