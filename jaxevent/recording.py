@@ -264,13 +264,8 @@ class Events:
         Raises:
             InputError: An event is outside.
         """
-        for name, values, size in (("x", self.x, width), ("y", self.y, height)):
-            if len(values) and int(values.max()) >= size:
-                row = int(np.argmax(values >= size))
-                raise InputError(
-                    f"{source}: event {first_row + row} has {name} = {values[row]} outside the "
-                    f"{width}x{height} sensor; give the sensor's size or remove the event"
-                )
+        for name, values in (("x", self.x), ("y", self.y)):
+            arrays.coordinates(name, values, (width, height), source, first_row=first_row)
 
 
 def _check_rows(rows: Any, what: str) -> None:

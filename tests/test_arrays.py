@@ -201,6 +201,6 @@ def test_files_stay_unread(tmp_path):
     assert renamed.events is stored.events and not isinstance(stored.events, Events)
     # A smaller sensor than the file's: events are checked for it when they are read.
     smaller = dataclasses.replace(stored, width=20)
-    with pytest.raises(InputError, match="outside the 20x48 sensor"):
+    with pytest.raises(InputError, match="on the 20x48 sensor"):
         smaller.events[:]
     assert_events(stored.events[:], v)
