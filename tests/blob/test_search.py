@@ -454,7 +454,7 @@ def test_candidates_are_those_of_a_slow_loop():
         polarity = 1 if k == 3 else None
         paths.append(TargetPath(t, p, np.zeros_like(p), C, n, 1000, 1.0, polarity))
     t = 2 * np.sort(rng.integers(0, 50_000, 1000)) + 1  # never half a window from a row
-    x, y = rng.integers(20, 90, 1000), rng.integers(25, 65, 1000)
+    x, y = rng.integers(20, 90, 1000), rng.integers(35, 60, 1000)
     on = rng.random(1000) < 0.5
     events = Events(t, x.astype(np.uint16), y.astype(np.uint16), on)
     told = owner_candidates(events, tabulate_paths(paths), 3.0)
@@ -476,7 +476,7 @@ def test_candidates_are_those_of_a_slow_loop():
         mine = np.argsort(far)[: min(np.isfinite(far).sum(), 2)]
         assert told[i].tolist() == [*mine, NO_OWNER, NO_OWNER][:2]
         several += np.isfinite(far).sum() > 2
-    assert several > 2
+    assert several > 5
 
 
 @pytest.mark.slow
