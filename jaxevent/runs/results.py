@@ -12,7 +12,7 @@ from jaxevent.errors import InputError
 from jaxevent.io.output import complete
 from jaxevent.io.places import check, locked
 from jaxevent.parameters import Parameters
-from jaxevent.show.report import flatten, markdown_table, means
+from jaxevent.show.tables import flatten, markdown_table, means
 
 if TYPE_CHECKING:
     import pandas
@@ -26,7 +26,7 @@ import numpy as np
 from jaxevent.confidence import ParameterInterval, confidence_intervals
 from jaxevent.io.output import finite
 from jaxevent.runs.fit_config import Plan, Task
-from jaxevent.show.report import lay_out
+from jaxevent.show.tables import lay_out
 from jaxevent.splits import SPLITS
 from jaxevent.tuning import Batches, FitResult, Run, begin
 

@@ -22,7 +22,7 @@ from jaxevent.blob.quantities import inverse_ttc, size_range
 from jaxevent.errors import InputError, install_command
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.show import tracks as written
-from jaxevent.show.track_pictures import track_colour
+from jaxevent.show.track_figures import track_colour
 from jaxevent.show.track_tables import COLUMNS
 from jaxevent.simulate import Line, Target, simulate_blobs
 

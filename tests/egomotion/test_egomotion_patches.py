@@ -18,8 +18,8 @@ from jaxevent.egomotion.patches import usual_speed
 from jaxevent.egomotion.still import edges_with_events
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Imu, Poses, Recording
-from jaxevent.show.motion import Written
-from jaxevent.show.motion_pictures import motion_figure
+from jaxevent.show.motion import WrittenMotion
+from jaxevent.show.motion_figures import motion_figure
 
 WIDTH, HEIGHT, F = 120, 96, 100.0
 CAMERA = PinholeCamera(F, F, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
@@ -179,7 +179,7 @@ def test_a_heading_that_nothing_tells_is_said():
     for sigma2, said in ((1.2, True), (1e-4, False)):
         covariance[:, [0, 1], [0, 1]] = sigma2
         motion = dataclasses.replace(Motion.of("general", t, mean, covariance), held=1)
-        lines = Written([], t, motion(t), motion, None, None, None).summary()
+        lines = WrittenMotion([], t, motion(t), motion, None, None, None).summary()
         assert lines[0].startswith("1 estimate, found")  # the other one holds it
         assert ("not observable" in " ".join(lines)) == ("not told" in lines[2]) == said
         # Nor is a heading drawn that is not told, or a panel without anything.

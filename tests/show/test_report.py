@@ -12,15 +12,14 @@ from PIL import Image
 from jaxevent.egomotion.comparison import FIGURES
 from jaxevent.errors import InputError, install_command
 from jaxevent.metrics import MEANINGS
-from jaxevent.show.report import (
-    COLUMNS,
+from jaxevent.show.images import (
     comparison_figure,
     display_limits,
-    markdown_table,
     tone_map,
     video_writer,
     write_png,
 )
+from jaxevent.show.tables import COLUMNS, markdown_table
 
 pytestmark = pytest.mark.slow
 
