@@ -22,13 +22,12 @@ import numba
 import numpy as np
 
 from jaxevent.egomotion import voting
-from jaxevent.egomotion.bundle import photometric
-from jaxevent.egomotion.bundle import windows as batch
-from jaxevent.egomotion.bundle.equations import FREE, Unknowns, linearise
-from jaxevent.egomotion.bundle.path import Path, advanced
-from jaxevent.egomotion.bundle.placing import POWERS
-from jaxevent.egomotion.bundle.tracks import Scene
-from jaxevent.egomotion.bundle.weighing import subtract_mean
+from jaxevent.egomotion.bundle import photometric_ba
+from jaxevent.egomotion.bundle.hypotheses import SCORED_EVENTS, WindowFit, WindowFitter
+from jaxevent.egomotion.bundle.normal_equations import N_PATH, Unknowns, linearise
+from jaxevent.egomotion.bundle.residuals import Scene, subtract_mean
+from jaxevent.egomotion.bundle.warp import N_ROWS, Path, predict_path
+from jaxevent.egomotion.bundle.windows import Params as BatchParams
 from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.particle_filter import filtering
@@ -166,19 +165,19 @@ def batch_bench() -> tuple[dict[str, float], dict[str, float]]:
     """
     recording, _ = motion_scene("texture", "varying", 200, duration=0.5)
     assert recording.camera is not None
-    windows = batch.Windows(recording, batch.Params.of({}), recording.camera)
-    first, last = windows.rows(250_000, 0.15)
+    windows = WindowFitter(recording, BatchParams.of({}), recording.camera)
+    first, last = windows.event_range(250_000, 0.15)
     assert last - first > 100_000
 
-    def whole() -> batch.Fit:
+    def whole() -> WindowFit:
         fit = windows.fit(250_000)
         assert fit is not None
         return fit
 
-    warm = advanced(whole().path, 0.0, 0.15)
+    warm = predict_path(whole().path, 0.0, 0.15)
 
-    def follow() -> batch.Fit | None:
-        return windows.ended(250_000, [windows.followed(250_000, warm)])
+    def follow() -> WindowFit | None:
+        return windows.refine_final(250_000, [windows.refine_from(250_000, warm)])
 
     name = "batch general motion, CPU s per window"
     begin = time.process_time()  # once: it takes long
@@ -222,44 +221,48 @@ def normal_bench() -> tuple[dict[str, float], dict[str, float]]:
     """One J' W J v of the batch fit, of 60,000 events where they are, beside a drawn map."""
     recording, truth = motion_scene("texture", "varying", 200, duration=0.4)
     assert recording.camera is not None
-    windows = batch.Windows(recording, batch.Params.of({}), recording.camera)
-    tracks, prior = windows.tracks(200_000, 0.15, batch.LAST), windows.prior(200_000, 0.15)
+    windows = WindowFitter(recording, BatchParams.of({}), recording.camera)
+    series, prior = windows.series(200_000, 0.15, SCORED_EVENTS), windows.prior(200_000, 0.15)
     T, Omega = (part[0] for part in truth.twist(np.array([0.2])))
-    rng, real = np.random.default_rng(0), tracks.x.dtype
-    depths = np.full(math.prod(tracks.nodes), np.log(np.linalg.norm(T)), real)
-    path = Path.constant(T / np.linalg.norm(T), Omega, depths)
-    scene = Scene(path, rng.normal(size=tracks.shape).astype(real), 0.0)
-    made = linearise(*photometric.begin(tracks, scene, prior, 1.0, plane=False), settling=False)
-    slopes, weight = made.slopes, made.seen.weight
-    E, n = len(weight), FREE + len(slopes.more)
-    v = rng.normal(size=tracks.shape), rng.normal(size=n), rng.normal(size=len(depths))
-    v = v[0].astype(real), np.append(v[1], np.zeros(FREE + 4 - n)), v[2].astype(real)
+    rng, real = np.random.default_rng(0), series.x.dtype
+    depths = np.full(math.prod(series.nodes), np.log(np.linalg.norm(T)), real)
+    path = Path.constant_twist(T / np.linalg.norm(T), Omega, depths)
+    scene = Scene(path, rng.normal(size=series.shape).astype(real), 0.0)
+    made = linearise(
+        *photometric_ba.init_problem(series, scene, prior, 1.0, plane=False), map_only=False
+    )
+    jacobian, weight = made.jacobian, made.evaluation.weight
+    E, n = len(weight), N_PATH + len(jacobian.more)
+    v = rng.normal(size=series.shape), rng.normal(size=n), rng.normal(size=len(depths))
+    v = v[0].astype(real), np.append(v[1], np.zeros(N_PATH + 4 - n)), v[2].astype(real)
 
     def product() -> Unknowns:
-        value = made.change(v)
-        subtract_mean(value, weight, tracks.begin)
+        value = made.jacobian_product(v)
+        subtract_mean(value, weight, series.begin)
         value *= weight
-        return made.transposed(value)
+        return made.transpose_product(value)
 
-    powers = slopes.tau[:, None] ** np.arange(1, POWERS + 1)
-    by_path = (slopes.base.T[:, :, None] * powers[:, None]).reshape(E, -1) @ made.chain
+    powers = jacobian.tau[:, None] ** np.arange(1, N_ROWS + 1)
+    by_path = (jacobian.base.T[:, :, None] * powers[:, None]).reshape(
+        E, -1
+    ) @ made.coefficient_jacobian
     across, down = (
         np.stack([(0.5 - t) ** 2 / 2, 0.75 - t**2, (0.5 + t) ** 2 / 2], 1)
-        for t in (slopes.u, slopes.v)
+        for t in (jacobian.u, jacobian.v)
     )
     share = (down[:, :, None] * across[:, None]).reshape(E, 9)
-    right, low = (np.stack([1 - t, t], 1) for t in (slopes.across, slopes.down))
+    right, low = (np.stack([1 - t, t], 1) for t in (jacobian.across, jacobian.down))
     node_share = (low[:, :, None] * right[:, None]).reshape(E, 4)
-    steps = (tracks.shape[1] * np.arange(3)[:, None] + np.arange(3)).ravel()
-    node_steps = (tracks.nodes[1] * np.arange(2)[:, None] + np.arange(2)).ravel()
-    pixel = np.repeat(np.arange(len(tracks.begin) - 1), np.diff(tracks.begin))
+    steps = (series.shape[1] * np.arange(3)[:, None] + np.arange(3)).ravel()
+    node_steps = (series.nodes[1] * np.arange(2)[:, None] + np.arange(2)).ravel()
+    pixel = np.repeat(np.arange(len(series.begin) - 1), np.diff(series.begin))
     total = np.maximum(np.bincount(pixel, weight), 1e-3)
     given = v[0].ravel(), v[1][:n], v[2], share, node_share, weight, total
     v_map, v_path, v_depth, share, node_share, own, total = (x.astype(np.float32) for x in given)
-    by_path = np.concatenate([by_path, slopes.more.T], 1).astype(np.float32)
+    by_path = np.concatenate([by_path, jacobian.more.T], 1).astype(np.float32)
     arguments = (
-        v_map, v_path, v_depth, slopes.first, steps, share, slopes.node, node_steps, node_share,
-        by_path, slopes.by_depth, own, pixel, total,
+        v_map, v_path, v_depth, jacobian.first, steps, share, jacobian.node, node_steps, node_share,
+        by_path, jacobian.by_depth, own, pixel, total,
     )  # fmt: skip
     for ours, its in zip(product(), normal_loop(*arguments), strict=True):
         ours = ours.ravel()[: its.size]

@@ -185,14 +185,18 @@ def definitions_of(path: Path) -> Iterator[Definition]:
     yield from walk(ast.parse(path.read_text()).body, (), False)
 
 
-def public_files() -> set[Path]:
-    """Return the files that a page of the reference shows."""
+def public_files() -> dict[Path, set[str] | None]:
+    """Return the files that a page of the reference shows, with the names shown; None: all."""
     pages = "\n".join(page.read_text() for page in (ROOT / "docs" / "api").glob("*.md"))
-    files = set()
-    for module in re.findall(r"^::: ([\w.]+)", pages, re.M):
+    files: dict[Path, set[str] | None] = {}
+    pattern = r"^::: ([\w.]+)(?:\n    options: \{.*?members: (\[.*?\]|false))?"
+    for module, members in re.findall(pattern, pages, re.M):
         base = ROOT.joinpath(*module.split("."))
-        files.add(base / "__init__.py" if base.is_dir() else base.with_suffix(".py"))
-    return {file for file in files if file.exists()}
+        file = base / "__init__.py" if base.is_dir() else base.with_suffix(".py")
+        known = files.get(file, set())
+        names = set(re.findall(r"\w+", members)) - {"false"} if members else None
+        files[file] = None if names is None or known is None else known | names
+    return {file: names for file, names in files.items() if file.exists()}
 
 
 def exported_names() -> dict[Path, set[str]]:
@@ -247,11 +251,15 @@ def is_documented_by_base(
     return False
 
 
-def is_public_surface(one: Definition, pages: set[Path], exported: dict[Path, set[str]]) -> bool:
+def is_public_surface(
+    one: Definition, pages: dict[Path, set[str] | None], exported: dict[Path, set[str]]
+) -> bool:
     """Return true if users see a definition: in the reference, or exported by a package."""
     if not one.is_public:
         return False
-    return one.path in pages or (*one.inside, one.name)[0] in exported.get(one.path, set())
+    top = (*one.inside, one.name)[0]
+    shown = pages.get(one.path, set())
+    return shown is None or top in shown or top in exported.get(one.path, set())
 
 
 def begins_badly(docstring: str) -> bool:

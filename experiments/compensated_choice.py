@@ -15,11 +15,12 @@ Frames that serve as truth are noisy: their own variance is added to that of the
 
 import argparse
 import dataclasses
+import functools
 import itertools
 import pickle
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +32,7 @@ import jaxevent
 from jaxevent.camera import UnknownResponse
 from jaxevent.metrics import ssim
 from jaxevent.reconstruction.compensated import estimator, fusion
-from jaxevent.reconstruction.compensated.parameters import OTHERS, SIGNS, Params
+from jaxevent.reconstruction.compensated.params import FALLBACKS, FEATURES, Params
 from jaxevent.recording import Frames
 from jaxevent.runs.protocols import frame_times
 from jaxevent.simulate import FITTING, SENSORS, TESTING, Objects, Pan, Sensor, scene, simulate
@@ -45,6 +46,17 @@ REAL = 2.0
 RARE = (6.25,)  # Hz, of frames so far apart that motion is hardly found
 BLURS = ((0.02, 0.05, 0.1), (25.0, 100.0, 300.0))  # s; px/s
 CUTS, AWAY = 4, (1, 2, 4, 8)  # places at which a recording is cut; frames from there
+# Parts of `FusionFeatures` that are kept of an image.
+FIELDS = (
+    "candidates",
+    "in_place",
+    "features",
+    "image_variance",
+    "beyond",
+    "rest",
+    "stationary",
+    "intervals_away",
+)
 GAPS = {2: 12, 4: 12, 8: 12, 16: 8}  # frames from one that is given to the next: images scored
 # What `jaxevent fit` finds with the likelihood of frames: configs/fit_slider_depth.toml, and the
 # same for davis346_street.
@@ -268,22 +280,15 @@ def ended(path: Path, params: Params) -> Iterator[tuple]:
 
 
 def compared(targets: Iterator[tuple]) -> Iterator[dict[str, Any]]:
-    compare = jax.jit(fusion.compare)
+    features = jax.jit(fusion.fusion_features)
     for label, video, t, truth, hdr in targets:
-        target = video.follow(t)
+        target = video.trajectories(t)
         if target.smooth is not None:  # nor is its brightness that of its images
             continue
-        told = compare(*estimator.look(video.params, target))
+        given = features(*estimator.compare_images(video.params, target))
         yield {
             "label": label,
-            "ingredients": np.asarray(told.ingredients),
-            "known": np.asarray(told.known),
-            "signs": np.asarray(told.signs),
-            "usual": np.asarray(told.usual),
-            "beyond": np.asarray(told.beyond),
-            "rest": np.asarray(told.rest),
-            "stays": np.asarray(told.stays),
-            "far": np.asarray(told.far),
+            **{name: np.asarray(getattr(given, name)) for name in FIELDS},
             "truth": truth.astype(np.float32),
             "I0": float(video.params.I0),
             "hdr": hdr,
@@ -307,7 +312,7 @@ def noise_in(row: dict[str, Any], noises: dict[str, float]) -> np.ndarray:
 def difficulty(row: dict[str, Any]) -> float:
     """What the first two ingredients get wrong, so that hard images do not outweigh."""
     known = (row["I0"], row["truth"], row["hdr"])
-    return float(np.sqrt(np.prod([errors(L, *known).mean() for L in row["ingredients"][:2]])))
+    return float(np.sqrt(np.prod([errors(L, *known).mean() for L in row["candidates"][:2]])))
 
 
 def weight(row: dict[str, Any], noises: dict[str, float]) -> float:
@@ -315,99 +320,210 @@ def weight(row: dict[str, Any], noises: dict[str, float]) -> float:
     return REAL if row["label"].split()[0] in noises else 1.0
 
 
-def _doubted(row: dict[str, Any]) -> np.ndarray:
-    """The signs by which the variance is told."""
-    given = (row["signs"], row["known"], row["beyond"] > 0, row["far"])
-    return np.asarray(fusion.signs_of_doubt(*map(jnp.asarray, given)))
+class Pixels(NamedTuple):
+    """Pixels of images that are fitted to, a row for each."""
+
+    X: Any  # (n, features)
+    variance_X: Any  # (n, features), of the variance
+    Y: Any  # (n, 3), candidates
+    in_place: Any  # (n, 1), logarithm
+    truth: Any
+    I0: Any
+    R: Any  # variance of the truth, (ln I)^2
+    hdr: Any
+    scale: Any  # weight of the squared error
+    share: Any  # weight for the variance: every kind of images counts the same
+    images: Any  # (images,), pixels of each
+    kinds: dict[str, list[int]]  # images by label
+
+    @property
+    def level(self) -> Any:
+        """The true ln(I + I0)."""
+        return jnp.log(self.truth + self.I0)
 
 
-def _standardised(X: jnp.ndarray) -> tuple[jnp.ndarray, jnp.ndarray, jnp.ndarray]:
-    """Signs (pixels, signs) of mean 0 and standard deviation 1, and what these were."""
+def gather(rows: list[dict], noises: dict[str, float], sub: int = 7) -> Pixels:
+    """Gather every `sub`-th pixel; `noises` are those of frames, by recording."""
+
+    def some(image) -> np.ndarray:
+        return np.asarray(image).reshape(*np.shape(image)[:-2], -1)[..., ::sub]
+
+    def column(part: Callable[[dict], Any]) -> Any:
+        return jnp.asarray(np.concatenate([np.asarray(part(r), np.float32) for r in rows]))
+
+    def constant(part: Callable[[dict], float]) -> Any:
+        return column(lambda r: np.full(len(some(r["truth"])), part(r)))
+
+    def variance_features(row: dict) -> np.ndarray:
+        given = (row["features"], row["in_place"], row["beyond"] > 0, row["intervals_away"])
+        return np.asarray(fusion.variance_features(*map(jnp.asarray, given)))
+
+    kinds: dict[str, list[int]] = {}
+    for k, row in enumerate(rows):
+        kinds.setdefault(row["label"], []).append(k)
+    images = np.array([len(some(r["truth"])) for r in rows])
+    share = constant(lambda r: 1 / (len(some(r["truth"])) * len(kinds[r["label"]])))
+    return Pixels(
+        column(lambda r: some(r["features"]).T),
+        column(lambda r: some(variance_features(r)).T),
+        column(lambda r: some(r["candidates"]).T),
+        column(lambda r: some(np.log(r["in_place"]))[:, None]),
+        column(lambda r: some(r["truth"])),
+        constant(lambda r: r["I0"]),
+        column(lambda r: some(noise_in(r, noises))),
+        constant(lambda r: r["hdr"]) > 0,
+        constant(lambda r: weight(r, noises) / difficulty(r)),
+        share / share.sum(),
+        images,
+        kinds,
+    )
+
+
+def blend(pixels: Pixels, W: Any) -> Any:
+    """Blend the candidates of pixels with weights W (2, features)."""
+    zero = jnp.zeros_like(pixels.in_place)
+    q = jax.nn.softmax(jnp.concatenate([zero, pixels.X @ W.T + pixels.in_place], 1))
+    return (q * pixels.Y).sum(1)
+
+
+def image_loss(pixels: Pixels, W: Any) -> Any:
+    """Return the mean squared error of blended pixels, in units of the candidates'."""
+    return (pixels.scale * errors(blend(pixels, W), pixels.I0, pixels.truth, pixels.hdr)).mean()
+
+
+def variance_loss(pixels: Pixels, w: Any, squares: Any) -> Any:
+    """Return the negative log-likelihood of squared errors with variance weights w (features,).
+
+    It is heavy-tailed as a t distribution, so that a few lost pixels do not set all variances.
+    """
+    P = jnp.exp(pixels.variance_X @ w) + pixels.R
+    tail = 10 * jnp.log1p(squares / P / 10)
+    return 0.5 * (pixels.share * (1.1 * tail + jnp.log(P))).sum()
+
+
+def standardise(X: Any) -> tuple[Any, Any, Any]:
+    """Return features of mean 0 and standard deviation 1, and these."""
     mean, spread = X.mean(0).at[-1].set(0), X.std(0).at[-1].set(1)
     spread = jnp.where(spread > 1e-3, spread, 1)
     return (X - mean) / spread, mean, spread
 
 
-def fit(
-    rows: list[dict],
-    noises: dict[str, float],
-    sub: int = 7,
-    iterations: int = 400,
-    l2: float = 3e-4,
-) -> tuple:
-    """`choice` (2, signs) and `doubt` (signs); `noises` are those of frames, by recording."""
+def plain(W: Any, mean: Any, spread: Any) -> Any:
+    """Convert weights of standardised features to those of the features as they are."""
+    W = W / spread
+    return W.at[..., -1].add(-(W[..., :-1] * mean[:-1]).sum(-1))
 
-    def column(part) -> jnp.ndarray:
-        return jnp.asarray(np.concatenate([np.asarray(part(r), np.float32) for r in rows]))
 
-    def some(image):
-        return image.reshape(*image.shape[:-2], -1)[..., ::sub]
+def minimise(value: Callable[[Any], Any], start: Any, used: Any, iterations: int) -> Any:
+    """Minimise a function of weights, all but those `used` 0."""
+    optimiser = optax.adam(0.05)
+    state, step = optimiser.init(start), jax.jit(jax.grad(lambda W: value(W * used)))
+    for _ in range(iterations):
+        change, state = optimiser.update(step(start), state)
+        start = optax.apply_updates(start, change)
+    return start * used
 
-    X = column(lambda r: some(r["signs"]).T)
-    Y = column(lambda r: some(r["ingredients"]).T)
-    known = column(lambda r: some(np.log(r["known"]))[:, None])
-    truth = column(lambda r: some(r["truth"]))
-    I0 = column(lambda r: np.full(len(some(r["truth"])), r["I0"]))
-    R = column(lambda r: some(noise_in(r, noises)))
-    groups: dict[str, list[int]] = {}
-    for k, row in enumerate(rows):
-        groups.setdefault(row["label"], []).append(k)
-    # Every kind of images counts the same for the variance.
-    share = column(
-        lambda r: np.full(
-            len(some(r["truth"])), 1 / (len(some(r["truth"])) * len(groups[r["label"]]))
+
+class Fit(NamedTuple):
+    """Weights of the choice and of the variance, on standardised pixels."""
+
+    pixels: Pixels
+    scales: tuple  # mean and standard deviation of features
+    variance_scales: tuple
+
+    @classmethod
+    def of(cls, pixels: Pixels) -> "Fit":
+        """Standardise features."""
+        X, *scales = standardise(pixels.X)
+        variance_X, *variance_scales = standardise(pixels.variance_X)
+        pixels = pixels._replace(X=X, variance_X=variance_X)
+        return cls(pixels, tuple(scales), tuple(variance_scales))
+
+    def choice_value(self, W: Any) -> Any:
+        """Return the loss of choice weights, with a penalty."""
+        return image_loss(self.pixels, W) + 3e-4 * (W[:, :-1] ** 2).sum()
+
+    def variance_value(self, w: Any, squares: Any) -> Any:
+        """Return the loss of variance weights, with a penalty."""
+        return variance_loss(self.pixels, w, squares) + 1e-4 * (w[:-1] ** 2).sum()
+
+    def choice(self, used: Any, iterations: int = 400) -> Any:
+        """Fit choice weights (2, features)."""
+        start = jnp.zeros((len(FALLBACKS), len(FEATURES) + 1))
+        start = start.at[:, -1].set(jnp.array([-2.0, -3.0]))
+        return minimise(self.choice_value, start, used, iterations)
+
+    def squares(self, W: Any) -> Any:
+        """Return the squared errors of log intensity."""
+        return (blend(self.pixels, W) - self.pixels.level) ** 2
+
+    def variance(self, used: Any, squares: Any, iterations: int = 400) -> Any:
+        """Fit variance weights (features,), scaled to a standardised square of 1.
+
+        Of that the geometric mean over images of a kind is taken, and then over kinds.
+        """
+        start = jnp.zeros(len(FEATURES) + 1).at[-1].set(jnp.log(squares.mean()))
+        w = minimise(lambda w: self.variance_value(w, squares), start, used, iterations)
+        edges, factor = np.cumsum([0, *self.pixels.images]), 1.0
+        for _ in range(5):
+            P = factor * jnp.exp(self.pixels.variance_X @ w) + self.pixels.R
+            z2 = np.asarray(squares / P)
+            means = [np.log(z2[i:j].mean()) for i, j in zip(edges[:-1], edges[1:], strict=True)]
+            kinds = self.pixels.kinds.values()
+            factor *= float(np.exp(np.mean([np.mean([means[k] for k in g]) for g in kinds])))
+        return w.at[-1].add(np.log(factor))
+
+
+def eliminate(value: Callable[[Any], Any], weights: Any, iterations: int = 60) -> list[int]:
+    """Order features by backward elimination: the first one is the first to go.
+
+    At each turn the feature goes without which the loss, after a few steps of the other weights, is
+    least.
+    """
+    used, order = np.ones(len(FEATURES) + 1, np.float32), []
+    while used[:-1].any():
+        found = []
+        for k in np.flatnonzero(used[:-1]):
+            fewer = used.copy()
+            fewer[k] = 0
+            W = minimise(value, weights, jnp.asarray(fewer), iterations)
+            found.append((float(value(W)), int(k), W))
+        _, gone, weights = min(found, key=lambda one: one[0])
+        used[gone] = 0
+        order.append(gone)
+    return order
+
+
+def select(fitting: list[dict], testing: list[dict], noises: dict[str, float]) -> None:
+    """Print the held-out losses of fewer features, in a table."""
+    few, held_out = Fit.of(gather(fitting, noises, 101)), gather(testing, noises)
+    fit = Fit.of(gather(fitting, noises))
+    every = jnp.ones(len(FEATURES) + 1)
+    W = few.choice(every)
+    squares = few.squares(W)
+    choice_order = eliminate(few.choice_value, W)
+    w = few.variance(every, squares)
+    variance_order = eliminate(functools.partial(few.variance_value, squares=squares), w)
+    whole = fit.choice(every)
+    squares = fit.squares(whole)
+    held_out_squares = (blend(held_out, plain(whole, *fit.scales)) - held_out.level) ** 2
+    for name, order in (("choice", choice_order), ("variance", variance_order)):
+        print(name, [FEATURES[k] for k in order])
+    print("| features | image loss, fitted | held out | variance loss, fitted | held out |")
+    print("|---:|---:|---:|---:|---:|")
+    for count in (16, 14, 12, 10, 8, 6, 4, 3, 2, 1, 0):
+        used = [
+            every.at[jnp.array(o[: len(FEATURES) - count], int)].set(0)
+            for o in (choice_order, variance_order)
+        ]
+        W, w = fit.choice(used[0]), fit.variance(used[1], squares)
+        cells = (
+            image_loss(fit.pixels, W),
+            image_loss(held_out, plain(W, *fit.scales)),
+            variance_loss(fit.pixels, w, squares),
+            variance_loss(held_out, plain(w, *fit.variance_scales), held_out_squares),
         )
-    )
-    share = share / share.sum()
-    doubted = column(lambda r: some(_doubted(r)).T)
-    hdr = column(lambda r: np.full(len(some(r["truth"])), r["hdr"])) > 0
-    scale = column(lambda r: np.full(len(some(r["truth"])), weight(r, noises) / difficulty(r)))
-    X, *scales = _standardised(X)
-    doubted, *doubted_scales = _standardised(doubted)
-    level = jnp.log(truth + I0)
-
-    def choose(W):
-        q = jax.nn.softmax(jnp.concatenate([jnp.zeros_like(X[:, :1]), X @ W.T + known], 1))
-        return (q * Y).sum(1)
-
-    def loss(W):
-        return (scale * errors(choose(W), I0, truth, hdr)).mean() + l2 * (W[:, :-1] ** 2).sum()
-
-    def surprise(w, squares):
-        # Heavy-tailed as a t distribution, so that a few lost pixels do not set all variances.
-        P = jnp.exp(doubted @ w) + R
-        tail = 10 * jnp.log1p(squares / P / 10)
-        return 0.5 * (share * (1.1 * tail + jnp.log(P))).sum() + 1e-4 * (w[:-1] ** 2).sum()
-
-    def descend(value: Callable[[Any], Any], start: Any) -> tuple[Any, float]:
-        optimiser = optax.adam(0.05)
-        state, step, found = optimiser.init(start), jax.jit(jax.value_and_grad(value)), 0.0
-        for _ in range(iterations):
-            found, gradient = step(start)
-            change, state = optimiser.update(gradient, state)
-            start = optax.apply_updates(start, change)
-        return start, float(found)
-
-    def plain(W, mean, spread):
-        W = W / spread
-        return W.at[..., -1].add(-(W[..., :-1] * mean[:-1]).sum(-1))
-
-    start = jnp.zeros((len(OTHERS), len(SIGNS) + 1)).at[:, -1].set(jnp.array([-2.0, -3.0]))
-    W, found = descend(loss, start)
-    squares = (choose(W) - level) ** 2
-    start = jnp.zeros(X.shape[1]).at[-1].set(jnp.log(squares.mean()))
-    w, _ = descend(lambda w: surprise(w, squares), start)
-    # Scaled so that the mean squared standardised error is 1, in the geometric mean over images of
-    # a kind, and then over kinds.
-    places = np.cumsum([0, *(len(some(r["truth"])) for r in rows)])
-    factor = 1.0
-    for _ in range(5):
-        z2 = np.asarray(squares / (factor * jnp.exp(doubted @ w) + R))
-        means = [np.log(z2[i:j].mean()) for i, j in zip(places[:-1], places[1:], strict=True)]
-        factor *= float(np.exp(np.mean([np.mean([means[k] for k in g]) for g in groups.values()])))
-    w = w.at[-1].add(np.log(factor))
-    print(f"loss {found:.4f}, variances times {factor:.2f}")
-    return np.asarray(plain(W, *scales)), np.asarray(plain(w, *doubted_scales))
+        print(f"| {count} | " + " | ".join(f"{float(v):.4f}" for v in cells) + " |", flush=True)
 
 
 def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:
@@ -416,24 +532,17 @@ def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:
     The last columns: which part of pixels is not valid; and among these and among the valid ones,
     which part is wrong by more than `vague`.
     """
-    decide = jax.jit(fusion.decide)
+    fuse_candidates = jax.jit(fusion.fuse_candidates)
     table: dict[str, list] = {}
     for r in rows:
-        told = fusion.Comparison(
-            jnp.asarray(r["ingredients"]),
-            jnp.asarray(r["known"]),
-            jnp.asarray(r["signs"]),
-            jnp.zeros((3, 1, 1)),
-            jnp.zeros((2, 1, 1)),
-            jnp.asarray(r["usual"]),
-            jnp.asarray(r["beyond"]),
-            jnp.asarray(r["rest"]),
-            jnp.asarray(r["stays"]),
-            jnp.asarray(r["far"]),
+        given = fusion.FusionFeatures(
+            shares=jnp.zeros((3, 1, 1)),
+            visible=jnp.zeros((2, 1, 1)),
+            **{name: jnp.asarray(r[name]) for name in FIELDS},
         )
-        fused = decide(params, told)
+        fused = fuse_candidates(params, given)
         line = []
-        for L in (*r["ingredients"], np.asarray(fused.L)):
+        for L in (*r["candidates"], np.asarray(fused.L)):
             line.append(float(errors(L, r["I0"], r["truth"], r["hdr"]).mean()) * 100)
         shown = (np.exp(np.asarray(fused.L)) - r["I0"]).clip(0, 1).astype(np.float32)
         line.append(float(ssim(shown, r["truth"])) if not r["hdr"] else np.nan)
@@ -459,6 +568,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--beyond", action="store_true", help="where frames are on one side alone")
+    parser.add_argument("--features", action="store_true", help="print losses of fewer features")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     data = given.data / "data"
@@ -473,7 +583,14 @@ def main() -> None:
     slider, street = data / "slider_depth.zip", data / "davis346_street.npz"
     noises = {path.stem: noise_of(frames_of(path)) for path in (slider, street)}
     fitting, testing = (_beyond if given.beyond else _two_sided)(kept, slider, street)
-    choice, doubt = fit([row for part in fitting for row in part], noises)
+    if given.features:
+        rows = ([row for part in parts for row in part] for parts in (fitting, testing))
+        return select(*rows, noises)
+    fit = Fit.of(gather([row for part in fitting for row in part], noises))
+    every = jnp.ones(len(FEATURES) + 1)
+    W = fit.choice(every)
+    w = fit.variance(every, fit.squares(W))
+    choice, doubt = (np.asarray(v) for v in (plain(W, *fit.scales), plain(w, *fit.variance_scales)))
     ending = "_beyond" if given.beyond else ""
     found = {f"choice{ending}": choice.ravel(), f"doubt{ending}": doubt}
     found = {name: [round(float(v), 3) for v in values] for name, values in found.items()}

@@ -29,7 +29,8 @@ import pandas as pd
 
 from jaxevent.egomotion import scores
 from jaxevent.egomotion.bundle import sequence
-from jaxevent.egomotion.bundle import windows as batch
+from jaxevent.egomotion.bundle.hypotheses import WindowFitter
+from jaxevent.egomotion.bundle.windows import Params
 from jaxevent.simulate import SENSORS, Sensor, motion_scene
 
 CENTRE = 250_000  # us
@@ -40,12 +41,12 @@ UNEVEN = dataclasses.replace(SENSORS["ideal"], c_on=0.16, c_off=0.26, mismatch=0
 
 
 def window(
-    scene: str, motion: str, seed: int, params: batch.Params, sensor: Sensor | None
+    scene: str, motion: str, seed: int, params: Params, sensor: Sensor | None
 ) -> dict[str, Any]:
     recording, source = motion_scene(scene, motion, seed, sensor=sensor)
     assert recording.camera is not None
     cpu, clock = time.process_time(), time.perf_counter()
-    windows = batch.Windows(recording, params, recording.camera)
+    windows = WindowFitter(recording, params, recording.camera)
     fit = windows.fit(CENTRE)
     cpu, clock = time.process_time() - cpu, time.perf_counter() - clock
     assert fit is not None
@@ -69,7 +70,7 @@ def window(
     }
 
 
-def whole(scene: str, seed: int, params: batch.Params, seconds: float) -> dict[str, Any]:
+def whole(scene: str, seed: int, params: Params, seconds: float) -> dict[str, Any]:
     recording, source = motion_scene(scene, "varying", seed, duration=seconds)
     clock = time.perf_counter()
     found = sequence.batch.estimate(recording, params)
@@ -106,7 +107,7 @@ def main() -> None:
     own = {"mismatch": arguments.mismatch, "jitter": arguments.jitter}
     sensor = dataclasses.replace(UNEVEN, **own) if arguments.uneven else None
     arguments.out.mkdir(parents=True, exist_ok=True)
-    params, rows = batch.Params.of({}), []
+    params, rows = Params.of({}), []
     if arguments.seconds:
         for seed in arguments.seeds:
             for scene in arguments.scenes:

@@ -42,7 +42,7 @@ from jaxevent import egomotion
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import batch, contrast, geometry, voting
 from jaxevent.egomotion.baselines.tracked_points import Params, followed, undistorted
-from jaxevent.egomotion.bundle.frames import offset
+from jaxevent.egomotion.bundle.windows import stamp_offset
 from jaxevent.egomotion.candidates import coordinates
 from jaxevent.errors import require
 
@@ -181,7 +181,7 @@ def evbench(data: Path, frames: bool = True) -> Rows:
             "heading deg, median": np.median(heading),
             "its sigma": np.median(sigma),
             "undecided %": 100 * (sigma > 57).mean(),
-            "frames late by ms": 1e-3 * offset(recording),
+            "frames late by ms": 1e-3 * stamp_offset(recording),
             "Omega %, median": 100 * np.median(turn),
             "max": 100 * turn.max(),
             "Omega, mean error": _numbers((mean[:, 3:] - twist[3:]).mean(0)),
@@ -222,7 +222,7 @@ def slider(data: Path, frames: bool = True) -> Rows:
         }
     )
     motion = fitted(recording[:3.1], frames)
-    late = 1e-3 * offset(recording)
+    late = 1e-3 * stamp_offset(recording)
     for first, last in ((0.0, 1.0), (1.0, 2.0), (2.0, 3.1)):
         here = motion.valid & (motion.t >= 1e6 * first) & (motion.t < 1e6 * last)
         mean, covariance = motion.mean[here], motion.covariance[here]

@@ -438,7 +438,7 @@ def video(store: Store, recording: Recording, fits: Chosen) -> None:
     """Time evenly spaced images, with the motion of anchors and with every target's own."""
     frames = recording.frames
     assert frames is not None
-    for gap, apart in itertools.product((2, 8), (estimator.APART, 1)):
+    for gap, apart in itertools.product((2, 8), (estimator.ANCHOR_STEPS, 1)):
         given, hidden = held_out(recording, gap)
         rows = evenly(hidden_between(len(frames), gap), IMAGES[gap])
         truth = hidden[np.searchsorted(hidden.t, frames.t[rows])]
@@ -455,7 +455,7 @@ def _paced(
     truth: Frames,
     apart: int,
 ) -> Row:
-    kept, estimator.APART = estimator.APART, apart
+    kept, estimator.ANCHOR_STEPS = estimator.ANCHOR_STEPS, apart
     times = frame_times(truth, params)
     evenly_spaced = times[len(times) // 2] + np.arange(16) * 10_000
 
@@ -475,7 +475,7 @@ def _paced(
         }
         row["smoother"] = seconds(smoother(progress=False), evenly_spaced)
     finally:
-        estimator.APART = kept
+        estimator.ANCHOR_STEPS = kept
     errors = (np.clip(image, 0, 1) - truth.intensity) ** 2
     return {**row, "mse": float(errors.mean()), "images": len(times)}
 

@@ -137,16 +137,16 @@ MUTATIONS = (
     ),
     Mutation(
         "conjugate gradients forget the direction before",
-        "jaxevent/egomotion/bundle/solving.py",
+        "jaxevent/egomotion/bundle/cg.py",
         "share = new / max(size, 1e-30)",
         "share = 0.0",
         "tests/egomotion/test_photometric_equations.py -k gradients",
     ),
     Mutation(
         "a step that costs more is not damped",
-        "jaxevent/egomotion/bundle/gauss_newton.py",
-        "max(now.damping * HARDER, DAMP)",
-        "now.damping",
+        "jaxevent/egomotion/bundle/photometric_ba.py",
+        "max(damping * DAMPING_GROWTH, FIRST_DAMPING)",
+        "damping",
         "tests/egomotion/test_gauss_newton.py -k accepted",
     ),
     Mutation(

@@ -50,7 +50,7 @@ from jaxevent.tuning import (
 LEVEL = 0.95
 STEP = 0.02  # of differences, in logarithms, or in shares of a number that has none
 WIDE = 2.0  # half widths in logarithms from which the curvature at one place does not tell them
-FIRST, DOUBLINGS, HALVINGS = 0.1, 6, 5  # of the steps that look for an end
+FIRST, DOUBLINGS, HALVINGS = 0.1, 6, 5  # of the steps of the search for an end
 AWAY = math.log(10.0)  # how far a number has run that ran away
 NEAR = 0.25  # of a bound, in the same measure
 
@@ -314,8 +314,8 @@ def _intervals_of_fitted(sample: _Sample, start: Parameters) -> list[ParameterIn
         if trusted:
             ends = [-widths[k], widths[k]]
         else:
-            look = functools.partial(_losses_at_step, sample, k, scales[k])
-            ends = [_find_interval_end(sample, look, sign) for sign in (-1.0, 1.0)]
+            objective = functools.partial(_losses_at_step, sample, k, scales[k])
+            ends = [_find_interval_end(sample, objective, sign) for sign in (-1.0, 1.0)]
         low, high = (None if end is None else sample.at[k] + end * scales[k] for end in ends)
         remark = _remark(sample, k, (sample.at[k] - begun[k]) / scales[k], ends, scales[k])
         if not remark and not settled and np.isfinite(newton[k]):
@@ -380,7 +380,7 @@ def _losses_at_step(
 
 
 def _find_interval_end(
-    sample: _Sample, look: Callable[[float], NDArray[np.float64] | None], sign: float
+    sample: _Sample, objective: Callable[[float], NDArray[np.float64] | None], sign: float
 ) -> float | None:
     """Find the distance at which the loss has risen enough.
 
@@ -388,7 +388,7 @@ def _find_interval_end(
     """
     inside, step = 0.0, FIRST
     for _ in range(DOUBLINGS + 1):
-        values = look(sign * step)
+        values = objective(sign * step)
         if values is None:
             return None
         risen = sample.rises(values)
@@ -401,7 +401,7 @@ def _find_interval_end(
         return None
     for _ in range(HALVINGS):
         middle = (inside + step) / 2
-        values = look(sign * middle)
+        values = objective(sign * middle)
         if values is None or sample.rises(values):
             step = middle
         else:
@@ -441,7 +441,7 @@ def _interval_of_searched(
     value, scale = float(getattr(found, name)), (high - low) / (count - 1)
     number = found.numbers[name]
 
-    def look(step: float) -> NDArray[np.float64] | None:
+    def objective(step: float) -> NDArray[np.float64] | None:
         place = value + step * scale
         if not low <= place <= high:
             return None
@@ -450,7 +450,7 @@ def _interval_of_searched(
         return sample.losses(params, prepared(params)[0])[0]
 
     sample = _Sample(loss, found, (), None, prepared(found)[0])
-    ends = [_find_interval_end(sample, look, sign) for sign in (-1.0, 1.0)]
+    ends = [_find_interval_end(sample, objective, sign) for sign in (-1.0, 1.0)]
     below, above = (None if end is None else value + end * scale for end in ends)
     remark = ""
     for bound in (low, high):

@@ -3,7 +3,9 @@
 `RENAMED` is the one table. A module or package that renamed something ends with
 `__getattr__ = renamed_names(__name__)`; modules that moved are found by `RenamedModules`.
 """
+# ruff: noqa: E501, one entry of the table is one line
 
+import functools
 import importlib
 import importlib.abc
 import importlib.machinery
@@ -11,7 +13,9 @@ import sys
 import types
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar, cast
+
+T = TypeVar("T")
 
 # The full name until this release, and the one from now on.
 RENAMED: dict[str, str] = {
@@ -30,6 +34,113 @@ RENAMED: dict[str, str] = {
     "jaxevent.parameters.Share": "jaxevent.parameters.UnitInterval",
     "jaxevent.parameters.nearest": "jaxevent.parameters.suggest_name",
     "jaxevent.parameters.shown": "jaxevent.parameters.format_value",
+    "jaxevent.reconstruction.compensated.MotionCompensated": "jaxevent.reconstruction.compensated.MotionCompensation",
+    "jaxevent.reconstruction.compensated.estimator.Followed": "jaxevent.reconstruction.compensated.estimator.TrajectoryEstimate",
+    "jaxevent.reconstruction.compensated.estimator.Follower": "jaxevent.reconstruction.compensated.estimator.TrajectoryEstimator",
+    "jaxevent.reconstruction.compensated.estimator.Images": "jaxevent.reconstruction.compensated.images.InstantImages",
+    "jaxevent.reconstruction.compensated.estimator.MotionCompensated": "jaxevent.reconstruction.compensated.estimator.MotionCompensation",
+    "jaxevent.reconstruction.compensated.estimator.Moving": "jaxevent.reconstruction.compensated.estimator.FlowSource",
+    "jaxevent.reconstruction.compensated.estimator.Shutter": "jaxevent.reconstruction.compensated.exposures.FrameExposures",
+    "jaxevent.reconstruction.compensated.estimator.Start": "jaxevent.reconstruction.compensated.estimator.InitialMotion",
+    "jaxevent.reconstruction.compensated.estimator.Targets": "jaxevent.reconstruction.compensated.estimator.PreparedTargets",
+    "jaxevent.reconstruction.compensated.estimator.evidence": "jaxevent.reconstruction.compensated.images.instant_smoother",
+    "jaxevent.reconstruction.compensated.estimator.follower_of": "jaxevent.reconstruction.compensated.estimator.make_trajectory_estimator",
+    "jaxevent.reconstruction.compensated.estimator.fuse_images": "jaxevent.reconstruction.compensated.estimator.fuse_target",
+    "jaxevent.reconstruction.compensated.estimator.look": "jaxevent.reconstruction.compensated.estimator.compare_images",
+    "jaxevent.reconstruction.compensated.estimator.schedule_of": "jaxevent.reconstruction.compensated.estimator.make_schedule",
+    "jaxevent.reconstruction.compensated.estimator.smoothed_back": "jaxevent.reconstruction.compensated.estimator.add_smooth_part",
+    "jaxevent.reconstruction.compensated.fusion.Comparison": "jaxevent.reconstruction.compensated.fusion.FusionFeatures",
+    "jaxevent.reconstruction.compensated.fusion.Fused": "jaxevent.reconstruction.compensated.fusion.FusedImage",
+    "jaxevent.reconstruction.compensated.fusion.Views": "jaxevent.reconstruction.compensated.fusion.ReferenceImages",
+    "jaxevent.reconstruction.compensated.fusion.compare": "jaxevent.reconstruction.compensated.fusion.fusion_features",
+    "jaxevent.reconstruction.compensated.fusion.decide": "jaxevent.reconstruction.compensated.fusion.fuse_candidates",
+    "jaxevent.reconstruction.compensated.fusion.signs_of_doubt": "jaxevent.reconstruction.compensated.fusion.variance_features",
+    "jaxevent.reconstruction.compensated.fusion.views": "jaxevent.reconstruction.compensated.fusion.reference_images",
+    "jaxevent.reconstruction.compensated.fusion.weight_after": "jaxevent.reconstruction.compensated.fusion.after_weight",
+    "jaxevent.reconstruction.compensated.normal_equations.Equations": "jaxevent.reconstruction.compensated.normal_equations.NormalEquations",
+    "jaxevent.reconstruction.compensated.normal_equations.Numbers": "jaxevent.reconstruction.compensated.normal_equations.CostParams",
+    "jaxevent.reconstruction.compensated.normal_equations.Seen": "jaxevent.reconstruction.compensated.normal_equations.MotionImages",
+    "jaxevent.reconstruction.compensated.normal_equations.depending": "jaxevent.reconstruction.compensated.normal_equations.implicit_trajectories",
+    "jaxevent.reconstruction.compensated.normal_equations.equations": "jaxevent.reconstruction.compensated.normal_equations.linearise_jax",
+    "jaxevent.reconstruction.compensated.normal_equations.imbalance": "jaxevent.reconstruction.compensated.normal_equations.residual",
+    "jaxevent.reconstruction.compensated.robust_mean.Agreement": "jaxevent.reconstruction.compensated.robust_mean.RobustMean",
+    "jaxevent.reconstruction.compensated.robust_mean.Place": "jaxevent.reconstruction.compensated.robust_mean.InstantLayout",
+    "jaxevent.reconstruction.compensated.robust_mean.across": "jaxevent.reconstruction.compensated.robust_mean.blur_along_x",
+    "jaxevent.reconstruction.compensated.robust_mean.agree": "jaxevent.reconstruction.compensated.robust_mean.robust_mean",
+    "jaxevent.reconstruction.compensated.robust_mean.agree_purely": "jaxevent.reconstruction.compensated.robust_mean.robust_mean_jax",
+    "jaxevent.reconstruction.compensated.robust_mean.blur": "jaxevent.reconstruction.compensated.robust_mean.blur_jax",
+    "jaxevent.reconstruction.compensated.robust_mean.blurred": "jaxevent.reconstruction.compensated.robust_mean.blur_image",
+    "jaxevent.reconstruction.compensated.robust_mean.down": "jaxevent.reconstruction.compensated.robust_mean.blur_along_y",
+    "jaxevent.reconstruction.compensated.robust_mean.place_of": "jaxevent.reconstruction.compensated.robust_mean.make_layout",
+    "jaxevent.reconstruction.compensated.robust_mean.shown": "jaxevent.reconstruction.compensated.robust_mean.visibility",
+    "jaxevent.reconstruction.compensated.robust_mean.steepness": "jaxevent.reconstruction.compensated.robust_mean.squared_gradient",
+    "jaxevent.reconstruction.compensated.robust_mean.stretch": "jaxevent.reconstruction.compensated.robust_mean.activity_range",
+    "jaxevent.reconstruction.compensated.robust_mean.taps_of": "jaxevent.reconstruction.compensated.robust_mean.gaussian_taps",
+    "jaxevent.reconstruction.compensated.trajectories.Motion": "jaxevent.reconstruction.compensated.trajectories.NodeTrajectories",
+    "jaxevent.reconstruction.compensated.trajectories.Pyramid": "jaxevent.reconstruction.compensated.trajectories.ImagePyramid",
+    "jaxevent.reconstruction.compensated.trajectories.Row": "jaxevent.reconstruction.compensated.warp.RowScratch",
+    "jaxevent.reconstruction.compensated.trajectories.Smoothness": "jaxevent.reconstruction.compensated.normal_equations.CostParams",
+    "jaxevent.reconstruction.compensated.trajectories.around": "jaxevent.reconstruction.compensated.warp.bilinear_cell",
+    "jaxevent.reconstruction.compensated.trajectories.between": "jaxevent.reconstruction.compensated.warp.interpolate_path",
+    "jaxevent.reconstruction.compensated.trajectories.by_clock": "jaxevent.reconstruction.compensated.trajectories.change_clock",
+    "jaxevent.reconstruction.compensated.trajectories.choose": "jaxevent.reconstruction.compensated.trajectories.select_paths",
+    "jaxevent.reconstruction.compensated.trajectories.fetch": "jaxevent.reconstruction.compensated.normal_equations.sample_trajectories",
+    "jaxevent.reconstruction.compensated.trajectories.follow": "jaxevent.reconstruction.compensated.trajectories.estimate_trajectories",
+    "jaxevent.reconstruction.compensated.trajectories.locate": "jaxevent.reconstruction.compensated.warp.locate_points",
+    "jaxevent.reconstruction.compensated.trajectories.misfit": "jaxevent.reconstruction.compensated.trajectories.robust_cost",
+    "jaxevent.reconstruction.compensated.trajectories.nodes": "jaxevent.reconstruction.compensated.trajectories.node_shape",
+    "jaxevent.reconstruction.compensated.trajectories.pack": "jaxevent.reconstruction.compensated.trajectories.pack_images",
+    "jaxevent.reconstruction.compensated.trajectories.refine": "jaxevent.reconstruction.compensated.trajectories.refine_paths",
+    "jaxevent.reconstruction.compensated.trajectories.resize": "jaxevent.reconstruction.compensated.warp.resize_nodes",
+    "jaxevent.reconstruction.compensated.trajectories.spread": "jaxevent.reconstruction.compensated.warp.interpolate_paths",
+    "jaxevent.reconstruction.compensated.trajectories.stages": "jaxevent.reconstruction.compensated.trajectories.plan_stages",
+    "jaxevent.reconstruction.compensated.trajectories.step": "jaxevent.reconstruction.compensated.trajectories.gauss_newton_step",
+    "jaxevent.reconstruction.compensated.trajectories.weigh": "jaxevent.reconstruction.compensated.normal_equations.fill_information",
+    "jaxevent.reconstruction.augment.Augmented": "jaxevent.reconstruction.augment.AugmentedFrame",
+    "jaxevent.reconstruction.augment.BetweenFrames": "jaxevent.reconstruction.augment.FrameInterpolation",
+    "jaxevent.reconstruction.augment.Blended": "jaxevent.reconstruction.augment.LinearBlend",
+    "jaxevent.reconstruction.augment.Greys": "jaxevent.reconstruction.augment.GreyFrames",
+    "jaxevent.reconstruction.augment.Held": "jaxevent.reconstruction.augment.ZeroOrderHold",
+    "jaxevent.reconstruction.augment.Level": "jaxevent.reconstruction.augment.LogIntensityModel",
+    "jaxevent.reconstruction.augment.Nothing": "jaxevent.reconstruction.augment.NoFrames",
+    "jaxevent.reconstruction.augment.belief": "jaxevent.reconstruction.augment.effective_certainty",
+    "jaxevent.reconstruction.augment.believed_rate": "jaxevent.reconstruction.augment.frame_information",
+    "jaxevent.reconstruction.augment.bounded_ratio": "jaxevent.reconstruction.augment.bound_ratio",
+    "jaxevent.reconstruction.augment.brightness": "jaxevent.reconstruction.augment.integrate_counts",
+    "jaxevent.reconstruction.augment.deblurred": "jaxevent.reconstruction.augment.deblur_level",
+    "jaxevent.reconstruction.augment.unclipped": "jaxevent.reconstruction.augment.unclipped_weight",
+    "jaxevent.reconstruction.complementary.Pull": "jaxevent.reconstruction.complementary.ConstantRateModel",
+    "jaxevent.reconstruction.complementary.advance": "jaxevent.reconstruction.complementary.predict",
+    "jaxevent.reconstruction.complementary.jump": "jaxevent.reconstruction.complementary.event_update",
+    "jaxevent.reconstruction.direct.Direct": "jaxevent.reconstruction.direct.DirectFrameModel",
+    "jaxevent.reconstruction.direct.advance": "jaxevent.reconstruction.direct.predict",
+    "jaxevent.reconstruction.filtering.Observer": "jaxevent.reconstruction.filtering.FrameModel",
+    "jaxevent.reconstruction.filtering.Place": "jaxevent.reconstruction.filtering.LaneBlock",
+    "jaxevent.reconstruction.filtering.State": "jaxevent.reconstruction.filtering.PixelState",
+    "jaxevent.reconstruction.filtering.log_intensity": "jaxevent.reconstruction.filtering.readout_log_intensity",
+    "jaxevent.reconstruction.filtering.without_variance": "jaxevent.reconstruction.filtering.init_without_variance",
+    "jaxevent.reconstruction.kalman.Augmentation": "jaxevent.reconstruction.kalman.AugmentedFrameModel",
+    "jaxevent.reconstruction.kalman.advance": "jaxevent.reconstruction.kalman.predict",
+    "jaxevent.reconstruction.kalman.initial": "jaxevent.reconstruction.kalman.init",
+    "jaxevent.reconstruction.kalman.jump": "jaxevent.reconstruction.kalman.event_update",
+    "jaxevent.reconstruction.kalman.noise": "jaxevent.reconstruction.kalman.process_noise",
+    "jaxevent.reconstruction.kalman.within": "jaxevent.reconstruction.kalman.refractory_indicator",
+    "jaxevent.reconstruction.smoother.Link": "jaxevent.reconstruction.smoother.MessageMap",
+    "jaxevent.reconstruction.smoother.Measured": "jaxevent.reconstruction.smoother.FrameMeasurements",
+    "jaxevent.reconstruction.smoother.Passage": "jaxevent.reconstruction.smoother.SmoothedWindow",
+    "jaxevent.reconstruction.smoother.Rows": "jaxevent.reconstruction.smoother.FrameSteps",
+    "jaxevent.reconstruction.smoother.Sided": "jaxevent.reconstruction.smoother.CensoredPixels",
+    "jaxevent.reconstruction.smoother.compose_links": "jaxevent.reconstruction.smoother.compose_message_maps",
+    "jaxevent.reconstruction.smoother.counts_around": "jaxevent.reconstruction.smoother.adjacent_counts",
+    "jaxevent.reconstruction.smoother.information": "jaxevent.reconstruction.smoother.state_to_message",
+    "jaxevent.reconstruction.smoother.initial": "jaxevent.reconstruction.smoother.init",
+    "jaxevent.reconstruction.smoother.join": "jaxevent.reconstruction.smoother.combine",
+    "jaxevent.reconstruction.smoother.make_rows": "jaxevent.reconstruction.smoother.make_frame_steps",
+    "jaxevent.reconstruction.smoother.measure": "jaxevent.reconstruction.smoother.frame_update",
+    "jaxevent.reconstruction.smoother.one_pixel": "jaxevent.reconstruction.smoother.single_pixel_frame",
+    "jaxevent.reconstruction.smoother.share_events": "jaxevent.reconstruction.smoother.redistribute_images",
+    "jaxevent.reconstruction.smoother.shared": "jaxevent.reconstruction.smoother.redistribute_events",
+    "jaxevent.reconstruction.smoother.step_between": "jaxevent.reconstruction.smoother.change_between",
     "jaxevent.tuning.Believed": "jaxevent.tuning.LossWithPrior",
     "jaxevent.tuning.Fitted": "jaxevent.tuning.FitResult",
     "jaxevent.tuning.Weighted": "jaxevent.tuning.WeightedBatch",
@@ -38,6 +149,12 @@ RENAMED: dict[str, str] = {
 }
 # Modules that have another name or are part of another one.
 MOVED_MODULES: dict[str, str] = {
+    "jaxevent.reconstruction.compensated.agreement": "jaxevent.reconstruction.compensated.robust_mean",
+    "jaxevent.reconstruction.compensated.borders": "jaxevent.reconstruction.compensated.trajectories",
+    "jaxevent.reconstruction.compensated.implicit": "jaxevent.reconstruction.compensated.normal_equations",
+    "jaxevent.reconstruction.compensated.parameters": "jaxevent.reconstruction.compensated.params",
+    "jaxevent.reconstruction.clock": "jaxevent.reconstruction.frames",
+    "jaxevent.reconstruction.prepared": "jaxevent.reconstruction.estimator",
     "jaxevent.sharing": "jaxevent.locks",
     "jaxevent.shown": "jaxevent.display",
 }
@@ -90,6 +207,65 @@ class RenamedAttribute:
     def __get__(self, instance: Any, owner: type) -> Any:
         warn_renamed(f"{owner.__name__}.{self.old}", f"{owner.__name__}.{self.new}")
         return getattr(owner if instance is None else instance, self.new)
+
+
+def renamed_fields(**names: str) -> Callable[[type[T]], type[T]]:
+    """Make a decorator that lets a dataclass take and give fields by their old names too.
+
+    Args:
+        names: The new name of each field by its old one.
+
+    Returns:
+        The decorator of the dataclass.
+    """
+
+    def decorate(cls: Any) -> Any:
+        init = cls.__init__
+
+        @functools.wraps(init)
+        def __init__(self: Any, *args: Any, **values: Any) -> None:
+            for old, new in names.items():
+                if old in values:
+                    warn_renamed(f"{cls.__name__}.{old}", f"{cls.__name__}.{new}")
+                    values[new] = values.pop(old)
+            init(self, *args, **values)
+
+        cls.__init__ = __init__
+        for old, new in names.items():
+            attribute = RenamedAttribute(new)
+            attribute.__set_name__(cls, old)
+            setattr(cls, old, attribute)
+        return cls
+
+    return decorate
+
+
+def renamed_methods(**names: str) -> Callable[[type[T]], type[T]]:
+    """Make a decorator that lets methods be called, and overridden in subclasses, by old names too.
+
+    Args:
+        names: The new name of each method or property by its old one.
+
+    Returns:
+        The decorator of the class.
+    """
+
+    def decorate(cls: Any) -> Any:
+        def __init_subclass__(sub: type, **options: Any) -> None:
+            super(cls, cast(Any, sub)).__init_subclass__(**options)
+            for old, new in names.items():
+                if old in vars(sub) and new not in vars(sub):
+                    warn_renamed(f"{sub.__name__}.{old}", f"{sub.__name__}.{new}")
+                    setattr(sub, new, vars(sub)[old])
+
+        cls.__init_subclass__ = classmethod(__init_subclass__)
+        for old, new in names.items():
+            attribute = RenamedAttribute(new)
+            attribute.__set_name__(cls, old)
+            setattr(cls, old, attribute)
+        return cls
+
+    return decorate
 
 
 class RenamedModules(importlib.abc.MetaPathFinder, importlib.abc.Loader):

@@ -572,7 +572,7 @@ class _Loop:
         """Search all searched parameters in turn, the others at the best start's values."""
         replay, leader = iter(list(self.run.tried)), self.leader()
 
-        def look(name: str, value: float) -> float:
+        def objective(name: str, value: float) -> float:
             """The fit loss of a candidate; infinite if it is not a number."""
             loss = next(replay, None)
             if loss is None:
@@ -587,7 +587,7 @@ class _Loop:
         for name, interval in self.intervals.items():
             here = float(getattr(leader, name))
             found = _search_minimum(
-                functools.partial(look, name), interval, here, self.run.stage // 2
+                functools.partial(objective, name), interval, here, self.run.stage // 2
             )
             leader = self._with_value(leader, name, found)
         searched = {name: leader.raw[name] for name in self.intervals}
@@ -612,16 +612,16 @@ class _Loop:
         while True:
             i, seen = run.iteration, None
             if i % settings.every == 0 or i == settings.iterations:
-                look = functools.partial(_values, self.function, params, position.raw)
-                seen = _mean(look, watched)
+                objective = functools.partial(_values, self.function, params, position.raw)
+                seen = _mean(objective, watched)
                 position, going = _update_best(position, seen, i, settings.patience)
                 if i == settings.iterations or not bool(going):
                     self._record(turn, i, None, seen)
                     break
-            look = functools.partial(
+            objective = functools.partial(
                 loss_and_grad, self.function, self.forward, params, position.raw
             )
-            losses, slope = _mean(look, [fit[k] for k in self._drawn(len(fit))])
+            losses, slope = _mean(objective, [fit[k] for k in self._drawn(len(fit))])
             fall = 0.55 + 0.45 * math.cos(math.pi * i / settings.iterations)
             position = _step(position, slope, settings.learning_rate / 2**turn * fall)
             self._record(turn, i, losses, seen)
@@ -650,7 +650,7 @@ class _Loop:
 
 
 def _search_minimum(
-    look: Callable[[float], float], interval: Interval, value: float, turn: int
+    objective: Callable[[float], float], interval: Interval, value: float, turn: int
 ) -> float:
     """Search one number for the least loss; `value` is among the candidates.
 
@@ -661,13 +661,13 @@ def _search_minimum(
     low, high, count = interval
     step = (high - low) / (count - 1)
     grid = [float(x) for x in np.linspace(low, high, count)]
-    losses = [look(x) for x in grid]
+    losses = [objective(x) for x in grid]
     k = int(np.argmin(losses))
-    best = min((losses[k], grid[k]), (look(value), value))
+    best = min((losses[k], grid[k]), (objective(value), value))
     if turn:
         reach, middle = step / 2 ** (turn - 1), min(max(best[1], low), high)
         found = scipy.optimize.minimize_scalar(
-            look,
+            objective,
             bounds=(max(low, middle - reach), min(high, middle + reach)),
             method="bounded",
             options={"xatol": step / 100, "maxiter": 20},
@@ -677,7 +677,7 @@ def _search_minimum(
         a, b, c = losses[k - 1 : k + 2]
         if math.isfinite(a + c) and a - 2 * b + c > 0:
             vertex = grid[k] + step * (a - c) / (a - 2 * b + c) / 2
-            best = min((look(vertex), vertex), best)
+            best = min((objective(vertex), vertex), best)
     return best[1]
 
 

@@ -112,7 +112,7 @@ def _shown(words: Sequence[str]) -> Iterator[None]:
         return
     from jaxevent.progress import stage
 
-    with stage(" ".join(words[:2])), contextlib.redirect_stdout(_Printed(sys.stdout)):
+    with stage(" ".join(words[:2])), contextlib.redirect_stdout(_ProgressAwareStream(sys.stdout)):
         yield
 
 
@@ -135,8 +135,8 @@ def _plain_warnings() -> Iterator[None]:
         yield
 
 
-class _Printed(io.TextIOBase):
-    """A stream before whose texts the line of progress is cleared."""
+class _ProgressAwareStream(io.TextIOBase):
+    """A stream that clears the line of progress before it writes."""
 
     def __init__(self, stream: Any):
         self._stream = stream
@@ -184,9 +184,9 @@ def _terminable() -> Iterator[None]:
 
     def leave(number: int, frame: Any) -> None:
         came.append(number)
-        again(number, frame)
+        handle_again(number, frame)
 
-    def again(number: int, frame: Any) -> None:
+    def handle_again(number: int, frame: Any) -> None:
         if not came:
             if callable(alarmed := before[number]):
                 alarmed(number, frame)
@@ -208,7 +208,7 @@ def _terminable() -> Iterator[None]:
         if number and signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
             before[number] = signal.signal(number, leave)
     if hasattr(signal, "SIGALRM"):
-        before[signal.SIGALRM] = signal.signal(signal.SIGALRM, again)
+        before[signal.SIGALRM] = signal.signal(signal.SIGALRM, handle_again)
     sys.unraisablehook = drop
     try:
         yield
@@ -226,7 +226,7 @@ def _terminable() -> Iterator[None]:
 
 
 def _imports(frame: Any) -> bool:
-    """Whether a module is being imported where a signal came."""
+    """Return true if a module was being imported when a signal came."""
     while frame is not None:
         if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
             return True
@@ -235,7 +235,7 @@ def _imports(frame: Any) -> bool:
 
 
 def _unwinds(error: BaseException | None) -> bool:
-    """Whether a signal's exception is being handled."""
+    """Return true if a signal's exception is being handled."""
     while error is not None:
         if isinstance(error, _Signal):
             return True

@@ -1,4 +1,4 @@
-"""What the commands share: their parsers, values of options, outputs, progress, what was stored."""
+"""Arguments, outputs and progress that commands share."""
 
 import argparse
 import contextlib
@@ -14,7 +14,7 @@ def command(
 ) -> argparse.ArgumentParser:
     """Add a command, named by the module of `run`, which takes the parsed options.
 
-    `part` is the name of one of its parts, as in `jaxevent camera merge`.
+    `part` is the name of a subcommand, as in `jaxevent camera merge`.
     """
     name = run.__module__.rpartition(".")[2] + f" {part}" * bool(part)
     lines = "".join(f"\n  jaxevent {name} {example}".rstrip() for example in examples)
@@ -34,7 +34,7 @@ def add_size(one: argparse.ArgumentParser) -> None:
         "--size",
         metavar="W,H",
         type=size,
-        help="sensor size in pixels, for a recording that does not tell it",
+        help="sensor size in pixels, for a recording that does not state it",
     )
 
 
@@ -47,8 +47,8 @@ def add_reading(one: argparse.ArgumentParser, frames: bool = True) -> None:
     one.add_argument(
         "--stream",
         metavar="NAME",
-        help="which camera, of a file that holds several: a topic, left, right or a number; none "
-        "reads its images alone",
+        help="camera of a file that holds several: a topic, left, right or a number; none "
+        "reads the images without events",
     )
     one.add_argument(
         "--camera",
@@ -106,11 +106,11 @@ def add_output(
 
 @contextlib.contextmanager
 def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """The options that a command's `run` takes, once its outputs are known to cost nothing.
+    """Check the outputs of a command, and yield the options that its `run` takes.
 
-    All paths among the options that are no outputs are inputs. Within the block, files that are
-    written say that the command line `words` made them of these. Raises `InputError` as
-    `jaxevent.io.places.check` does.
+    All paths among the options that are no outputs are inputs. Within the block, written files
+    record that the command line `words` made them from these inputs. Raises `InputError` like
+    `jaxevent.io.places.check`.
     """
     outputs = options.get("outputs", {})
     force = options.get("force", False)

@@ -33,9 +33,9 @@ def add(commands: Any) -> None:
         metavar="NAME",
         nargs="+",
         default=[],
-        help="besides those of the file: of images lpips, hdr_quality, global_ssim, matlab_ssim "
-        "(MATLAB's), authors_ssim and masked_mse (of the AKF's authors), or your own: "
-        "package.module:function",
+        help="metrics in addition to the file's: for images lpips, hdr_quality, global_ssim, "
+        "matlab_ssim (MATLAB's), authors_ssim and masked_mse (of the AKF's authors), or "
+        "your own: package.module:function",
     )
     where = one.add_mutually_exclusive_group()
     where.add_argument(
@@ -48,7 +48,7 @@ def add(commands: Any) -> None:
         "--scheduler-file",
         metavar="FILE",
         type=Path,
-        help="the same, of the scheduler that wrote this file",
+        help="compute on the Dask cluster whose scheduler wrote this file",
     )
     one.add_argument(
         "--retries",

@@ -23,7 +23,12 @@ def add(commands: Any) -> None:
     arguments.add_reading(one)
     steps = one.add_argument_group("steps")
     steps.add_argument("--start", metavar="S", type=float, help="on the recording's clock, in s")
-    steps.add_argument("--stop", metavar="S", type=float, help="the first time left out, in s")
+    steps.add_argument(
+        "--stop",
+        metavar="S",
+        type=float,
+        help="end of the events kept, exclusive, in s on the recording's clock",
+    )
     steps.add_argument("--hot-pixels", action="store_true", help="leave out pixels that are hot")
     steps.add_argument(
         "--crop",

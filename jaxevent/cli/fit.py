@@ -22,7 +22,7 @@ def add(commands: Any) -> None:
         "configs/fit_slider_depth.toml --recording mine.h5 --out mine --resume",
         "mine.toml --out fitted --coordinator host1:4321 --processes 2 --process 0",
     )
-    one.add_argument("config", metavar="CONFIG.toml", type=Path, help="what to fit, and to what")
+    one.add_argument("config", metavar="CONFIG.toml", type=Path, help="configuration of the fit")
     arguments.add_output(
         one,
         "--out",
@@ -36,19 +36,21 @@ def add(commands: Any) -> None:
         metavar="PATH",
         dest="recordings",
         action="append",
-        help="fitted to instead of those in the file: a path, a pattern, or NAME:FOLDER for all of "
-        "a data set; may be repeated",
+        help="recording to fit to, instead of those in the file: a path, a pattern, or "
+        "NAME:FOLDER for a whole data set; may be repeated",
     )
-    one.add_argument("--resume", action="store_true", help="go on from the checkpoint in DIR")
+    one.add_argument("--resume", action="store_true", help="continue from the checkpoint in DIR")
     one.add_argument(
         "--coordinator", metavar="HOST:PORT", help="a free port of the machine of process 0"
     )
-    one.add_argument("--processes", metavar="N", type=int, help="how many fit together")
-    one.add_argument("--process", metavar="I", type=int, help="which of them this is, from 0")
+    one.add_argument(
+        "--processes", metavar="N", type=int, help="number of processes that fit together"
+    )
+    one.add_argument("--process", metavar="I", type=int, help="number of this process, from 0")
     one.add_argument(
         "--distributed",
         action="store_true",
-        help="the same, found by JAX: under SLURM, Open MPI, Kubernetes",
+        help="let JAX find coordinator and processes: under SLURM, Open MPI, Kubernetes",
     )
 
 

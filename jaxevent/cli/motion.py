@@ -46,7 +46,7 @@ def add(commands: Any) -> None:
         type=Path,
         help="TOML file of name = value lines, e.g. particles = 400, or params.toml of a fit",
     )
-    one.add_argument("--seed", metavar="N", type=int, default=0, help="of all that is random")
+    one.add_argument("--seed", metavar="N", type=int, default=0, help="seed of random numbers")
     _add_known(one)
     one.add_argument(
         "--rate", metavar="HZ", type=float, default=1000.0, help="rows per second; default: 1000"
@@ -54,28 +54,33 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--centred",
         action="store_true",
-        help="take every estimate for the time that what it saw shows, some ms earlier",
+        help="assign each estimate to the middle of the events that it rests on, some ms earlier",
     )
     one.add_argument(
-        "--smooth", action="store_true", help="use the events that come later too, with voting"
+        "--smooth", action="store_true", help="use later events too, with --method voting"
     )
-    one.add_argument("--start", metavar="S", type=float, help="on the recording's clock")
-    one.add_argument("--stop", metavar="S", type=float, help="its end")
     one.add_argument(
-        "--flow", action="store_true", help="write the optical flow of each event too: flow.h5"
+        "--start", metavar="S", type=float, help="start time, in s on the recording's clock"
+    )
+    one.add_argument(
+        "--stop", metavar="S", type=float, help="end time, in s on the recording's clock"
+    )
+    one.add_argument(
+        "--flow", action="store_true", help="also write the optical flow of each event: flow.h5"
     )
     one.add_argument(
         "--focal",
         metavar="PX",
         type=float,
-        help="focal length, for a recording without calibration; the centre is the sensor's",
+        help="focal length in px, for a recording without calibration; the principal point is "
+        "the sensor's centre",
     )
     arguments.add_reading(one)
     arguments.add_output(one, "--out", metavar="DIR", required=True, help="folder to write")
 
 
 def _add_known(one: Any) -> None:
-    """What else tells the motion: a table, poses, the gyro."""
+    """Add options for ground truth: a table, poses, the gyro."""
     one.add_argument(
         "--truth",
         metavar="CSV",
@@ -89,14 +94,14 @@ def _add_known(one: Any) -> None:
         "--depth",
         metavar="M",
         type=float,
-        help="of the scene, with --truth: the image velocity that poses make at it; default: at "
-        "the depth that fits best",
+        help="depth of the scene in m, with --truth: it converts poses to an image velocity; "
+        "default: the depth that fits best",
     )
     one.add_argument(
         "--imu",
         action="store_true",
-        help="let the recording's gyro help, with batch; its bias is told by --still, else it is "
-        "found from a first estimate",
+        help="use the recording's gyro, with --method batch; its bias is taken from --still, "
+        "or else estimated",
     )
     one.add_argument(
         "--imu-rotation",
@@ -109,7 +114,7 @@ def _add_known(one: Any) -> None:
         "--still",
         metavar="S,S",
         type=arguments.span,
-        help="from when to when the camera is still: what its gyro shows then is its bias",
+        help="time span in s in which the camera is still, from which the gyro's bias is measured",
     )
 
 
@@ -314,7 +319,7 @@ def _told(estimator: Any, recording: Any, values: Any, settings: dict[str, Any],
 def _gyro(
     estimator: Any, recording: Any, values: Any, settings: Any, bias: Any, turned: Any
 ) -> Any:
-    """What the gyro measured, without its bias: if it is not known, that of a first estimate."""
+    """Return the gyro's rates without bias; an unknown bias is taken from a first estimate."""
     import numpy as np
 
     from jaxevent.egomotion import from_gyro

@@ -46,10 +46,15 @@ def add(commands: Any) -> None:
         "--start",
         metavar="S",
         type=float,
-        help="first time of images, on the recording's clock, in s; what is before it still "
-        "counts, so that images are those of the whole recording (jaxevent filter cuts it)",
+        help="first time of images, in s on the recording's clock; earlier events are still "
+        "processed (to discard them use jaxevent filter)",
     )
-    one.add_argument("--stop", metavar="S", type=float, help="the first time left out, in s")
+    one.add_argument(
+        "--stop",
+        metavar="S",
+        type=float,
+        help="end of the images, exclusive, in s on the recording's clock",
+    )
     one.add_argument(
         "--params",
         metavar="FILE",
@@ -68,8 +73,8 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--colour",
         action="store_true",
-        help="in the colours of the frames, for a recording that holds extra/rgb; in .h5 images "
-        "of red, green, blue without variance",
+        help="reconstruct colours, for a recording that holds extra/rgb; an .h5 output then "
+        "has red, green and blue images without variance",
     )
     arguments.add_output(
         one, "--out", metavar="DIR_or_FILE", required=True, help="name in .h5, .mp4 or none"

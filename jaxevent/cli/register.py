@@ -34,7 +34,7 @@ def add(commands: Any) -> None:
         "--reference",
         metavar="OTHER",
         type=Path,
-        help="the same of HDR images, which become the reference of `jaxevent evaluate`",
+        help="HDR images of another camera, which become the reference of `jaxevent evaluate`",
     )
     one.add_argument(
         "--homography",
@@ -60,26 +60,28 @@ def add(commands: Any) -> None:
         "--depth",
         metavar="M_or_NPY",
         type=arguments.number_or_path,
-        help="of the scene in m, one number or a map of the event camera's pixels; default: far",
+        help="depth of the scene in m, a number or a map of the event camera's pixels; "
+        "default: infinity",
     )
     one.add_argument(
         "--plane",
         metavar="A,B,C,D",
         type=arguments.plane,
-        help="instead: the scene is a x + b y + c z = d (m); --plane=A,... where A is negative",
+        help="plane of the scene, a x + b y + c z = d (m), instead of --depth; write "
+        "--plane=A,... if A is negative",
     )
     _add_clock(one)
     one.add_argument(
         "--exposure",
         metavar="S",
         type=float,
-        help="of images in a folder, where its timestamps do not tell it",
+        help="exposure time in s of images in a folder, if its timestamps do not state it",
     )
     one.add_argument(
-        "--white", metavar="V", type=float, help="their value of intensity 1; default: the largest"
+        "--white", metavar="V", type=float, help="pixel value of intensity 1; default: the largest"
     )
     one.add_argument(
-        "--crop", action="store_true", help="cut to a rectangle of pixels that both cameras see"
+        "--crop", action="store_true", help="crop to a rectangle of pixels that both cameras see"
     )
     arguments.add_frames(one, "--images", "OTHER")
     arguments.add_reading(one, frames=False)
@@ -91,7 +93,7 @@ def _add_clock(one: argparse.ArgumentParser) -> None:
         "--offset",
         metavar="S",
         type=float,
-        help="added to the other camera's time stamps; default: estimated",
+        help="offset in s added to the other camera's time stamps; default: estimated",
     )
     one.add_argument(
         "--triggers",
@@ -104,11 +106,9 @@ def _add_clock(one: argparse.ArgumentParser) -> None:
         "halfway between both (exposure); default: exposure where there are both edges",
     )
     one.add_argument(
-        "--channel", metavar="N", type=int, help="of the triggers, where there are several"
+        "--channel", metavar="N", type=int, help="channel of the triggers, if there are several"
     )
-    one.add_argument(
-        "--search", metavar="S", type=float, help="the largest offset that is thought possible"
-    )
+    one.add_argument("--search", metavar="S", type=float, help="largest possible offset in s")
 
 
 def _check(given: set[str]) -> None:

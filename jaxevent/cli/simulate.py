@@ -44,7 +44,7 @@ def add(commands: Any) -> None:
     source.add_argument(
         "--motion",
         metavar="NAME",
-        help="of the camera: planar, rotation, or general before a wall, shapes or texture",
+        help="motion of the camera: planar, rotation, or general before a wall, shapes or texture",
     )
     _add_settings(one)
 
@@ -56,7 +56,7 @@ def _add_settings(one: Any) -> None:
         metavar="NAME",
         help="ideal, good, davis or poor; default: davis, with --motion an ideal one",
     )
-    one.add_argument("--seed", metavar="N", type=int, default=0, help="of all that is random")
+    one.add_argument("--seed", metavar="N", type=int, default=0, help="seed of random numbers")
     one.add_argument(
         "--speed",
         metavar="SPEED",
@@ -88,7 +88,7 @@ def _add_settings(one: Any) -> None:
     group.add_argument(
         "--change",
         metavar="HOW",
-        help="how the motion changes: constant (default), linear or varying",
+        help="change of the motion over time: constant (default), linear or varying",
     )
     group = one.add_argument_group("only for a video")
     group.add_argument("--start", metavar="S", type=float, help="first second used; default: 0")
@@ -154,10 +154,14 @@ def run(
     if video is not None:
         _refuse("is for a scene or --objects; scale a video with --max-size", size=size)
         given = {name.replace("-", "_"): v for name, v in of_video.items() if v is not None}
-        return _simulate_video(video, out, chosen, seed, speed, duration, given)
+        return _simulate_video(
+            video, out, sensor=chosen, seed=seed, speed=speed, duration=duration, given=given
+        )
     what = "--objects" if objects else "--scene"
     _refuse(f"is for a video; leave it out with {what}", **of_video)
-    _simulate_frames(scene, out, chosen, seed, speed, duration, size)
+    _simulate_frames(
+        scene, out, sensor=chosen, seed=seed, speed=speed, duration=duration, size=size
+    )
 
 
 def _refuse(why: str, **given: Any) -> None:
@@ -170,6 +174,7 @@ def _refuse(why: str, **given: Any) -> None:
 def _simulate_video(
     video: Path,
     out: Path,
+    *,
     sensor: Any,
     seed: int,
     speed: str | None,
@@ -197,6 +202,7 @@ def _simulate_video(
 def _simulate_frames(
     scene: str | None,
     out: Path,
+    *,
     sensor: Any,
     seed: int,
     speed: str | None,

@@ -45,46 +45,51 @@ def add(commands: Any) -> None:
         dest="seeds",
         type=arguments.seed,
         action="append",
-        help="where a blob is (px), how large (standard deviation of its events, px) and from when "
-        "(s, default: the start); may be repeated. Without, targets are found",
+        help="initial position (px) and size (standard deviation of its events, px) of a blob, "
+        "and its start time (s; default: the start of the recording); may be repeated. "
+        "Without seeds the targets are found automatically",
     )
     one.add_argument(
         "--detect",
         action="store_true",
-        help="tracks begin where events are many on a grid, as --params says, instead of the "
-        "search through the whole recording; with seeds: further ones",
+        help="start tracks in grid cells with many events, as set in --params, instead of "
+        "searching the whole recording; with seeds: in addition to them",
     )
     one.add_argument(
         "--filtered",
         action="store_true",
-        help="states rest on the events up to each time, as they are known while events come; "
-        "default: on all, where the method can",
+        help="causal estimates, from the events up to each time; default: smoothed over the "
+        "whole recording, if the method can",
     )
     one.add_argument(
         "--accuracy",
         metavar="SHARE",
         type=float,
-        help="events share steps while positions are at most by this share less certain than event "
-        "by event, e.g. 0.05; default: about 32 steps in the window that is found",
+        help="process events in batches; allow this relative loss of position accuracy against "
+        "single events, e.g. 0.05; default: about 32 batches per window",
     )
     when = one.add_mutually_exclusive_group()
     when.add_argument(
         "--rate", metavar="HZ", type=float, default=1000.0, help="rows per second; default: 1000"
     )
-    when.add_argument("--at", choices=["events"], help="a row for each event of a track")
+    when.add_argument("--at", choices=["events"], help="one row for each event of a track")
     one.add_argument(
-        "--start", metavar="S", type=float, help="of tracking, on the recording's clock"
+        "--start", metavar="S", type=float, help="start time, in s on the recording's clock"
     )
-    one.add_argument("--stop", metavar="S", type=float, help="its end")
+    one.add_argument(
+        "--stop", metavar="S", type=float, help="end time, in s on the recording's clock"
+    )
     one.add_argument(
         "--background",
         choices=["events", "high-pass"],
         default="events",
-        help="behind the tracks in the video; default: events",
+        help="background of the video; default: events",
     )
     arguments.add_reading(one)
     _add_quantities(one)
-    arguments.add_output(one, "--out", metavar="DIR_or_FILE", required=True, help="what to write")
+    arguments.add_output(
+        one, "--out", metavar="DIR_or_FILE", required=True, help="output folder or file"
+    )
 
 
 def _add_quantities(one: Any) -> None:
@@ -98,15 +103,15 @@ def _add_quantities(one: Any) -> None:
         dest="pairs",
         type=arguments.pair,
         action="append",
-        help="two tracks whose distance tells 1 / TTC; may be repeated",
+        help="two tracks whose distance gives 1 / TTC; may be repeated",
     )
-    group.add_argument("--extent", metavar="M", type=float, help="the target's size in m")
+    group.add_argument("--extent", metavar="M", type=float, help="size of the target in m")
     group.add_argument("--focal", metavar="PX", type=float, help="focal length in px")
     group.add_argument(
         "--size-factor",
         metavar="K",
         type=float,
-        help="lambda over the diameter in the image; default: 0.354, of an even rim",
+        help="ratio of lambda to the diameter in the image; default: 0.354, a uniform rim",
     )
 
 
@@ -171,7 +176,7 @@ def run(
     texts = {"params.toml": toml.parameters(tracks.params) + "\n"}
     written = output.write(tracks, show_progress(), texts, tracker.name)
     count = recording.events.index(tracks.stop) - recording.events.index(tracks.start)
-    print("\n".join(written.summary()) if len(tracks) else _nothing(found))
+    print("\n".join(written.summary()) if len(tracks) else _explain_no_tracks(found))
     if written.left_out:
         print("\n" + "\n".join(written.left_out))
     how = ", ".join(written.files) + f" in {out}" if not out.suffix else str(out)
@@ -182,8 +187,8 @@ def run(
     )
 
 
-def _nothing(found: Any) -> str:
-    """What to say where no blob was tracked, of what was found without settings, or None."""
+def _explain_no_tracks(found: Any) -> str:
+    """Explain why no blob was tracked, given the result of the search, or None."""
     if found is not None and found.camera_moves:
         return (
             "the camera moves, and no blob was found that goes its own way; jaxevent motion tells "

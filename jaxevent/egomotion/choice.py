@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion.bundle.translation import Guess, told
+from jaxevent.egomotion.bundle.hypotheses import MotionGuess, translation_z
 from jaxevent.egomotion.candidates import coordinates
 from jaxevent.egomotion.geometry import rotation_basis
 from jaxevent.egomotion.models import MODELS, General, Model, Planar, Rotation
@@ -96,7 +96,9 @@ def choose(recording: Recording, camera: PinholeCamera | None = None) -> Choice:
         pair: standard(every[pair[0]] - every[pair[1]])
         for pair in (("rotation", "planar"), ("general", "planar"), ("general", "rotation"))
     }
-    return decide(z, lambda: told(recording, camera, guesses[:: -(-len(guesses) // WINDOWS)]))
+    return decide(
+        z, lambda: translation_z(recording, camera, guesses[:: -(-len(guesses) // WINDOWS)])
+    )
 
 
 def decide(z: dict[tuple[str, str], float], longer: Callable[[], float | None]) -> Choice:
@@ -125,9 +127,11 @@ def decide(z: dict[tuple[str, str], float], longer: Callable[[], float | None]) 
     return Choice(chosen, tuple(lines), z)
 
 
-def _guess(seen: Look, turn: NDArray, six: NDArray) -> Guess:
+def _guess(seen: Look, turn: NDArray, six: NDArray) -> MotionGuess:
     """A rotation (rad) and a general motion of a window, per second."""
-    return Guess(seen.middle, WAY / seen.length, turn / seen.length, six[:3], six[3:] / seen.length)
+    return MotionGuess(
+        seen.middle, WAY / seen.length, turn / seen.length, six[:3], six[3:] / seen.length
+    )
 
 
 def _line(one: str, other: str, z: float, enough: float) -> str:

@@ -12,6 +12,8 @@ kinds of tile are made of: as much work for each, and none waits for another.
 
 import abc
 import dataclasses
+import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -22,9 +24,13 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
+from jaxevent.deprecated import renamed_methods
 from jaxevent.devices import AXIS, make_mesh, shard
 from jaxevent.estimator import ShortRepr
-from jaxevent.reconstruction.layout import LANES
+
+SHAPES = ((8, 4096), (64, 512), (512, 64))  # ranks, lanes of the three kinds of tile
+SLOTS = 8 * 4096
+LANES = 64  # of the narrowest tile; on several devices each has a part of every so many lanes
 
 # Prepared on the host, where they stay until a jitted function takes them.
 if TYPE_CHECKING:
@@ -33,6 +39,9 @@ else:
     Numeric = Array | np.ndarray
 
 
+@renamed_methods(
+    of_frame="gather_frame", of_piece="gather_piece", of_piece_alone="gather_piece_value"
+)
 class Points(eqx.Module):
     """Where points lie among the frames, and how to look a table [rows, pixels] up at them."""
 
@@ -42,15 +51,17 @@ class Points(eqx.Module):
     off: Float[Numeric, "*points"]
 
     @abc.abstractmethod
-    def of_piece(self, table: Float[Array, "pieces pixels"]) -> Float[Array, "..."]:
+    def gather_piece(self, table: Float[Array, "pieces pixels"]) -> Float[Array, "..."]:
         """The table's entries for the points' pieces and pixels."""
 
     @abc.abstractmethod
-    def of_frame(self, table: Float[Array, "frames pixels"]) -> Float[Array, "..."]:
+    def gather_frame(self, table: Float[Array, "frames pixels"]) -> Float[Array, "..."]:
         """The table's entries for the frames before the points."""
 
     @abc.abstractmethod
-    def of_piece_alone(self, values: Float[Array, " pieces"], pixels: int) -> Float[Array, "..."]:
+    def gather_piece_value(
+        self, values: Float[Array, " pieces"], pixels: int
+    ) -> Float[Array, "..."]:
         """The values of the points' pieces, equal for all pixels."""
 
 
@@ -60,13 +71,15 @@ class EventPoints(Points):
     piece_cell: Int[Numeric, "*points"]  # piece * pixels + pixel
     frame_cell: Int[Numeric, "*points"]  # frame before the point * pixels + pixel
 
-    def of_piece(self, table: Float[Array, "pieces pixels"]) -> Float[Array, "..."]:
+    def gather_piece(self, table: Float[Array, "pieces pixels"]) -> Float[Array, "..."]:
         return table.reshape(-1).at[self.piece_cell].get(mode="clip")
 
-    def of_frame(self, table: Float[Array, "frames pixels"]) -> Float[Array, "..."]:
+    def gather_frame(self, table: Float[Array, "frames pixels"]) -> Float[Array, "..."]:
         return table.reshape(-1).at[self.frame_cell].get(mode="clip")
 
-    def of_piece_alone(self, values: Float[Array, " pieces"], pixels: int) -> Float[Array, "..."]:
+    def gather_piece_value(
+        self, values: Float[Array, " pieces"], pixels: int
+    ) -> Float[Array, "..."]:
         return values.at[self.piece_cell // pixels].get(mode="clip")
 
 
@@ -77,13 +90,15 @@ class ImagePoints(Points):
     frame: Int[Numeric, " times"]  # the frame before
     elapsed: Float[Numeric, " times"]  # s since mid-exposure of the frame before; negative: none is
 
-    def of_piece(self, table: Float[Array, "pieces pixels"]) -> Float[Array, "..."]:
+    def gather_piece(self, table: Float[Array, "pieces pixels"]) -> Float[Array, "..."]:
         return table.at[self.piece].get(mode="clip")
 
-    def of_frame(self, table: Float[Array, "frames pixels"]) -> Float[Array, "..."]:
+    def gather_frame(self, table: Float[Array, "frames pixels"]) -> Float[Array, "..."]:
         return table.at[self.frame].get(mode="clip")
 
-    def of_piece_alone(self, values: Float[Array, " pieces"], pixels: int) -> Float[Array, "..."]:
+    def gather_piece_value(
+        self, values: Float[Array, " pieces"], pixels: int
+    ) -> Float[Array, "..."]:
         return values.at[self.piece].get(mode="clip")[:, None]
 
 
@@ -188,7 +203,7 @@ class FrameFeatures(ShortRepr):
     width: int = eqx.field(static=True)  # of the sensor, whose pixels are in rows
 
 
-class Growth(eqx.Module):
+class DeadTimeDerivative(eqx.Module):
     """Derivatives of event counts with respect to the dead time `rho_ref` (1/s), array by array.
 
     Counts are made for one dead time; around it they are continued linearly.
@@ -205,7 +220,7 @@ class Features(ShortRepr):
     tiles: Tiles | None  # None where the estimator does not filter
     start: ImagePoints  # every pixel at the recording's start
     last: Int[Numeric, " pixels"]  # the slot of each pixel's last event, -1 if it has none
-    growth: Growth | None = None
+    growth: DeadTimeDerivative | None = None
 
     def counts(self) -> list[Any]:
         """The arrays that count events."""
@@ -244,7 +259,7 @@ class Features(ShortRepr):
                 counts[:-2] = over_pixels(counts[:-2], mesh, pixels)
             else:
                 counts = over_pixels(counts, mesh, pixels)
-            growth = Growth(counts, over_pixels(growth.rho_ref, mesh, pixels))
+            growth = DeadTimeDerivative(counts, over_pixels(growth.rho_ref, mesh, pixels))
         rest = (self.frames, self.start, self.last)
         frames, start, last = over_pixels(rest, mesh, pixels)
         tiles = None if self.tiles is None else self.tiles.over(mesh)
@@ -257,7 +272,7 @@ class ReadOut(ShortRepr):
     points: ImagePoints
     slot: Int[Numeric, "times pixels"]  # of the pixel's last event in the window, -1 if none
     since: Float[Numeric, "times pixels"]  # s since the pixel's last event
-    growth: Growth | None = None
+    growth: DeadTimeDerivative | None = None
 
     def counts(self) -> list[Any]:
         """The arrays that count events."""
@@ -269,7 +284,7 @@ class ReadOut(ShortRepr):
         counts = None if self.growth is None else self.growth.counts
         # JAX takes 4 ms of CPU for each array, a quarter of a fit that searches.
         chosen, counts = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (parts, counts))
-        growth = None if self.growth is None else Growth(counts, self.growth.rho_ref)
+        growth = None if self.growth is None else DeadTimeDerivative(counts, self.growth.rho_ref)
         points, slot, since = chosen
         return ReadOut(points, slot, since, growth)
 
@@ -321,4 +336,23 @@ def _weighted(counting: Counting, factors: list[Any]) -> Counting:
     weighted = eqx.tree_at(lambda c: c.counts(), counting, times(counting.counts()))
     if growth is None:
         return weighted
-    return dataclasses.replace(weighted, growth=Growth(times(growth.counts), growth.rho_ref))
+    return dataclasses.replace(
+        weighted, growth=DeadTimeDerivative(times(growth.counts), growth.rho_ref)
+    )
+
+
+_count_arrays = itertools.count()
+
+
+def aligned(shape: tuple[int, ...], dtype: Any, empty: bool = False) -> NDArray:
+    """An array of zeros (or anything) whose data start at a multiple of 64 bytes.
+
+    XLA takes it without a copy.
+    """
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    # Large arrays all begin at the same place of a memory page. Written side by side they would
+    # share one set of the cache; every array begins some lines further than the one before.
+    stagger = 64 * (next(_count_arrays) * 5 % 64)
+    memory = (np.empty if empty else np.zeros)(size + stagger + 64, np.uint8)
+    begin = -memory.ctypes.data % 64 + stagger
+    return memory[begin : begin + size].view(dtype).reshape(shape)

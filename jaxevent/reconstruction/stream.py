@@ -107,14 +107,6 @@ def note_latest(stream, last):
         last[np.int64(y[i]) * stream.width + x[i]] = t[i]
 
 
-@njit_noalloc
-def narrow(stream, base, t, cell):
-    """Times (us) from a base and 2 pixel + (1 if ON) of events, in 32 bits."""
-    for i in range(len(stream.t)):
-        t[i] = stream.t[i] - base
-        cell[i] = 2 * (np.int64(stream.y[i]) * stream.width + stream.x[i]) + stream.p[i]
-
-
 def weigh(stream: Stream, last: NDArray[np.int64], dead: DeadTime) -> NDArray[np.float64]:
     """What each event stands for; `last` holds the times of the events before, at each pixel."""
     out = np.empty(len(stream.t))

@@ -115,6 +115,7 @@ class TrackGoal(Goal):
 
     @property
     def measure(self) -> str:
+        """Key of the error in a row: "rmse" of positions, or "nll"."""
         return "rmse" if self.loss.name == "positions" else "nll"
 
     def files(self, recording: Path) -> list[Path]:

@@ -124,7 +124,10 @@ class TrackProtocol(Protocol):
             mean, covariance = _of_function(recording, method, known.t)
         else:
             params = params or method.Params()
-            tracks = _tracked(recording, method, params, begin, targets, known, options, progress)
+            tracks = _track(
+                recording, method, params, begin=begin, targets=targets, known=known,
+                options=options, progress=progress,
+            )  # fmt: skip
             mean, covariance = _states(tracks, known.t)
             noise = float(tracks.params.Q_lambda)
         seconds = time.perf_counter() - clock
@@ -165,10 +168,11 @@ class TrackProtocol(Protocol):
         }
 
 
-def _tracked(
+def _track(
     recording: Recording,
     method: Tracker,
     params: TrackerParams,
+    *,
     begin: str,
     targets: Targets,
     known: KnownPositions,

@@ -250,19 +250,19 @@ def absolute_path(given: Any) -> Any:
 
 
 def files_named_in(config: Path) -> list[Path]:
-    """The existing files that a configuration names, in whichever setting."""
+    """Return the existing files that a configuration names, in any setting."""
     found: list[Path] = []
 
-    def look(value: Any) -> None:
+    def collect(value: Any) -> None:
         if isinstance(value, str):
             with contextlib.suppress(OSError, ValueError):  # text that can be no name
                 path = config.parent / os.path.expanduser(os.path.expandvars(value))
                 found.extend([path] if path.is_file() else [])
         elif isinstance(value, dict | list):
             for part in value.values() if isinstance(value, dict) else value:
-                look(part)
+                collect(part)
 
-    look(read_toml(config))
+    collect(read_toml(config))
     return found
 
 

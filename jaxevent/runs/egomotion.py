@@ -1,4 +1,4 @@
-"""What evaluations and fits ask of egomotion; what methods are fitted to: motion that is known.
+"""Fits of egomotion methods to known motion, and their scores.
 
 Settings of a method of egomotion in a configuration of `jaxevent.runs.fit`:
 
@@ -112,6 +112,7 @@ class MotionGoal(Goal):
 
     @property
     def kind(self) -> type[Model]:
+        """The motion model."""
         return find_model(self.model)
 
     def files(self, recording: Path) -> list[Path]:

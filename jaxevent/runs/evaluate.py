@@ -317,7 +317,9 @@ def _rows(plan: "Plan", outcomes: list[Outcome]) -> list[dict[str, Any]]:
             rows.append({**outcome.result["row"], **named})
         else:
             skipped = {"skipped": True} if outcome.skipped else {}
-            rows.append({**named, "params": entry.shown(), "error": outcome.error, **skipped})
+            rows.append(
+                {**named, "params": entry.display_values(), "error": outcome.error, **skipped}
+            )
     errors = list(dict.fromkeys(row["error"] for row in rows if "error" in row))
     if all("error" in row for row in rows):
         more = f" (and {len(errors) - 1} further errors)" if len(errors) > 1 else ""
@@ -399,6 +401,7 @@ def _key(
 
 
 def _compute(
+    *,
     recording: str | Recording,
     method: str | Estimator | MethodFunction,
     params: dict[str, Any],
@@ -489,7 +492,7 @@ class Entry:
             return dict(vars(self.method))
         return {} if self.params is None else self.params.values()
 
-    def shown(self) -> dict[str, Any]:
+    def display_values(self) -> dict[str, Any]:
         """Return the parameters as a row shows them."""
         if isinstance(self.method, Source):
             return self.method.values()

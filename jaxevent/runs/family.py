@@ -136,7 +136,7 @@ class Goal(abc.ABC):
     loss: Loss  # of `optimise`; equal goals have losses that are equal and hash alike
     forward: bool | None = None  # derivatives forwards or in reverse; None: see `tuning.FORWARD`
     measure: str  # of a row, what the gain of a fit is told in; the smaller the better
-    part: str = "window"  # of which parts the loss is a mean; see `jaxevent.confidence`
+    part_name: str = "window"  # word for the parts that the loss averages over
 
     def files(self, recording: Path) -> list[Path]:
         """Return the files that are read besides the recording."""

@@ -402,7 +402,7 @@ def _score(
         scored.append((task, task.label, one.params, warning))
     mine = range(jax.process_index(), len(scored), jax.process_count())
     found = devices.on_all_processes(
-        lambda: {k: list(_rows(*scored[k], sources, plan, progress)) for k in mine}
+        lambda: {k: list(_rows(*scored[k], sources, plan, progress=progress)) for k in mine}
     )
     told = {k: some for each in devices.allgather(found) for k, some in each.items()}
     return [row for k in range(len(scored)) for row in told[k]]
@@ -415,6 +415,7 @@ def _rows(
     warning: dict[str, str],
     sources: Sources,
     plan: Plan,
+    *,
     progress: bool | None,
 ) -> Iterator[dict[str, Any]]:
     for row in task.goal.score(sources, plan.split, plan.window, params, progress):

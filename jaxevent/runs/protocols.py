@@ -1,4 +1,4 @@
-"""What of a recording a method of reconstruction is given, and which images it is asked for.
+"""Protocols of reconstruction: the input of a method, and the true images to compare with.
 
 "held-out" gives frames 0, 2, 4, ... and asks for images where frames 1, 3, 5, ... are, at their
 time stamps plus the method's `clock_offset`. With a `gap` g it gives every g-th frame, 0, g, 2 g,

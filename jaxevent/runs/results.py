@@ -209,7 +209,7 @@ def find_intervals(
         task.loss, task.params, one.params, task.names, problem, task.search,
         task.settings.forward,
     )  # fmt: skip
-    of = f"{told.parts} {task.goal.part}s" if told.parts else INDEPENDENT
+    of = f"{told.parts} {task.goal.part_name}s" if told.parts else INDEPENDENT
     return [_row(task, finding, of) for finding in told.intervals]
 
 

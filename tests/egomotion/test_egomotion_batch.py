@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import geometry
-from jaxevent.egomotion.bundle import frames, images, photometric, sequence, starts
-from jaxevent.egomotion.bundle import windows as batch
-from jaxevent.egomotion.bundle.depths import depths as look_for_depths
-from jaxevent.egomotion.bundle.frames import DARK, look_at, offset
-from jaxevent.egomotion.bundle.path import ROWS, Path, advanced, normalised, warp
-from jaxevent.egomotion.bundle.photometric import Report, compute_covariance
-from jaxevent.egomotion.bundle.tracks import Scene, misfits, placed
+from jaxevent.egomotion.bundle import hypotheses, initialise, photometric_ba, sequence
+from jaxevent.egomotion.bundle import windows as data
+from jaxevent.egomotion.bundle.alignment import ImageScratch
+from jaxevent.egomotion.bundle.hypotheses import Stage, WindowFit, WindowFitter
+from jaxevent.egomotion.bundle.photometric_ba import FitReport, compute_covariance, search_depths
+from jaxevent.egomotion.bundle.residuals import Scene, project_events, residuals
+from jaxevent.egomotion.bundle.warp import N_ROWS, Path, Points, normalise, predict_path, warp
+from jaxevent.egomotion.bundle.windows import DARK, Params, read_frame_pixels, stamp_offset
 from jaxevent.egomotion.twists import Twists
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Recording
@@ -90,7 +91,7 @@ def seen(planes: tuple = ROOF, finest: float = 9.0, frames: bool = False) -> Rec
 
 
 GIVEN = {"events": 8192, "fewest": 500, "starts": 3, "rivals": 1, "flow_max": 120.0, "cell": 16}
-PARAMS = batch.Params.of(GIVEN)
+PARAMS = Params.of(GIVEN)
 
 
 def test_the_warp_is_the_rigid_scene():
@@ -98,7 +99,7 @@ def test_the_warp_is_the_rigid_scene():
     rng = np.random.default_rng(1)
     O = rng.normal(size=(3, 3)) * [[1.0], [4], [20]]  # noqa: E741
     D = rng.normal(size=(3, 3))
-    more = np.zeros((ROWS - 3, 3))
+    more = np.zeros((N_ROWS - 3, 3))
     path = Path(np.append(O, more, 0), np.append(D, more, 0), np.zeros(1))
     C = path.coefficients()[1]
     np.testing.assert_allclose(C[1], D[1] + np.cross(O[0], D[0]))
@@ -110,18 +111,18 @@ def test_the_warp_is_the_rigid_scene():
     local = R.apply(P - powers @ C, inverse=True)
     seen = F * local[:, :2] / local[:, 2:]
     rho = 1 / P[:, 2]
-    x, y = warp(path, F, seen[:, 0], seen[:, 1], tau, rho)
+    x, y = warp(path, F, Points(seen[:, 0], seen[:, 1], tau), rho)
     exact = F * P[:, :2] / P[:, 2:]
     np.testing.assert_allclose(np.stack([x, y], 1), exact, atol=2e-4)
 
 
 def test_twists_of_a_path():
     """Against differences of its poses; a constant twist stays one."""
-    path = Path.constant(T, OMEGA, np.zeros(1))
+    path = Path.constant_twist(T, OMEGA, np.zeros(1))
     heading, Omega = path.twist(np.array([-0.1, 0.0, 0.1]))
     np.testing.assert_allclose(Omega, np.broadcast_to(OMEGA, (3, 3)))
     np.testing.assert_allclose(heading, np.broadcast_to(T / np.linalg.norm(T), (3, 3)), atol=2e-3)
-    later = advanced(path, 0.05, 0.15)
+    later = predict_path(path, 0.05, 0.15)
     np.testing.assert_allclose(later.D[0], T / np.linalg.norm(T), atol=1e-3)
 
 
@@ -132,25 +133,27 @@ def test_a_path_goes_on_in_the_next_window():
     t = np.linspace(-0.15, 0.15, 31)
     for tau in (0.0, 0.05, -0.05):
         T, Omega = path.twist(np.clip(t + tau, -0.15, 0.15))
-        heading, turn = advanced(path, tau, 0.15).twist(t)
+        heading, turn = predict_path(path, tau, 0.15).twist(t)
         np.testing.assert_allclose(turn, Omega, atol=0.03 if tau else 1e-3)
         np.testing.assert_allclose(heading, T, atol=0.03 if tau else 1e-3)
     # The fifth power of what turns by 0.02 rad/s more within the window does not go on beyond.
     steep = dataclasses.replace(path, O=path.O.copy())
     steep.O[4] = 1e3
     for tau in (0.1, -0.1):
-        change = advanced(steep, tau, 0.15).twist(t)[1] - advanced(path, tau, 0.15).twist(t)[1]
+        change = (
+            predict_path(steep, tau, 0.15).twist(t)[1] - predict_path(path, tau, 0.15).twist(t)[1]
+        )
         assert np.abs(change).max() < 0.03
     # Depths are in units of the speed at the reference time.
     fast = dataclasses.replace(path, D=path.D.copy())
     fast.D[1] = 2 * path.D[0]
-    ratio = np.exp(float(advanced(fast, 0.1, 0.15).log_rho[0] - path.log_rho[0]))
+    ratio = np.exp(float(predict_path(fast, 0.1, 0.15).log_rho[0] - path.log_rho[0]))
     assert ratio == pytest.approx(1.2, abs=0.03)
 
 
 @functools.cache
-def fitted() -> tuple[batch.Windows, batch.Fit]:
-    windows = batch.Windows(seen(), PARAMS, CAMERA)
+def fitted() -> tuple[WindowFitter, WindowFit]:
+    windows = WindowFitter(seen(), PARAMS, CAMERA)
     fit = windows.fit(150_000)
     assert fit is not None
     return windows, fit
@@ -169,24 +172,26 @@ def test_the_motion_of_a_window_is_found():
 def test_the_motion_before_a_wall_is_found():
     """The homography has two, the true one costs less with a plane's depths."""
     recording = seen(ROOF[:1], 5.0)
-    few = batch.Windows(recording, PARAMS, CAMERA)
-    windows = batch.Windows(recording, batch.Params.of({**GIVEN, "events": 10_000}), CAMERA)
+    few = WindowFitter(recording, PARAMS, CAMERA)
+    windows = WindowFitter(recording, Params.of({**GIVEN, "events": 10_000}), CAMERA)
     normal = np.array(ROOF[0][0]) / ROOF[0][1]
     exact = np.cross(np.eye(3), OMEGA) + np.outer(T, normal)
     exact -= np.trace(exact) / 3 * np.eye(3)
-    M = starts.homography(few.cut(150_000, 0.05, batch.COARSE), few.rotation(150_000))
+    M = initialise.homography_flow(
+        few.sample_events(150_000, 0.05, hypotheses.FLOW_EVENTS), few.rotation(150_000)
+    )
     assert np.linalg.norm(M - exact) < 0.5 * np.linalg.norm(exact)
 
     near = exact + 0.05 * np.linalg.norm(exact) * np.diag([0.5, -0.7, 0.5])
-    made = starts.before_a_plane(near)
-    found = windows.before_a_plane(150_000, made)
+    made = initialise.planar_solutions(near)
+    found = windows.planar_hypotheses(150_000, made)
     assert len(found) == 2 and found[0][1].cost < found[1][1].cost
     heading, turn = found[0][0].path.twist(0.0)
     assert np.degrees(np.arccos(heading[0] @ T / np.linalg.norm(T))) < 1
     assert np.linalg.norm(turn[0] - OMEGA) < 0.02 * np.linalg.norm(OMEGA)
     # Depths are the plane's; smaller than LEAST some were not.
     (x, y), rho = (
-        windows.tracks(150_000, 0.15, batch.TRIED).places,
+        windows.series(150_000, 0.15, hypotheses.HYPOTHESIS_EVENTS).places,
         np.exp(found[0][0].path.log_rho),
     )
     rays = np.stack([x / F, y / F, np.ones(len(x))], 1)
@@ -194,59 +199,60 @@ def test_the_motion_before_a_wall_is_found():
     n = np.linalg.lstsq(rays[ahead], rho[ahead])[0]
     np.testing.assert_allclose(rays[ahead] @ n, rho[ahead], rtol=1e-3)
     np.testing.assert_allclose(n, normal * np.linalg.norm(T), atol=0.01)
-    roof = batch.Windows(seen(), PARAMS, CAMERA)
-    assert roof.before_a_plane(150_000, made) == []
+    roof = WindowFitter(seen(), PARAMS, CAMERA)
+    assert roof.planar_hypotheses(150_000, made) == []
 
 
-def adjust(tracks, scene, prior, sigma, settle, steps):
-    return photometric.adjust(tracks, scene, prior, sigma=sigma, settle=settle, steps=steps)
+def adjust(series, scene, prior, sigma, map_steps, steps):
+    return photometric_ba.adjust(
+        series, scene, prior, sigma=sigma, map_steps=map_steps, steps=steps
+    )
 
 
-def scene_of(fit: batch.Fit) -> Scene:
+def scene_of(fit: WindowFit) -> Scene:
     return Scene(fit.path, fit.map, 0.0)
 
 
 def test_tracks_are_the_events_of_pixels():
     windows, _ = fitted()
-    tracks = windows.tracks(150_000, 0.15, 3000)
+    series = windows.series(150_000, 0.15, 3000)
     events = seen().events
-    assert 2000 < len(tracks.x) <= 3000
-    assert tracks.begin[0] == 0 and tracks.begin[-1] == len(tracks.x)
+    assert 2000 < len(series.x) <= 3000
+    assert series.begin[0] == 0 and series.begin[-1] == len(series.x)
     where = events.y.astype(int) * WIDTH + events.x
-    for first, last in zip(tracks.begin[:-1:20], tracks.begin[1::20], strict=True):
+    for first, last in zip(series.begin[:-1:20], series.begin[1::20], strict=True):
         at = slice(first, last)
-        x, y = np.rint([tracks.x[first] + CAMERA.cx, tracks.y[first] + CAMERA.cy]).astype(int)
+        x, y = np.rint([series.x[first] + CAMERA.cx, series.y[first] + CAMERA.cy]).astype(int)
         own = np.flatnonzero(where == y * WIDTH + x)
-        np.testing.assert_allclose(tracks.x[at], x - CAMERA.cx)
-        np.testing.assert_array_equal(tracks.p[at], 2.0 * events.p[own] - 1)
-        np.testing.assert_array_equal(tracks.level[at], np.cumsum(2.0 * events.p[own] - 1))
-        np.testing.assert_array_equal(tracks.number[at], np.arange(len(own)) + 1)
-        np.testing.assert_allclose(tracks.tau[at], (events.t[own] - 150_000) * 1e-6, atol=1e-12)
+        np.testing.assert_allclose(series.x[at], x - CAMERA.cx)
+        np.testing.assert_array_equal(series.p[at], 2.0 * events.p[own] - 1)
+        np.testing.assert_array_equal(series.level[at], np.cumsum(2.0 * events.p[own] - 1))
+        np.testing.assert_array_equal(series.count[at], np.arange(len(own)) + 1)
+        np.testing.assert_allclose(series.tau[at], (events.t[own] - 150_000) * 1e-6, atol=1e-12)
 
 
 def true_path(log_rho: np.ndarray) -> Path:
-    return Path.constant(T / np.linalg.norm(T), OMEGA, log_rho)
+    return Path.constant_twist(T / np.linalg.norm(T), OMEGA, log_rho)
 
 
 def test_events_are_placed_on_the_nearest_surface():
     """Against the largest of the inverse depths that a fine search finds on each ray."""
     windows, _ = fitted()
-    tracks = windows.tracks(150_000, 0.15, 3000)
-    rows, columns = tracks.nodes
+    series = windows.series(150_000, 0.15, 3000)
+    rows, columns = series.nodes
     # A near square before a far wall.
     depths = np.full((rows, columns), np.log(0.3))
     depths[rows // 3 : 2 * rows // 3, columns // 3 : 2 * columns // 3] = np.log(1.8)
     path = true_path(depths.ravel())
-    X, Y, log_rho = placed(path, tracks)
+    (X, Y), log_rho = project_events(path, series)
     found = np.stack([X, Y], 1)
     lattice = [
-        tracks.corner[axis] + tracks.node * np.arange(n) for axis, n in ((1, rows), (0, columns))
+        series.corner[axis] + series.node * np.arange(n) for axis, n in ((1, rows), (0, columns))
     ]
     there = scipy.interpolate.RegularGridInterpolator(lattice, depths, bounds_error=False)
     tried = np.linspace(np.log(1.9), np.log(0.28), 1000)
     far, near = (
-        np.stack(warp(path, tracks.f, tracks.x, tracks.y, tracks.tau, np.array(rho)), 1)
-        for rho in (0.0, 1.0)
+        np.stack(warp(path, series.f, series.points, np.array(rho)), 1) for rho in (0.0, 1.0)
     )
     seen_at = far + np.exp(tried)[:, None, None] * (near - far)
     off = tried[:, None] - there(seen_at[..., ::-1])
@@ -259,7 +265,7 @@ def test_events_are_placed_on_the_nearest_surface():
     assert hidden.sum() > 20 and right[hidden].mean() > 0.7
     # From where they lay before the motion was changed a little they are found too.
     changed = Path(1.02 * path.O, path.D, path.log_rho)
-    searched, near = placed(changed, tracks), placed(changed, tracks, log_rho)
+    searched, near = (project_events(changed, series, rho)[0] for rho in (None, log_rho))
     assert np.abs(searched[0] - X).max() > 0.1
     same = np.hypot(searched[0] - near[0], searched[1] - near[1]) < 0.01
     assert same.mean() > 0.97
@@ -268,15 +274,14 @@ def test_events_are_placed_on_the_nearest_surface():
 def test_contrast_changes_as_told():
     """By each generator of a homography flow, against differences."""
     windows, _ = fitted()
-    cut, basis = windows.cut(150_000, 0.15, 3000), np.concatenate([starts.TURNS, starts.STRAINS])
-    image, work = np.empty((2, *cut.shape), cut.x.dtype)
-    terms, slope = np.empty((3, images.ORDER + 1, 3)), np.empty(len(basis))
+    cut = windows.sample_events(150_000, 0.15, 3000)
+    basis = np.concatenate([initialise.ROTATION_GENERATORS, initialise.STRAIN_GENERATORS])
+    terms = np.empty((3, initialise.EXPONENTIAL_ORDER + 1, 3))
+    scratch, slope = ImageScratch.of(cut.shape, cut.x.dtype, terms), np.empty(len(basis))
 
     def contrast(values: np.ndarray) -> float:
         M = np.tensordot(values, basis, 1)
-        return images.contrast_and_slope(
-            cut.x, cut.y, cut.tau, cut.p, M, basis, cut.corner, cut.f, 4, image, work, terms, slope
-        )
+        return initialise.contrast_and_gradient(cut, M, basis, 4, scratch, slope)
 
     values = np.linspace(-0.4, 0.5, len(basis))
     # Steps over which the image moves by some hundredths of a pixel.
@@ -294,7 +299,7 @@ def test_a_function_of_few_numbers_is_minimised():
         a, b = 1 - at[0], at[1] - at[0] ** 2
         return a**2 + 100 * b**2, np.array([-2 * a - 400 * at[0] * b, 200 * b])
 
-    at, least = starts._least(rosenbrock, np.array([-1.2, 1.0]), 60)
+    at, least = initialise.minimise_bfgs(rosenbrock, np.array([-1.2, 1.0]), 60)
     np.testing.assert_allclose(at, 1, atol=1e-3)
     assert 0 <= least < 1e-6
 
@@ -302,12 +307,12 @@ def test_a_function_of_few_numbers_is_minimised():
 def test_depths_of_a_known_path():
     """The roof's, where events tell them, from a plane at half the distance."""
     windows, _ = fitted()
-    tracks = windows.tracks(150_000, 0.15, 8192)
-    rows, columns = tracks.nodes
+    series = windows.series(150_000, 0.15, 8192)
+    rows, columns = series.nodes
     flat = true_path(np.full(rows * columns, np.log(1.2)))
-    found = look_for_depths(flat, tracks).reshape(rows, columns)
-    j, i = np.mgrid[:rows, :columns] * tracks.node
-    rays = np.stack([(i + tracks.corner[0]) / F, (j + tracks.corner[1]) / F, np.ones(i.shape)], -1)
+    found = search_depths(flat, series).reshape(rows, columns)
+    j, i = np.mgrid[:rows, :columns] * series.node
+    rays = np.stack([(i + series.corner[0]) / F, (j + series.corner[1]) / F, np.ones(i.shape)], -1)
     normals, distances = (np.array(part) for part in zip(*ROOF, strict=True))
     exact = np.log(np.linalg.norm(T) * (rays @ normals.T / distances).max(-1))
     middle = (abs(rays[..., 0]) < 0.4) & (abs(rays[..., 1]) < 0.3)
@@ -319,42 +324,44 @@ def test_two_motions_before_a_plane_have_the_same_flow():
     x, y = (part.ravel() for part in np.meshgrid(np.linspace(-40, 40, 9), np.linspace(-30, 30, 7)))
     a, b = (np.asarray(part(x, y, F)) for part in (geometry.A, geometry.B))
 
-    def flow(one: starts.Plane) -> np.ndarray:
+    def flow(one: initialise.PlanarMotion) -> np.ndarray:
         rho = np.stack([x / F, y / F, np.ones(len(x))], 1) @ one.normal
         return (a @ one.T) * rho[:, None] + b @ one.Omega
 
     rng = np.random.default_rng(3)
     for _ in range(20):
-        made = starts.Plane(rng.normal(size=3), np.append(rng.normal(size=2), 1.0), OMEGA)
+        made = initialise.PlanarMotion(
+            rng.normal(size=3), np.append(rng.normal(size=2), 1.0), OMEGA
+        )
         M = np.cross(np.eye(3), made.Omega) + np.outer(made.T, made.normal)
-        both = starts.before_a_plane(M - np.trace(M) / 3 * np.eye(3))
+        both = initialise.planar_solutions(M - np.trace(M) / 3 * np.eye(3))
         for one in both:
             np.testing.assert_allclose(flow(one), flow(made), atol=1e-9)
         off = [abs(one.Omega - made.Omega).max() for one in both]
         assert min(off) < 1e-9 and max(off) > 1e-2
-    path = made.path(x, y, F, np.dtype(float))
+    path = made.path((x, y), F, np.dtype(float))
     at = np.abs(x) + np.abs(y) < 20
     heading = made.T / np.linalg.norm(made.T)
     there = (a @ heading) * np.exp(path.log_rho)[:, None] + b @ path.O[0]
     np.testing.assert_allclose(there[at], flow(made)[at], atol=1e-9)
-    still = starts.before_a_plane(np.cross(np.eye(3), OMEGA))
+    still = initialise.planar_solutions(np.cross(np.eye(3), OMEGA))
     assert all(np.isfinite(np.concatenate(one)).all() for one in still)
 
 
 def test_the_map_is_the_least_squares_one():
     """For a path held fixed, against a sparse solver on splines' weights written out."""
     windows, fit = fitted()
-    tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
-    scene = scene_of(fit)._replace(map=np.zeros(tracks.shape))
+    series, prior = windows.series(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    scene = scene_of(fit)._replace(map=np.zeros(series.shape))
     # All events' weights are 1: sigma is so large that none costs anything beside it, and 4 times
     # as much counts where costs are small.
     prior = prior._replace(alike=4e-6, flat=0.02)
     for _ in range(2):
-        scene, _ = adjust(tracks, scene, prior, 1e3, 100, 8)
-    left = misfits(scene, tracks)
-    X, Y, _ = placed(scene.path, tracks)
-    i, j = X - tracks.corner[0], Y - tracks.corner[1]
-    height, width = tracks.shape
+        scene, _ = adjust(series, scene, prior, 1e3, 100, 8)
+    left = residuals(scene, series)
+    (X, Y), _ = project_events(scene.path, series)
+    i, j = X - series.corner[0], Y - series.corner[1]
+    height, width = series.shape
     inside = (i >= 1) & (i < width - 2) & (j >= 1) & (j < height - 2)
     i, j, e = i[inside], j[inside], np.arange(inside.sum())
     column, row = np.rint(i).astype(int), np.rint(j).astype(int)
@@ -365,7 +372,7 @@ def test_the_map_is_the_least_squares_one():
         for v in (-1, 0, 1)
     ]
     rows, columns, values = (np.concatenate(part) for part in zip(*parts, strict=True))
-    pixel = np.repeat(np.arange(len(tracks.begin) - 1), np.diff(tracks.begin))[inside]
+    pixel = np.repeat(np.arange(len(series.begin) - 1), np.diff(series.begin))[inside]
     pixel = np.unique(pixel, return_inverse=True)[1]
     offsets = scipy.sparse.csr_array((-np.ones(len(e)), (e, pixel)), (len(e), pixel.max() + 1))
     events = scipy.sparse.csr_array((values, (rows, columns)), (len(e), height * width))
@@ -378,7 +385,7 @@ def test_the_map_is_the_least_squares_one():
     matrix = scipy.sparse.vstack(
         [scipy.sparse.hstack([events, offsets]), scipy.sparse.hstack([prior_rows, none])]
     )
-    level = tracks.level[inside]
+    level = series.level[inside]
     side = np.append(level, np.zeros(prior_rows.shape[0]))
     found = scipy.sparse.linalg.lsqr(matrix, side, iter_lim=300)
     cost = np.linalg.norm(left) ** 2 + ((prior_rows @ scene.map.ravel()) ** 2).sum()
@@ -389,13 +396,13 @@ def test_the_map_is_the_least_squares_one():
 def test_the_photometric_fit_ends_at_the_truth():
     """From 6 degrees beside it, and depths of a plane that faces the camera."""
     windows, _ = fitted()
-    tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
-    depths = np.full(tracks.nodes[0] * tracks.nodes[1], np.log(np.linalg.norm(T) / 1.5))
+    series, prior = windows.series(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    depths = np.full(series.nodes[0] * series.nodes[1], np.log(np.linalg.norm(T) / 1.5))
     path = true_path(depths)
     path.D[0] += np.array([0.1, 0, 0])
-    scene = Scene(normalised(path), np.zeros(tracks.shape), 0.0)
-    for sigma, settle, steps in ((0.3, 2, 12), (0.2, 0, 15), (0.05, 0, 15)):
-        scene, report = adjust(tracks, scene, prior, sigma, settle, steps)
+    scene = Scene(normalise(path), np.zeros(series.shape), 0.0)
+    for sigma, map_steps, steps in ((0.3, 2, 12), (0.2, 0, 15), (0.05, 0, 15)):
+        scene, report = adjust(series, scene, prior, sigma, map_steps, steps)
     heading, Omega = (part[0] for part in scene.path.twist(0.0))
     assert np.degrees(np.arccos(heading @ T / np.linalg.norm(T))) < 3
     assert np.linalg.norm(Omega - OMEGA) < 0.06 * np.linalg.norm(OMEGA)
@@ -404,16 +411,16 @@ def test_the_photometric_fit_ends_at_the_truth():
 
 def test_frames_tell_their_intensity_in_units_of_the_threshold():
     recording = seen(frames=True)
-    shown = look_at(recording, 0, 300_000)
-    assert shown is not None and len(shown.t) == 7 and (shown.trust > 0.5).mean() > 0.9
+    shown = read_frame_pixels(recording, 0, 300_000)
+    assert shown is not None and len(shown.t) == 7 and (shown.precision > 0.5).mean() > 0.9
     logarithm = np.log(recording.frames.intensity.reshape(7, -1) + DARK)
     slope = np.polyfit(logarithm.ravel(), shown.level.ravel(), 1)[0]
     assert slope == pytest.approx(1 / 0.25, rel=0.15)
-    assert look_at(recording, 0, 50_000) is None  # one frame tells no change
+    assert read_frame_pixels(recording, 0, 50_000) is None  # one frame tells no change
     exchanged = dataclasses.replace(recording.events, p=~recording.events.p)
-    assert look_at(dataclasses.replace(recording, events=exchanged), 0, 300_000) is None
+    assert read_frame_pixels(dataclasses.replace(recording, events=exchanged), 0, 300_000) is None
     mirrored = dataclasses.replace(recording.frames, images=recording.frames.images[:, :, ::-1])
-    assert look_at(dataclasses.replace(recording, frames=mirrored), 0, 300_000) is None
+    assert read_frame_pixels(dataclasses.replace(recording, frames=mirrored), 0, 300_000) is None
 
 
 def stamped(late: int) -> Recording:
@@ -425,45 +432,49 @@ def stamped(late: int) -> Recording:
 
 def test_frames_stamps_are_held_against_the_events():
     for late in (-6000, 0, 9000):
-        assert abs(offset(stamped(late)) - late) < 1500  # in which the image moves by 0.07 px
+        assert abs(stamp_offset(stamped(late)) - late) < 1500  # in which the image moves by 0.07 px
     recording = stamped(9000)
     mirrored = dataclasses.replace(recording.frames, images=recording.frames.images[:, :, ::-1])
-    assert offset(dataclasses.replace(recording, frames=mirrored)) == 0
-    assert offset(dataclasses.replace(recording, frames=recording.frames[:1])) == 0
+    assert stamp_offset(dataclasses.replace(recording, frames=mirrored)) == 0
+    assert stamp_offset(dataclasses.replace(recording, frames=recording.frames[:1])) == 0
 
 
 @pytest.mark.parametrize(
     "told, expected", [((4000, 5500), 4000), ((4000, 6500), 0), ((4000, None), 0), ((None, 0), 0)]
 )
 def test_an_offset_that_depends_on_pixels_is_none(monkeypatch, told, expected):
-    monkeypatch.setattr(frames, "_agreed", lambda *given: told[frames.ACCOUNTS.index(given[-1])])
-    assert offset(stamped(0)) == expected
+    monkeypatch.setattr(
+        data, "_best_offset", lambda *given: told[data.OFFSET_METHODS.index(given[-1])]
+    )
+    assert stamp_offset(stamped(0)) == expected
 
 
 def test_frames_tell_motion_where_events_are_few():
     """From 6 degrees beside it, with a tenth of the events; frames are stamped 9 ms early."""
     off = []
     for given in (True, False):
-        params = batch.Params.of({**GIVEN, "frames": given})
-        windows = batch.Windows(stamped(9000), params, CAMERA)
-        tracks, prior = windows.tracks(150_000, 0.15, 1500), windows.prior(150_000, 0.15)
-        assert (len(tracks.x) > tracks.events) == given
-        path = true_path(np.full(math.prod(tracks.nodes), np.log(np.linalg.norm(T) / 1.5)))
+        params = Params.of({**GIVEN, "frames": given})
+        windows = WindowFitter(stamped(9000), params, CAMERA)
+        series, prior = windows.series(150_000, 0.15, 1500), windows.prior(150_000, 0.15)
+        assert (len(series.x) > series.n_events) == given
+        path = true_path(np.full(math.prod(series.nodes), np.log(np.linalg.norm(T) / 1.5)))
         path.D[0] += np.array([0.1, 0, 0])
-        stages = tuple(batch.Stage(sigma, 12) for sigma in (0.3, 0.2, 0.05))
-        blank = batch.blank(tracks, normalised(path), prior)
-        (scene, _) = batch._begun(tracks, blank, prior, stages)
+        stages = tuple(Stage(sigma, 12) for sigma in (0.3, 0.2, 0.05))
+        blank = hypotheses.blank_scene(series, normalise(path), prior)
+        (scene, _) = hypotheses._settle_and_refine(series, blank, prior, stages)
         off.append(np.degrees(np.arccos(scene.path.D[0] @ T / np.linalg.norm(T))))
     assert off[0] < 4 and off[0] < 0.5 * off[1], off
 
 
 def test_a_lens_leaves_errors_across_the_heading():
     bent = dataclasses.replace(CAMERA, distortion=(-0.1, 0.0, 0.0, 0.0, 0.0))
-    ideal, real = (batch.Windows(seen(), PARAMS, camera) for camera in (CAMERA, bent))
+    ideal, real = (WindowFitter(seen(), PARAMS, camera) for camera in (CAMERA, bent))
     heading = T / np.linalg.norm(T)
-    near, far = (Path.constant(heading, np.zeros(3), np.full(4, np.log(d))) for d in (2.0, 1.0))
-    assert not ideal.of_lens(near).any()
-    one, other = real.of_lens(near), real.of_lens(far)
+    near, far = (
+        Path.constant_twist(heading, np.zeros(3), np.full(4, np.log(d))) for d in (2.0, 1.0)
+    )
+    assert not ideal.lens_covariance(near).any()
+    one, other = real.lens_covariance(near), real.lens_covariance(far)
     np.testing.assert_allclose(one[:3, :3] @ heading, 0, atol=1e-12)
     # Of a translation alone the heading is as well told at any speed, Omega errs with the speed.
     np.testing.assert_allclose(one[:3, :3], other[:3, :3])
@@ -473,12 +484,12 @@ def test_a_lens_leaves_errors_across_the_heading():
 def test_the_covariance_is_that_of_repeated_fits():
     """Of the same events at times that are off by some ms, anew each time."""
     windows, fit = fitted()
-    tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    series, prior = windows.series(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
     rng = np.random.default_rng(0)
     rows, told = [], []
     for _ in range(12):
-        tau = tracks.tau + 5e-3 * rng.normal(size=len(tracks.tau))
-        noisy = dataclasses.replace(tracks, tau=tau)
+        tau = series.tau + 5e-3 * rng.normal(size=len(series.tau))
+        noisy = series._replace(tau=tau)
         scene, _ = adjust(noisy, scene_of(fit), prior, 0.2, 1, 8)
         rows.append(np.concatenate([part[0] for part in scene.path.twist(0.0)]))
         if len(told) < 3:  # they are alike
@@ -490,40 +501,40 @@ def test_the_covariance_is_that_of_repeated_fits():
 def test_steps_never_cost_more():
     """Beside true depths, with a sigma rather small for how far they are."""
     windows, _ = fitted()
-    tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    series, prior = windows.series(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
     rng = np.random.default_rng(0)
-    depths = np.log(0.6) + 0.1 * rng.normal(size=tracks.nodes[0] * tracks.nodes[1])
-    scene = Scene(true_path(depths), np.zeros(tracks.shape), 0.0)
-    scene, first = adjust(tracks, scene, prior, 0.1, 3, 3)
-    costs = [adjust(tracks, scene, prior, 0.1, 0, steps)[1].cost for steps in (1, 2, 4, 8, 16)]
+    depths = np.log(0.6) + 0.1 * rng.normal(size=series.nodes[0] * series.nodes[1])
+    scene = Scene(true_path(depths), np.zeros(series.shape), 0.0)
+    scene, first = adjust(series, scene, prior, 0.1, 3, 3)
+    costs = [adjust(series, scene, prior, 0.1, 0, steps)[1].cost for steps in (1, 2, 4, 8, 16)]
     assert costs[-1] < 0.1 * first.cost
     assert (np.diff(costs) <= 1e-3 * np.array(costs[:-1])).all()
 
 
 def test_priors_pull():
     windows, fit = fitted()
-    tracks, prior = windows.tracks(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
+    series, prior = windows.series(150_000, 0.15, 8192), windows.prior(150_000, 0.15)
     strong = prior._replace(omega=1e9)
-    scene, _ = adjust(tracks, scene_of(fit), strong, 0.1, 0, 8)
+    scene, _ = adjust(series, scene_of(fit), strong, 0.1, 0, 8)
     assert np.linalg.norm(scene.path.O[0]) < 0.1 * np.linalg.norm(fit.path.O[0])
     t = np.array([0, 300_000])
     wrong = OMEGA + [0.0, 0.2, 0.0]
-    windows = batch.Windows(
-        seen(), batch.Params.of({**GIVEN, "gyro_std": 1e-5}), CAMERA,
+    windows = WindowFitter(
+        seen(), Params.of({**GIVEN, "gyro_std": 1e-5}), CAMERA,
         Twists(t, np.stack([wrong, wrong]), None, 0, 300_000),
     )  # fmt: skip
     prior = windows.prior(150_000, 0.15)
-    scene, _ = adjust(tracks, scene_of(fit), prior, 0.1, 0, 8)
+    scene, _ = adjust(series, scene_of(fit), prior, 0.1, 0, 8)
     np.testing.assert_allclose(scene.path.twist(0.0)[1][0], wrong, atol=1e-2)
-    covariance = compute_covariance(tracks, scene, prior, sigma=0.1)
+    covariance = compute_covariance(series, scene, prior, sigma=0.1)
     assert np.sqrt(np.diag(covariance)[3:]).max() < 1e-4
 
 
 def test_a_recording_from_end_to_end(monkeypatch):
     """With fewer steps than `fitted`, which are enough to come near."""
-    monkeypatch.setattr(batch, "ROUNDS", (batch.Stage(0.3, 4),))
-    monkeypatch.setattr(batch, "FINAL", (batch.Stage(0.1, 3),))
-    monkeypatch.setattr(batch, "GROWING", ())
+    monkeypatch.setattr(hypotheses, "COARSE_TO_FINE", (Stage(0.3, 4),))
+    monkeypatch.setattr(hypotheses, "FINAL", (Stage(0.1, 3),))
+    monkeypatch.setattr(hypotheses, "PLANAR", ())
     motion = sequence.batch.estimate(seen(), PARAMS)
     mean, covariance, valid = motion(motion.t[len(motion) // 2 :][:1])
     assert valid[0] and covariance.shape == (1, 6, 6)
@@ -541,14 +552,14 @@ def test_a_recording_from_end_to_end(monkeypatch):
     assert len(sequence.batch.estimate(empty, PARAMS)) == 0
 
 
-def a_fit(path, cost, doubted=0.0):
-    return batch.Fit(path, np.eye(6), 1.0, cost, np.zeros((1, 1)), doubted)
+def a_fit(path, cost, ambiguity=0.0):
+    return WindowFit(path, np.eye(6), 1.0, cost, np.zeros((1, 1)), ambiguity)
 
 
 def test_windows_that_disagree_are_less_sure():
     """By the mean square of differences halfway to the windows before and after."""
     turns = [np.array([0.0, 0, w]) for w in (0.0, 0.2, 0.1)]
-    paths = [Path.constant(np.array([0.0, 0, 1]), turn, np.zeros(1)) for turn in turns]
+    paths = [Path.constant_twist(np.array([0.0, 0, 1]), turn, np.zeros(1)) for turn in turns]
     paths[1].O[1, 2] = -2.0  # rad/s^2
     fits = [a_fit(path, 1.0) for path in paths]
     centres = np.array([0, 100_000, 200_000])
@@ -566,25 +577,25 @@ def test_windows_that_disagree_are_less_sure():
 
 def test_the_end_of_a_path_is_less_sure():
     """Where no other window tells the motion, and by how far it is from that at the middle."""
-    path = Path.constant(np.array([0.0, 0, 1]), np.array([0, 0, 0.5]), np.zeros(1))
+    path = Path.constant_twist(np.array([0.0, 0, 1]), np.array([0, 0, 0.5]), np.zeros(1))
     path.O[1, 2] = -2.0  # rad/s^2
     fits, half = [a_fit(path, 1.0)._replace(covariance=np.eye(6) * 1e-4)] * 3, 150_000
-    told = sequence._blended(np.arange(3) * 100_000, [*fits], half, 100_000, -half, 2 * half)
+    told = sequence._blend(np.arange(3) * 100_000, [*fits], half, 100_000, (-half, 2 * half))
     middle = np.abs(told.t - 100_000) < 100_000
     apart = told.covariance[middle, 5, 5] - 1e-4  # of the windows, which a ramp does not join
-    lone = sequence._blended(np.zeros(1, int), fits[:1], half, 100_000, -half, half)
+    lone = sequence._blend(np.zeros(1, int), fits[:1], half, 100_000, (-half, half))
     assert list(lone.t[[0, -1]]) == [-100_000, 100_000]
-    grown = 1e-4 + (sequence.BENT * 2.0 * lone.t * 1e-6) ** 2
+    grown = 1e-4 + (sequence.EDGE_UNCERTAINTY * 2.0 * lone.t * 1e-6) ** 2
     np.testing.assert_allclose(lone.covariance[:, 5, 5], grown)
     np.testing.assert_allclose(lone.covariance[:, :5, :5], np.tile(np.eye(5) * 1e-4, (11, 1, 1)))
     np.testing.assert_allclose(apart, (2.0 * 0.1) ** 2)
-    short = sequence._blended(np.zeros(1, int), fits[:1], half, 100_000, -4000, 4000)
+    short = sequence._blend(np.zeros(1, int), fits[:1], half, 100_000, (-4000, 4000))
     assert list(short.t) == [-4000, -2000, 0, 2000, 4000]
     first = told.covariance[told.t == -100_000, 5, 5]
-    assert first > (sequence.BENT * 0.2) ** 2
+    assert first > (sequence.EDGE_UNCERTAINTY * 0.2) ** 2
     # Where the camera is slower the same errors of its velocity turn the heading farther.
     path.D[1, 2] = -9.9  # 1/s^2, of |T| at the middle
-    slower = sequence._blended(np.zeros(1, int), fits[:1], half, 100_000, -half, half)
+    slower = sequence._blend(np.zeros(1, int), fits[:1], half, 100_000, (-half, half))
     pace = np.clip(1 - 9.9 * slower.t * 1e-6, 0.02 / np.pi * np.sqrt(3), 1)
     heading = np.diagonal(slower.covariance[:, :3, :3], axis1=1, axis2=2)
     np.testing.assert_allclose(heading, np.tile(1e-4 / pace[:, None] ** 2, 3), rtol=1e-6)
@@ -598,28 +609,29 @@ def windows_that(monkeypatch, fit, follow):
     """Windows whose fits are given, by centre and path; what was asked for, in order."""
     asked = []
 
-    def anew(self, centre, warm=None):
+    def fit_anew(self, centre, warm=None):
         asked.append(("anew", centre))
         return a_fit(*fit(centre, warm))
 
-    def followed(self, centre, warm):
-        return Scene(warm, np.full((), centre), 0.0), Report(0.0, 0.0, 0.0)
+    def refine_from(self, centre, warm):
+        return Scene(warm, np.full((), centre), 0.0), FitReport(0.0, 0.0, 0.0)
 
-    def ended(self, centre, rivals, stages=()):
+    def refine_final(self, centre, rivals, stages=()):
         ((scene, _),) = rivals
         assert scene.map == centre
         asked.append(("followed", centre))
         return a_fit(*follow(centre, scene.path))
 
-    for name, function in (("fit", anew), ("followed", followed), ("ended", ended)):
-        monkeypatch.setattr(batch.Windows, name, function)
+    monkeypatch.setattr(WindowFitter, "fit", fit_anew)
+    monkeypatch.setattr(WindowFitter, "refine_from", refine_from)
+    monkeypatch.setattr(WindowFitter, "refine_final", refine_final)
     return asked
 
 
 def test_a_path_that_is_lost_or_doubted_is_not_followed(monkeypatch):
     path = true_path(np.zeros(4))
     # The third window costs much more, what the sixth costs cannot be told.
-    costs = {2: 2 * sequence.LOST * 1e-3, 5: np.nan}
+    costs = {2: 2 * sequence.LOST_COST_RATIO * 1e-3, 5: np.nan}
     asked = windows_that(
         monkeypatch,
         lambda centre, warm: (path, 1e-3, 2.0 * (centre == first)),
@@ -628,7 +640,7 @@ def test_a_path_that_is_lost_or_doubted_is_not_followed(monkeypatch):
     recording = seen()
     first = int(recording.events.t[0]) + 20_000
     short = {"half_window": 0.02, "step": 0.02, "fresh": 100}
-    sequence.batch.estimate(recording, batch.Params.of({**GIVEN, **short}))
+    sequence.batch.estimate(recording, Params.of({**GIVEN, **short}))
     assert [(kind, (centre - first) // 20_000) for kind, centre in asked][:10] == [
         ("anew", 0),
         ("anew", 1),
@@ -655,7 +667,7 @@ def test_new_starts_that_agree_are_made_less_often(monkeypatch):
     recording = seen()
     first = int(recording.events.t[0]) + 10_000
     short = {"half_window": 0.01, "step": 0.01, "fewest": 1, "fresh": 2}
-    sequence.batch.estimate(recording, batch.Params.of({**GIVEN, **short}))
+    sequence.batch.estimate(recording, Params.of({**GIVEN, **short}))
     anew = [(centre - first) // 10_000 for kind, centre in asked if kind == "anew"]
     # 2 windows after the first, 4, 8, where they do not agree, again 2.
     assert anew == [0, 2, 6, 14, 16, 20]
@@ -680,7 +692,7 @@ def test_a_wrong_beginning_is_fitted_again(monkeypatch, cheaper):
         lambda centre, warm: (wrong if warm is None else right, 1e-3),
         follow,
     )
-    params = batch.Params.of({**GIVEN, "half_window": 0.05, "step": 0.05, "fresh": 3})
+    params = Params.of({**GIVEN, "half_window": 0.05, "step": 0.05, "fresh": 3})
     motion = sequence.batch.estimate(recording, params)
     at = np.searchsorted(motion.t, first + 50_000 * np.arange(4))
     along = motion.mean[at, :3] @ right.twist(0.0)[0].ravel()

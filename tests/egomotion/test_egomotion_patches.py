@@ -7,7 +7,7 @@ import pytest
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import batch, contrast, find_model, truth, twists, voting
-from jaxevent.egomotion.bundle.translation import Told, together
+from jaxevent.egomotion.bundle.hypotheses import WindowTest, combine_z
 from jaxevent.egomotion.candidates import coordinates
 from jaxevent.egomotion.choice import choose, decide
 from jaxevent.egomotion.geometry import A, B, rotation_basis
@@ -167,10 +167,10 @@ def test_windows_that_share_events_count_as_often_as_these():
     for spans in ([(0, 400), (0, 400)], [(0, 300), (100, 400)], [(0, 150), (250, 400)]):
         z = []
         for row in noise:
-            sums = [Told(row[a:b].sum() / np.sqrt(b - a), a, b) for a, b in spans]
-            z.append(together(sums))
+            sums = [WindowTest(row[a:b].sum() / np.sqrt(b - a), a, b) for a, b in spans]
+            z.append(combine_z(sums))
         assert np.array(z, float).var() == pytest.approx(1, abs=0.1)
-    assert together([]) is None and together([Told(2.5, 0, 10)]) == pytest.approx(2.5)
+    assert combine_z([]) is None and combine_z([WindowTest(2.5, 0, 10)]) == pytest.approx(2.5)
 
 
 def test_a_heading_that_nothing_tells_is_said():

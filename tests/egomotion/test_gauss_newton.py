@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxevent.egomotion.bundle import gauss_newton, rows
-from jaxevent.egomotion.bundle.gauss_newton import Acceptance, accept
-from jaxevent.egomotion.bundle.path import SEGMENTS, Path, Prior
-from jaxevent.egomotion.bundle.placing import POWERS
+from jaxevent.egomotion.bundle import warp
+from jaxevent.egomotion.bundle.photometric_ba import StepControl, update_control
+from jaxevent.egomotion.bundle.warp import N_ROWS, N_SEGMENTS, Path, Prior
 
 K = 3
 HALF = 0.15
@@ -26,14 +25,14 @@ HALF = 0.15
     ],
 )
 def test_steps_are_accepted_or_damped(before, better, gain, after):
-    now = accept(Acceptance(*before), better, gain, 1.0, True)
+    now = update_control(StepControl(*before), better, gain, 1.0, True)
     assert (now.momentum, now.damping) == pytest.approx(after)
-    assert now.goes_on == (after[1] < 50)
+    assert now.should_continue == (after[1] < 50)
 
 
 def test_steps_are_limited():
-    assert gauss_newton.limit_step(np.array([1.0, -8.0])) == 0.5
-    assert gauss_newton.limit_step(np.array([1.0, -3.0])) == 1
+    assert warp.step_fraction(np.array([1.0, -8.0])) == 0.5
+    assert warp.step_fraction(np.array([1.0, -3.0])) == 1
 
 
 def a_path() -> Path:
@@ -43,13 +42,13 @@ def a_path() -> Path:
 
 def test_rows_are_put_back():
     path = a_path()
-    first = rows.rows_of(path, K)
-    moved = rows.with_rows(path, 2 * first)
-    np.testing.assert_allclose(rows.rows_of(moved, K), 2 * first)
+    first = warp.pack_rows(path, K)
+    moved = warp.replace_rows(path, 2 * first)
+    np.testing.assert_allclose(warp.pack_rows(moved, K), 2 * first)
     np.testing.assert_array_equal(moved.O[K:], path.O[K:])
     np.testing.assert_array_equal(moved.D[K:], path.D[K:])
     # Omega of 1 / (f h) moves an image by 1 px at the window's end, its change by 2 / (f h^2).
-    unit = rows.units_of_rows(path, 80.0, HALF, K).reshape(2, K, 3)
+    unit = warp.row_units(path, 80.0, HALF, K).reshape(2, K, 3)
     np.testing.assert_allclose(unit[0, :, 0], [1 / 12, 2 / 1.8, 6 / 0.27], rtol=1e-12)
     usual = np.exp(np.median(path.log_rho))
     np.testing.assert_allclose(unit[1], unit[0] / usual, rtol=1e-12)
@@ -59,27 +58,28 @@ def test_rows_are_put_back():
 def test_coefficients_change_with_rows_as_told(k):
     """Against differences of the polynomials, in half windows."""
     path = a_path()
-    unit = rows.units_of_rows(path, 80.0, HALF, k)
-    powers = HALF ** np.arange(1, POWERS + 1)
+    unit = warp.row_units(path, 80.0, HALF, k)
+    powers = HALF ** np.arange(1, N_ROWS + 1)
 
     def coefficients(at: Path) -> np.ndarray:
         both = np.stack(at.polynomials()) * powers[:, None]
         return both.transpose(0, 2, 1).ravel()
 
-    found, h = rows.chain(path, unit, HALF, k), 1e-6
-    assert found.shape == (6 * POWERS, 6 * k)
+    found, h = warp.coefficient_jacobian(path, unit, HALF, k), 1e-6
+    assert found.shape == (6 * N_ROWS, 6 * k)
     for n, one in enumerate(np.eye(6 * k)):
         step = h * one * unit
         ends = [
-            coefficients(rows.with_rows(path, rows.rows_of(path, k) + s)) for s in (step, -step)
+            coefficients(warp.replace_rows(path, warp.pack_rows(path, k) + s))
+            for s in (step, -step)
         ]
         np.testing.assert_allclose(found[:, n], (ends[0] - ends[1]) / (2 * h), atol=1e-7)
 
 
 def test_the_size_of_the_translation_is_held():
     path = dataclasses.replace(a_path(), D=np.eye(5, 3))
-    unit = rows.units_of_rows(path, 80.0, HALF, K)
-    gauge = rows.gauge_of_rows(path, unit, 6 * K + 4)
+    unit = warp.row_units(path, 80.0, HALF, K)
+    gauge = warp.gauge_direction(path, unit, 6 * K + 4)
     expected = np.zeros(6 * K + 4)
     expected[3 * K] = unit[3 * K]
     np.testing.assert_allclose(gauge, expected)
@@ -88,22 +88,22 @@ def test_the_size_of_the_translation_is_held():
 def test_priors_pull_as_written():
     rng = np.random.default_rng(2)
     now, unit = rng.normal(size=6 * K), rng.uniform(0.5, 2, 6 * K)
-    gyro = rng.normal(size=(SEGMENTS, 3))
+    gyro = rng.normal(size=(N_SEGMENTS, 3))
     prior = Prior(1.0, 1.0, 0.3, 0.7, gyro, 2.0, 1.0, 1.0, 1.0)
     O = (now * unit)[: 3 * K].reshape(K, 3)  # noqa: E741
-    t = ((np.arange(SEGMENTS) + 0.5) / SEGMENTS * 2 - 1) * HALF
+    t = ((np.arange(N_SEGMENTS) + 0.5) / N_SEGMENTS * 2 - 1) * HALF
     seen = O[0] + O[1] * t[:, None] + O[2] * t[:, None] ** 2 / 2
     changes = np.concatenate([now[3 : 3 * K], now[3 * K + 3 :]])
     expected = 0.7 * (O[0] ** 2).sum() + 0.3 * (changes**2).sum()
-    expected += 2.0 / SEGMENTS * ((seen - gyro) ** 2).sum()
-    H, b, constant = rows.priors_of_rows(prior, unit, HALF)
+    expected += 2.0 / N_SEGMENTS * ((seen - gyro) ** 2).sum()
+    H, b, constant = warp.row_priors(prior, unit, HALF)
     cost = now @ H @ now / 2 - b @ now + constant
     assert cost == pytest.approx(expected / 2, rel=1e-12)
 
 
 def test_bonds_give_way_at_edges():
     log_rho = np.array([[0.0, 0.01, 5.0], [0.0, 0.01, 5.0]])
-    across, down, cost = gauss_newton.bonds(log_rho, 2.0, 0.1)
+    across, down, cost = warp.smoothness_weights(log_rho, 2.0, 0.1)
     row = [0, 2 / 1.01, 2 / (1 + 49.9**2)]
     np.testing.assert_allclose(across, [row, row])
     np.testing.assert_allclose(down, [[0, 0, 0], [2, 2, 2]])

@@ -15,25 +15,28 @@ from jaxevent.errors import InputError
 from jaxevent.methods import find
 from jaxevent.reconstruction.colour import chrominance, colour_video, luminance
 from jaxevent.reconstruction.compensated import (
-    agreement,
-    borders,
-    course,
     estimator,
     exposures,
     fusion,
-    implicit,
     instants,
+    normal_equations,
+    robust_mean,
     trajectories,
-    warping,
+    warp,
 )
-from jaxevent.reconstruction.compensated.parameters import OTHERS, SIGNS, Params
-from jaxevent.reconstruction.compensated.solving import solve
+from jaxevent.reconstruction.compensated.normal_equations import (
+    CostParams,
+    NormalEquations,
+    PackedImages,
+    solve,
+)
+from jaxevent.reconstruction.compensated.params import FALLBACKS, FEATURES, Params
 from jaxevent.recording import Frames
 from jaxevent.simulate import Sensor, simulate
 
 mc = find("mc", "reconstruction")
 fuse = jax.jit(fusion.fuse)
-SMOOTHNESS = trajectories.Smoothness(40.0, 0.04, 0.1, 0.2)
+COST = CostParams(*map(np.float32, (2e-4, 10, 40, 0.04, 0.1, 0.2)))
 
 
 def texture(height, width, seed=0):
@@ -65,16 +68,16 @@ def moved(v, a, s, height=40, width=56):
 def test_motion_is_found_from_nothing(v, a):
     s = np.array([-1, -0.75, -0.5, -0.25, 0, 0.25, 0.5, 0.75, 1], np.float32)
     L = moved(v, a, s)
-    pyramid = trajectories.Pyramid(L, np.full_like(L, 1e-3), 0.35)
-    plan = trajectories.stages(s, 0.5)
-    motion = trajectories.follow(pyramid, s, plan, 2e-4, 10.0, SMOOTHNESS)
+    pyramid = trajectories.ImagePyramid(L, np.full_like(L, 1e-3), 0.35)
+    plan = trajectories.plan_stages(s, 0.5)
+    motion = trajectories.estimate_trajectories(pyramid, s, plan, COST)
     assert motion.level == 1
-    p = motion.at(0, 40, 56).p
+    p = motion.at_level(0, (40, 56)).p
     inner = p[6:-6, 6:-6]
     # The scene's points go by v s + a s^2.
     np.testing.assert_allclose(inner.mean((0, 1)), [*v, *a], atol=0.15)
     assert np.abs(inner - inner.mean((0, 1)))[..., :2].max() < 0.6
-    paths = trajectories.spread(p, (40, 56))
+    paths = warp.interpolate_paths(p, (40, 56))
     np.testing.assert_allclose(paths[12:-12, 12:-12].mean((0, 1)), [*v, *a], atol=0.15)
 
 
@@ -83,9 +86,9 @@ def test_motion_of_half_the_image_alone():
     s = np.array([-1, -0.5, 0, 0.5, 1], np.float32)
     still, moving = moved((0, 0), (0, 0), s), moved((3.0, 0), (0, 0), s)
     L = np.where(np.arange(56) < 28, still, moving).astype(np.float32)
-    pyramid = trajectories.Pyramid(L, np.full_like(L, 1e-3), 0.35)
-    plan = trajectories.stages(s, 0.5)
-    p = trajectories.follow(pyramid, s, plan, 2e-4, 10.0, SMOOTHNESS).p
+    pyramid = trajectories.ImagePyramid(L, np.full_like(L, 1e-3), 0.35)
+    plan = trajectories.plan_stages(s, 0.5)
+    p = trajectories.estimate_trajectories(pyramid, s, plan, COST).p
     assert np.abs(p[:, :5, :2] * 2).max() < 0.3  # of half resolution
     np.testing.assert_allclose(p[2:-2, -5:-2, 0] * 2, 3, atol=0.4)
 
@@ -115,7 +118,7 @@ def test_equations_are_solved():
     across, down = weights[0], weights[1]
     smooth = np.array([2, 2, 3, 3], np.float32)
     ridge = np.array([0.1, 0.1, 0.5, 0.5], np.float32)
-    d = solve(N, b, p, across, down, smooth, ridge, 60)
+    d = solve(NormalEquations(N, b, across, down, smooth, ridge), p, 60)
 
     size = rows * columns
     laplacian = np.zeros((size, size))
@@ -144,11 +147,12 @@ def test_pixels_take_the_path_of_their_side():
     s = np.array([-1, -0.5, 0, 0.5, 1], np.float32)
     x = np.arange(56)
     still, moving = moved((0, 0), (0, 0), s), moved((6.0, -3.0), (0, 0), s)
-    images = trajectories.pack(np.where(x < 28, still, moving), np.full_like(still, 1e-3))
+    packed = trajectories.pack_images(np.where(x < 28, still, moving), np.full_like(still, 1e-3))
+    images = PackedImages.of(packed, s)
     # Between both motions a ramp, 12 px wide, as nodes leave it.
     part = np.clip((x - 21.5) / 12, 0, 1)[None, :, None] * np.ones((40, 1, 1))
     paths = (part * [6.0, -3, 0, 0]).astype(np.float32)
-    whose = borders.choose(images, s, paths, 2e-4, 10.0)
+    whose = trajectories.select_paths(images, paths, COST)
     chosen = paths.reshape(-1, 4)[whose][4:-4]
     before = paths[4:-4]
     truth = np.where(x < 28, 0.0, 6.0)
@@ -160,23 +164,23 @@ def test_pixels_take_the_path_of_their_side():
     # What moves has left the image's other half, so that some pixels see it in few instants.
     assert wrong(before) > 0.5 and wrong(chosen) < 0.25
     # Steps from paths of others leave fewer wrong ones than steps alone; sizes may be odd.
-    rules = 2e-4, 10.0, trajectories.Smoothness(40.0, 0.04, 0.1, 0.2)
-    odd, p = np.ascontiguousarray(images[:, :39, :55]), paths[::2, ::2]
-    refined, of = borders.refine(odd, s, p, *rules)
-    plain = trajectories.step(odd, s, trajectories.step(odd, s, p, *rules), *rules)
+    odd, p = PackedImages.of(np.ascontiguousarray(packed[:, :39, :55]), s), paths[::2, ::2]
+    refined, of = trajectories.refine_paths(odd, p, COST)
+    step = trajectories.gauss_newton_step
+    plain = step(odd, step(odd, p, COST), COST)
     near, truth = near[:55], truth[:55]
-    after, steps_alone = (trajectories.spread(one, (39, 55)) for one in (refined, plain))
+    after, steps_alone = (warp.interpolate_paths(one, (39, 55)) for one in (refined, plain))
     assert of.shape == (39, 55) and wrong(after) < 0.9 * wrong(steps_alone)
     # Where all move alike none is better, and each keeps its own.
     even = np.broadcast_to(np.float32([6, -3, 0, 0]), paths.shape).copy()
     own = np.arange(40 * 56).reshape(40, 56)
-    np.testing.assert_array_equal(borders.choose(images, s, even, 2e-4, 10.0), own)
+    np.testing.assert_array_equal(trajectories.select_paths(images, even, COST), own)
     # What noise prefers is not chosen: here nothing but noise tells paths apart.
     rng = np.random.default_rng(4)
     noise = rng.normal(0, 0.05, still.shape).astype(np.float32)
-    images = trajectories.pack(noise, np.full_like(still, 0.01))
+    images = PackedImages.of(trajectories.pack_images(noise, np.full_like(still, 0.01)), s)
     rough = rng.normal(0, 1, paths.shape).astype(np.float32)
-    assert (borders.choose(images, s, rough, 2e-4, 10.0) != own).mean() < 0.05
+    assert (trajectories.select_paths(images, rough, COST) != own).mean() < 0.05
 
 
 @functools.cache
@@ -186,17 +190,17 @@ def warped_case():
     V = rng.uniform(0.01, 0.1, L.shape).astype(np.float32)
     clear = (rng.random(L.shape) < 0.5).astype(np.float32)
     p = rng.uniform(-4, 4, (9, 12, 4)).astype(np.float32)
-    return L, V, clear, np.float32([-1, 0, 1]), trajectories.spread(p, (18, 23))
+    return L, V, clear, np.float32([-1, 0, 1]), warp.interpolate_paths(p, (18, 23))
 
 
 @pytest.mark.slow
 def test_images_along_trajectories():
     L, V, clear, s, paths = warped_case()
-    quick = warping.warp(L, V, clear, s, paths)
-    pure = jax.jit(warping.warp_purely)(L, V, clear, s, paths)
+    quick = warp.warp(L, V, clear, s, paths)
+    pure = jax.jit(warp.warp_jax)(L, V, clear, s, paths)
     for one, other in zip(quick, pure, strict=True):
         np.testing.assert_allclose(one, other, atol=2e-5)
-    Y, X = (np.asarray(v) for v in warping.places(jnp.asarray(paths), jnp.asarray(s)))
+    Y, X = (np.asarray(v) for v in warp.positions(jnp.asarray(paths), jnp.asarray(s)))
     for k in range(3):
         at = [Y[k], X[k]]
         expected = map_coordinates(V[k], at, order=1, mode="nearest")
@@ -212,7 +216,7 @@ def place(count, own, before, after):
     framed = np.zeros(count, np.float32)
     framed[[before, after]] = 1
     near = (np.abs(np.arange(count) - own) <= 1).astype(np.float32)
-    return agreement.Place(
+    return robust_mean.InstantLayout(
         s, np.ones(count, np.float32), framed, near, *map(np.int32, (own, before, after, after))
     )
 
@@ -220,22 +224,22 @@ def place(count, own, before, after):
 def still(L, V=0.01):
     """Images along trajectories that stand still."""
     ones = np.ones_like(L)
-    return warping.Along(L, np.full_like(L, V), ones, ones)
+    return warp.WarpedImages(L, np.full_like(L, V), ones, ones)
 
 
 @pytest.mark.slow
 def test_agreement_is_that_of_the_pure_function():
     L, V, clear, s, paths = warped_case()
-    along = warping.warp(L, V, clear, s, paths)
+    along = warp.warp(L, V, clear, s, paths)
     L[0, 4:9, 5:12] += 1.0  # a thing in front
     # Activity is what changes between frames; where none follows, or is before, up to the target.
-    purely = jax.jit(agreement.agree_purely)
+    purely = jax.jit(robust_mean.robust_mean_jax)
     activity = ((3, 1, 0, 2), 0), ((3, 2, 0, 0), L[2] - L[1]), ((3, 0, 2, 2), L[1] - L[0])
     for numbers, change in activity:
         at = place(*numbers)
-        one = agreement.agree(Params(), L, along, at)
+        one = robust_mean.robust_mean(Params(), L, along, at)
         other = purely(Params(), L, along, at)
-        for name, quick, pure in zip(agreement.Agreement._fields, one, other, strict=True):
+        for name, quick, pure in zip(robust_mean.RobustMean._fields, one, other, strict=True):
             np.testing.assert_allclose(quick, pure, rtol=3e-5, atol=3e-5, err_msg=name)
         np.testing.assert_allclose(one.activity, np.broadcast_to(change, L[0].shape) ** 2, 1e-6)
 
@@ -244,8 +248,8 @@ def only(name, beyond="none"):
     """Params that choose one ingredient; `beyond` where frames are on one side alone."""
     chosen = []
     for one in (name, beyond):
-        rows = np.zeros((len(OTHERS), len(SIGNS) + 1))
-        rows[:, -1] = [40.0 if one == other else -40.0 for other in OTHERS]
+        rows = np.zeros((len(FALLBACKS), len(FEATURES) + 1))
+        rows[:, -1] = [40.0 if one == other else -40.0 for other in FALLBACKS]
         chosen.append(rows.ravel().tolist())
     return Params(choice=chosen[0], choice_beyond=chosen[1])
 
@@ -266,7 +270,7 @@ def test_what_differs_is_hidden():
     np.testing.assert_allclose(np.asarray(fused.sources).sum(0), 1, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", OTHERS)
+@pytest.mark.parametrize("name", FALLBACKS)
 def test_other_ingredients_can_be_chosen(name):
     L = moved((3.0, 1.0), (0, 0), np.linspace(-1, 1, 9), 20, 24)
     at = place(9, 2, 1, 5)
@@ -285,7 +289,7 @@ def test_other_ingredients_can_be_chosen(name):
     mild = Params(choice=(np.array(only(name).choice) / 10).tolist())
     V = np.full_like(L, 0.01)
     V[:, 5, 7] = 9.0
-    share = np.asarray(fuse(mild, L, V, still(L), at).sources)[3 + OTHERS.index(name)]
+    share = np.asarray(fuse(mild, L, V, still(L), at).sources)[3 + FALLBACKS.index(name)]
     assert share[5, 7] < 0.03 and np.delete(share, 5, 0).min() > 0.97
 
 
@@ -321,7 +325,7 @@ def test_a_point_that_stays_is_as_its_smoother_says():
     np.testing.assert_allclose(staying[:, :6], L[2, :, :6], atol=1e-4)
     np.testing.assert_allclose(staying[10, 12], far[10, 12], rtol=1e-2)
     frames_move = np.float32([1.0, -2.0, 0.5, 0])  # to 1.5, -2 px at s = 1
-    assert warping.reach(np.broadcast_to(frames_move, (2, 3, 4))).tolist() == [[6.25] * 3] * 2
+    assert warp.squared_reach(np.broadcast_to(frames_move, (2, 3, 4))).tolist() == [[6.25] * 3] * 2
 
 
 @pytest.mark.slow
@@ -340,7 +344,7 @@ def test_instants_that_fill_up_change_nothing():
     pad = np.zeros((2, 20, 24), np.float32)
     L2 = np.concatenate([L, pad])
     V2 = np.concatenate([np.full_like(L, 0.01), pad])
-    along = warping.Along(*(np.concatenate([part, pad]) for part in still(L)))
+    along = warp.WarpedImages(*(np.concatenate([part, pad]) for part in still(L)))
     again = fuse(params, L2, V2, along, longer)
     np.testing.assert_allclose(fused.L, again.L, atol=1e-5)
     np.testing.assert_allclose(fused.P, again.P, rtol=1e-3)
@@ -349,16 +353,16 @@ def test_instants_that_fill_up_change_nothing():
 def test_instants():
     frames = np.arange(10) * 40_000
     choose = instants.Schedule(frames, (0, 360_000), 100.0)
-    assert choose.step == 6_000 and choose.reach == 60_000
+    assert choose.step == 6_000 and choose.max_distance == 60_000
     one = choose(133_333)
-    assert one.t[one.own] == 133_333 and one.s[one.own] == 0
+    assert one.t[one.target] == 133_333 and one.s[one.target] == 0
     assert (np.diff(one.t) > 0).all() and np.abs(one.s).max() == 1
     assert one.t[one.before] == 120_000 and one.t[one.after] == 160_000
     assert set(one.t) >= {80_000, 120_000, 160_000, 200_000} and 40_000 not in one.t
     between = one.t[(one.t > 120_000) & (one.t < 160_000) & (one.t != 133_333)]
     assert (between % 6_000 == 0).all() and len(between) >= 2
     first = choose(0)  # nothing before
-    assert first.own == first.before - 0 or first.t[first.before] > 0
+    assert first.target == first.before - 0 or first.t[first.before] > 0
     assert (first.t >= 0).all()
 
 
@@ -368,10 +372,10 @@ def test_a_clock_that_stops_with_the_scene():
     apart = 400_000 / len(gone)
 
     def clock(share):
-        return course.Course(lambda t: int(np.searchsorted(gone, t)), 0, apart, share)
+        return instants.MotionClock(lambda t: int(np.searchsorted(gone, t)), 0, apart, share)
 
     times = np.array([0, 100_000, 200_000, 250_000, 300_000, 400_000])
-    np.testing.assert_array_equal(course.TIME(times), times)
+    np.testing.assert_array_equal(instants.TIME_CLOCK(times), times)
     even = clock(1.0)(times) / apart
     np.testing.assert_allclose(even, [0, 1000, 2000, 2000, 2000, 2500])
     np.testing.assert_allclose(clock(0.25)(times), 0.75 * times + 0.25 * apart * even)
@@ -381,8 +385,8 @@ def test_a_clock_that_stops_with_the_scene():
     still = np.diff(one.s)[(one.t[:-1] >= 200_000) & (one.t[1:] <= 300_000)]
     steps = np.diff(one.t)[(one.t[:-1] >= 200_000) & (one.t[1:] <= 300_000)]
     np.testing.assert_allclose(still * one.unit, 0.1e-6 * steps, rtol=1e-3)
-    np.testing.assert_allclose(one.at(one.t), one.s, atol=1e-6)
-    assert one.pace(1000) * one.unit == pytest.approx(0.1)
+    np.testing.assert_allclose(one.relative_times(one.t), one.s, atol=1e-6)
+    assert one.clock_rate(1000) * one.unit == pytest.approx(0.1)
     # At rest after the last frame and before the first; not between two, nor while things move.
     early, late = frames[:7], frames[7:]
     assert (
@@ -391,7 +395,10 @@ def test_a_clock_that_stops_with_the_scene():
     )
     assert instants.Schedule(early, (0, 400_000), 100.0, clock(0.9))(262_000).rest > 0.9
     assert instants.Schedule(early, (0, 400_000), 100.0, clock(0.9))(390_000).rest < 0.05
-    plain, timed = one.by(course.TIME), instants.Schedule(frames, (0, 400_000), 100.0)(262_000)
+    plain, timed = (
+        one.with_clock(instants.TIME_CLOCK),
+        instants.Schedule(frames, (0, 400_000), 100.0)(262_000),
+    )
     np.testing.assert_array_equal(plain.s, timed.s)
     assert plain.unit == timed.unit
 
@@ -401,12 +408,12 @@ def test_parts_of_the_image_that_share_a_course():
     pace = np.array([1.0, 2, 3, 2, 1, 0, 0, 0.5])
     texture = rng.uniform(50, 500, (1, 9, 1))
     together = rng.poisson(texture * pace, (3, 9, 8)).astype(float)
-    assert course.common_part(together) == course.MOST
+    assert instants.common_share(together) == instants.MAX_EVENT_SHARE
     alone = rng.poisson(texture * rng.permuted(np.tile(pace, (3, 9, 1)), axis=2)).astype(float)
-    assert course.common_part(alone) < 0.1
+    assert instants.common_share(alone) < 0.1
     even = rng.poisson(texture * np.ones(8), (3, 9, 8)).astype(float)
-    assert course.common_part(even) < 0.2
-    assert course.common_part(np.zeros((1, 9, 8))) == 0
+    assert instants.common_share(even) < 0.2
+    assert instants.common_share(np.zeros((1, 9, 8))) == 0
 
 
 def test_trajectories_on_another_clock():
@@ -417,12 +424,12 @@ def test_trajectories_on_another_clock():
     def gone(p, s):
         return p[..., :2, None] * s + p[..., 2:, None] * s**2
 
-    twice = trajectories.by_clock(p, s, s / 2)
+    twice = trajectories.change_clock(p, s, s / 2)
     np.testing.assert_allclose(gone(twice, s / 2), gone(p, s), atol=1e-5)
     # A clock that goes ever faster makes parabolas of straight lines.
     straight = p * np.array([1, 1, 0, 0], np.float32)
     early = (np.sqrt(1 + 4 * 0.2 * s) - 1) / (2 * 0.2)  # s = early + 0.2 early^2
-    bent = trajectories.by_clock(straight, s, early.astype(np.float32))
+    bent = trajectories.change_clock(straight, s, early.astype(np.float32))
     np.testing.assert_allclose(bent[..., 2:], 0.2 * straight[..., :2], atol=1e-4)
     np.testing.assert_allclose(bent[..., :2], straight[..., :2], atol=1e-4)
 
@@ -442,10 +449,10 @@ def exposed(half=0.5):
     frames = np.stack(
         [np.mean([seen(s + h) for h in np.linspace(-half, half, 401)], 0) for s in (-0.5, 0.4)]
     )
-    taken = exposures.Taken(
+    taken = exposures.AdjacentExposures(
         np.int32([0, 1]), np.float32([-0.5, 0.4]), np.float32([half, half]), np.ones(2, np.float32)
     )
-    shots = exposures.Shots(
+    shots = exposures.AdjacentFrames(
         np.full((2, 18 * 23), 0.5, np.float32),
         frames.reshape(2, -1).astype(np.float32),
         np.linspace(0, 1, 256, dtype=np.float32),
@@ -458,13 +465,14 @@ def exposed(half=0.5):
 
 
 def held(params, L, P, case, samples):
-    """`constrain`, which is `constrain_purely`."""
+    """Constrain an image in loops, and check that JAX does the same."""
     _, taken, shots, paths = case
     ones = jnp.ones((7, *L.shape), np.float32)
-    fused = fusion.Fused(jnp.asarray(L), jnp.asarray(P), ones[:5], ones[:2])
-    quick = exposures.constrain(params, fused, paths, taken, shots, samples)
-    purely = jax.jit(exposures.constrain_purely, static_argnames="samples")
-    pure = purely(params, fused, jnp.asarray(paths, float), taken, shots, samples=samples)
+    fused = fusion.FusedImage(jnp.asarray(L), jnp.asarray(P), ones[:5], ones[:2])
+    model = exposures.ExposureModel(taken, shots, paths)
+    quick = exposures.constrain_image(params, fused, model, samples)
+    purely = jax.jit(exposures.constrain_image_jax, static_argnames="samples")
+    pure = purely(params, fused, model._replace(paths=jnp.asarray(paths, float)), samples=samples)
     for one, other in ((quick.L, pure.L), (quick.P, pure.P)):
         np.testing.assert_allclose(one, other, rtol=2e-4, atol=2e-4)
     return np.asarray(quick.L), np.asarray(quick.P)
@@ -474,11 +482,11 @@ def held(params, L, P, case, samples):
 def test_an_exposure_is_the_mean_along_trajectories():
     L, taken, shots, paths = exposed()
     I0 = float(Params().I0)
-    smeared = jax.jit(exposures.smeared)
-    D = jax.jit(exposures._shifts, static_argnums=2)(taken, paths, 15)
+    smeared = jax.jit(exposures.smear_jax)
+    D = jax.jit(exposures.exposure_displacements, static_argnums=2)(taken, paths, 15)
     B, shares = smeared(L, D)
     np.testing.assert_allclose(shares.sum(1), 1, atol=1e-5)
-    Y, X = (np.asarray(v) for v in warping.places(jnp.asarray(paths), jnp.asarray(taken.s)))
+    Y, X = (np.asarray(v) for v in warp.positions(jnp.asarray(paths), jnp.asarray(taken.s)))
     for k in range(2):
         seen = map_coordinates(shots.intensity[k].reshape(18, 23), [Y[k], X[k]], order=3)
         expected = np.log(seen + I0)  # exp L is I + I0, whose mean is that of I, plus I0
@@ -488,7 +496,7 @@ def test_an_exposure_is_the_mean_along_trajectories():
     rng = np.random.default_rng(1)
     q, dL = np.zeros((2, 18, 23), np.float32), np.zeros((18, 23), np.float32)
     q[:, 7:11, 8:14], dL[5:13, 6:16] = rng.normal(size=(2, 4, 6)), rng.normal(size=(8, 10))
-    back = exposures._quickly_returned(q, np.asarray(shares), np.asarray(D))
+    back = exposures.smear_adjoint(q, np.asarray(shares), np.asarray(D))
     slope = jax.jvp(lambda L: smeared(L, D)[0], (jnp.asarray(L),), (jnp.asarray(dL),))[1]
     np.testing.assert_allclose((back * dL).sum(), (q * slope).sum(), rtol=0.1)
 
@@ -593,7 +601,7 @@ class Swirl:
 
 
 def test_motion_that_is_known_is_begun_with():
-    p = estimator.Start(Swirl())(500_000, 2_000, 0.2)
+    p = estimator.InitialMotion(Swirl())(500_000, 2_000, 0.2)
     x = (np.arange(15) * 2 + 0.5)[None]
     u = 3.0 * x - 20  # px/s, and points accelerate by -40 + 3 u
     np.testing.assert_allclose(p[:-1, 1:-1, 0], np.repeat(0.2 * u, 10, 0)[:, 1:-1], rtol=1e-5)
@@ -712,7 +720,7 @@ def test_a_later_clock_changes_nothing():
     moved_images = mc.estimate(late, params(), progress=False)
     # The first and last instants of the recording, and its grid, are those of its own clock.
     t = np.array([205_000])
-    assert moved_images.follow.schedule.step == video().follow.schedule.step
+    assert moved_images.trajectories.schedule.step == video().trajectories.schedule.step
     one, other = video()(t), moved_images(t + shift)
     np.testing.assert_array_equal(one.mean, other.mean)
 
@@ -759,10 +767,10 @@ def test_prepared_images_of_frames_that_are_not_steady(monkeypatch):
     times, value = prepared()
     sure = video()(times)
     # What is in doubt of brightness is in the variance, of steady frames too.
-    monkeypatch.setattr(estimator.Steadiness, "doubt", lambda *_: 0.02)
+    monkeypatch.setattr(estimator.FrameBrightness, "variance", lambda *_: 0.02)
     steady = mc.estimate(slide(), params(), progress=False)(times)
     np.testing.assert_allclose(steady.covariance, sure.covariance + 0.02, rtol=1e-5)
-    monkeypatch.setattr(estimator.Steadiness, "__call__", lambda *_: False)
+    monkeypatch.setattr(estimator.FrameBrightness, "is_steady", lambda *_: False)
     whole = mc.estimate(slide(), params(), progress=False)(times)
     assert (whole.mean != sure.mean).any() and whole.covariance.min() > 0.02
     _, out = mc.prepare(slide(), times, params())
@@ -776,7 +784,7 @@ def test_images_are_of_learned_thresholds(monkeypatch):
     """The video and prepared images take what is learned; tests/reconstruction/test_thresholds."""
     times, at = prepared()[0], params()
     factors = np.random.default_rng(2).uniform(1, 4, (2, 40 * 48)).astype(np.float32)
-    monkeypatch.setattr(estimator, "learn", lambda *_: factors)
+    monkeypatch.setattr(estimator, "learn_thresholds", lambda *_: factors)
     images = mc.estimate(slide(), at, progress=False)(times).mean
     assert np.abs(images - video()(times).mean).max() > 0.01
     features, out = mc.prepare(slide(), times, at)
@@ -813,28 +821,25 @@ def balanced():
     p = np.float32([1, -0.5, 0.2, 0.1]) + rng.normal(0, 0.02, (5, 5, 4))
     images = [np.asarray(v, np.float32) for v in (L, V, s, np.ones(3))]
     numbers = [np.float32(v) for v in (2e-4, 10, 40, 0.04, 0.1, 0.2)]
-    values = (p.astype(np.float32), implicit.Seen(*images), implicit.Numbers(*numbers))
+    values = (p.astype(np.float32), normal_equations.MotionImages(*images), CostParams(*numbers))
     return jax.tree.map(jnp.asarray, values)
 
 
 @pytest.mark.slow
 def test_equations_are_those_of_the_steps():
     p, (L, V, s, _), numbers = jax.tree.map(np.asarray, balanced())
-    near = np.exp(-2 * s**2).astype(np.float32)
-    images = trajectories.pack(L, V)
-    floor, nu = float(numbers.floor), float(numbers.robust)
-    N, b, edge = trajectories.linearise(*trajectories.fetch(images, s, near, p, floor, nu), s)
-    found = jax.jit(implicit.equations)(*balanced())
-    softened = trajectories.soften(N)
-    upper = [found.N[..., i, j] for i in range(4) for j in range(i, 4)]
-    scale = np.abs(softened).max()
-    np.testing.assert_allclose(np.stack(upper, -1), softened, atol=1e-4 * scale)
-    np.testing.assert_allclose(found.b, trajectories.soften(b), atol=1e-4 * np.abs(b).max())
-    across, down = np.zeros((2, 5, 5), np.float32)
-    smoothness = trajectories.Smoothness(*(float(v) for v in numbers[2:]))
-    trajectories._weigh_differences(p, edge, np.float32(1), smoothness, across, down)
-    np.testing.assert_allclose(found.across, across[:, :-1], rtol=1e-3)
-    np.testing.assert_allclose(found.down, down[:-1], rtol=1e-3)
+    images = PackedImages.of(trajectories.pack_images(L, V), s)
+    cost = CostParams(*map(np.float32, numbers))
+    samples = normal_equations.sample_trajectories(images, p, cost)
+    quick = normal_equations.linearise(samples, p, cost)
+    found = jax.jit(normal_equations.linearise_jax)(*balanced())
+    upper = np.stack([found.N[..., i, j] for i in range(4) for j in range(i, 4)], -1)
+    np.testing.assert_allclose(upper, quick.N, atol=1e-4 * np.abs(quick.N).max())
+    np.testing.assert_allclose(found.b, quick.b, atol=1e-4 * np.abs(quick.b).max())
+    np.testing.assert_allclose(found.across, quick.across[:, :-1], rtol=1e-3)
+    np.testing.assert_allclose(found.down, quick.down[:-1], rtol=1e-3)
+    for name in ("smooth", "ridge"):
+        np.testing.assert_allclose(getattr(found, name), getattr(quick, name), rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -844,10 +849,14 @@ def test_motion_keeps_its_balance():
     rng = np.random.default_rng(7)
     noise = jnp.float32(rng.normal(0, 0.02, seen.L.shape))
     change = (seen._replace(L=noise, V=0.3 * seen.V, s=0 * seen.s, present=0 * seen.s), numbers)
-    step = jax.jit(lambda *d: jax.jvp(lambda *v: implicit.depending(p, *v), (seen, numbers), d))
+    step = jax.jit(
+        lambda *d: jax.jvp(
+            lambda *v: normal_equations.implicit_trajectories(p, *v), (seen, numbers), d
+        )
+    )
     same, dp = step(*change)
     np.testing.assert_array_equal(same, p)
-    balance, h = jax.jit(implicit.imbalance), 1e-3
+    balance, h = jax.jit(normal_equations.residual), 1e-3
 
     def slope(dp):
         ends = [
@@ -901,27 +910,29 @@ def test_tiny_sensors_and_single_frames(size):
 def test_blurring_is_scipys():
     image = np.random.default_rng(5).normal(size=(20, 25)).astype(np.float32)
     expected = gaussian_filter(image, 1.5, mode="nearest", truncate=3.34)
-    blurred = jax.jit(agreement.blur, static_argnums=1)(image, 1.5)
+    blurred = jax.jit(robust_mean.blur_jax, static_argnums=1)(image, 1.5)
     np.testing.assert_allclose(blurred, expected, atol=1e-5)
 
 
 def test_frames_on_one_side_tell_doubt_as_they_show_points_and_are_far():
     X, known = (
-        np.random.default_rng(3).normal(-4, 1, (len(SIGNS) + 1, 1, 3)),
+        np.random.default_rng(3).normal(-4, 1, (len(FEATURES) + 1, 1, 3)),
         np.array([[0, 0.5, 1]]),
     )
     given = jnp.asarray(X), jnp.asarray(known)
     np.testing.assert_array_equal(
-        fusion.signs_of_doubt(*given, jnp.asarray(False), jnp.asarray(3)), X
+        fusion.variance_features(*given, jnp.asarray(False), jnp.asarray(3)), X
     )
     told, far, near = (
-        np.asarray(fusion.signs_of_doubt(*given, jnp.asarray(True), jnp.asarray(away)))
+        np.asarray(fusion.variance_features(*given, jnp.asarray(True), jnp.asarray(away)))
         for away in (1, 3, 0.5)
     )
-    apart, twice = (SIGNS.index(name) for name in ("from_each_other", "seen_twice"))
-    squares = np.exp(X[apart]) - fusion.TINY
-    np.testing.assert_allclose(np.exp(told[apart]) - fusion.TINY, known * squares, atol=1e-7)
-    np.testing.assert_allclose(np.exp(far[apart]) - fusion.TINY, 3 * known * squares, atol=1e-7)
+    apart, twice = (FEATURES.index(name) for name in ("from_each_other", "seen_twice"))
+    squares = np.exp(X[apart]) - fusion.MIN_SQUARE
+    np.testing.assert_allclose(np.exp(told[apart]) - fusion.MIN_SQUARE, known * squares, atol=1e-7)
+    np.testing.assert_allclose(
+        np.exp(far[apart]) - fusion.MIN_SQUARE, 3 * known * squares, atol=1e-7
+    )
     np.testing.assert_array_equal(near, told)
     np.testing.assert_allclose(told[twice], known * X[twice])
     others = np.delete(np.arange(len(X)), [apart, twice])

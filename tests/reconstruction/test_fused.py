@@ -31,7 +31,7 @@ from jaxevent import codegen
 from jaxevent.codegen import numeric
 from jaxevent.codegen.host import HostProgram, run
 from jaxevent.methods import METHODS
-from jaxevent.reconstruction.compensated.estimator import evidence
+from jaxevent.reconstruction.compensated.images import instant_smoother
 from jaxevent.reconstruction.engine import bands, room
 from jaxevent.reconstruction.engine.images import FusedImages
 from jaxevent.reconstruction.engine.smoothed import SmoothedVideo
@@ -106,7 +106,7 @@ def test_smoothers_of_one_kernel_equal_the_scan(monkeypatch):
     factors = np.random.default_rng(1).uniform(0.5, 2.0, (2, 99))
 
     def images(compiler):
-        video = evidence.estimate(
+        video = instant_smoother.estimate(
             recording, params, compiler=compiler, window_events=200, factors=factors
         )
         return video(times, extrapolate=True)
@@ -226,11 +226,11 @@ def test_which_compiler_serves(float32):
     with jax.enable_x64(True):
         assert type(blend.estimate(recording)) is Video
     # Where a function has no translation the scan serves.
-    for advance, reason in (
+    for predict, reason in (
         (lambda p, s, dt, f: dataclasses.replace(s, L=jnp.sinh(f.level)), "'sinh'"),
         (lambda p, s, dt, f: 1 / 0, "fail for one pixel"),
     ):
-        odd = dataclasses.replace(jaxevent.cf, advance=advance)
+        odd = dataclasses.replace(jaxevent.cf, predict=predict)
         assert type(odd.estimate(recording)) is Video
         with pytest.raises(jaxevent.InputError, match=reason):
             odd.estimate(recording, compiler="numba")

@@ -16,9 +16,9 @@ from noise import small
 import jaxevent
 from jaxevent.methods import names
 from jaxevent.reconstruction import video
-from jaxevent.reconstruction.compensated import estimator as compensated
+from jaxevent.reconstruction.compensated.images import InstantImages
 from jaxevent.reconstruction.estimator import PixelEstimator
-from jaxevent.reconstruction.filtering import Event, Observation, State
+from jaxevent.reconstruction.filtering import Event, Observation, PixelState
 from jaxevent.recording import Events, Frames, Recording
 
 PARAMS = {
@@ -216,8 +216,8 @@ def test_windows_do_not_change_the_result_of_baselines(name):
 def test_windows_do_not_change_the_evidence_of_mc():
     recording, params = random_recording(4, 300, 6, exposure=500), jaxevent.mc.Params()
     times = np.linspace(recording.start, recording.stop, 7).astype(np.int64)
-    whole = compensated.Images(recording, params, 10**6)(times)
-    for a, b in zip(whole, compensated.Images(recording, params, 37)(times), strict=True):
+    whole = InstantImages(recording, params, 10**6)(times)
+    for a, b in zip(whole, InstantImages(recording, params, 37)(times), strict=True):
         np.testing.assert_allclose(b, a, rtol=2e-6, atol=1e-9)  # kept in single precision
 
 
@@ -382,7 +382,7 @@ def recorded(path):
         before.append((L[at], P[at]))
         path.append(row)
         L[at], P[at] = row["L_after"], row.get("P_after", par["p_ini"])
-    state = State(*(jnp.asarray(v) for v in zip(*before, strict=True)))
+    state = PixelState(*(jnp.asarray(v) for v in zip(*before, strict=True)))
     rows = {k: jnp.asarray([row[k] for row in path]) for k in columns}
     assert len(path) == 1257
     return par, float(z["in_ct"]), state, rows
@@ -456,7 +456,7 @@ def test_step_maps_over_pixels():
     rng = np.random.default_rng(0)
     L, P, dt, near, u, rate = rng.uniform(0.1, 1, (6, 5))
     polarity = np.array([1, -1, 1, 0, -1])
-    pixels, events = State(L, P), Event(dt, near, polarity, Observation(u, rate))
+    pixels, events = PixelState(L, P), Event(dt, near, polarity, Observation(u, rate))
     mapped = jax.jit(jax.vmap(jaxevent.akf.step, (None, 0, 0)))(params, pixels, events)
     alone = jax.jit(jaxevent.akf.step)
     for i in range(5):

@@ -9,8 +9,8 @@ from scipy.ndimage import gaussian_filter
 
 from jaxevent.camera import UnknownResponse
 from jaxevent.methods import find
-from jaxevent.reconstruction.compensated import estimator, steadiness
-from jaxevent.reconstruction.compensated.agreement import Place
+from jaxevent.reconstruction.compensated import estimator, images
+from jaxevent.reconstruction.compensated.robust_mean import InstantLayout
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate import Sensor, simulate
 
@@ -32,10 +32,10 @@ class Pane:
 
 def brightened(recording):
     """The same with one brighter frame."""
-    images = recording.frames.images.copy()
-    images[BRIGHT] = (images[BRIGHT] * 1.25 + 20).clip(0, 250).astype(np.uint8)
+    pictures = recording.frames.images.copy()
+    pictures[BRIGHT] = (pictures[BRIGHT] * 1.25 + 20).clip(0, 250).astype(np.uint8)
     return dataclasses.replace(
-        recording, frames=dataclasses.replace(recording.frames, images=images)
+        recording, frames=dataclasses.replace(recording.frames, images=pictures)
     )
 
 
@@ -52,61 +52,61 @@ def pane():
     return simulate(Pane(), sensor, 4, "pane")
 
 
-def still(images, moves=()):
+def still(grey, moves=()):
     """A recording of frames, with events at the columns `moves`, between all frames."""
     x, y = (p.ravel().astype(np.uint16) for p in np.meshgrid(list(moves), range(HEIGHT)))
     t = np.linspace(1_000, STAMPS[-1], 4 * len(x)).astype(np.int64)
     events = Events(t, np.tile(x, 4), np.tile(y, 4), np.ones(len(t), bool))
-    return Recording("still", WIDTH, HEIGHT, events, Frames(STAMPS, images, np.zeros_like(STAMPS)))
+    return Recording("still", WIDTH, HEIGHT, events, Frames(STAMPS, grey, np.zeros_like(STAMPS)))
 
 
 def steady(recording):
-    return steadiness.Steadiness(recording, recording.frames.t, 0.3)
+    return images.FrameBrightness(recording, recording.frames.t, 0.3)
 
 
 def test_frames_are_steady_unless_they_change_without_events():
     rng = np.random.default_rng(3)
     wall = rng.integers(40, 160, (1, HEIGHT, WIDTH)) + rng.integers(-3, 4, (5, HEIGHT, WIDTH))
     wall = wall.astype(np.uint8)
-    assert steady(still(wall, [3]))(0, 200_000)
+    assert steady(still(wall, [3])).is_steady(0, 200_000)
     told = steady(brightened(still(wall, [3])))
-    assert not told(0, 200_000)
+    assert not told.is_steady(0, 200_000)
     before, around, after = (0, 99_999), (50_000, 100_000), (100_001, 200_000)
-    assert [told(*span) for span in (before, around, after)] == [True, False, True]
+    assert [told.is_steady(*span) for span in (before, around, after)] == [True, False, True]
     # Where events are everywhere the change may be that of the scene.
-    assert steady(brightened(still(wall, range(0, WIDTH, 2))))(0, 200_000)
+    assert steady(brightened(still(wall, range(0, WIDTH, 2)))).is_steady(0, 200_000)
     # What goes by without events is brighter here and darker there.
     passing = wall.astype(float)
     passing[BRIGHT] *= np.where(np.arange(WIDTH) < WIDTH // 2, 1.3, 1 / 1.3)
-    assert steady(still(passing.astype(np.uint8), [3]))(0, 200_000)
+    assert steady(still(passing.astype(np.uint8), [3])).is_steady(0, 200_000)
     moving = wall.copy()
     moving[BRIGHT, :, : WIDTH // 2] += 50
-    assert steady(still(moving, range(WIDTH // 2)))(0, 200_000)
+    assert steady(still(moving, range(WIDTH // 2))).is_steady(0, 200_000)
 
 
 def test_brightness_is_in_doubt_where_frames_differ_from_those_around():
     wall = np.full((5, HEIGHT, WIDTH), 100, np.uint8)
-    assert steady(still(wall, [3])).doubt(75_000) == 0
+    assert steady(still(wall, [3])).variance(75_000) == 0
     wall[BRIGHT] = 145
     told = steady(still(wall, [3]))
     b = np.log((145 / 255 + 0.3) / (100 / 255 + 0.3))
     left_out = np.mean([(b / 2) ** 2, b**2, (b / 2) ** 2])  # frames 1 to 3, from their neighbours
-    np.testing.assert_allclose(told.doubt(75_000), left_out, rtol=1e-5)
-    np.testing.assert_allclose(told.doubt(62_500), 0.75 * left_out, rtol=1e-5)
-    np.testing.assert_allclose(told.doubt(250_000), left_out, rtol=1e-5)
-    assert told.doubt(100_000) == 0
+    np.testing.assert_allclose(told.variance(75_000), left_out, rtol=1e-5)
+    np.testing.assert_allclose(told.variance(62_500), 0.75 * left_out, rtol=1e-5)
+    np.testing.assert_allclose(told.variance(250_000), left_out, rtol=1e-5)
+    assert told.variance(100_000) == 0
     two = steady(still(wall, [3]).with_frames(slice(1, 3)))
-    doubts = [two.doubt(t) for t in (75_000, 62_500, 250_000, 0, 100_000)]
+    doubts = [two.variance(t) for t in (75_000, 62_500, 250_000, 0, 100_000)]
     np.testing.assert_allclose(doubts, b**2 * np.array([0.75, 0.75**2, 1, 1, 0]), rtol=1e-5)
     # An exposure that adapts evenly leaves nothing in doubt.
     wall = np.exp(np.linspace(-1, -0.4, 5))[:, None, None] * np.ones((5, HEIGHT, WIDTH))
     told = steady(still((255 * wall - 0.3 * 255).round().astype(np.uint8), [3]))
-    assert not told(0, 200_000) and told.doubt(75_000) == 0
+    assert not told.is_steady(0, 200_000) and told.variance(75_000) == 0
 
 
 def test_smooth_part():
     image = np.random.default_rng(5).normal(size=(2, HEIGHT, WIDTH)).astype(np.float32)
-    got, reach = steadiness.smooth_part(image), steadiness.REACH
+    got, reach = images.smooth_part(image), images.SMOOTH_SIGMA_PX
     ones = gaussian_filter(np.ones((HEIGHT, WIDTH)), reach, mode="constant", truncate=8)
     for one, part in zip(image, got, strict=True):
         expected = gaussian_filter(one, reach, mode="constant", truncate=8) / ones
@@ -118,24 +118,24 @@ def test_beyond_the_frames_brightness_is_that_of_the_nearest_along_trajectories(
     wall[4] = 145
     b = np.log((145 / 255 + 0.3) / (100 / 255 + 0.3))
     told = steady(still(wall, [3]))
-    usual = [told.brightness(t).usual for t in (-50_000, 100_000, 200_000, 225_000, 900_000)]
+    usual = [told.prior(t).offset for t in (-50_000, 100_000, 200_000, 225_000, 900_000)]
     np.testing.assert_allclose(usual, [0, 0, 0, -b / 2, -b], rtol=1e-5)
-    flipped = steady(still(wall[::-1], [3])).brightness(-25_000).usual
+    flipped = steady(still(wall[::-1], [3])).prior(-25_000).offset
     np.testing.assert_allclose(flipped, -b / 2, rtol=1e-5)
     wall[3] = 60  # which of the three is unusual is not told
-    assert steady(still(wall, [3])).brightness(900_000).usual == 0
+    assert steady(still(wall, [3])).prior(900_000).offset == 0
     # The point of a pixel was 3 px farther right in the nearest frame, at s = -1.
     frame, own = np.random.default_rng(2).normal(size=(2, HEIGHT, WIDTH)).astype(np.float32)
     paths = np.zeros((HEIGHT, WIDTH, 4), np.float32)
     paths[..., 0] = -3
     at, zero = np.arange(2, dtype=np.float32), np.zeros((), np.float32)
-    place = Place(at - 1, at * 0 + 1, 1 - at, at, *np.array([1, 0, 0, 0]))
-    brightness = steadiness.Brightness(np.float32(0.02), np.float32(-b))
-    base, P = steadiness.smooth_at_target(np.stack([frame, own]), place, zero, paths, brightness)
+    layout = InstantLayout(at - 1, at * 0 + 1, 1 - at, at, *np.array([1, 0, 0, 0]))
+    brightness = images.BrightnessPrior(np.float32(0.02), np.float32(-b))
+    base, P = images.smooth_at_target(np.stack([frame, own]), layout, zero, paths, brightness)
     np.testing.assert_allclose(base[:, :-3], frame[:, 3:] - b, rtol=1e-6)
     np.testing.assert_allclose(P, 0.02, rtol=1e-6)
-    between = place._replace(after=np.array(1))
-    base, _ = steadiness.smooth_at_target(np.stack([frame, own]), between, zero, paths, brightness)
+    between = layout._replace(after=np.array(1))
+    base, _ = images.smooth_at_target(np.stack([frame, own]), between, zero, paths, brightness)
     np.testing.assert_array_equal(base, own)
 
 
@@ -149,7 +149,7 @@ def test_images_between_frames_of_different_brightness(monkeypatch):
 
     def error(image):
         L = np.log(image.reshape(HEIGHT, WIDTH) + 0.1)
-        detail = (L - level) - steadiness.smooth_part((L - level)[None])[0]
+        detail = (L - level) - images.smooth_part((L - level)[None])[0]
         return float((detail[HEIGHT // 2 + 4 : -4, 6:-6] ** 2).mean())
 
     video = mc.estimate(recording, params, progress=False)
@@ -158,7 +158,7 @@ def test_images_between_frames_of_different_brightness(monkeypatch):
     assert P.mean() > 0.2 * np.log(1.4) ** 2 / 4
     low, high = (recording.frames.intensity[k].mean() for k in (BRIGHT + 1, BRIGHT))
     assert low + 0.1 * (high - low) < image.mean() < high - 0.1 * (high - low)
-    monkeypatch.setattr(estimator.Steadiness, "__call__", lambda *_: True)
+    monkeypatch.setattr(estimator.FrameBrightness, "is_steady", lambda *_: True)
     unaware = mc.estimate(recording, params, progress=False)(t).mean
     assert error(image) < 0.5 * error(unaware)
 
@@ -170,7 +170,7 @@ def test_frames_on_one_side_do_not_confirm_each_other():
     video = mc.estimate(
         given, mc.Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4), progress=False
     )
-    told, seen = estimator.look(video.params, video.follow(t))
+    told, seen = estimator.compare_images(video.params, video.trajectories(t))
     assert float(seen.beyond) == 1 and seen.inside_before.max() == 1
     assert np.asarray(seen.inside_after).max() == 0
     sources = video.sources(np.array([t]))

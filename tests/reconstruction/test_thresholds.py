@@ -4,10 +4,10 @@ import jax
 import numpy as np
 import pytest
 
-from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.compensated import thresholds
-from jaxevent.reconstruction.compensated.evidence import Evidence
-from jaxevent.reconstruction.compensated.parameters import Params
+from jaxevent.reconstruction.compensated.images import InstantSmoother
+from jaxevent.reconstruction.compensated.params import Params
+from jaxevent.reconstruction.frames import Timing
 from jaxevent.reconstruction.windows import prepare
 from jaxevent.recording import Events, Frames, Recording
 
@@ -65,7 +65,7 @@ def params(**changes):
 
 def test_thresholds_are_learned():
     recording, factors, images = recorded(0.15)
-    learned = thresholds.learn(recording, params(), SPAN, images)
+    learned = thresholds.learn_thresholds(recording, params(), SPAN, images)
     assert learned is not None
     before, after = np.std(factors - 1), np.std(learned - factors)
     assert after < 0.6 * before, after / before
@@ -73,24 +73,24 @@ def test_thresholds_are_learned():
 
 def test_nothing_is_learned_from_little():
     recording, _, images = recorded(0.15)
-    assert thresholds.learn(recording, params(learn=False), SPAN, images) is None
+    assert thresholds.learn_thresholds(recording, params(learn=False), SPAN, images) is None
     few, _, images = recorded(0.15, swings=0.3)
-    assert thresholds.learn(few, params(), SPAN, images) is None
+    assert thresholds.learn_thresholds(few, params(), SPAN, images) is None
     alike, _, images = recorded(0.0)
-    assert thresholds.learn(alike, params(), SPAN, images) is None
+    assert thresholds.learn_thresholds(alike, params(), SPAN, images) is None
 
 
 def test_deviations_are_those_of_single_regressions():
     rng = np.random.default_rng(0)
     rest, on, off = rng.normal(size=(3, 6, 5))
-    changes = thresholds.Changes(rest, on, off, rng.uniform(0.5, 2, (6, 5)))
+    changes = thresholds.LogChanges(rest, on, off, rng.uniform(0.5, 2, (6, 5)))
     found = thresholds.regress(changes, 0.3)
     for k in range(5):
         W = np.diag(1 / (changes.V[:, k] + rest[:, k] ** 2 / thresholds.TAIL))
         X = np.stack([on[:, k], off[:, k]], 1)
         left = np.linalg.inv(X.T @ W @ X + np.eye(2) / 0.3**2)
         np.testing.assert_allclose(found.d[:, k], left @ X.T @ W @ rest[:, k], rtol=1e-10)
-        np.testing.assert_allclose(found.left[:, k], np.diag(left) / 0.3**2, rtol=1e-10)
+        np.testing.assert_allclose(found.remaining[:, k], np.diag(left) / 0.3**2, rtol=1e-10)
 
 
 def test_what_halves_agree_in_is_the_spread():
@@ -98,9 +98,9 @@ def test_what_halves_agree_in_is_the_spread():
     true = 0.07 * rng.normal(size=(2, 20_000))
     on, off = rng.uniform(0, 1, (2, 8, 20_000))
     rest = true[0] * on - true[1] * off + 0.1 * rng.normal(size=on.shape)
-    changes = thresholds.Changes(rest, on, -off, np.full(on.shape, 0.01))
-    halves = [thresholds.regress(changes.part(rows), 0.1) for rows in (slice(4), slice(4, 8))]
-    assert thresholds.spread(*halves) == pytest.approx(0.07, rel=0.1)
+    changes = thresholds.LogChanges(rest, on, -off, np.full(on.shape, 0.01))
+    halves = [thresholds.regress(changes.select(rows), 0.1) for rows in (slice(4), slice(4, 8))]
+    assert thresholds.estimate_sigma(*halves) == pytest.approx(0.07, rel=0.1)
 
 
 @pytest.mark.slow
@@ -112,11 +112,11 @@ def test_weighted_events_are_those_of_other_thresholds(rho):
     # Their noise is a part of thresholds, too.
     chosen = params(rho_ref=rho, sigma_event=0.0, share=0.0)
     features, out = prepare(recording, at, Timing(rho_ref=rho), filtering=False)
-    evidence = Evidence("evidence", Params)
+    smoother = InstantSmoother("smoother", Params)
 
     @jax.jit
     def read(p, features, out):
-        return evidence.read(p, evidence.run(p, features)[0], out)
+        return smoother.read(p, smoother.run(p, features)[0], out)
 
     factors = np.repeat([[1.3], [0.8]], PIXELS, 1).astype(np.float32)
     weighted = read(chosen, features.weighted(factors), out.weighted(factors))

@@ -1,4 +1,4 @@
-"""Segments of a window of events aligned with each other: a motion from far beside it.
+"""Alignment of a window's segments with each other: a motion from distant starts.
 
 I_s is the signed image of the warped events of one segment,
 
@@ -7,55 +7,61 @@ I_s is the signed image of the warped events of one segment,
 by Gauss-Newton on displacements of every cell in every segment with their information (Lucas &
 Kanade's equations, k_s per cell and segment), the assignment of events to cells held fixed. It
 comes within some ten degrees from most starts; its own optimum is some degrees off.
+
+The pixel [j, i] of an image lies at (i, j) + corner, px. An event is shared among four pixels.
 """
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.egomotion.bundle import images
-from jaxevent.egomotion.bundle.coarse import factorise, substitute
-from jaxevent.egomotion.bundle.gauss_newton import DEEPEST, bonds, limit_step
-from jaxevent.egomotion.bundle.path import SEGMENTS, Path, Prior, normalised, warp
-from jaxevent.egomotion.bundle.placing import (
-    POWERS,
-    Cells,
+from jaxevent.codegen import njit_fastmath, njit_fastmath_inlined
+from jaxevent.egomotion.bundle.cg import cholesky, cholesky_solve
+from jaxevent.egomotion.bundle.warp import (
+    MAX_DEPTH_STEP,
+    N_ROWS,
+    N_SEGMENTS,
+    CellGrid,
+    Path,
     Points,
-    assign,
-    slopes_by_coefficients,
+    Positions,
+    Prior,
+    assign_cells,
+    coefficient_jacobian,
+    gauge_direction,
+    normalise,
+    pack_rows,
+    point_derivatives,
+    replace_rows,
+    row_priors,
+    row_units,
+    segment_times,
+    smoothness_weights,
+    step_fraction,
+    warp,
 )
-from jaxevent.egomotion.bundle.rows import (
-    chain,
-    gauge_of_rows,
-    priors_of_rows,
-    rows_of,
-    units_of_rows,
-    with_rows,
-)
 
-BORDER = 3  # px at the sensor's border that are not compared
-BLOCK = 12  # px, of the score
-K = 3  # rows of O and of D that move
-FREE = 6 * K  # their numbers
-EDGE = 0.3  # a larger difference of log depth between cells is an edge
+BORDER_PX = 3  # at the sensor's border, that is not compared
+SCORE_BLOCK_PX = 12  # of the image, whose contrast is scored
+N_ALIGNED_ROWS = 3  # of O and of D that are fitted
+N_ALIGNED = 6 * N_ALIGNED_ROWS  # their numbers
+CELL_EDGE = 0.3  # a larger difference of log depth between cells is an edge
 
 
-@dataclasses.dataclass(frozen=True)
-class Window:
-    """Events of a window: places (px, undistorted, from the principal point), tau, polarity."""
+class WindowEvents(NamedTuple):
+    """Events (n,) of a window, and the sensor and the cells in the reference view."""
 
-    x: NDArray
+    x: NDArray  # px, undistorted, from the principal point
     y: NDArray
     tau: NDArray  # s from the reference time
     p: NDArray  # +-1
     f: float  # px
     half: float  # s
-    box: tuple[float, float, float, float]  # px, where the sensor is: x0, x1, y0, y1
-    shape: tuple[int, int]  # of the reference view
-    corner: tuple[float, float]  # px, where its pixel [0, 0] lies
-    cell: int
+    box: tuple[float, float, float, float]  # px, sensor's extent: x0, x1, y0, y1
+    shape: tuple[int, int]  # of the reference view, px
+    corner: tuple[float, float]  # px, position of its pixel [0, 0]
+    cell: int  # px
 
     @property
     def cells(self) -> tuple[int, int]:
@@ -63,16 +69,36 @@ class Window:
         return self.shape[0] // self.cell, self.shape[1] // self.cell
 
     @property
-    def places(self) -> tuple[NDArray, NDArray]:
-        """Where cells' centres lie: x and y (px), row by row."""
+    def cell_positions(self) -> tuple[NDArray, NDArray]:
+        """Positions x and y (cells,) of the cells' centres, px, row by row."""
         rows, columns = self.cells
         j, i = np.divmod(np.arange(rows * columns), columns)
         middle = (self.cell - 1) / 2
         return self.corner[0] + i * self.cell + middle, self.corner[1] + j * self.cell + middle
 
 
+class ImageScratch(NamedTuple):
+    """Scratch for images of events."""
+
+    images: NDArray  # (2, height, width): signed, and numbers of events
+    work: NDArray  # (height, width)
+    sums: NDArray
+
+    @classmethod
+    def of(cls, shape: tuple[int, int], real: np.dtype, sums: NDArray) -> "ImageScratch":
+        """Allocate it for images of a shape."""
+        return cls(np.empty((2, *shape), real), np.empty(shape, real), sums)
+
+
+class ContrastMaps(NamedTuple):
+    """Contrast (sum of squares of the signed image) and number of events, by part of the image."""
+
+    contrast: NDArray[np.float64]
+    number: NDArray[np.float64]
+
+
 class Displacements(NamedTuple):
-    """By how much cells seem displaced in segments (S, cells), as information and its product."""
+    """Displacements of cells in segments (S, cells), as information and its product with them."""
 
     xx: NDArray[np.float64]
     xy: NDArray[np.float64]
@@ -81,85 +107,241 @@ class Displacements(NamedTuple):
     vy: NDArray[np.float64]
 
 
-class Lattice(NamedTuple):
-    """The cells' centres in all segments: where they lie (S, cells) px, and the times (s)."""
+class CellTracks(NamedTuple):
+    """Centres of cells (S, cells) in all segments, px; `tau` (s) are the segments' middles."""
 
     X: NDArray[np.float64]
     Y: NDArray[np.float64]
     tau: NDArray[np.float64]
 
     @classmethod
-    def of(cls, window: Window) -> "Lattice":
-        times = ((np.arange(SEGMENTS) + 0.5) / SEGMENTS * 2 - 1) * window.half
-        parts = np.broadcast_arrays(*window.places, times[:, None])
+    def of(cls, window: WindowEvents) -> "CellTracks":
+        """Return the centres at rest."""
+        times = segment_times(window.half)[:, None]
+        parts = np.broadcast_arrays(*window.cell_positions, times)
         return cls(*(np.array(part, np.float64) for part in parts))
 
 
-def warped(path: Path, window: Window) -> tuple[NDArray[np.int32], NDArray, NDArray]:
-    """The cell of every event, by its warped position, and this."""
-    number = np.empty(len(window.x), np.int32)
-    X, Y = np.empty_like(window.x), np.empty_like(window.x)
+class VisibleRegion(NamedTuple):
+    """Region of the sensor, px of the image, and shifts (S, cells) of cells to segments' times."""
+
+    low: NDArray
+    high: NDArray
+    left: NDArray
+    top: NDArray
+
+
+@njit_fastmath_inlined
+def splat(image, x, y, weight):
+    """Add an event at (x, y) px from the corner; the part outside the image is lost."""
+    height, width = image.shape
+    if not (x > -1 and y > -1 and x < width and y < height):
+        return
+    i, j = int(np.floor(x)), int(np.floor(y))
+    u, v = x - i, y - j
+    if i >= 0 and j >= 0:
+        image[j, i] += weight * (1 - u) * (1 - v)
+    if i + 1 < width and j >= 0:
+        image[j, i + 1] += weight * u * (1 - v)
+    if i >= 0 and j + 1 < height:
+        image[j + 1, i] += weight * (1 - u) * v
+    if i + 1 < width and j + 1 < height:
+        image[j + 1, i + 1] += weight * u * v
+
+
+@njit_fastmath
+def blur(image, work, times):
+    """Blur an image by [1 2 1] / 4 in x and in y, `times` times, in place; black beyond its border.
+
+    `work` is scratch of the same shape.
+    """
+    height, width = image.shape
+    quarter, half = image.dtype.type(0.25), image.dtype.type(0.5)
+    for _ in range(times):
+        for j in range(height):
+            row, to = image[j], work[j]
+            to[0] = half * row[0] + quarter * row[1]
+            for i in range(1, width - 1):
+                to[i] = quarter * (row[i - 1] + row[i + 1]) + half * row[i]
+            to[width - 1] = half * row[width - 1] + quarter * row[width - 2]
+        for i in range(width):
+            image[0, i] = half * work[0, i] + quarter * work[1, i]
+            image[height - 1, i] = half * work[height - 1, i] + quarter * work[height - 2, i]
+        for j in range(1, height - 1):
+            above, here, below, to = work[j - 1], work[j], work[j + 1], image[j]
+            for i in range(width):
+                to[i] = quarter * (above[i] + below[i]) + half * here[i]
+
+
+@njit_fastmath
+def _accumulate_segments(window, images):
+    """Add the signed images of segments (S, height, width) of warped events."""
+    segments, height, width = images.shape
+    half = window.half
+    for e in range(len(window.x)):
+        x, y = window.x[e] - window.corner[0], window.y[e] - window.corner[1]
+        if x >= 0 and y >= 0 and x <= width - 1 and y <= height - 1:
+            s = min(max(int((window.tau[e] + half) / (2 * half) * segments), 0), segments - 1)
+            splat(images[s], x, y, window.p[e])
+
+
+@njit_fastmath
+def _compare_segments(images, cell, region, others, share, sums):
+    """Compare each segment's image of a cell with that of all other segments.
+
+    Args:
+        images: (S, height, width) of segments; pixels that are not visible are set to 0.
+        cell: Size of a cell, px.
+        region: `VisibleRegion`.
+        others: (S, height, width) output, images of the other segments.
+        share: (S, cells) output, visible pixels.
+        sums: (S, cells, 3) output, sums of I T, T^2 and I^2, T the others' image.
+    """
+    segments, height, width = images.shape
+    columns, real = width // cell, images.dtype.type
+    low, high, left, top = region
+    for j in range(height):
+        for i in range(width):
+            k, total, seen, count = j // cell * columns + i // cell, real(0), 0, 0
+            for s in range(segments):
+                x, y = i + left[s, k], j + top[s, k]
+                if x > low[0] and x < high[0] and y > low[1] and y < high[1]:
+                    total += images[s, j, i]
+                    seen, count = seen | 1 << s, count + 1
+                    share[s, k] += 1
+            scale = real(segments / count if count > 2 else 0)
+            for s in range(segments):
+                if not seen >> s & 1:
+                    images[s, j, i] = others[s, j, i] = 0
+                    continue
+                own = images[s, j, i]
+                other = (total - own) * scale
+                others[s, j, i] = other
+                sums[s, k, 0] += own * other
+                sums[s, k, 1] += other * other
+                sums[s, k, 2] += own * own
+
+
+@njit_fastmath
+def _accumulate_gradients(images, others, gain, cell, sums):
+    """Add sums over cells (S, cells, 6) of d = gain T - I and the gradient g of T.
+
+    They are those of d^2, gx^2, gx gy, gy^2, gx d, gy d.
+    """
+    segments, height, width = images.shape
+    columns = width // cell
+    for s in range(segments):
+        for j in range(height):
+            for i in range(width):
+                k = j // cell * columns + i // cell
+                T = others[s]
+                gx = ((T[j, i + 1] if i + 1 < width else 0) - (T[j, i - 1] if i else 0)) / 2
+                gy = ((T[j + 1, i] if j + 1 < height else 0) - (T[j - 1, i] if j else 0)) / 2
+                d = gain[s, k] * T[j, i] - images[s, j, i]
+                to = sums[s, k]
+                to[0] += d * d
+                to[1] += gx * gx
+                to[2] += gx * gy
+                to[3] += gy * gy
+                to[4] += gx * d
+                to[5] += gy * d
+
+
+@njit_fastmath
+def _contrast_by_block(window, block, scratch, out):
+    """Write the `ContrastMaps` of blocks (rows, columns), `block` px wide, of warped events."""
+    images, S, N = scratch.images, out.contrast, out.number
+    images[:] = 0
+    for e in range(len(window.x)):
+        x, y = window.x[e] - window.corner[0], window.y[e] - window.corner[1]
+        splat(images[0], x, y, window.p[e])
+        splat(images[1], x, y, images.dtype.type(1))
+    blur(images[0], scratch.work, 1)
+    blur(images[1], scratch.work, 1)
+    S[:] = 0
+    N[:] = 0
+    for j in range(S.shape[0] * block):
+        for i in range(S.shape[1] * block):
+            S[j // block, i // block] += images[0, j, i] ** 2
+            N[j // block, i // block] += images[1, j, i]
+
+
+def _warp_by_cells(path: Path, window: WindowEvents) -> WindowEvents:
+    """Warp events to the reference view, with the depths of their cells."""
+    index = np.empty(len(window.x), np.int32)
+    out = Positions(np.empty_like(window.x), np.empty_like(window.x))
     rho = np.exp(path.log_rho.astype(np.float64))
     points = Points(window.x, window.y, window.tau)
-    cells = Cells(window.corner, window.cell, *window.cells)
-    assign(points, path.motion(window.f), rho, cells, number, X, Y)
-    return number, X, Y
+    cells = CellGrid(window.corner, window.cell, *window.cells)
+    assign_cells(points, path.motion(window.f), rho, cells, index, out)
+    return window._replace(x=out.X, y=out.Y)
 
 
-def refine(
-    window: Window, path: Path, prior: Prior, *, degree: int, blurs: int, steps: int
+def align_segments(
+    window: WindowEvents, path: Path, prior: Prior, *, degree: int, blurs: int, steps: int
 ) -> Path:
-    """So many Gauss-Newton steps from a path; of O and D the rows up to `degree` (<= 2) move.
+    """Refine a path by the alignment of segments.
 
-    Images are blurred `blurs` times by [1 2 1] / 4.
+    Args:
+        window: Events.
+        path: Path to begin with, with log depths of cells.
+        prior: Priors on path and depths.
+        degree: Highest row of O and D that is fitted, at most 2.
+        blurs: Number of times that images are blurred by [1 2 1] / 4.
+        steps: Number of Gauss-Newton steps.
     """
-    lattice = Lattice.of(window)
+    centres = CellTracks.of(window)
     for _ in range(steps):
-        x, y = trace_cells(path, window, lattice)
-        found = measure_displacements(path, window, lattice, x, y, blurs)
-        path = step(path, *linearise(path, window, lattice, x, y, found, prior), degree)
+        tracks = _trace_cells(path, window, centres)
+        shifts = Positions(tracks.X - centres.X, tracks.Y - centres.Y)
+        found = _measure_displacements(path, window, shifts, blurs)
+        path = _take_step(path, window, tracks, found, prior, degree)
     return path
 
 
-def trace_cells(path: Path, window: Window, lattice: Lattice) -> tuple[NDArray, NDArray]:
-    """Where the cells' centres were at the segments' times, x and y (S, cells) px."""
-    rho, (x, y) = np.exp(path.log_rho), lattice[:2]
+def _trace_cells(path: Path, window: WindowEvents, centres: CellTracks) -> CellTracks:
+    """Find the positions of the cells' centres at the segments' times."""
+    rho, (x, y, tau) = np.exp(path.log_rho), centres
     for _ in range(4):
-        X, Y = warp(path, window.f, x, y, lattice.tau, rho)
-        x, y = x - (X - lattice.X), y - (Y - lattice.Y)
-    return x, y
+        X, Y = warp(path, window.f, Points(x, y, tau), rho)
+        x, y = x - (X - centres.X), y - (Y - centres.Y)
+    return CellTracks(x, y, tau)
 
 
-def measure_displacements(
-    path: Path, window: Window, lattice: Lattice, x: NDArray, y: NDArray, blurs: int
+def _measure_displacements(
+    path: Path, window: WindowEvents, shifts: Positions, blurs: int
 ) -> Displacements:
-    """By how much cells seem displaced, by Lucas and Kanade's equations."""
-    real, cells = window.x.dtype, lattice.X.shape[1]
-    _, X, Y = warped(path, window)
-    own = np.zeros((SEGMENTS, *window.shape), real)
-    images.segment_images(X, Y, window.tau, window.p, window.half, window.corner, own)
+    """Measure the displacements of cells by Lucas and Kanade's equations.
+
+    Args:
+        path: Path that warps the events.
+        window: Events.
+        shifts: (S, cells) px, shifts of cells' centres from the reference to the segments' times.
+        blurs: Number of times that images are blurred.
+    """
+    real, cells = window.x.dtype, shifts.X.shape[1]
+    own = np.zeros((N_SEGMENTS, *window.shape), real)
+    _accumulate_segments(_warp_by_cells(path, window), own)
     work = np.empty(window.shape, real)
     for image in own:
-        images.blur(image, work, blurs)
+        blur(image, work, blurs)
     low, high = (
         np.array([window.box[k], window.box[2 + k]]) - np.array(window.corner) for k in (0, 1)
     )
-    others, share = np.empty_like(own), np.zeros((SEGMENTS, cells))
-    both = np.zeros((SEGMENTS, cells, 3))
-    images.compare(
-        own, window.cell, low + BORDER, high - BORDER, x - lattice.X, y - lattice.Y, others, share,
-        both,
-    )  # fmt: skip
+    others, share = np.empty_like(own), np.zeros((N_SEGMENTS, cells))
+    both = np.zeros((N_SEGMENTS, cells, 3))
+    region = VisibleRegion(low + BORDER_PX, high - BORDER_PX, *shifts)
+    _compare_segments(own, window.cell, region, others, share, both)
     share /= window.cell**2
     gain = both[..., 0] / np.maximum(both[..., 1], 1e-6)
-    sums = np.zeros((SEGMENTS, cells, 6))
-    images.measure(own, others, gain, window.cell, sums)
+    sums = np.zeros((N_SEGMENTS, cells, 6))
+    _accumulate_gradients(own, others, gain, window.cell, sums)
     # Noise (per px) of a cell; blurring correlates it.
     noise = sums[..., 0].sum(0) / np.maximum(share.sum(0), 1) / window.cell**2
     weight = np.where((gain > 0) & (share > 0), 1 / (noise + 1e-3), 0) / (1 + 1.5 * blurs)
     xx, xy, yy = (weight * gain**2 * sums[..., k] for k in (1, 2, 3))
     vx, vy = (weight * gain * sums[..., k] for k in (4, 5))
-    # A cell that seems displaced by more than about a pixel is not what it is taken for.
+    # A displacement by more than about a pixel is an outlier.
     small = 1e-2
     det = (xx + small) * (yy + small) - xy**2
     dx, dy = ((yy + small) * vx - xy * vy) / det, ((xx + small) * vy - xy * vx) / det
@@ -167,57 +349,70 @@ def measure_displacements(
     return Displacements(*(robust * part for part in (xx, xy, yy, vx, vy)))
 
 
-def linearise(
+def _take_step(
     path: Path,
-    window: Window,
-    lattice: Lattice,
-    x: NDArray,
-    y: NDArray,
+    window: WindowEvents,
+    tracks: CellTracks,
     found: Displacements,
     prior: Prior,
-) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """H and g of the displacements and the priors, the path's rows, and their units.
+    degree: int,
+) -> Path:
+    """Take a Gauss-Newton step of the rows up to `degree` and the depths of cells.
 
     Unknowns are the path's first rows, in px at the window's end, and the cells' log depths.
     """
-    f, half, tau, n = window.f, window.half, lattice.tau, lattice.X.size
-    rho = np.broadcast_to(np.exp(path.log_rho), tau.shape)
-    unit = units_of_rows(path, f, half, K)
+    f, half, (_, cells), n = window.f, window.half, tracks.X.shape, tracks.X.size
+    rho = np.broadcast_to(np.exp(path.log_rho), tracks.X.shape)
+    unit = row_units(path, f, half, N_ALIGNED_ROWS)
     by, r = np.empty((n, 6, 2)), np.empty((n, 2))
-    parts = [np.ascontiguousarray(part, np.float64).ravel() for part in (x, y, tau, rho)]
-    slopes_by_coefficients(Points(*parts[:3]), parts[3], path.motion(f), by, r)
-    powers = (tau.ravel() / half)[:, None] ** np.arange(1, POWERS + 1)
-    J = (by[:, :, None] * powers[:, None, :, None]).reshape(n, 6 * POWERS, 2)
-    J = J.transpose(0, 2, 1) @ chain(path, unit, half, K)
-    now = rows_of(path, K) / unit
+    parts = [np.ascontiguousarray(part, np.float64).ravel() for part in (*tracks, rho)]
+    point_derivatives(Points(*parts[:3]), parts[3], path.motion(f), by, r)
+    powers = (parts[2] / half)[:, None] ** np.arange(1, N_ROWS + 1)
+    J = (by[:, :, None] * powers[:, None, :, None]).reshape(n, 6 * N_ROWS, 2)
+    J = J.transpose(0, 2, 1) @ coefficient_jacobian(path, unit, half, N_ALIGNED_ROWS)
+    now = pack_rows(path, N_ALIGNED_ROWS) / unit
     W = np.stack([found.xx, found.xy, found.xy, found.yy], -1).reshape(n, 2, 2)
     v = np.stack([found.vx, found.vy], -1).reshape(n, 2)
     MJ = W @ J
-    cells = lattice.X.shape[1]
     # By einsum: larger products wake BLAS's threads, which spin then, beside other starts' steps.
-    upper = np.einsum("ep,eq->pq", J.reshape(-1, FREE), MJ.reshape(-1, FREE))
-    mixed = np.einsum("ekp,ek->ep", MJ, r).reshape(SEGMENTS, cells, FREE).sum(0).T
-    lower = np.einsum("ek,ekl,el->e", r, W, r).reshape(SEGMENTS, cells).sum(0)
+    upper = np.einsum("ep,eq->pq", J.reshape(-1, N_ALIGNED), MJ.reshape(-1, N_ALIGNED))
+    mixed = np.einsum("ekp,ek->ep", MJ, r).reshape(N_SEGMENTS, cells, N_ALIGNED).sum(0).T
+    lower = np.einsum("ek,ekl,el->e", r, W, r).reshape(N_SEGMENTS, cells).sum(0)
     H = np.block([[upper, mixed], [mixed.T, np.diag(lower)]])
     g = np.concatenate(
-        [np.einsum("ekp,ek->p", J, v), (r * v).sum(1).reshape(SEGMENTS, cells).sum(0)]
+        [np.einsum("ekp,ek->p", J, v), (r * v).sum(1).reshape(N_SEGMENTS, cells).sum(0)]
     )
     depth = path.log_rho.reshape(window.cells)
-    bound = bond_matrix(*bonds(depth, prior.smooth, EDGE)[:2])
-    H[FREE:, FREE:] += bound
-    g[FREE:] += np.einsum("ij,j->i", bound, path.log_rho)
-    H[FREE:, FREE:] += prior.relief * np.eye(cells)
-    g[FREE:] += prior.relief * (path.log_rho - path.log_rho.mean())
-    known, side, _ = priors_of_rows(prior, unit, half)
-    H[:FREE, :FREE] += known
-    g[:FREE] += known @ now - side
-    gauge = gauge_of_rows(path, unit, len(g))
-    H = H + 100 * np.trace(upper) / FREE * gauge[:, None] * gauge
-    return H + np.diag(1e-3 * np.diag(H) + 1e-6), g, now, unit
+    bound = _smoothness_matrix(*smoothness_weights(depth, prior.smooth, CELL_EDGE)[:2])
+    H[N_ALIGNED:, N_ALIGNED:] += bound
+    g[N_ALIGNED:] += np.einsum("ij,j->i", bound, path.log_rho)
+    H[N_ALIGNED:, N_ALIGNED:] += prior.relief * np.eye(cells)
+    g[N_ALIGNED:] += prior.relief * (path.log_rho - path.log_rho.mean())
+    known, side, _ = row_priors(prior, unit, half)
+    H[:N_ALIGNED, :N_ALIGNED] += known
+    g[:N_ALIGNED] += known @ now - side
+    gauge = gauge_direction(path, unit, len(g))
+    H = H + 100 * np.trace(upper) / N_ALIGNED * gauge[:, None] * gauge
+    H = H + np.diag(1e-3 * np.diag(H) + 1e-6)
+
+    moves = np.ones(len(g), bool)
+    moves[:N_ALIGNED] = np.repeat(np.tile(np.arange(N_ALIGNED_ROWS) <= degree, 2), 3)
+    change = np.zeros(len(g))
+    # LAPACK would wake BLAS's threads, which spin then: half of the CPU seconds of all starts.
+    free, down = H[np.ix_(moves, moves)], -g[moves]
+    cholesky(free)
+    cholesky_solve(free, down)
+    change[moves] = down
+    if not np.isfinite(change).all():
+        return path
+    change *= step_fraction(change[:N_ALIGNED])
+    path = replace_rows(path, (now + change[:N_ALIGNED]) * unit)
+    deeper = np.clip(change[N_ALIGNED:], -MAX_DEPTH_STEP, MAX_DEPTH_STEP)
+    return normalise(Path(path.O, path.D, path.log_rho + deeper.astype(path.log_rho.dtype)))
 
 
-def bond_matrix(across: NDArray, down: NDArray) -> NDArray[np.float64]:
-    """Of the sum of squares of differences to the cells before, with these weights."""
+def _smoothness_matrix(across: NDArray, down: NDArray) -> NDArray[np.float64]:
+    """Return the matrix of a weighted sum of squared differences to the cells before."""
     number = np.arange(across.size).reshape(across.shape)
     found = np.zeros((across.size, across.size))
     for a, b, weight in (
@@ -229,30 +424,12 @@ def bond_matrix(across: NDArray, down: NDArray) -> NDArray[np.float64]:
     return found
 
 
-def step(path: Path, H: NDArray, g: NDArray, now: NDArray, unit: NDArray, degree: int) -> Path:
-    """The path after a step, whose rows above `degree` stay."""
-    moves = np.ones(len(g), bool)
-    moves[:FREE] = np.repeat(np.tile(np.arange(K) <= degree, 2), 3)
-    change = np.zeros(len(g))
-    # LAPACK would wake BLAS's threads, which spin then: half of the CPU seconds of all starts.
-    free, down = H[np.ix_(moves, moves)], -g[moves]
-    factorise(free)
-    substitute(free, down)
-    change[moves] = down
-    if not np.isfinite(change).all():
-        return path
-    change *= limit_step(change[:FREE])
-    path = with_rows(path, (now + change[:FREE]) * unit)
-    deeper = np.clip(change[FREE:], -DEEPEST, DEEPEST)
-    return normalised(Path(path.O, path.D, path.log_rho + deeper.astype(path.log_rho.dtype)))
-
-
-def score(window: Window, path: Path) -> float:
-    """What selects among paths: the mean over blocks of n (log S - 1.5 log n) / N."""
-    _, X, Y = warped(path, window)
-    both = np.empty((2, *window.shape), X.dtype)
-    S, n = (np.empty(tuple(size // BLOCK for size in window.shape)) for _ in range(2))
-    work = np.empty(window.shape, X.dtype)
-    images.block_sums(X, Y, window.p, window.corner, BLOCK, both, work, S, n)
-    S, n = S[n > 5], n[n > 5]
-    return float((n * (np.log(S + 1e-6) - 1.5 * np.log(n))).sum()) / max(len(X), 1)
+def contrast_score(window: WindowEvents, path: Path) -> float:
+    """Score a path by the mean over blocks of n (log S - 1.5 log n) / N, S the contrast."""
+    warped, real = _warp_by_cells(path, window), window.x.dtype
+    shape = tuple(size // SCORE_BLOCK_PX for size in window.shape)
+    out = ContrastMaps(np.empty(shape), np.empty(shape))
+    scratch = ImageScratch.of(window.shape, real, np.empty(0))
+    _contrast_by_block(warped, SCORE_BLOCK_PX, scratch, out)
+    S, n = (part[out.number > 5] for part in out)
+    return float((n * (np.log(S + 1e-6) - 1.5 * np.log(n))).sum()) / max(len(window.x), 1)

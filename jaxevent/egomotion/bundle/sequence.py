@@ -1,4 +1,4 @@
-"""A recording's windows one beside another, each from where the one before goes on."""
+"""Motion of a whole recording: its windows one after another, and their blend."""
 
 import dataclasses
 from collections.abc import Callable
@@ -7,63 +7,84 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.egomotion.bundle.path import Path, advanced
-from jaxevent.egomotion.bundle.windows import Fit, Params, Rival, Windows, near_to
+from jaxevent.egomotion.bundle.hypotheses import Hypothesis, WindowFit, WindowFitter, is_near
+from jaxevent.egomotion.bundle.warp import Path, predict_path
+from jaxevent.egomotion.bundle.windows import Params
 from jaxevent.egomotion.estimator import COMMON, Given, OnHost
 from jaxevent.egomotion.models import General
 from jaxevent.egomotion.motion import Motion
 from jaxevent.egomotion.patches import Speed
 from jaxevent.progress import bar
 
-WAYS = 24.0, 150.0  # px in a window, with which the default length is kept
-SHORTEST, LONGEST = 0.02, 2.0  # s, of half a window
-# Of how far the motion at a window's end is from that at its middle, what is not known of it. Of
-# varying motion (seeds 810, 811) squared errors of Omega 0.1 s from the middle are 40 to 180 times
-# the variance at the middle, 0.1 to 2 with this; of constant motion about 1.
-BENT = 0.5
-# rad, `Fit.doubted`, from which the next window is not followed but has rivals of its own: what is
-# followed is alone, and so told too surely.
-DOUBTED = 1.0
-LOST = 4  # times the least cost of the windows before: the path is not followed
+WINDOW_PX_RANGE = (
+    24.0,
+    150.0,
+)  # motion of the image in a window, with which the default length stays
+MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S = 0.02, 2.0
+# Uncertainty of the motion at the end of a window without neighbour, by its difference from that at
+# the middle. Squared errors of Omega 0.1 s from the middle are then 0.1 to 2 times the variance.
+EDGE_UNCERTAINTY = 0.5
+MAX_AMBIGUITY_RAD = 1.0  # of a window whose path is followed into the next one
+LOST_COST_RATIO = 4  # times the least cost of the windows before: the path is not followed
 
 
-def solve(params: Params, given: Given) -> Motion:
-    """The general motion of a camera, from windows that overlap.
+def estimate_motion(params: Params, given: Given) -> Motion:
+    """Estimate the general motion of a camera from windows that overlap.
 
-    The motion at a time is the mean of what the windows around it tell, of those nearer the more
-    (a raised cosine). Estimates are a fifth of a `step` apart. The seed chooses events where a
-    window has more than `events`. The option `gyro` (`twists.from_gyro`) settles Omega.
+    The motion at a time is the mean of those of the windows around it, those nearer weighted more
+    (a raised cosine). Estimates are a fifth of a `step` apart.
+
+    Args:
+        params: Parameters.
+        given: Recording, camera, seed of the choice of events, and the option `gyro`
+            (`twists.from_gyro`), which gives Omega.
+
+    Returns:
+        The motion, lost at times that no window determines.
     """
     recording, camera, gyro = given.recording, given.camera, given.more.get("gyro")
     assert camera is not None
     if not len(recording.events):
         return Motion.nothing(given.model)
-    windows = Windows(recording, params, camera, gyro, given.seed)
+    windows = WindowFitter(recording, params, camera, gyro, given.seed)
     first, last = int(recording.events[:1].t[0]), int(recording.events[-1:].t[0])
     half, step = (round(1e6 * float(value)) for value in (params.half_window, params.step))
     centres = np.arange(first + half, last - half + 1, step)
     if not len(centres):
         centres = np.array([(first + last) // 2])
-    fits = _followed(windows, centres.tolist(), step, half, given.progress)
-    return _blended(centres, fits, half, step, first, last)
+    fits = _fit_windows(windows, centres.tolist(), step, half, given.progress)
+    return _blend(centres, fits, half, step, (first, last))
 
 
-def _followed(
-    windows: Windows, centres: list[int], step: int, half: int, progress: bool | None
-) -> list[Fit | None]:
-    """The windows one after the other, each from where the one before goes on.
+def _fit_windows(
+    windows: WindowFitter, centres: list[int], step: int, half: int, progress: bool | None
+) -> list[WindowFit | None]:
+    """Fit windows one after another, each from the predicted path of the one before.
 
-    One is followed while the one before is at its last stage: steps of one keep about one core
-    busy, and that stage changes little.
+    After some windows new starts compete with that path. The next window is begun while the last
+    stage of the one before runs: steps of one keep about one core busy, and that stage changes
+    little.
+
+    Args:
+        windows: Windows of the recording.
+        centres: Middles of the windows, us.
+        step: Time from one to the next, us.
+        half: Half the length of one, us.
+        progress: Whether to show a bar.
+
+    Returns:
+        The fits; None for windows that are lost.
     """
-    fits: list[Fit | None] = []
-    enough = [np.diff(windows.rows(c, half * 1e-6))[0] >= windows.params.fewest for c in centres]
+    fits: list[WindowFit | None] = []
+    enough = [
+        np.diff(windows.event_range(c, half * 1e-6))[0] >= windows.params.fewest for c in centres
+    ]
     warm: Path | None = None
-    ahead: Future[Rival] | None = None
+    ahead: Future[Hypothesis] | None = None
     since, wait, cost = 0, windows.params.fresh, 0.0
 
     def onward(path: Path, steps: int = 1) -> Path:
-        return advanced(path, steps * step * 1e-6, half * 1e-6)
+        return predict_path(path, steps * step * 1e-6, half * 1e-6)
 
     shown = bar(centres, desc="fit motion", unit="window", progress=progress)
     with ThreadPoolExecutor(1) as beside:
@@ -75,13 +96,13 @@ def _followed(
             since, fit = since + 1, None
             anew = warm is None or since >= wait
             if warm is not None and not anew:
-                rival = ahead.result() if ahead else windows.followed(centre, warm)
+                found = ahead.result() if ahead else windows.refine_from(centre, warm)
                 ahead = None
                 if since + 1 < wait and row + 1 < len(centres) and enough[row + 1]:
-                    path = onward(rival[0].path)
-                    ahead = beside.submit(windows.followed, centres[row + 1], path)
-                fit = windows.ended(centre, [rival])
-                anew = fit is None or not fit.cost <= LOST * cost
+                    path = onward(found[0].path)
+                    ahead = beside.submit(windows.refine_from, centres[row + 1], path)
+                fit = windows.refine_final(centre, [found])
+                anew = fit is None or not fit.cost <= LOST_COST_RATIO * cost
             if anew:
                 ahead, fit = None, windows.fit(centre, warm)
             fits.append(fit)
@@ -89,53 +110,73 @@ def _followed(
                 warm = None
                 continue
             if anew:
-                agreed = warm is not None and near_to(fit.path, warm)
+                agreed = warm is not None and is_near(fit.path, warm)
                 if warm is not None and not agreed:
-                    _revise(windows, centres[: len(fits)], fits, onward)
+                    _refit_backwards(windows, centres[: len(fits)], fits, onward)
                 since, wait = 0, 2 * wait if agreed else windows.params.fresh
-                if fit.doubted > DOUBTED:
+                if fit.ambiguity > MAX_AMBIGUITY_RAD:
                     since = wait
             cost = fit.cost if anew else min(cost, fit.cost)
             warm = onward(fit.path)
     return fits
 
 
-def _revise(
-    windows: Windows, centres: list[int], fits: list[Fit | None], onward: Callable[..., Path]
+def _refit_backwards(
+    windows: WindowFitter,
+    centres: list[int],
+    fits: list[WindowFit | None],
+    onward: Callable[..., Path],
 ) -> None:
-    """The last window found a motion that was not followed to it: those before are fitted again.
+    """Refit the windows before one in which new starts found another motion, in place.
 
     Each starts from the one after it, back to where that ends at what was found before; of the new
-    ones so many of the last remain as together save most.
+    fits so many of the last remain as together save most.
+
+    Args:
+        windows: Windows of the recording.
+        centres: Middles of the windows so far, us.
+        fits: Their fits.
+        onward: Predicts a path by a number of windows.
     """
     row, later, gained = len(fits) - 1, fits[-1], 0.0
-    new: dict[int, Fit] = {}
+    new: dict[int, WindowFit] = {}
     while row > 0 and later is not None:
         row, old = row - 1, fits[row - 1]
-        before = windows.followed(centres[row], onward(later.path, -1))
-        later = windows.ended(centres[row], [before])
-        if old is None or later is None or near_to(later.path, old.path):
+        before = windows.refine_from(centres[row], onward(later.path, -1))
+        later = windows.refine_final(centres[row], [before])
+        if old is None or later is None or is_near(later.path, old.path):
             break
         new[row] = later
-        gained += old.cost + windows.turning(old.path)
-        gained -= later.cost + windows.turning(later.path)
+        gained += old.cost + windows.rotation_prior(old.path)
+        gained -= later.cost + windows.rotation_prior(later.path)
         if gained > 0:
             for at, fit in new.items():
                 fits[at] = fit
             new, gained = {}, 0.0
 
 
-def _blended(
-    centres: NDArray, fits: list[Fit | None], half: int, step: int, first: int, last: int
+def _blend(
+    centres: NDArray,
+    fits: list[WindowFit | None],
+    half: int,
+    step: int,
+    span: tuple[int, int],
 ) -> Motion:
-    """The motion of overlapping windows; lost where none tells it.
+    """Blend the motions of overlapping windows.
 
-    Of a window the middle two thirds count, those beyond `reach` where no other tells more. How far
-    a window disagrees with its neighbours is in its covariance; on a side where it has none, `BENT`
-    of how far its motion there is from that at its middle. Where the camera is slower than at the
-    middle the heading is known less.
+    Of a window the middle two thirds count, those beyond `step` hardly. The covariance contains the
+    window's disagreement with its neighbours; on a side without neighbour, `EDGE_UNCERTAINTY` of
+    the difference of its motion there from that at its middle. If the camera is slower than at the
+    middle, the heading is less certain.
+
+    Args:
+        centres: Middles of the windows, us.
+        fits: Fits of the windows, None if lost.
+        half: Half the length of a window, us.
+        step: Time from one window to the next, us.
+        span: First and last time of the recording, us.
     """
-    end = 2 * half // 3
+    (first, last), end = span, 2 * half // 3
     every = max(min(step // 5, (last - first) // 4), 1)
     t = np.arange(max(centres[0] - end, first), min(centres[-1] + end, last) + 1, every)
     heading, Omega = np.zeros((len(t), 3)), np.zeros((len(t), 3))
@@ -152,10 +193,11 @@ def _blended(
         heading[near] += weight[:, None] * T
         Omega[near] += weight[:, None] * turn
         way = np.concatenate([T, turn], 1) - np.concatenate(fit.path.twist(0.0), 1)
-        way = BENT * way * _alone(fits, k, t[near] - centre)[:, None]
+        way = EDGE_UNCERTAINTY * way * _has_no_neighbour(fits, k, t[near] - centre)[:, None]
         bent = way[:, :, None] * way[:, None, :]
-        told = _slower(fit.covariance, fit.path.pace((t[near] - centre) * 1e-6))
-        covariance[near] += weight[:, None, None] * (told + off + bent)
+        speed = fit.path.relative_speed((t[near] - centre) * 1e-6)
+        scaled = _scale_heading_covariance(fit.covariance, speed)
+        covariance[near] += weight[:, None, None] * (scaled + off + bent)
         agreement[near] += weight * fit.agreement
         total[near] += weight
     lost = (total < 1e-6) | ~np.isfinite(covariance).all((1, 2))
@@ -163,36 +205,36 @@ def _blended(
     size = np.linalg.norm(heading, axis=1, keepdims=True)
     heading = np.where(size > 0, heading / np.where(size > 0, size, 1), np.array([0.0, 0, 1]))
     mean = np.concatenate([heading, Omega / safe[:, None]], 1)
-    told = Motion.of(General, t, mean, covariance / safe[:, None, None], ~lost)
-    return dataclasses.replace(told, agreement=agreement / safe)
+    found = Motion.of(General, t, mean, covariance / safe[:, None, None], ~lost)
+    return dataclasses.replace(found, agreement=agreement / safe)
 
 
-def _slower(covariance: NDArray, pace: NDArray) -> NDArray[np.float64]:
-    """Covariances (times, 6, 6) where |T| is `pace` times that of which one is known.
+def _scale_heading_covariance(covariance: NDArray, speed: NDArray) -> NDArray[np.float64]:
+    """Scale a covariance (6, 6) to times at which |T| has changed by factors `speed` (times,).
 
-    What is known is the velocity, whose direction is known less the slower it is.
+    The velocity is determined, whose direction is the less certain the slower it is.
     """
-    told = float(np.trace(covariance[:3, :3]))
-    most = np.pi / 2 / np.sqrt(told) if told > 0 else np.inf
-    grown = np.clip(1 / np.maximum(pace, 1e-6), 1, max(most, 1))
-    factors = np.ones((len(pace), 6))
+    variance = float(np.trace(covariance[:3, :3]))
+    most = np.pi / 2 / np.sqrt(variance) if variance > 0 else np.inf
+    grown = np.clip(1 / np.maximum(speed, 1e-6), 1, max(most, 1))
+    factors = np.ones((len(speed), 6))
     factors[:, :3] = grown[:, None]
     return factors[:, :, None] * covariance * factors[:, None, :]
 
 
-def _alone(fits: list[Fit | None], row: int, since: NDArray) -> NDArray[np.bool_]:
-    """Whether at times since a window's middle there is no window beside it, on that side."""
+def _has_no_neighbour(fits: list[WindowFit | None], row: int, since: NDArray) -> NDArray[np.bool_]:
+    """Return whether a window has no neighbour on the side of times since its middle."""
     there = [0 <= other < len(fits) and fits[other] is not None for other in (row - 1, row + 1)]
     return np.where(since < 0, not there[0], not there[1])
 
 
 def _disagreements(
-    centres: NDArray, fits: list[Fit | None], half: int
+    centres: NDArray, fits: list[WindowFit | None], half: int
 ) -> list[NDArray[np.float64]]:
-    """Mean squares (6, 6) of how far windows differ from those before and after that they overlap.
+    """Return mean squares (6, 6) of the differences of windows from those that they overlap.
 
-    Halfway between them. What one window shows beside its own errors is whether another, of other
-    events in part, finds the same: a minimum that is not the truth's comes and goes.
+    They are taken halfway between both middles. Another window has other events in part, and a
+    false minimum comes and goes.
     """
     found: list[list[NDArray[np.float64]]] = [[] for _ in fits]
     for k, (one, other) in enumerate(zip(fits[:-1], fits[1:], strict=True)):
@@ -209,22 +251,24 @@ def _disagreements(
     return [np.mean(squares, 0) if squares else np.zeros((6, 6)) for squares in found]
 
 
-def lengths(params: Params, speed: Speed) -> dict[str, float]:
-    """Windows in which the image moves by some pixels."""
+def adapt_lengths(params: Params, speed: Speed) -> dict[str, float]:
+    """Return `half_window` and `step` for windows in which the image moves by some pixels."""
     way = 2 * float(params.half_window) * speed.usual
-    if WAYS[0] <= way <= WAYS[1]:
+    low, high = WINDOW_PX_RANGE
+    if low <= way <= high:
         return {}
-    half = min(max((WAYS[0] if way < WAYS[0] else WAYS[1]) / speed.usual / 2, SHORTEST), LONGEST)
+    half = (low if way < low else high) / speed.usual / 2
+    half = min(max(half, MIN_HALF_WINDOW_S), MAX_HALF_WINDOW_S)
     return {"half_window": half, "step": half * float(params.step) / float(params.half_window)}
 
 
 batch = OnHost(
     "batch",
     Params,
-    solve,
+    estimate_motion,
     models=(General.name,),
     options=COMMON | {"gyro"},
-    lengths=lengths,
+    lengths=adapt_lengths,
     about="General motion by fitting a whole window of events: the camera's path and the scene's "
     "depth. Estimates of overlapping windows are blended, a fifth of a `step` apart.",
 )

@@ -2,10 +2,12 @@
 
 import dataclasses
 
-from jaxevent.reconstruction.compensated.estimator import CompensatedVideo, MotionCompensated, mc
-from jaxevent.reconstruction.compensated.parameters import Params
+from jaxevent.deprecated import renamed_names
+from jaxevent.reconstruction.compensated.estimator import CompensatedVideo, MotionCompensation, mc
+from jaxevent.reconstruction.compensated.params import Params
 
-__all__ = ["CompensatedVideo", "MotionCompensated", "Params", "mc", "mc_through_motion"]
+__all__ = ["CompensatedVideo", "MotionCompensation", "Params", "mc", "mc_through_motion"]
 
 # The same images, for fits whose derivatives go through the motion.
 mc_through_motion = dataclasses.replace(mc, through_motion=True)
+__getattr__ = renamed_names(__name__)

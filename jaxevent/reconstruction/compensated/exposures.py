@@ -1,12 +1,12 @@
-"""What frames say of an image besides sharp, unclipped values: blurred averages and clipped pixels.
+"""Constraints of frames on a fused image: exposures that blur, and clipped pixels.
 
-A frame integrates over its exposure. While it does, the points of the target's image L move on: at
-the pixel to which the point x has gone by mid-exposure, the frame has seen
+A frame integrates over its exposure. Meanwhile the points of the target's image L move on: at the
+pixel to which the point x has gone by mid-exposure, the frame has seen
 
     B(x) = ln mean_j exp L(x - D_j(x)),   D_j(x) = u(x, s + h_j) - u(x, s),
 
-the mean over the exposure, as the event double integral has it per pixel. Where a pixel of a frame
-is clipped it says only that B lies beyond the clip. Both correct the image that was fused, with its
+the mean over the exposure, as the event double integral has it per pixel. A clipped pixel of a
+frame shows only that B lies beyond the clip. Both correct the image that was fused, with its
 variance P as prior, by preconditioned gradient steps of
 
     (L' - L)^2 / P + sum over frames of rho((b - B(L'))^2 / R),   b: what the frame read.
@@ -22,33 +22,46 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, run_over_rows
-from jaxevent.reconstruction.augment import clipped_side, clipping_bound, unclipped
-from jaxevent.reconstruction.compensated.agreement import MISFIT, blur, steepness
-from jaxevent.reconstruction.compensated.fusion import Fused
-from jaxevent.reconstruction.compensated.parameters import Params
-from jaxevent.reconstruction.compensated.trajectories import around
-from jaxevent.reconstruction.compensated.warping import displaced, places, sample, within
+from jaxevent.reconstruction.augment import clipped_side, clipping_bound, unclipped_weight
+from jaxevent.reconstruction.compensated.fusion import FusedImage
+from jaxevent.reconstruction.compensated.instants import Instants
+from jaxevent.reconstruction.compensated.params import Params
+from jaxevent.reconstruction.compensated.robust_mean import (
+    RESIDUAL_SIGMA_PX,
+    blur_jax,
+    squared_gradient,
+)
+from jaxevent.reconstruction.compensated.warp import (
+    bilinear_cell,
+    displacements,
+    is_inside,
+    positions,
+    sample,
+)
 from jaxevent.reconstruction.features import Numeric
+from jaxevent.reconstruction.frames import Clock, Timing
 from jaxevent.reconstruction.smoother import Gaussian, Message, one_sided_message
+from jaxevent.recording import Recording
 
-STEPS = 4
-BLURRED = 0.5  # px that a point moves within an exposure, below which the frame counts as sharp
-DISCORD = 0.5  # px, by which points that met within an exposure may move in other ways
-PER_SAMPLE = 2.0  # px of that motion, at most, from one sample of an exposure to the next
-SAMPLES = (3, 7, 15, 31)  # of an exposure; few numbers, so that few programs are compiled
+N_STEPS = 4
+BLURRED_PX = 0.5  # motion within an exposure, below which the frame counts as sharp
+DISAGREEMENT_PX = 0.5  # by which points that met within an exposure may move differently
+MAX_SAMPLE_PX = 2.0  # motion from one sample of an exposure to the next
+SAMPLE_COUNTS = (3, 7, 15, 31)  # of an exposure; few numbers, so that few programs are compiled
+FASTEST = 2.0  # times the measured speed, for which exposures are sampled
 
 
-class Taken(NamedTuple):
-    """When the frames next to a target were taken: those before and after, or at its time."""
+class AdjacentExposures(NamedTuple):
+    """Exposures of the n frames next to a target: before, and after or at its time."""
 
-    frame: Int[Numeric, " n"]  # of the recording
-    s: Float[Numeric, " n"]  # mid-exposures, relative to the target as `Place.s`
+    frame: Int[Numeric, " n"]  # index in the recording
+    s: Float[Numeric, " n"]  # mid-exposures, relative to the target as `InstantLayout.s`
     half: Float[Numeric, " n"]  # half of the exposures, on the same clock
     present: Float[Numeric, " n"]  # 1, or 0 where there is none
 
 
-class Shots(NamedTuple):
-    """These frames as the camera gave them, as `features.FrameFeatures` has them."""
+class AdjacentFrames(NamedTuple):
+    """The images of these frames as the camera gave them, as in `features.FrameFeatures`."""
 
     grey: Float[Numeric, "n pixels"]
     intensity: Float[Numeric, "n pixels"]
@@ -56,33 +69,79 @@ class Shots(NamedTuple):
     gain: Float[Numeric, " n"]
 
 
-class _Seen(NamedTuple):
-    """What shots tell of the target's points, each (n, h, w)."""
+class _FrameEvidence(NamedTuple):
+    """Evidence of frames on the target's points, each (n, h, w)."""
 
     level: Float[Array, "n h w"]  # ln(I + I0)
     V: Float[Array, "n h w"]  # its variance
-    clear: Float[Array, "n h w"]  # 1 where it is believed: unclipped and blurred
-    clipped: Message  # what clipped pixels tell of B
+    weight: Float[Array, "n h w"]  # 1 where it is used: unclipped and blurred
+    clipped: Message  # of clipped pixels on B
 
 
-class _Side(NamedTuple):
+class _ClippedSide(NamedTuple):
     """Clipped pixels as `smoother.one_sided_message` reads them."""
 
     side: Float[Array, "n h w"]  # +1, -1: B lies above, below `bound`; 0: nothing known
     bound: Float[Array, "n h w"]
 
 
-def samples_for(moved: float) -> int:
-    """How many samples of an exposure are needed in which points move that far (px)."""
-    if moved < BLURRED:
+def choose_samples(moved: float) -> int:
+    """Choose the number of samples of an exposure in which points move that far (px)."""
+    if moved < BLURRED_PX:
         return 1
-    return next((n for n in SAMPLES if n * PER_SAMPLE >= moved), SAMPLES[-1])
+    return next((n for n in SAMPLE_COUNTS if n * MAX_SAMPLE_PX >= moved), SAMPLE_COUNTS[-1])
 
 
-def smeared(L: Array, D: Array) -> tuple[Array, Array]:
-    """B (n, h, w), and the shares (n, j, h, w) of the samples in it.
+class FrameExposures:
+    """The exposures of a recording's frames.
 
-    L is (h, w), D are displacements (n, j, h, w, 2) of x and y.
+    Args:
+        recording: The recording.
+        params: Parameters of `mc`.
+        speed: Speed of the moving points, px/s.
+
+    Attributes:
+        mid: (frames,) the first whole microsecond after mid-exposure.
+        samples: Samples of each exposure; None where images need no constraints.
+    """
+
+    def __init__(self, recording: Recording, params: Params, speed: float):
+        clock = Clock.of(recording, Timing.of(params))
+        self.mid = np.ceil(clock.mid).astype(np.int64) + clock.origin
+        self._half = np.rint((clock.right - clock.left) / 2).astype(np.int64)  # us
+        moved = FASTEST * speed * 2e-6 * float(self._half.max(initial=0))
+        samples = choose_samples(moved) if params.deblur else 1
+        wanted = samples > 1 or (float(params.margin) > 0 and params.one_sided)
+        self.samples = samples if params.integrate and wanted else None
+
+    def __call__(self, t: int, instants: Instants) -> AdjacentExposures:
+        """Return the exposures next to a target at a time (us), whose instants are given."""
+        after = int(np.searchsorted(self.mid, t, "right"))
+        here = int(np.searchsorted(self.mid, t, "left"))
+        frame, present = np.array([here - 1, after]), np.array([here > 0, after < len(self.mid)])
+        if here < after:  # the farther one gives way to that at this time
+            far = np.where(present, np.abs(self.mid[frame.clip(0, len(self.mid) - 1)] - t), 1 << 62)
+            frame[far.argmax()], present[far.argmax()] = here, True
+        frame = frame.clip(0, max(len(self.mid) - 1, 0)).astype(np.int32)
+        mid, half = self.mid[frame], self._half[frame]
+        begin, end = instants.relative_times(mid - half), instants.relative_times(mid + half)
+        return AdjacentExposures(
+            frame,
+            np.where(present, instants.relative_times(mid), 0).astype(np.float32),
+            ((end - begin) / 2).astype(np.float32),
+            present.astype(np.float32),
+        )
+
+
+def smear_jax(L: Array, D: Array) -> tuple[Array, Array]:
+    """Average an image over exposures; differentiable.
+
+    Args:
+        L: (h, w) log intensity.
+        D: (n, j, h, w, 2) displacements along x and y at the samples of each exposure, px.
+
+    Returns:
+        B (n, h, w), and the shares (n, j, h, w) of the samples in it.
     """
     h, w = L.shape
     n, j = D.shape[:2]
@@ -92,8 +151,8 @@ def smeared(L: Array, D: Array) -> tuple[Array, Array]:
     return jax.scipy.special.logsumexp(moved, axis=1) - np.log(j), jax.nn.softmax(moved, axis=1)
 
 
-def returned(error: Array, shares: Array, D: Array) -> Array:
-    """Errors (n, h, w) of B, brought back to the points of L that it averaged: (h, w)."""
+def smear_adjoint_jax(error: Array, shares: Array, D: Array) -> Array:
+    """Bring errors (n, h, w) of B back to the points of L that it averaged: (h, w)."""
     n, j, h, w = shares.shape
     y, x = jnp.arange(h)[:, None], jnp.arange(w)
     Y, X = (y + D[..., 1]).reshape(-1, h, w), (x + D[..., 0]).reshape(-1, h, w)
@@ -111,7 +170,7 @@ def _smear(begin, end, L, D, B, shares):
                 total = np.float32(0)
                 for j in range(count):
                     X, Y = np.float32(x) - D[k, j, y, x, 0], np.float32(y) - D[k, j, y, x, 1]
-                    _, x0, y0, x1, y1, fx, fy = around(X, Y, h, w)
+                    x0, y0, x1, y1, fx, fy = bilinear_cell(X, Y, h, w)
                     top = (one - fx) * L[y0, x0] + fx * L[y0, x1]
                     bottom = (one - fx) * L[y1, x0] + fx * L[y1, x1]
                     shares[k, j, y, x] = np.exp((one - fy) * top + fy * bottom)
@@ -122,7 +181,7 @@ def _smear(begin, end, L, D, B, shares):
 
 
 @njit_noalloc
-def _return(begin, end, error, shares, D, out):
+def _smear_adjoint(begin, end, error, shares, D, out):
     n, count, h, w, _ = D.shape
     one = np.float32(1)
     for y in range(begin, end):
@@ -131,43 +190,38 @@ def _return(begin, end, error, shares, D, out):
             for k in range(n):
                 for j in range(count):
                     X, Y = np.float32(x) + D[k, j, y, x, 0], np.float32(y) + D[k, j, y, x, 1]
-                    _, x0, y0, x1, y1, fx, fy = around(X, Y, h, w)
-                    a, b = (
-                        error[k, y0, x0] * shares[k, j, y0, x0],
-                        error[k, y0, x1] * shares[k, j, y0, x1],
-                    )
-                    c, d = (
-                        error[k, y1, x0] * shares[k, j, y1, x0],
-                        error[k, y1, x1] * shares[k, j, y1, x1],
-                    )
+                    x0, y0, x1, y1, fx, fy = bilinear_cell(X, Y, h, w)
+                    part, e = shares[k, j], error[k]
+                    a, b = e[y0, x0] * part[y0, x0], e[y0, x1] * part[y0, x1]
+                    c, d = e[y1, x0] * part[y1, x0], e[y1, x1] * part[y1, x1]
                     total += (one - fy) * ((one - fx) * a + fx * b) + fy * ((one - fx) * c + fx * d)
             out[y, x] = total
 
 
-def _quickly_smeared(L: NDArray, D: NDArray) -> tuple[NDArray, NDArray]:
-    """`smeared`, in loops."""
+def smear(L: NDArray, D: NDArray) -> tuple[NDArray, NDArray]:
+    """Average an image over exposures, as `smear_jax` does."""
     B, shares = np.empty((len(D), *L.shape), np.float32), np.empty(D.shape[:-1], np.float32)
     run_over_rows(_smear, len(L), L, D, B, shares)
     return B, shares
 
 
-def _quickly_returned(error: NDArray, shares: NDArray, D: NDArray) -> NDArray:
-    """`returned`, in loops."""
+def smear_adjoint(error: NDArray, shares: NDArray, D: NDArray) -> NDArray:
+    """Bring errors of B back to the points of L, as `smear_adjoint_jax` does."""
     out = np.empty(error.shape[1:], np.float32)
-    run_over_rows(_return, len(out), error, shares, D, out)
+    run_over_rows(_smear_adjoint, len(out), error, shares, D, out)
     return out
 
 
-def _shifts(taken: Taken, paths: Array, samples: int) -> Array:
-    """D (n, samples, h, w, 2)."""
-    s, half = jnp.asarray(taken.s), jnp.asarray(taken.half)
+def exposure_displacements(exposures: AdjacentExposures, paths: Array, samples: int) -> Array:
+    """Return D (n, samples, h, w, 2), px, along paths (h, w, 4)."""
+    s, half = jnp.asarray(exposures.s), jnp.asarray(exposures.half)
     at = s[:, None] + half[:, None] * ((jnp.arange(samples) + 0.5) / samples * 2 - 1)
-    whole = displaced(paths, at.reshape(-1)).reshape(*at.shape, *paths.shape[:2], 2)
-    return whole - displaced(paths, s)[:, None]
+    whole = displacements(paths, at.reshape(-1)).reshape(*at.shape, *paths.shape[:2], 2)
+    return whole - displacements(paths, s)[:, None]
 
 
-def _discord(D: Array) -> Array:
-    """By how much (px) points that met at x within an exposure move in other ways, (n, h, w).
+def _motion_disagreement(D: Array) -> Array:
+    """Return the difference (px) in motion of points that met within an exposure, (n, h, w).
 
     At the edges of moving things the mean along one path is not what the frame has seen.
     """
@@ -182,78 +236,91 @@ def _discord(D: Array) -> Array:
     return found
 
 
-def _look(
-    params: Params, taken: Taken, shots: Shots, paths: Array, D: Array, B: Array, fused: Fused
-) -> _Seen:
-    """What shots tell; B is what they would show of the image."""
+class ExposureModel(NamedTuple):
+    """The frames next to a target, and the paths of its points."""
+
+    exposures: AdjacentExposures
+    frames: AdjacentFrames
+    paths: Float[Numeric, "h w 4"]  # px
+
+
+def _frame_evidence(
+    params: Params, model: ExposureModel, D: Array, B: Array, fused: FusedImage
+) -> _FrameEvidence:
+    """Return the evidence of frames; B is what they would show of the image."""
+    exposures, frames, paths = model
     _, h, w = B.shape
-    Y, X = places(paths, jnp.asarray(taken.s))
-    light = jnp.asarray(shots.intensity) + params.I0
-    own = jnp.asarray(taken.s)[:, None, None] == 0
-    inside = within(Y, X, h, w) * jnp.asarray(taken.present)[:, None, None]
-    inside = inside * jnp.where(own, 1, fused.visible)
+    Y, X = positions(paths, jnp.asarray(exposures.s))
+    light = jnp.asarray(frames.intensity) + params.I0
+    at_target = jnp.asarray(exposures.s)[:, None, None] == 0
+    inside = is_inside(Y, X, h, w) * jnp.asarray(exposures.present)[:, None, None]
+    inside = inside * jnp.where(at_target, 1, fused.visible)
     moved = jnp.sqrt(((D[:, -1] - D[:, 0]) ** 2).sum(-1) + 1e-12)
-    blurred = jnp.clip((moved - BLURRED) / BLURRED, 0, 1)
-    blurred = blurred / (1 + (_discord(D) / DISCORD) ** 2)
+    blurred = jnp.clip((moved - BLURRED_PX) / BLURRED_PX, 0, 1)
+    blurred = blurred / (1 + (_motion_disagreement(D) / DISAGREEMENT_PX) ** 2)
 
     def read(values: Array) -> Array:
         return sample(values.reshape(-1, h, w), Y, X)
 
     # A clipped pixel acts as the Gaussian that gives the moments of the truncated one.
-    side = read(clipped_side(params, shots)) * inside * params.one_sided
-    row = _Side(side, read(clipping_bound(params, shots)))
+    side = read(clipped_side(params, frames)) * inside * params.one_sided
+    row = _ClippedSide(side, read(clipping_bound(params, frames)))
     state = Gaussian(B, jnp.broadcast_to(fused.P, B.shape))
-    said, _ = one_sided_message(state, row, params.sigma_floor**2)
-    return _Seen(
+    message, _ = one_sided_message(state, row, params.sigma_floor**2)
+    return _FrameEvidence(
         read(jnp.log(light)),
         (params.sigma_pixel * read(1 / light)) ** 2 + 1e-4,
-        read(unclipped(params, shots)) * inside * blurred,
-        jax.tree.map(lambda part: jnp.where(side == 0, 0, part), said),
+        read(unclipped_weight(params, frames)) * inside * blurred,
+        jax.tree.map(lambda part: jnp.where(side == 0, 0, part), message),
     )
 
 
-def _weigh(params: Params, seen: _Seen, B: Array) -> tuple[Array, Array]:
-    """What shots say of B: the pull, which is information times error, and the information."""
-    slope = jax.vmap(steepness)(B)
-    V = seen.V + params.sigma_place**2 * slope + params.sigma_between**2
-    square = (seen.level - B) ** 2 / V
-    hidden = (blur(square, MISFIT) / params.tolerance) ** 2
-    W = seen.clear / V / (1 + hidden) / (1 + square / params.robust)
-    pull = W * (seen.level - B) + seen.clipped.h - seen.clipped.J * B
-    return pull, (W + seen.clipped.J).sum(0)
+def _pull_and_information(
+    params: Params, evidence: _FrameEvidence, B: Array
+) -> tuple[Array, Array]:
+    """Return information times error (n, h, w) of B, and the information (h, w)."""
+    steepness = jax.vmap(squared_gradient)(B)
+    V = evidence.V + params.sigma_place**2 * steepness + params.sigma_between**2
+    square = (evidence.level - B) ** 2 / V
+    hidden = (blur_jax(square, RESIDUAL_SIGMA_PX) / params.tolerance) ** 2
+    W = evidence.weight / V / (1 + hidden) / (1 + square / params.robust)
+    clipped = evidence.clipped
+    pull = W * (evidence.level - B) + clipped.h - clipped.J * B
+    return pull, (W + clipped.J).sum(0)
 
 
-def _lost(seen: _Seen, image: Array, B: Array) -> Array:
-    """What exposures smear, squared."""
-    lost = (seen.clear * (B - image) ** 2).sum(0) / jnp.maximum(seen.clear.sum(0), 1)
-    return blur(lost, MISFIT)
+def _squared_blur(evidence: _FrameEvidence, image: Array, B: Array) -> Array:
+    """Return the squared change (h, w) of an image by the blur of exposures."""
+    total = (evidence.weight * (B - image) ** 2).sum(0)
+    return blur_jax(total / jnp.maximum(evidence.weight.sum(0), 1), RESIDUAL_SIGMA_PX)
 
 
-def constrain_purely(
-    params: Params, fused: Fused, paths: Array, taken: Taken, shots: Shots, samples: int
-) -> Fused:
-    """An image held to what frames integrated and to clipped pixels; differentiable.
+def constrain_image_jax(
+    params: Params, fused: FusedImage, model: ExposureModel, samples: int
+) -> FusedImage:
+    """Fit an image to exposures and clipped pixels; differentiable.
 
     Args:
-        params: Its `smear` says which part of what an exposure smears is in doubt.
+        params: Parameters of `mc`.
         fused: The image.
-        paths: Of all pixels, (h, w, 4).
-        taken: When the frames were taken.
-        shots: The frames.
-        samples: Of each exposure.
+        model: The frames, and the paths of the image's points.
+        samples: Samples of each exposure.
+
+    Returns:
+        The image with other `L` and `P`.
     """
-    D = _shifts(taken, paths, samples)
+    D = exposure_displacements(model.exposures, model.paths, samples)
     L, P = fused.L.astype(D.dtype), fused.P.astype(D.dtype)
-    seen = _look(params, taken, shots, paths, D, smeared(L, D)[0], fused)
+    evidence = _frame_evidence(params, model, D, smear_jax(L, D)[0], fused)
 
     def step(image: Array, _: None) -> tuple[Array, None]:
-        B, shares = smeared(image, D)
-        pull, information = _weigh(params, seen, B)
-        pull = (L - image) / P + returned(pull, shares, D)
+        B, shares = smear_jax(image, D)
+        pull, information = _pull_and_information(params, evidence, B)
+        pull = (L - image) / P + smear_adjoint_jax(pull, shares, D)
         return image + pull / (1 / P + information), None
 
-    image, _ = jax.lax.scan(step, L, None, length=STEPS)
-    P = P + params.smear * _lost(seen, image, smeared(image, D)[0])
+    image, _ = jax.lax.scan(step, L, None, length=N_STEPS)
+    P = P + params.smear * _squared_blur(evidence, image, smear_jax(image, D)[0])
     return dataclasses.replace(fused, L=image, P=P)
 
 
@@ -261,23 +328,24 @@ def _single(values: Any) -> NDArray[np.float32]:
     return np.asarray(values, np.float32)
 
 
-_shifts_now = jax.jit(_shifts, static_argnums=2)
-_look_now, _weigh_now, _lost_now = jax.jit(_look), jax.jit(_weigh), jax.jit(_lost)
+_compiled_displacements = jax.jit(exposure_displacements, static_argnums=2)
+_compiled_evidence, _compiled_pull = jax.jit(_frame_evidence), jax.jit(_pull_and_information)
+_compiled_squared_blur = jax.jit(_squared_blur)
 
 
-def constrain(
-    params: Params, fused: Fused, paths: Any, taken: Taken, shots: Shots, samples: int
-) -> Fused:
-    """The same as `constrain_purely`, in loops."""
+def constrain_image(
+    params: Params, fused: FusedImage, model: ExposureModel, samples: int
+) -> FusedImage:
+    """Fit an image to exposures and clipped pixels, as `constrain_image_jax` does."""
     L, P = _single(fused.L), _single(fused.P)
-    D = _single(_shifts_now(taken, paths, samples))
-    B, _ = _quickly_smeared(L, D)
-    seen, image = _look_now(params, taken, shots, paths, D, B, fused), L
-    for _ in range(STEPS):
-        B, shares = _quickly_smeared(image, D)
-        pull, information = map(_single, _weigh_now(params, seen, B))
-        back = _quickly_returned(pull, shares, D)
+    D = _single(_compiled_displacements(model.exposures, model.paths, samples))
+    B, _ = smear(L, D)
+    evidence, image = _compiled_evidence(params, model, D, B, fused), L
+    for _ in range(N_STEPS):
+        B, shares = smear(image, D)
+        pull, information = map(_single, _compiled_pull(params, evidence, B))
+        back = smear_adjoint(pull, shares, D)
         image = image + ((L - image) / P + back) / (1 / P + information)
-    B, _ = _quickly_smeared(image, D)
-    P = P + _single(params.smear) * _single(_lost_now(seen, image, B))
+    B, _ = smear(image, D)
+    P = P + _single(params.smear) * _single(_compiled_squared_blur(evidence, image, B))
     return dataclasses.replace(fused, L=jnp.asarray(image), P=jnp.asarray(P))

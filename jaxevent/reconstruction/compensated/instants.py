@@ -1,75 +1,177 @@
-"""At which instants around a target time images are compared."""
+"""Instants around a target time at which images are compared, and the clock that they are put on.
+
+The clock goes as fast as the scene moves. Where the camera speeds up, slows down or stops, all
+points do so together. Trajectories that are parabolas of time miss that over a few frames. Events
+come in proportion to motion, so parabolas of the number of events do not miss it. Where objects
+move independently, no clock suits all of them, and the clock is time. Parts of the image decide
+between both: the rate of events in one part is regressed on the rate in all others.
+"""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.reconstruction.compensated.course import TIME, Course
+from jaxevent.recording import Recording
 
-OFFSETS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # in steps, of instants from the target
-STEP = 0.6  # px that what moves does so in a step
-NEAR = 6.0  # px that it may move between the target and a further frame
-FRAMES = (2, 8)  # on either side: at least, at most
-NEAREST = 2.2  # steps: the horizon at which motion is first sought
-RESTING = 0.1  # of the mean rate of events, below which a scene is at rest
-ROOM = 4  # numbers of instants are multiples, to compile few shapes
+GRID_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # distances of instants from the target
+STEP_PX = 0.6  # motion within a step of the grid
+MAX_FRAME_MOTION_PX = 6.0  # between the target and a frame beyond the nearest ones
+MIN_FRAMES, MAX_FRAMES = 2, 8  # on either side of the target
+FIRST_HORIZON_STEPS = 2.2  # the horizon at which motion is first sought
+REST_RATE = 0.1  # of the mean rate of events, below which a scene is at rest
+COUNT_MULTIPLE = 4  # numbers of instants are multiples, to compile few shapes
+MIN_STEP_US = 200
+
+MAX_EVENT_SHARE = 0.9  # of the clock: time never stands still
+N_SEGMENTS = 8  # of a recording, in which parts of the image are compared
+SEGMENT_FRAMES = 4  # intervals of frames, the length of a segment
+N_PARTS, N_BINS = 4, 16  # of the image along each axis, and of a segment
+N_CACHED_TIMES = 4096  # times whose number of earlier events is remembered
+MIN_RATE_DEVIATION = 0.05  # deviations of the rate, as a part of it, that do not matter
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionClock:
+    """A monotone map from time to motion time: a weighted mean of time and the event count.
+
+    Over the whole recording it goes as fast as time.
+    """
+
+    count_before: Callable[[int], int]  # events before a time (us)
+    origin: int  # us
+    event_interval: float  # us, mean over the recording
+    event_share: float  # weight of the event count, 0..1
+
+    def __call__(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the motion time (us) at times (us)."""
+        elapsed = np.asarray(times - self.origin, float)
+        if not self.event_share:
+            return elapsed
+        counts = np.array([self.count_before(t) for t in times.tolist()], float)
+        return (1 - self.event_share) * elapsed + self.event_share * self.event_interval * counts
+
+    def relative_rate(self, begin: int, end: int) -> float:
+        """Return the rate of events between two times (us), in units of the mean rate."""
+        if not (self.event_interval and end > begin):
+            return 1.0
+        count = self.count_before(end) - self.count_before(begin)
+        return count * self.event_interval / (end - begin)
+
+
+TIME_CLOCK = MotionClock(lambda _: 0, 0, 0.0, 0.0)
+
+
+def fit_motion_clock(recording: Recording, span: tuple[int, int], interval: int) -> MotionClock:
+    """Fit the motion clock of a recording.
+
+    Args:
+        recording: The recording.
+        span: First and last time with data, us.
+        interval: Time between frames, us.
+
+    Returns:
+        The clock.
+    """
+    first, last = span
+    length = min(SEGMENT_FRAMES * interval, last - first)
+    begins = np.linspace(first, last - length, N_SEGMENTS).astype(np.int64)
+    counts = [_count_parts(recording, int(begin), length) for begin in np.unique(begins)]
+    event_interval = (recording.stop - recording.start) / max(len(recording.events), 1)
+    # Targets share instants, and formats that are decoded are slow to search.
+    count_before = functools.lru_cache(N_CACHED_TIMES)(recording.events.index)
+    return MotionClock(count_before, first, event_interval, common_share(np.stack(counts)))
+
+
+def common_share(counts: NDArray[np.floating]) -> float:
+    """Estimate how far the parts of the image move in common.
+
+    Returns the slope of a regression: of the deviation of a part's rate of events from a constant
+    one, on that of all other parts.
+
+    Args:
+        counts: (segments, parts, bins) numbers of events.
+
+    Returns:
+        0 for independent parts, to `MAX_EVENT_SHARE`.
+    """
+    total = counts.sum((1, 2), keepdims=True)
+    own, rest = counts.sum(2, keepdims=True), counts.sum(1, keepdims=True) - counts
+    bins = counts.shape[2]
+    here = counts / np.maximum(own, 1) * bins - 1
+    there = rest / np.maximum(total - own, 1) * bins - 1
+    least = MIN_RATE_DEVIATION**2
+    slope = (own * here * there).sum() / max((own * (there**2 + least)).sum(), 1e-12)
+    return float(min(max(slope, 0.0), MAX_EVENT_SHARE))
+
+
+def _count_parts(recording: Recording, begin: int, length: int) -> NDArray[np.floating]:
+    """Count the events of a segment, (parts, bins)."""
+    source = recording.events
+    events = source[source.index(begin) : source.index(begin + length)]
+    row = events.y.astype(np.int64) * N_PARTS // recording.height
+    column = events.x.astype(np.int64) * N_PARTS // recording.width
+    bin_ = (events.t - begin) * N_BINS // max(length, 1)
+    cell = (row * N_PARTS + column) * N_BINS + bin_
+    counts = np.bincount(cell, minlength=N_PARTS**2 * N_BINS)
+    return counts.reshape(N_PARTS**2, N_BINS).astype(float)
 
 
 @dataclasses.dataclass(frozen=True)
 class Instants:
-    """Those of one target: times (us), which is the target and which hold frames.
+    """The instants of one target, sorted, and their times on a clock."""
 
-    `s` are the times relative to the target by the scene's course, -1..1; `unit` (s) is what 1
-    stands for.
-    """
-
-    t: NDArray[np.int64]
-    own: int
-    before: int  # of the nearest frames; where there is none on a side, the other one
+    t: NDArray[np.int64]  # us
+    target: int  # index of the target
+    before: int  # index of the nearest frames; where there is none on a side, the other one
     after: int
-    s: NDArray[np.float32]
-    unit: float
-    first: float  # the horizon, in s, at which motion is first sought
-    course: Course
-    # How far the scene is at rest between the target and frames that are on one side of it alone,
-    # 0..1; 0 where they are on both.
+    s: NDArray[np.float32]  # times relative to the target on the clock, -1..1
+    unit: float  # s, what 1 stands for
+    first_horizon: float  # in units of `s`, at which motion is first sought
+    clock: MotionClock
+    # 1 where the scene is at rest between the target and frames on one side of it alone, else 0;
+    # 0 where frames are on both sides.
     rest: float = 0.0
 
-    def at(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Times (us) as those of `s`."""
-        both = self.course(np.append(times, self.t[self.own]))
+    def relative_times(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Convert times (us) to those of `s`."""
+        both = self.clock(np.append(times, self.t[self.target]))
         return (both[:-1] - both[-1]) * 1e-6 / self.unit
 
-    def pace(self, over: int) -> float:
-        """How much of s passes per s at the target, within so many us before and after it."""
-        begin, end = self.at(self.t[self.own] + np.array([-over, over]))
-        return float(end - begin) / (2e-6 * over)
+    def clock_rate(self, span: int) -> float:
+        """Return the change of `s` per second, over `span` us before and after the target."""
+        begin, end = self.relative_times(self.t[self.target] + np.array([-span, span]))
+        return float(end - begin) / (2e-6 * span)
 
-    def by(self, course: Course) -> "Instants":
-        """The same on another clock."""
-        s, unit = _relative(course, self.t, self.own)
-        return dataclasses.replace(self, s=s, unit=unit, course=course)
+    def with_clock(self, clock: MotionClock) -> "Instants":
+        """Put the instants on another clock."""
+        s, unit = _relative_times(clock, self.t, self.target)
+        return dataclasses.replace(self, s=s, unit=unit, clock=clock)
 
     def __len__(self) -> int:
         return len(self.t)
 
 
-def _relative(
-    course: Course, times: NDArray[np.int64], own: int
+def _relative_times(
+    clock: MotionClock, times: NDArray[np.int64], target: int
 ) -> tuple[NDArray[np.float32], float]:
-    """Times (us) relative to that of a target, in -1..1, and what 1 stands for in s."""
-    gone = course(times)
-    gone -= gone[own]
-    unit = max(float(np.abs(gone).max()), 1.0)
-    return (gone / unit).astype(np.float32), unit * 1e-6
+    """Return times (us) relative to that of a target, -1..1, and what 1 stands for (s)."""
+    elapsed = clock(times)
+    elapsed -= elapsed[target]
+    unit = max(float(np.abs(elapsed).max()), 1.0)
+    return (elapsed / unit).astype(np.float32), unit * 1e-6
 
 
 class Schedule:
-    """Chooses instants: frames around a target, and between the two next to it a grid of steps.
+    """Chooses the instants of a target: frames around it, and a grid between the nearest two.
 
-    `speed` (px/s) is that of what moves.
+    Args:
+        frames: (frames,) times of frames, us.
+        span: First and last time with data, us.
+        speed: Speed of the moving points, px/s.
+        clock: Clock of the instants.
     """
 
     def __init__(
@@ -77,60 +179,77 @@ class Schedule:
         frames: NDArray[np.int64],
         span: tuple[int, int],
         speed: float,
-        course: Course = TIME,
+        clock: MotionClock = TIME_CLOCK,
     ):
-        self.frames, self.span, self.course = frames, span, course
+        self.frames, self.span, self.clock = frames, span, clock
         gap = float(np.median(np.diff(frames))) if len(frames) > 1 else float(span[1] - span[0])
         self.speed = speed = max(speed, 1e-3)
-        self.step = max(round(min(STEP / speed * 1e6, gap / 2)), 200)
-        self.reach = NEAR / speed * 1e6
+        self.step = max(round(min(STEP_PX / speed * 1e6, gap / 2)), MIN_STEP_US)  # us
+        self.max_distance = MAX_FRAME_MOTION_PX / speed * 1e6  # us, of further frames
 
     def __call__(self, t: int) -> Instants:
-        frames, step = self.frames, self.step
+        """Choose the instants of the target at a time (us)."""
+        frames = self.frames
         right = int(np.searchsorted(frames, t, "right"))  # of frames at t, none is left or right
         left = int(np.searchsorted(frames, t, "left"))
-        chosen = set()
-        for side in (range(left - 1, -1, -1), range(right, len(frames))):
-            for n, k in enumerate(side):
-                if n >= FRAMES[1] or (n >= FRAMES[0] and abs(frames[k] - t) > self.reach):
-                    break
-                chosen.add(int(frames[k]))
-        low = int(frames[left - 1]) if left > 0 else self.span[0]
-        high = int(frames[right]) if right < len(frames) else self.span[1]
-        # On a grid, so that targets share instants.
-        first, middle = self.span[0], round((t - self.span[0]) / step)
-        for o in OFFSETS:
-            for at in (first + (middle - o) * step, first + (middle + o) * step):
-                if low < at < high and abs(at - t) > step // 2:
-                    chosen.add(at)
-        chosen.add(t)
-        times = np.array(sorted(chosen), np.int64)
-        own = int(np.searchsorted(times, t))
-        s, unit = _relative(self.course, times, own)
-        at = [
+        times = np.array(sorted({t, *self._near_frames(t), *self._grid(t)}), np.int64)
+        target = int(np.searchsorted(times, t))
+        s, unit = _relative_times(self.clock, times, target)
+        nearest = [
             int(np.searchsorted(times, frames[k]))
             for k in (left - 1, right)
             if 0 <= k < len(frames)
         ]
-        before, after = (at[0], at[-1]) if at else (own, own)
+        before, after = (nearest[0], nearest[-1]) if nearest else (target, target)
         far = np.sort(np.abs(s))
         # At least two instants on either side, where there are.
-        horizon = max(NEAREST * step * 1e-6 / unit, float(far[min(4, len(far) - 1)]))
+        first_step = FIRST_HORIZON_STEPS * self.step * 1e-6 / unit
+        horizon = float(min(max(first_step, float(far[min(4, len(far) - 1)])), 1))
         rest = 0.0
-        if len(at) == 1 and left == right:
-            rate = self.course.rate(*sorted((int(times[at[0]]), t)))
-            rest = 1 / (1 + (rate / RESTING) ** 2)
-        horizon = float(min(horizon, 1))
-        return Instants(times, own, before, after, s, unit, horizon, self.course, rest)
+        if len(nearest) == 1 and left == right:
+            rate = self.clock.relative_rate(*sorted((int(times[nearest[0]]), t)))
+            rest = 1 / (1 + (rate / REST_RATE) ** 2)
+        return Instants(times, target, before, after, s, unit, horizon, self.clock, rest)
+
+    def _near_frames(self, t: int) -> set[int]:
+        """Return the times (us) of the frames to use around a time (us)."""
+        frames, chosen = self.frames, set()
+        right = int(np.searchsorted(frames, t, "right"))
+        left = int(np.searchsorted(frames, t, "left"))
+        for side in (range(left - 1, -1, -1), range(right, len(frames))):
+            for n, k in enumerate(side[:MAX_FRAMES]):
+                if n >= MIN_FRAMES and abs(frames[k] - t) > self.max_distance:
+                    break
+                chosen.add(int(frames[k]))
+        return chosen
+
+    def _grid(self, t: int) -> set[int]:
+        """Return the times (us) of a common grid, between the frames next to a time (us)."""
+        frames, step, (first, last) = self.frames, self.step, self.span
+        right = int(np.searchsorted(frames, t, "right"))
+        left = int(np.searchsorted(frames, t, "left"))
+        low = int(frames[left - 1]) if left > 0 else first
+        high = int(frames[right]) if right < len(frames) else last
+        middle = round((t - first) / step)
+        grid = {first + (middle + sign * n) * step for n in GRID_STEPS for sign in (-1, 1)}
+        return {at for at in grid if low < at < high and abs(at - t) > step // 2}
 
 
-def speed_of(
+def measure_speed(
     images: Callable[[NDArray[np.int64]], NDArray], times: NDArray[np.int64], lag: int
 ) -> float:
-    """The speed (px/s) of what moves in the smoother's images, (T, H, W) of log intensity.
+    """Measure the speed of the moving points in the smoother's images.
 
-    Normal flow |dL/dt| / |grad L| between images at `times` and `lag` (us) later, a mean over
-    blocks of 4 x 4 pixels by their change; `lag` is shortened until the flow is below 2 px.
+    It is the normal flow |dL/dt| / |grad L|, a mean over blocks of 4 x 4 pixels weighted by the
+    squared change. The lag is halved until the flow is below 2 px.
+
+    Args:
+        images: A function from times (T,), us, to images (T, h, w) of log intensity.
+        times: (times,) us.
+        lag: Time between the images of a pair, us.
+
+    Returns:
+        The speed, px/s.
     """
     while True:
         both = images(np.concatenate([times, times + lag]))
@@ -139,32 +258,32 @@ def speed_of(
         gx = (mean[:, 1:-1, 2:] - mean[:, 1:-1, :-2]) / 2
         gy = (mean[:, 2:, 1:-1] - mean[:, :-2, 1:-1]) / 2
         change = np.abs(late - early)
-        slope = gx**2 + gy**2
-        step, steep, weight = (
-            _blocks(part) for part in (change * np.sqrt(slope), slope, change**2)
+        gradient2 = gx**2 + gy**2
+        product, steepness, weight = (
+            _block_means(part) for part in (change * np.sqrt(gradient2), gradient2, change**2)
         )
-        weight = weight * (steep > 1e-4)  # what is steeper than 1 % per px
-        flow = step / np.maximum(steep, 1e-4)
+        weight = weight * (steepness > 1e-4)  # of blocks steeper than 1 % per px
+        flow = product / np.maximum(steepness, 1e-4)
         moved = float((weight * flow).sum() / max(float(weight.sum()), 1e-12))
         if moved < 2 or lag < 1000:
             return moved / lag * 1e6
         lag //= 2
 
 
-def _blocks(images: NDArray) -> NDArray:
+def _block_means(images: NDArray) -> NDArray:
     h, w = (size // 4 * 4 for size in images.shape[1:])
     return images[:, :h, :w].reshape(len(images), h // 4, 4, w // 4, 4).mean((2, 4))
 
 
-def room_for(number: int) -> int:
-    """The number up to which a target's instants are filled."""
-    return -(-number // ROOM) * ROOM
+def padded_count(count: int) -> int:
+    """Return the number to which a target's instants are padded."""
+    return -(-count // COUNT_MULTIPLE) * COUNT_MULTIPLE
 
 
-def all_instants(targets: Sequence[Instants]) -> NDArray[np.int64]:
-    """Those of all targets (us), sorted; the last one fills them up to a power of two.
+def merge_instants(targets: Sequence[Instants]) -> NDArray[np.int64]:
+    """Merge the times (us) of several targets, sorted and padded to a power of two by the last.
 
-    So windows of a fit share their programs, each of which takes 15 s to compile.
+    Windows of a fit so share their programs, each of which takes 15 s to compile.
     """
     t = np.unique(np.concatenate([one.t for one in targets]))
     return np.pad(t, (0, (1 << (len(t) - 1).bit_length()) - len(t)), mode="edge")

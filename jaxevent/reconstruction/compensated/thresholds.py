@@ -1,14 +1,14 @@
-"""Thresholds of single pixels, learned from fused images.
+"""Contrast thresholds of single pixels, learned from fused images.
 
-No two pixels of a sensor have the same contrast thresholds. Along trajectories others see what a
-pixel saw, so the fused images tell by how much the log intensity at it changed, and its events by
-how many thresholds. Between two times, for every pixel,
+No two pixels of a sensor have the same contrast thresholds. Along trajectories other pixels see
+what a pixel saw, so fused images show the change of log intensity at it, and its events count it in
+thresholds. Between two times, for every pixel,
 
     M(t') - M(t) = (1 + d_on) c_on n_on - (1 + d_off) c_off n_off + noise,   d ~ N(0, sigma^2),
 
-with the variances of both images, those of the events' steps, and of what is left of a threshold at
-both ends. sigma is what both halves of the changes agree in, so it is that of left-out evidence;
-where it is small, or events are few, nothing is gained and all pixels stay alike.
+with the variances of both images, of the events' steps, and of the rest of a threshold at both
+ends. sigma is estimated from what both halves of the changes have in common. Where it is small, or
+events are few, nothing is gained and all pixels keep the common thresholds.
 """
 
 from collections.abc import Callable
@@ -18,44 +18,52 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from jaxevent.reconstruction.compensated.parameters import Params
+from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.stream import DeadTime, Stream, count_before, weigh
 from jaxevent.recording import Recording
 
-CHANGES = 8  # between pairs of images that are evenly spaced over a recording
-APART = 4  # intervals of frames, at most, between the images of a pair
-ENOUGH = 40.0  # events per pixel in all changes together; with fewer nothing is learned
-EXPECTED = 0.1  # standard deviation of d, before it is known
-LEAST = 0.05  # of it; pixels that are less unlike are averaged by the fusion as well
-AROUND = 4.0  # px, of the Gaussian over pixels that one is compared with
+N_CHANGES = 8  # between pairs of images that are evenly spaced over a recording
+MAX_FRAME_INTERVALS = 4  # between the images of a pair
+MIN_EVENTS = 40.0  # per pixel in all changes together; with fewer nothing is learned
+EXPECTED_SIGMA = 0.1  # standard deviation of d, before it is known
+MIN_SIGMA = 0.05  # of d; pixels that differ less are averaged by the fusion as well
+AROUND_SIGMA_PX = 4.0  # of the Gaussian over the pixels that one is compared with
 TAIL = 5.0  # standardised squares beyond which changes count less
-FACTORS = (0.5, 2.0)  # of the common threshold, at least and at most
+FACTOR_BOUNDS = (0.5, 2.0)  # on the common threshold
 
-Images = Callable[[int], tuple[NDArray, NDArray]]  # log intensity and variance at a time (us)
+ImageFunction = Callable[[int], tuple[NDArray, NDArray]]  # log intensity, variance at a time (us)
 
 
-class Changes(NamedTuple):
-    """Changes of log intensity, each (changes, pixels), and what events tell of them."""
+class LogChanges(NamedTuple):
+    """Changes of log intensity, each (changes, pixels), ln I."""
 
-    rest: NDArray[np.floating]  # what the common thresholds leave
-    on: NDArray[np.floating]  # what ON events tell, by the common threshold
-    off: NDArray[np.floating]  # OFF events, negative
+    rest: NDArray[np.floating]  # left by the events and the common thresholds
+    on: NDArray[np.floating]  # of ON events by the common threshold
+    off: NDArray[np.floating]  # of OFF events, negative
     V: NDArray[np.floating]  # the variance of `rest`
 
-    def part(self, rows: slice) -> "Changes":
-        """Some of them."""
-        return Changes(*(values[rows] for values in self))
+    def select(self, rows: slice) -> "LogChanges":
+        """Select some of the changes."""
+        return LogChanges(*(values[rows] for values in self))
 
 
-class Regressed(NamedTuple):
-    """Deviations of ON and OFF thresholds of pixels, each (2, pixels)."""
+class ThresholdDeviations(NamedTuple):
+    """Relative deviations of ON and OFF thresholds of pixels, each (2, pixels)."""
 
     d: NDArray[np.floating]
-    left: NDArray[np.floating]  # of their variance, 0..1: what changes did not tell
+    remaining: NDArray[np.floating]  # part of their prior variance that is left, 0..1
 
 
-def regress(changes: Changes, mismatch: float) -> Regressed:
-    """The mean of d, by robust ridge regression of every pixel."""
+def regress(changes: LogChanges, mismatch: float) -> ThresholdDeviations:
+    """Estimate the deviations d by robust ridge regression of every pixel.
+
+    Args:
+        changes: The changes.
+        mismatch: Prior standard deviation of d.
+
+    Returns:
+        The deviations.
+    """
     rest, on, off, V = changes
     W = 1 / (V + rest**2 / TAIL)
     A = (W * on * on).sum(0) + mismatch**-2
@@ -64,40 +72,40 @@ def regress(changes: Changes, mismatch: float) -> Regressed:
     a, b = (W * on * rest).sum(0), (W * off * rest).sum(0)
     det = A * C - B * B
     d = np.stack([C * a - B * b, A * b - B * a]) / det
-    return Regressed(d, np.stack([C, A]) / det / mismatch**2)
+    return ThresholdDeviations(d, np.stack([C, A]) / det / mismatch**2)
 
 
-def stand_out(found: Regressed, size: tuple[int, int]) -> Regressed:
-    """The same, as deviations from the pixels around. Errors of the scene's are common to these."""
+def local_deviation(found: ThresholdDeviations, size: tuple[int, int]) -> ThresholdDeviations:
+    """Subtract the mean of the pixels around: errors of the scene's motion are common to these."""
     d = found.d.reshape(2, *size)
-    smooth = gaussian_filter(d, (0, AROUND, AROUND))
+    smooth = gaussian_filter(d, (0, AROUND_SIGMA_PX, AROUND_SIGMA_PX))
     return found._replace(d=(d - smooth).reshape(found.d.shape))
 
 
-def spread(one: Regressed, other: Regressed) -> float:
-    """The standard deviation of deviations, from two regressions on different changes.
+def estimate_sigma(one: ThresholdDeviations, other: ThresholdDeviations) -> float:
+    """Estimate the standard deviation of d from two regressions on different changes.
 
-    Each finds the share 1 - left of them, and errors that do not go together.
+    Each finds the part 1 - `remaining` of d, with independent errors.
     """
-    common = (one.d * other.d).sum() / ((1 - one.left) * (1 - other.left)).sum().clip(1e-12)
-    return float(np.sqrt(max(common, 0.0)))
+    found = ((1 - one.remaining) * (1 - other.remaining)).sum().clip(1e-12)
+    return float(np.sqrt(max((one.d * other.d).sum() / found, 0.0)))
 
 
-def _times(recording: Recording, span: tuple[int, int]) -> list[tuple[int, int]]:
-    """Begins and ends (us) of changes that do not overlap."""
+def _change_times(recording: Recording, span: tuple[int, int]) -> list[tuple[int, int]]:
+    """Return begins and ends (us) of changes that do not overlap."""
     first, last = span
     assert recording.frames is not None
-    lag = (last - first) // CHANGES
+    lag = (last - first) // N_CHANGES
     if len(recording.frames) > 1:
-        lag = min(lag, APART * int(np.median(np.diff(recording.frames.t))))
-    begins = np.linspace(first, last - lag, CHANGES).astype(np.int64)
+        lag = min(lag, MAX_FRAME_INTERVALS * int(np.median(np.diff(recording.frames.t))))
+    begins = np.linspace(first, last - lag, N_CHANGES).astype(np.int64)
     return [(t, t + lag) for t in begins.tolist()]
 
 
-def _count(recording: Recording, begin: int, end: int, rho: float) -> NDArray[np.floating]:
-    """ON and OFF events (2, pixels) in between, those after a dead time (us) weighted for it."""
+def _count_events(recording: Recording, begin: int, end: int, rho: float) -> NDArray[np.floating]:
+    """Count ON and OFF events (2, pixels), weighted for a dead time `rho` (us)."""
     source = recording.events
-    # Of the pixels' events before as many as tell the gaps of nearly all.
+    # With enough events before the begin to know the gaps of nearly all pixels.
     rows = slice(source.index(2 * begin - end), source.index(end))
     stream = Stream.of(source[rows], recording.width)
     pixels = recording.width * recording.height
@@ -106,21 +114,28 @@ def _count(recording: Recording, begin: int, end: int, rho: float) -> NDArray[np
     return after - before
 
 
-def learn(
-    recording: Recording, params: Params, span: tuple[int, int], images: Images
+def learn_thresholds(
+    recording: Recording, params: Params, span: tuple[int, int], images: ImageFunction
 ) -> NDArray[np.float32] | None:
-    """Every pixel's ON and OFF thresholds (2, pixels) as parts of the common ones.
+    """Learn the ON and OFF thresholds of every pixel.
 
-    None where the events are too few, or what both halves of the changes say of pixels does not
-    agree in more than `LEAST`. `span` (us) is where the recording has data; `images` tells log
-    intensity and variance, of any shape.
+    Args:
+        recording: The recording.
+        params: Parameters of `mc`.
+        span: First and last time with data, us.
+        images: A function from a time (us) to log intensity and its variance, of any shape.
+
+    Returns:
+        (2, pixels) factors on the common thresholds. None where events are too few, or where both
+        halves of the changes do not have deviations above `MIN_SIGMA` in common.
     """
     c_on, c_off = float(params.c_on), float(params.c_off)
-    if not params.learn or span[1] - span[0] < CHANGES:
+    if not params.learn or span[1] - span[0] < N_CHANGES:
         return None
-    times = _times(recording, span)
-    counts = np.stack([_count(recording, *pair, 1e6 * float(params.rho_ref)) for pair in times], 1)
-    if counts.sum((0, 1)).mean() < ENOUGH:
+    times = _change_times(recording, span)
+    rho = 1e6 * float(params.rho_ref)  # us
+    counts = np.stack([_count_events(recording, *pair, rho) for pair in times], 1)
+    if counts.sum((0, 1)).mean() < MIN_EVENTS:
         return None
     known = {t: images(t) for t in sorted({t for pair in times for t in pair})}
     rest = np.stack([(known[b][0] - known[a][0]).ravel() for a, b in times])
@@ -128,11 +143,13 @@ def learn(
     on, off = c_on * counts[0], -c_off * counts[1]
     steps = float(params.sigma_event) ** 2 * (c_on * on - c_off * off)
     drift = float(params.sigma_bg) ** 2 * np.array([(b - a) * 1e-6 for a, b in times])[:, None]
-    changes = Changes(rest - on - off, on, off, P + steps + drift + c_on * c_off / 3)
+    changes = LogChanges(rest - on - off, on, off, P + steps + drift + c_on * c_off / 3)
     size = (recording.height, recording.width)
-    halves = (slice(0, CHANGES // 2), slice(CHANGES // 2, None))
-    found = spread(*(stand_out(regress(changes.part(half), EXPECTED), size) for half in halves))
-    if not found > LEAST:
+    halves = (slice(0, N_CHANGES // 2), slice(N_CHANGES // 2, None))
+    found = estimate_sigma(
+        *(local_deviation(regress(changes.select(half), EXPECTED_SIGMA), size) for half in halves)
+    )
+    if not found > MIN_SIGMA:
         return None
-    factors = 1 + stand_out(regress(changes, found), size).d
-    return factors.clip(*FACTORS).astype(np.float32)
+    factors = 1 + local_deviation(regress(changes, found), size).d
+    return factors.clip(*FACTOR_BOUNDS).astype(np.float32)

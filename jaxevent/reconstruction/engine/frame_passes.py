@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.reconstruction.clock import Clock
 from jaxevent.reconstruction.engine.bands import BandLayout
 from jaxevent.reconstruction.engine.frame_loop import (
     FrameLine,
@@ -28,6 +27,7 @@ from jaxevent.reconstruction.engine.smoothing import (
     SmoothingMethod,
     smoother_kernel,
 )
+from jaxevent.reconstruction.frames import Clock
 from jaxevent.reconstruction.stream import StreamState
 
 

@@ -25,12 +25,12 @@ from jaxevent.devices import full_precision, has_accelerator
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.locks import TurnLock
-from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.engine.loop import Images
 from jaxevent.reconstruction.engine.passes import DividedRecording, Passes
 from jaxevent.reconstruction.engine.pixel import Directions
 from jaxevent.reconstruction.engine.video import wants_kernel, without_kernel
 from jaxevent.reconstruction.features import Numeric
+from jaxevent.reconstruction.frames import Timing
 from jaxevent.reconstruction.windows import sorted_times
 from jaxevent.recording import Recording, Times
 
@@ -49,7 +49,7 @@ class Divided(abc.ABC):
     """
 
     def __init__(self, method: Any, recording: Recording, times: NDArray[np.int64], params: Any):
-        self.recording = DividedRecording(recording, Timing.of(params), method.filters)
+        self.recording = DividedRecording(recording, Timing.of(params), method.is_event_driven)
         self.method, self.dtype = method, self.recording.dtype
         self.pixels = recording.width * recording.height
         self.clock_offset = np.asarray(params.clock_offset)

@@ -46,7 +46,7 @@ _programs: dict[Any, tuple[Traced, Programs]] = {}
 
 def program_of(
     method: FilterMethod,
-    observe: Any,
+    frame_model: Any,
     params: Any,
     fixed: dict[str, NDArray],
     exposed: bool,
@@ -63,7 +63,7 @@ def program_of(
     about, programs = once(
         _programs,
         key,
-        lambda: (traced(method, observe, params, exposed, dtype, directions), Programs()),
+        lambda: (traced(method, frame_model, params, exposed, dtype, directions), Programs()),
     )
     given = [*host_inputs(about, params, fixed).values()]
     return programs.get(given, lambda: translated(about, params, fixed))
@@ -71,7 +71,7 @@ def program_of(
 
 def kernel_of(
     method: FilterMethod,
-    observe: Any,
+    frame_model: Any,
     params: Any,
     fixed: dict[str, NDArray],
     exposed: bool,
@@ -84,7 +84,7 @@ def kernel_of(
     It is compiled once for a machine.
     """
     program, modules, values = program_of(
-        method, observe, params, fixed, exposed, dtype, directions
+        method, frame_model, params, fixed, exposed, dtype, directions
     )
 
     def made() -> tuple[Source, ModuleType]:

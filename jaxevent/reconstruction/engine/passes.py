@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from jaxevent.codegen import run_over_rows
 from jaxevent.codegen.expressions import Untranslatable
 from jaxevent.errors import InputError
-from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.engine.bands import BandLayout
 from jaxevent.reconstruction.engine.entering import steps_of
 from jaxevent.reconstruction.engine.kernel import Kernel, kernel_of, program_of
@@ -26,8 +25,8 @@ from jaxevent.reconstruction.engine.loop import (
 )
 from jaxevent.reconstruction.engine.pixel import Directions
 from jaxevent.reconstruction.engine.timeline import NEVER, make_line
-from jaxevent.reconstruction.frames import FrameImages
-from jaxevent.reconstruction.memory import aligned
+from jaxevent.reconstruction.features import aligned
+from jaxevent.reconstruction.frames import FrameImages, Timing
 from jaxevent.reconstruction.stream import Stream, StreamState, weigh
 from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import ColumnSource, EventColumns, Recording
@@ -113,14 +112,14 @@ class DividedRecording:
         """
         fixed, clock = self.fixed(clock_offset), self.windows.clock
         return kernel_of(
-            method, method.observe, params, fixed, clock.exposed, self.dtype, self.layout.stride,
-            directions,
+            method, method.frame_model, params, fixed, clock.exposed, self.dtype,
+            self.layout.stride, directions,
         )  # fmt: skip
 
     def check(self, method: Any, params: Any, clock_offset: Any, directions: Directions) -> None:
         """Raise `Untranslatable` if there can be no such kernel."""
         fixed, exposed = self.fixed(clock_offset), self.windows.clock.exposed
-        program_of(method, method.observe, params, fixed, exposed, self.dtype, directions)
+        program_of(method, method.frame_model, params, fixed, exposed, self.dtype, directions)
 
     def fixed(self, clock_offset: Any) -> dict[str, NDArray]:
         """What is known with the parameters."""

@@ -33,9 +33,9 @@ class FilterMethod(Protocol):
     @property
     def name(self) -> str: ...
 
-    def initial_state(self, params: Any, observer: Any, points: Any) -> Any: ...
+    def init_from_frames(self, params: Any, frame_model: Any, points: Any) -> Any: ...
 
-    def at_pixel(
+    def step_and_readout(
         self, params: Any, frame: Any, state: Any, since: Any, near: Any, polarity: Any
     ) -> tuple[Any, Any, Any]: ...
 
@@ -139,7 +139,7 @@ def _abstract(exposed: bool, dtype: np.dtype) -> dict[str, jax.ShapeDtypeStruct]
 
 def traced(
     method: FilterMethod,
-    observe: Any,
+    frame_model: Any,
     params: Any,
     exposed: bool,
     dtype: Any,
@@ -162,21 +162,21 @@ def traced(
 
     def observed(params: Any, v: dict[str, Any]) -> tuple[Any, Point]:
         point = Point(*(v[f.name] for f in dataclasses.fields(Point)))
-        return observe(params, frames_of(v)), point
+        return frame_model(params, frames_of(v)), point
 
-    def begun(params: Any, observer: Any, point: Point) -> Any:
-        state = method.initial_state(params, observer, point.points(False))
+    def begun(params: Any, frame_model: Any, point: Point) -> Any:
+        state = method.init_from_frames(params, frame_model, point.points(False))
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (1,))[0], state)
 
     def start(params: Any, v: dict[str, Any]) -> Any:
         return begun(params, *observed(params, v))
 
     def at_point(params: Any, v: dict[str, Any], state: Any) -> Any:
-        observer, point = observed(params, v)
-        frame = jax.tree.map(scalar, observer(point.points(True)))
+        frame_model, point = observed(params, v)
+        frame = jax.tree.map(scalar, frame_model(point.points(True)))
         event = {name: v[name] for name in ("since", "near", "polarity")}
-        first = begun(params, observer, point)
-        return first, *method.at_pixel(params, frame, state, **event)
+        first = begun(params, frame_model, point)
+        return first, *method.step_and_readout(params, frame, state, **event)
 
     try:
         state = jax.eval_shape(start, params, given)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from jaxevent.codegen import run_over_rows
 from jaxevent.estimator import Estimate
 from jaxevent.progress import bar
-from jaxevent.reconstruction.clock import Clock, Timing
 from jaxevent.reconstruction.engine.frame_loop import (
     GivenFrames,
     filter_frames,
@@ -24,6 +23,7 @@ from jaxevent.reconstruction.engine.frame_passes import FramePasses, Stretch
 from jaxevent.reconstruction.engine.passes import DividedRecording
 from jaxevent.reconstruction.engine.room import ImageRoom
 from jaxevent.reconstruction.engine.smoothing import LATER, LINK, STATE, SmoothingMethod
+from jaxevent.reconstruction.frames import Clock, Timing
 from jaxevent.reconstruction.video import ImageSequence, P
 from jaxevent.recording import Recording
 
@@ -155,6 +155,6 @@ class SmoothedVideo(ImageSequence[P]):
         assert given is not None
         later = [np.zeros_like(states[0])]
         while len(links) > 1:
-            later.insert(0, self._method.through(links.pop(), later[0]))
+            later.insert(0, self._method.apply_message_map(links.pop(), later[0]))
         self._states, self._later = states, later
         self._smooth(last, given)

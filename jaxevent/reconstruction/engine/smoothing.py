@@ -1,6 +1,6 @@
 """A smoother as the text of functions of one pixel: translated, written and compiled.
 
-A smoother says what it does at one pixel in functions by name (`Smoother.of_pixel`). They read and
+A smoother consists of functions of one pixel, by name (`Smoother.pixel_functions`). They read and
 write the pixel's numbers: those of the frame that a pass has come to (`WORK`), and those that are
 kept of every frame (`ROW`, and what images need beside them).
 """
@@ -52,11 +52,11 @@ UNIFORM = {
 class SmoothingMethod(ImageMethod, Protocol):
     """What such a kernel is made of; see `smoother.Smoother`."""
 
-    def held_by_pixel(self, number: Any) -> dict[str, Any]: ...
+    def pixel_state_spec(self, number: Any) -> dict[str, Any]: ...
 
-    def through(self, link: NDArray, later: NDArray) -> NDArray: ...
+    def apply_message_map(self, link: NDArray, later: NDArray) -> NDArray: ...
 
-    def of_pixel(self, exposed: bool) -> dict[str, Callable[..., dict[str, Any]]]: ...
+    def pixel_functions(self, exposed: bool) -> dict[str, Callable[..., dict[str, Any]]]: ...
 
 
 HEAD = '''"""The functions of a smoother (`jaxevent.reconstruction.engine.smoothing`)."""
@@ -220,7 +220,7 @@ def _translated(
     for leaf in jax.tree.leaves(known):
         host.add_input(np.asarray(leaf))
     shape = jax.ShapeDtypeStruct((1, 1), dtype)
-    functions, of = method.of_pixel(exposed), dict[str, Function]()
+    functions, of = method.pixel_functions(exposed), dict[str, Function]()
 
     def tree(names: tuple[str, ...]) -> dict[str, Any]:
         return dict.fromkeys(names, shape)
@@ -228,7 +228,7 @@ def _translated(
     image, counts = tree(("grey", "intensity", "certainty")), tree(COUNTS)
     moved, seconds = tree(("moved_on", "moved_off")), tree(("seconds",))
     given: dict[str, Any] = {**image, **tree(("gain", "exists", "total", "inside"))}
-    held = jax.eval_shape(method.held_by_pixel, shape)
+    held = jax.eval_shape(method.pixel_state_spec, shape)
     state, said = held["state"], held["said"]
     try:
         frame = functools.partial(functions["frame"], known[:2])

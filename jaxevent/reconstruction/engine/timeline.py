@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.reconstruction.clock import Clock, rates
 from jaxevent.reconstruction.engine.loop import Line
 from jaxevent.reconstruction.engine.pixel import ROWS, Variant, pieces, variants
+from jaxevent.reconstruction.frames import Clock, rates
 
 NEVER = 1 << 45  # us, longer than any recording and within an event's bits
 

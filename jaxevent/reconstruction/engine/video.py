@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from jaxevent.codegen.expressions import Untranslatable
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
-from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.engine.passes import DividedRecording, Held, Passes, Window
 from jaxevent.reconstruction.engine.room import ImageRoom
 from jaxevent.reconstruction.engine.timeline import NEVER
+from jaxevent.reconstruction.frames import Timing
 from jaxevent.reconstruction.stream import StreamState
 from jaxevent.reconstruction.video import BEGINS, ImageSequence, P
 from jaxevent.recording import Recording
@@ -51,7 +51,7 @@ class FusedVideo(ImageSequence[P]):
     ):
         super().__init__(estimator, recording, params, progress=progress)
         self._divided = DividedRecording(
-            recording, Timing.of(params), estimator.filters, window_events
+            recording, Timing.of(params), estimator.is_event_driven, window_events
         )
         # Divided for the parameters' own clock: the lag is exactly 0.
         kernel = self._divided.kernel(estimator, params, params.clock_offset)

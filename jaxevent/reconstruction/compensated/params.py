@@ -3,8 +3,8 @@
 from jaxevent.parameters import Choice, Number, Positive, UnitInterval
 from jaxevent.reconstruction import smoother
 
-# What the choice between the ingredients looks at; `fusion.compare` computes them.
-SIGNS = (
+# Features of a pixel that decide between the candidates; `fusion.fusion_features` computes them.
+FEATURES = (
     "fused",
     "scatter",
     "smoothed",
@@ -22,27 +22,27 @@ SIGNS = (
     "near_from_blend",
     "activity",
 )
-OTHERS = ("smoothed", "blend")  # ingredients beside the mean along trajectories
+FALLBACKS = ("smoothed", "blend")  # candidates beside the mean along trajectories
 
-# Fitted by experiments/compensated_choice.py: a number for every sign and one more, for each of
-# `OTHERS`; and the same for the result's variance. Those called beyond, by its --beyond, are of
-# times after the last frame and before the first.
+# Fitted by experiments/compensated_choice.py: a weight of every feature and a constant, for each of
+# `FALLBACKS`; and the same for the logarithm of the result's variance. Those called beyond, by its
+# --beyond, are of times after the last frame and before the first.
 # fmt: off
-CHOICE = (
+CHOICE_WEIGHTS = (
     0.796, 0.089, 0.222, 0.939, 0.532, -3.802, -3.169, 0.234, -0.268, -0.368, 0.687, 0.136,
     -0.164, -0.973, 0.199, 0.31, 12.023, 0.413, -0.497, -1.449, 0.701, 0.813, 1.587, -2.601,
     -0.125, 0.87, -0.653, 0.533, 0.069, -0.324, -0.284, -0.98, -0.146, -7.035,
 )
-DOUBT = (
+VARIANCE_WEIGHTS = (
     0.183, 0.317, 0.14, 0.312, 0.556, 0.5, -2.306, 0.08, -0.349, -0.039, -0.185, -0.169, 0.004,
     0.305, -0.176, 0.104, 4.619,
 )
-CHOICE_BEYOND = (
+CHOICE_WEIGHTS_BEYOND = (
     0.062, -0.023, -0.084, 0.512, 0.82, -2.139, -3.161, 0.489, -0.183, -0.522, 0.425, 0.089, 0.277,
     -1.001, -0.334, -0.016, 6.655, 0.001, -0.175, -1.018, 1.193, 0.111, -2.982, -2.434, 0.697,
     -0.361, -0.356, 0.139, -0.267, -0.136, -1.273, 0.165, -0.824, -9.161,
 )
-DOUBT_BEYOND = (
+VARIANCE_WEIGHTS_BEYOND = (
     0.243, 0.068, 0.355, 0.254, 0.679, -2.704, -2.138, 0.412, -0.28, -0.011, 0.071, -0.054, 0.179,
     -0.115, -0.132, -0.038, 7.789,
 )
@@ -50,7 +50,7 @@ DOUBT_BEYOND = (
 
 
 class Params(smoother.Params):
-    """Parameters of `mc`; those of the smoother say what the images at single instants are."""
+    """Parameters of `mc`; those of the smoother are of the images at single instants."""
 
     c_on = Positive(0.2, "ln I", "contrast threshold of ON events")
     c_off = Positive(0.2, "ln I", "contrast threshold of OFF events")
@@ -64,47 +64,55 @@ class Params(smoother.Params):
     share = Positive(0.7, "1", "part of an event's change that belongs to its 8 neighbours")
 
     sigma_pixel = Positive(0.004, "intensity", "noise of a frame's pixel, along trajectories")
-    floor = Positive(2e-4, "(ln I)^2", "variance of any image at a point between pixels")
+    floor = Positive(2e-4, "(ln I)^2", "least variance of an image read between pixels")
     information = UnitInterval(
-        0.15, "1", "of an instant without frame, whose errors resemble others'"
+        0.15, "1", "weight of an instant without frame, as errors of instants are correlated"
     )
     sigma_place = Positive(0.1, "px", "error of trajectories where images are fused")
     sigma_between = Positive(0.003, "ln I", "error of interpolation between pixels")
-    tolerance = Positive(3.0, "1", "standardised squared difference by which a point is hidden")
+    tolerance = Positive(3.0, "1", "standardised squared difference beyond which a point is hidden")
     caution = Positive(
         6.0, "1", "factor on the smoother's variance where motion is estimated", gradient=False
     )
     robust = Positive(
-        10.0, "1", "standardised squared residual of motion", gradient=False, least=1e-6
+        10.0,
+        "1",
+        "standardised squared residual of motion beyond which weights fall",
+        gradient=False,
+        least=1e-6,
     )
-    smooth = Positive(40.0, "1 / px^2", "weight of differences of motion", gradient=False)
+    smooth = Positive(40.0, "1 / px^2", "weight of spatial differences of motion", gradient=False)
     jump = Positive(
-        0.04, "px", "difference of motion that counts linearly", gradient=False, least=1e-6
+        0.04, "px", "difference of motion beyond which costs are linear", gradient=False, least=1e-6
     )
     edge = Positive(
-        0.1, "ln I / px", "gradient over which motions part", gradient=False, least=1e-6
+        0.1, "ln I / px", "gradient across which motion may change", gradient=False, least=1e-6
     )
     straight = Positive(0.2, "1 / px^2", "weight of acceleration", gradient=False)
     choice = Number(
-        CHOICE,
-        "1",
-        "how signs choose smoother and blend instead of the mean along trajectories",
+        CHOICE_WEIGHTS, "1", "weights of features in the logits of the smoother and the blend"
     )
-    doubt = Number(DOUBT, "1", "how signs tell the logarithm of the result's variance")
+    doubt = Number(
+        VARIANCE_WEIGHTS, "1", "weights of features in the logarithm of the result's variance"
+    )
     choice_beyond = Number(
-        CHOICE_BEYOND, "1", "the same as `choice`, after the last frame and before the first"
+        CHOICE_WEIGHTS_BEYOND, "1", "`choice` after the last frame and before the first"
     )
     doubt_beyond = Number(
-        DOUBT_BEYOND, "1", "the same as `doubt`, after the last frame and before the first"
+        VARIANCE_WEIGHTS_BEYOND, "1", "`doubt` after the last frame and before the first"
     )
-    common = Positive(0.6, "1", "part of the variance of images from events that all of them share")
+    common = Positive(
+        0.6, "1", "least variance of the result, as part of that of images from events alone"
+    )
     integrate = Choice(
-        (True, False), "whether images are held to what exposures and clipped pixels tell of them"
+        (True, False), "whether images are fitted to the frames' exposures and clipped pixels"
     )
     learn = Choice(
-        (True, False), "whether thresholds of single pixels are learned where events allow"
+        (True, False), "whether thresholds of single pixels are learned where events suffice"
     )
-    smear = Positive(1.2, "1", "part of what an exposure smears, squared, that is in doubt")
+    smear = Positive(
+        1.2, "1", "variance of the result, as part of the squared change by the exposure's blur"
+    )
     vague = Positive(
         0.2, "ln I", "standard deviation from which an image is not valid", gradient=False
     )

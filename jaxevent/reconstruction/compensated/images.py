@@ -1,0 +1,285 @@
+"""Images at single instants, and how the brightness of frames changes without events.
+
+An exposure that adapts, or flicker, changes frames where no events come. Such frames show the same
+points with other values, so they do not agree along any trajectory. They agree in what is left when
+the part that varies slowly over the image is taken away. Around frames that are not steady, images
+are compared and fused without that smooth part. The result is given the smooth part of the
+smoother's image at the target, which goes from frame to frame as a blend does. Beyond the frames it
+drifts with the events, and brightness is that of the nearest frame along trajectories. If that one
+is the exception, since the two next to it are alike, brightness becomes theirs within an interval
+of frames.
+
+Frames are steady if pixels without events around them keep their values: a change there is none of
+the scene. If some frames are brighter than those before and after, an image between frames may be
+brighter, too, and nothing determines it. The variance of the brightness is then estimated by
+leaving out each of the frames around and predicting it from its neighbours.
+"""
+
+import collections
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+
+from jaxevent.devices import full_precision
+from jaxevent.estimator import Estimate
+from jaxevent.reconstruction.compensated.params import Params
+from jaxevent.reconstruction.compensated.robust_mean import InstantLayout
+from jaxevent.reconstruction.compensated.warp import positions, sample
+from jaxevent.reconstruction.features import FrameFeatures, Numeric
+from jaxevent.reconstruction.frames import FrameImages
+from jaxevent.reconstruction.smoother import FrameMeasurements, Gaussian, Smoother
+from jaxevent.recording import Recording
+
+N_CACHED_IMAGES = 96  # of instants, in a video
+SMOOTH_SIGMA_PX = 12.0  # of the Gaussian that leaves the smooth part
+MIN_CHANGE = 0.05  # ln I, between frames that are not steady
+BLOCK_PX = 16  # over which the change of pixels without events is a median
+MIN_BLOCK_PIXELS, MIN_BLOCKS = 8, 4  # without events
+MAX_FRAMES = 8  # on either side, from which the variance of brightness is estimated
+# Of independent brightnesses of variance v two differ by 2 v, squared, and one from the mean of two
+# others by 3 v / 2.
+MIDPOINT_FACTOR = 0.75
+UNCLIPPED_GREY = (0.02, 0.98)  # grey values of pixels that are not clipped
+
+
+class FrameLevels(NamedTuple):
+    """Log intensity of frames at the middle of their exposures."""
+
+    z: Float[Array, "*frames pixels"]  # log intensity
+    V: Float[Array, "*frames pixels"]  # its variance
+    clear: Float[Array, "*frames pixels"]  # 1 where the pixel is unclipped
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class InstantSmoother(Smoother):
+    """Smoother whose images are the frames themselves at the middle of their exposures.
+
+    It reads log intensity L, its variance V, and whether a frame shows the pixel unclipped. The
+    smoother weighs a frame by a noise model made for integrating events. At the middle of an
+    exposure the frame itself is more accurate: L of its pixel with the variance
+    (sigma_pixel / (I + I0))^2 + 1e-4, deblurred as far as events determine it.
+    """
+
+    def frame_info(
+        self, params: Params, frames: FrameFeatures, measured: FrameMeasurements, events: Any
+    ) -> FrameLevels:
+        z, V = measured.z, (params.sigma_pixel * measured.slope) ** 2 + 1e-4
+        if events is not None:
+            blurred = jnp.log(frames.intensity + params.I0)
+            change = z - blurred
+            # The correction by events is no better than a threshold and their noise: where it is
+            # not larger than that, a blurred frame is nearer to the truth.
+            error = params.c_on * params.c_off * (0.25 + params.sigma_event**2 * events / 3)
+            trust = change**2 / (change**2 + error)
+            z, V = blurred + trust * change, V + trust * error
+        return FrameLevels(z, V, measured.clear)
+
+    def readout(self, params: Params, state: Gaussian, kept: FrameLevels, here: Array) -> Estimate:
+        L = jnp.log(jnp.maximum(jnp.exp(state.m) - params.I0, 0) + params.I0)
+        shown = here & (kept.clear > 0.5)
+        V = jnp.where(shown, jnp.minimum(state.P, kept.V), state.P)
+        return Estimate(jnp.where(shown, kept.z, L), V, shown)
+
+
+instant_smoother = InstantSmoother("instant-smoother", Params, fuses=False)
+
+
+class InstantImages:
+    """The smoother's images at any instants of a recording; the latest ones are remembered.
+
+    Args:
+        recording: The recording.
+        params: Parameters of `mc`.
+        window_events: Events per window of the smoother.
+        factors: (2, pixels) factors on the ON and OFF thresholds of pixels; None for 1.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        params: Params,
+        window_events: int,
+        factors: NDArray[np.floating] | None = None,
+    ):
+        self.factors = factors
+        self._video = instant_smoother.estimate(
+            recording, params, window_events=window_events, progress=False, factors=factors
+        )
+        self._cache: collections.OrderedDict[int, Estimate] = collections.OrderedDict()
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Type of the smoother's images."""
+        return self._video.dtype
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width, px."""
+        return self._video.recording.height, self._video.recording.width
+
+    def fetch(self, times: NDArray[np.int64]) -> None:
+        """Compute the images at sorted times (us) that are not remembered."""
+        missing = np.array([t for t in times.tolist() if t not in self._cache], np.int64)
+        for t in times.tolist():
+            if t in self._cache:
+                self._cache.move_to_end(t)
+        for batch, part in self._video.batches(missing, extrapolate=True):
+            for n, t in enumerate(batch.tolist()):
+                self._cache[t] = Estimate(*(np.array(v[n], np.float32) for v in part))
+        while len(self._cache) > max(N_CACHED_IMAGES, len(times)):
+            self._cache.popitem(last=False)
+
+    def __call__(self, times: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
+        """Return L, V and clear, each (times, h, w) float32, at sorted times (us)."""
+        self.fetch(times)
+        chosen = [self._cache[t] for t in times.tolist()]
+        L, V, clear = (np.stack(part) for part in zip(*chosen, strict=True))
+        return L, V, clear
+
+
+@functools.cache
+def _averages(size: int, sigma: float) -> NDArray[np.float32]:
+    """Return the matrix that blurs an axis; weights at the border are of the pixels inside."""
+    at = np.arange(size)
+    weights = np.exp(-0.5 * ((at[:, None] - at) / sigma) ** 2)
+    return (weights / weights.sum(1, keepdims=True)).astype(np.float32)
+
+
+@full_precision
+def smooth_part(L: Any, sigma: float = SMOOTH_SIGMA_PX) -> Any:
+    """Blur images (..., h, w), of NumPy or JAX, by a Gaussian of `sigma` px."""
+    return _averages(L.shape[-2], sigma) @ L @ _averages(L.shape[-1], sigma).T
+
+
+class BrightnessPrior(NamedTuple):
+    """Brightness at a time beside that of the nearest frames, each ()."""
+
+    variance: Numeric  # (ln I)^2, of what no frame determines
+    offset: Numeric  # ln I, to be added to the nearest frame; 0 between frames
+
+
+def smooth_at_target(
+    smooth: Numeric, layout: InstantLayout, weight: Numeric, paths: Numeric, prior: BrightnessPrior
+) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+    """Return the smooth part of the target's image, ln I, and its variance.
+
+    Between two frames nothing determines which of the two has the brightness of the target.
+
+    Args:
+        smooth: (K, h, w) smooth parts of the images at the target's instants.
+        layout: The instants.
+        weight: (), of the frame after the target in the blend of the two, 0..1.
+        paths: (h, w, 4) paths to frames that are on one side alone, px.
+        prior: Brightness at the target.
+
+    Returns:
+        The smooth part (h, w) and its variance (h, w), (ln I)^2.
+    """
+    nearest = jnp.asarray(smooth)[layout.before][None]
+    Y, X = positions(jnp.asarray(paths), jnp.asarray(layout.s)[layout.before][None])
+    beyond = sample(nearest, Y, X)[0] + prior.offset
+    difference = smooth[layout.after] - smooth[layout.before]
+    variance = jnp.maximum(weight * (1 - weight) * difference**2, prior.variance)
+    one_sided = layout.before == layout.after
+    return jnp.where(one_sided, beyond, smooth[layout.target]), variance
+
+
+class FrameBrightness:
+    """Changes of the brightness of a recording's frames that events do not show.
+
+    Args:
+        recording: The recording.
+        mid: (frames,) times of the frames, us.
+        I0: Offset inside the logarithm.
+    """
+
+    def __init__(self, recording: Recording, mid: NDArray[np.int64], I0: float):
+        self._recording, self._mid, self._I0 = recording, mid, I0
+        self._images = FrameImages(recording, np.dtype(np.float32))
+        self._changes: dict[int, float] = {}
+
+    def is_steady(self, first: int, last: int) -> bool:
+        """Return whether all frames between two times (us), included, are equally bright."""
+        low = int(np.searchsorted(self._mid, first, "left"))
+        high = int(np.searchsorted(self._mid, last, "right"))
+        return all(abs(self._change(k)) < MIN_CHANGE for k in range(low, high - 1))
+
+    def prior(self, t: int) -> BrightnessPrior:
+        """Return the prior of the brightness at a time (us)."""
+        return BrightnessPrior(np.float32(self.variance(t)), np.float32(self._offset(t)))
+
+    def _offset(self, t: int) -> float:
+        """Return the brightness (ln I) to add to the nearest frame, beyond the frames; else 0."""
+        mid = self._mid
+        if len(mid) < 3 or mid[0] <= t <= mid[-1]:
+            return 0.0
+        if t < mid[0]:
+            change, next_change = self._change(0), self._change(1)
+            distance, interval = mid[0] - t, mid[1] - mid[0]
+        else:
+            change, next_change = -self._change(len(mid) - 2), self._change(len(mid) - 3)
+            distance, interval = t - mid[-1], mid[-1] - mid[-2]
+        if abs(change) < MIN_CHANGE or abs(next_change) >= MIN_CHANGE:
+            return 0.0
+        return change * min(1.0, float(distance / interval))
+
+    def variance(self, t: int) -> float:
+        """Return the variance (ln I)^2 of the brightness at a time (us).
+
+        It is 0 at the frames and largest halfway between two, and beyond the last and the first.
+        """
+        right = int(np.searchsorted(self._mid, t, "right"))
+        left = int(np.searchsorted(self._mid, t, "left"))
+        low, high = max(left - MAX_FRAMES, 0), min(right + MAX_FRAMES, len(self._mid))
+        if left < right or high - low < 2:
+            return 0.0
+        mid = (self._mid[low:high] - t) * 1e-6
+        level = np.cumsum([0.0, *(self._change(k) for k in range(low, high - 1))])
+        between = low < right < high
+        if high - low > 2:
+            w = (mid[1:-1] - mid[:-2]) / (mid[2:] - mid[:-2])
+            error, factor = level[1:-1] - (1 - w) * level[:-2] - w * level[2:], 1.0
+        else:
+            error, factor = level[1:], MIDPOINT_FACTOR if between else 1.0
+        variance = factor * float((np.where(np.abs(error) < MIN_CHANGE, 0, error) ** 2).mean())
+        if not between:
+            return variance
+        w = -mid[left - 1 - low] / (mid[right - low] - mid[left - 1 - low])
+        return float(variance * 4 * w * (1 - w))
+
+    def _change(self, frame: int) -> float:
+        """Return the change of ln(I + I0) from a frame to the next, and remember it."""
+        if frame not in self._changes:
+            self._changes[frame] = self._measure_change(frame)
+        return self._changes[frame]
+
+    def _measure_change(self, frame: int) -> float:
+        """Measure the change of ln(I + I0): the median over blocks of pixels without events."""
+        source, size = self._recording.events, (self._recording.height, self._recording.width)
+        begin, end = (source.index(int(t)) for t in self._mid[frame : frame + 2])
+        grey, intensity, _, _ = self._images.read(slice(frame, frame + 2), 2)
+        black, white = UNCLIPPED_GREY
+        unclipped = ((grey > black) & (grey < white)).all(0).reshape(size)
+        events = source[begin:end]
+        counts = np.zeros(size, np.float32)
+        np.add.at(counts, (events.y, events.x), 1)
+        quiet = unclipped & (uniform_filter(counts, 3) < 1 / 18)
+        change = np.diff(np.log(intensity + self._I0), axis=0).reshape(size)
+        h, w = (length // BLOCK_PX for length in size)
+
+        def blocks(image: NDArray) -> NDArray:
+            cut = image[: h * BLOCK_PX, : w * BLOCK_PX].reshape(h, BLOCK_PX, w, BLOCK_PX)
+            return cut.swapaxes(1, 2).reshape(h * w, BLOCK_PX**2)
+
+        changes = [
+            float(np.median(values[chosen]))
+            for values, chosen in zip(blocks(change), blocks(quiet), strict=True)
+            if chosen.sum() >= MIN_BLOCK_PIXELS
+        ]
+        return float(np.median(changes)) if len(changes) >= MIN_BLOCKS else 0.0

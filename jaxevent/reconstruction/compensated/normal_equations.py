@@ -1,0 +1,701 @@
+"""Normal equations of trajectories: in numba for their estimate, in JAX for its derivatives.
+
+A Gauss-Newton step d of the trajectories p, one of four numbers for every node, solves
+
+    (N + smooth Laplacian + ridge) d = b - smooth Laplacian p - ridge p
+
+with N and b of the images, and a Laplacian that weighs differences between neighbouring nodes.
+
+Converged trajectories are where the right-hand side vanishes, F(p, images, cost) = 0. So
+dp = A^-1 dF at fixed p, with A = -dF/dp. Derivatives solve these equations once, backwards the
+transposed ones. A is close to the normal matrix, which conjugate gradients invert as the
+preconditioner of the whole.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.sparse.linalg import bicgstab, cg
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
+from jaxevent.deprecated import renamed_names
+from jaxevent.devices import full_precision
+from jaxevent.reconstruction.compensated.params import Params
+from jaxevent.reconstruction.compensated.warp import (
+    RowScratch,
+    bilinear_weights,
+    gradient,
+    gradient_jax,
+    interpolate_path,
+    interpolate_paths_jax,
+    is_inside,
+    locate_points,
+    pad_edge,
+    positions,
+    sample,
+)
+from jaxevent.reconstruction.features import Numeric
+
+OUTSIDE_INFORMATION = np.float32(1e-6)  # of values outside the image
+# Iterations for derivatives: of conjugate gradients with the normal matrix, and of the whole.
+CG_ITERATIONS, BICGSTAB_ITERATIONS = 30, 8
+
+
+class CostParams(NamedTuple):
+    """Parameters of the cost that trajectories minimise; `Params` has their meanings."""
+
+    floor: Numeric  # (ln I)^2
+    robust: Numeric
+    smooth: Numeric  # 1 / px^2
+    jump: Numeric  # px
+    edge: Numeric  # ln I / px
+    straight: Numeric  # 1 / px^2
+
+    @classmethod
+    def of(cls, params: Params, convert: Callable[[Any], Any] = np.float32) -> "CostParams":
+        """Take the parameters of the cost from those of `mc`.
+
+        Args:
+            params: Parameters of `mc`.
+            convert: Conversion of each number.
+
+        Returns:
+            The parameters.
+        """
+        return cls(*(convert(getattr(params, name)) for name in cls._fields))
+
+
+class NormalEquations(NamedTuple):
+    """The equations of all nodes at some trajectories."""
+
+    N: Float[Numeric, "rows columns *matrix"]  # (4, 4), or the 10 entries of its upper triangle
+    b: Float[Numeric, "rows columns 4"]
+    across: Float[Numeric, "rows columns-1"]  # weights of differences; numba: (rows, columns)
+    down: Float[Numeric, "rows-1 columns"]
+    smooth: Float[Numeric, " 4"]
+    ridge: Float[Numeric, " 4"]
+
+
+class PackedImages(NamedTuple):
+    """Images at K instants with their gradients."""
+
+    pixels: NDArray[np.float32]  # (K, h, w, 4): log intensity, its variance, gradient along x, y
+    s: NDArray[np.float32]  # (K,), times relative to the target, -1..1
+    near: NDArray[np.float32]  # (K,), weights with which a robust mean begins
+
+    @classmethod
+    def of(cls, pixels: NDArray[np.float32], s: NDArray[np.float32]) -> "PackedImages":
+        """Add the weights, which fall with the distance from the target.
+
+        Args:
+            pixels: (K, h, w, 4) packed images; see `trajectories.pack_images`.
+            s: (K,) times relative to the target, -1..1.
+
+        Returns:
+            Images with weights.
+        """
+        return cls(pixels, s, np.exp(-2 * (s / horizon_of(s)) ** 2).astype(np.float32))
+
+
+def horizon_of(s: NDArray[np.float32]) -> np.float32:
+    """Return the largest distance of instants s (K,) from the target."""
+    return np.float32(max(float(np.abs(s).max()), 1e-3))
+
+
+class TrajectorySamples(NamedTuple):
+    """Packed images read along the trajectories of pixels."""
+
+    points: NDArray[np.float32]  # (h, 4, K, w): log intensity, robust weight, gradient along x, y
+    M: NDArray[np.float32]  # (h, w), their robust mean
+    s: NDArray[np.float32]  # (K,), -1..1
+
+
+@njit_noalloc_inlined
+def fill_information(V, inside, floor, W):
+    """Write the information of values.
+
+    Args:
+        V: (points,) their variances, (ln I)^2.
+        inside: (points,) 1, or 0 beyond the image's border.
+        floor: Variance to add, (ln I)^2.
+        W: (points,) output, the information.
+    """
+    one = np.float32(1)
+    for i in range(len(V)):
+        W[i] = one / (V[i] + floor) if inside[i] > 0 else OUTSIDE_INFORMATION
+
+
+@njit_noalloc_inlined
+def robust_means(values, W, near, nu, out):
+    """Write robust means of values.
+
+    First the near instants determine the mean; then all of them.
+
+    Args:
+        values: (K, points) values.
+        W: (K, points) their information.
+        near: (K,) weights of the instants to begin with.
+        nu: Standardised squared residual beyond which weights fall.
+        out: Output, the weights R (K, points) and means (points,), and scratch (2, points).
+    """
+    R, means, sums = out
+    one, total, mean = np.float32(1), sums[0], sums[1]
+    for turn in range(3):
+        for i in range(len(means)):
+            total[i], mean[i] = np.float32(0), np.float32(0)
+        for k in range(len(values)):
+            level, info, weight, early = values[k], W[k], R[k], near[k]
+            if turn == 0:
+                for i in range(len(means)):
+                    weight[i] = info[i] * early
+            else:
+                for i in range(len(means)):
+                    e = level[i] - means[i]
+                    weight[i] = info[i] / (one + e * e * info[i] / nu)
+            for i in range(len(means)):
+                total[i] += weight[i]
+                mean[i] += weight[i] * level[i]
+        for i in range(len(means)):
+            means[i] = mean[i] / total[i]
+
+
+@njit_noalloc_inlined
+def _read_channels(image, pixel, part, k, points):
+    """Write an image's channels at points, bilinear: (4, K, points)."""
+    h, w, _ = image.shape
+    for i in range(pixel.shape[1]):
+        x0, y0 = pixel[0, i], pixel[1, i]
+        x1 = min(x0 + 1, w - 1)
+        upper, lower = image[y0], image[min(y0 + 1, h - 1)]
+        a, b, c, d = bilinear_weights(part[0, i], part[1, i])
+        for q in range(4):
+            points[q, k, i] = (
+                a * upper[x0, q] + b * upper[x1, q] + c * lower[x0, q] + d * lower[x1, q]
+            )
+
+
+@njit_noalloc
+def _sample(begin, end, inputs, scratch, out):
+    images, p, cost = inputs
+    count, h, w, _ = images.pixels.shape
+    rows, W, sums = scratch
+    path, at, pixel = rows.path[begin], rows.x[begin], rows.pixel[begin]
+    part, inside, info = rows.part[begin], rows.inside[begin], W[begin]
+    points, M, half = out.points, out.M, np.float32(0.5)
+    for x in range(w):
+        at[x] = np.float32(x)
+    for y in range(begin, end):
+        at_y = np.float32(y) * half - np.float32(0.25)
+        for x in range(w):
+            interpolate_path(p, at_y, np.float32(x) * half - np.float32(0.25), path[:, x])
+        for k in range(count):
+            row = (path, at, pixel, part, inside)
+            locate_points(np.float32(y), images.s[k], (h, w), w, row)
+            _read_channels(images.pixels[k], pixel, part, k, points[y])
+            fill_information(points[y, 1, k], inside, cost.floor, info[k])
+        found = (points[y, 1], M[y], sums[begin])
+        robust_means(points[y, 0], info, images.near, cost.robust, found)
+
+
+def sample_trajectories(
+    images: PackedImages, p: NDArray[np.float32], cost: CostParams
+) -> TrajectorySamples:
+    """Read packed images along trajectories.
+
+    Args:
+        images: The packed images.
+        p: (rows, columns, 4) trajectories of nodes, px.
+        cost: Parameters of the cost, float32.
+
+    Returns:
+        What the images show along the trajectories of pixels.
+    """
+    count, h, w, _ = images.pixels.shape
+    points, M = np.empty((h, 4, count, w), np.float32), np.empty((h, w), np.float32)
+    samples = TrajectorySamples(points, M, images.s)
+    scratch = RowScratch.allocate(h, w), row_scratch(h, count, w), row_scratch(h, 2, w)
+    run_over_rows(_sample, h, (images, p, cost), scratch, samples)
+    return samples
+
+
+@njit_noalloc_inlined
+def _add_product(a, b, out):
+    for i in range(len(out)):
+        out[i] += a[i] * b[i]
+
+
+@njit_noalloc_inlined
+def _add_pixels(samples, y, grad_M, scratch, sums):
+    """Add the equations of each pixel of a row to sums (14, w): N (10) and b (4).
+
+    The derivative of values by a path's four numbers is J = g (s, s^2). The gradient g along
+    trajectories and that of the mean, `grad_M` (2, w), are both that of the scene; the mean of the
+    two has less noise. M, the mean of the values by R, is eliminated: J is J - sum R J / sum R.
+    """
+    points, M, s = samples.points[y], samples.M[y], samples.s
+    J, total, means, r = scratch[:4], scratch[4], scratch[5:9], scratch[9]
+    total[:] = np.float32(0)
+    means[:] = np.float32(0)
+    for k in range(len(s)):
+        R = points[1, k]
+        for c in range(2):
+            for i in range(len(M)):
+                J[c, i] = (points[2 + c, k, i] + grad_M[c, i]) * np.float32(0.5) * s[k]
+            for i in range(len(M)):
+                J[2 + c, i] = J[c, i] * s[k]
+        for i in range(len(M)):
+            total[i] += R[i]
+        entry = 0
+        for c in range(4):
+            for i in range(len(M)):
+                r[i] = R[i] * J[c, i]
+                means[c, i] += r[i]
+                sums[10 + c, i] -= r[i] * (points[0, k, i] - M[i])
+            for e in range(c, 4):
+                _add_product(r, J[e], sums[entry])
+                entry += 1
+    entry = 0
+    for c in range(4):
+        for i in range(len(M)):
+            r[i] = -means[c, i] / total[i]
+        for e in range(c, 4):
+            _add_product(r, means[e], sums[entry])
+            entry += 1
+
+
+@njit_noalloc
+def _linearise(begin, end, samples, scratch, out):
+    """Write N (10 entries) and b (4) of the nodes of some rows, and |grad M|: (15,) each."""
+    M = samples.M
+    h, w = M.shape
+    own, grad_M, sums = scratch[begin, :10], scratch[begin, 10:12], scratch[begin, 12:]
+    for i in range(begin, end):
+        sums[:] = np.float32(0)
+        below = min(2 * i + 2, h)
+        for y in range(2 * i, below):
+            for x in range(w):
+                gx, gy = gradient(M, y, x)
+                grad_M[0, x], grad_M[1, x] = gx, gy
+                sums[14, x] += np.sqrt(gx * gx + gy * gy)
+            _add_pixels(samples, y, grad_M, own, sums)
+        for j in range(out.shape[1]):
+            left, right = 2 * j, min(2 * j + 1, w - 1)
+            both = np.float32(right - left)  # 0 or 1
+            share = np.float32(1) / (np.float32(below - 2 * i) * (np.float32(1) + both))
+            for c in range(15):
+                out[i, j, c] = (sums[c, left] + both * sums[c, right]) * share
+
+
+@njit_noalloc
+def _smooth_nodes(values, row, out):
+    """Blur nodes by (1, 6, 1) / 8: by a Gaussian of 1 px."""
+    rows, columns, channels = out.shape
+    for i in range(rows):
+        up, down = max(i - 1, 0), min(i + 1, rows - 1)
+        for j in range(columns):
+            for c in range(channels):
+                row[j, c] = (
+                    values[up, j, c] + np.float32(6) * values[i, j, c] + values[down, j, c]
+                ) / np.float32(8)
+        for j in range(columns):
+            left, right = max(j - 1, 0), min(j + 1, columns - 1)
+            for c in range(channels):
+                out[i, j, c] = (
+                    row[left, c] + np.float32(6) * row[j, c] + row[right, c]
+                ) / np.float32(8)
+
+
+@njit_noalloc
+def _weigh_differences(p, edge, horizon, cost, out):
+    """Write the weights of differences between neighbouring nodes, across and down."""
+    rows, columns, _ = p.shape
+    jump, scale = np.float32(cost.jump), np.float32(cost.edge)
+    for i in range(rows):
+        for j in range(columns):
+            for turn in range(2):
+                i1, j1 = i + (turn == 1), j + (turn == 0)
+                if i1 >= rows or j1 >= columns:
+                    continue
+                dx = (p[i1, j1, 0] - p[i, j, 0]) * horizon
+                dy = (p[i1, j1, 1] - p[i, j, 1]) * horizon
+                weight = jump / np.sqrt(dx * dx + dy * dy + jump * jump)
+                steepness = (edge[i, j] + edge[i1, j1]) * np.float32(0.5)
+                weight *= np.float32(0.1) + np.float32(0.9) * np.exp(-steepness / scale)
+                out[turn, i, j] = weight
+
+
+def linearise(
+    samples: TrajectorySamples, p: NDArray[np.float32], cost: CostParams
+) -> NormalEquations:
+    """Set up the normal equations at some trajectories.
+
+    Args:
+        samples: Images along these trajectories.
+        p: (rows, columns, 4) the trajectories of nodes, px.
+        cost: Parameters of the cost, float32.
+
+    Returns:
+        The equations, N as the 10 entries of its upper triangle.
+    """
+    shape = p.shape[:2]
+    entries = np.empty((*shape, 15), np.float32)
+    scratch = row_scratch(shape[0], 12 + 15, samples.M.shape[1])
+    run_over_rows(_linearise, shape[0], samples, scratch, entries)
+    blurred = np.empty((*shape, 14), np.float32)
+    _smooth_nodes(entries, np.empty((shape[1], 14), np.float32), blurred)
+    horizon = horizon_of(samples.s)
+    weights = np.zeros((2, *shape), np.float32)
+    _weigh_differences(p, entries[..., 14], horizon, cost, weights)
+    squared = horizon * horizon
+    smooth = cost.smooth * squared * np.array([1, 1, squared, squared], np.float32)
+    bend, tiny = cost.straight * squared * squared, np.float32(1e-5) * smooth[0]
+    ridge = np.array([tiny, tiny, bend, bend], np.float32)
+    return NormalEquations(blurred[..., :10], blurred[..., 10:], *weights, smooth, ridge)
+
+
+@njit_noalloc_inlined
+def _add_difference(weight, a, b, out):
+    for x in range(len(out)):
+        out[x] += weight[x] * (a[x] - b[x])
+
+
+@njit_noalloc_inlined
+def _scale_and_add(factor, a, out):
+    """Write factor out + a."""
+    for x in range(len(out)):
+        out[x] = factor * out[x] + a[x]
+
+
+@njit_noalloc_inlined
+def _add_scaled(factor, a, out):
+    for x in range(len(out)):
+        out[x] += factor * a[x]
+
+
+@njit_noalloc_inlined
+def _multiply(N, i, q, out):
+    """Multiply the symmetric 4 x 4 matrices of a row of nodes by vectors (4, columns)."""
+    for c in range(len(out)):  # numbers that are not known are not unrolled: less to compile
+        for x in range(out.shape[1]):
+            out[c, x] = np.float32(0)
+        for e in range(len(out)):
+            low, high = min(c, e), max(c, e)
+            _add_product(N[low * (7 - low) // 2 + high, i], q[e], out[c])
+
+
+@njit_noalloc_inlined
+def _laplacian(q, across, down, i, out):
+    """Write the weighted graph Laplacian (columns,) of a row; all are padded by a node."""
+    width = len(out)
+    here, left, right = q[i + 1, 1:-1], q[i + 1, :width], q[i + 1, 2:]
+    out[:] = np.float32(0)
+    _add_difference(across[i, :width], here, left, out)
+    _add_difference(across[i, 1:], here, right, out)
+    _add_difference(down[i], here, q[i, 1:-1], out)
+    _add_difference(down[i + 1], here, q[i + 2, 1:-1], out)
+
+
+@njit_noalloc_inlined
+def _invert(N, added, scratch, out):
+    """Write the inverse (10 entries) of a symmetric 4 x 4 matrix with `added` on its diagonal."""
+    # Cholesky, in double precision: nodes without texture are nearly singular.
+    A, C, inverse = scratch[0], scratch[1], scratch[2]
+    entry = 0
+    for i in range(4):
+        for j in range(i, 4):
+            A[i, j] = N[entry]
+            A[j, i] = N[entry]
+            entry += 1
+        A[i, i] += added[i]
+    for i in range(4):
+        for j in range(i + 1):
+            total = A[i, j]
+            for k in range(j):
+                total -= C[i, k] * C[j, k]
+            C[i, j] = np.sqrt(max(total, 1e-12)) if i == j else total / C[j, j]
+    for j in range(4):  # the inverse of C
+        for i in range(j, 4):
+            total = 1.0 if i == j else 0.0
+            for k in range(j, i):
+                total -= C[i, k] * inverse[k, j]
+            inverse[i, j] = total / C[i, i]
+    entry = 0
+    for i in range(4):
+        for j in range(i, 4):
+            total = 0.0
+            for k in range(j, 4):
+                total += inverse[k, i] * inverse[k, j]
+            out[entry] = total
+            entry += 1
+
+
+class _SolverScratch(NamedTuple):
+    """Scratch memory of conjugate gradients for rows x columns of nodes."""
+
+    blocks: NDArray[np.float32]  # (2, 10, rows, columns), of the equations and their inverses
+    beside: NDArray[np.float32]  # (rows, columns + 1), weights of differences, 0 at the ends
+    below: NDArray[np.float32]  # (rows + 1, columns), the same between rows
+    q: NDArray[np.float32]  # (4, rows + 2, columns + 2), the direction, 0 around the nodes
+    vectors: NDArray[np.float32]  # (4, rows, 4, columns)
+    lines: NDArray[np.float32]  # (2, columns)
+    node: NDArray[np.float32]  # (14,)
+    inverse: NDArray[np.float64]  # (3, 4, 4)
+
+    @classmethod
+    def zeros(cls, rows: int, columns: int) -> "_SolverScratch":
+        """Allocate zeros."""
+        shapes = (
+            (2, 10, rows, columns), (rows, columns + 1), (rows + 1, columns),
+            (4, rows + 2, columns + 2), (4, rows, 4, columns), (2, columns), (14,),
+        )  # fmt: skip
+        single = [np.zeros(shape, np.float32) for shape in shapes]
+        return cls._make([*single, np.zeros((3, 4, 4))])
+
+
+def solve(eq: NormalEquations, p: NDArray[np.float32], iterations: int = 12) -> NDArray[np.float32]:
+    """Solve the normal equations by conjugate gradients, preconditioned by the nodes' own blocks.
+
+    Args:
+        eq: The equations, of `linearise`.
+        p: (rows, columns, 4) trajectories at which they were set up, px.
+        iterations: Number of iterations.
+
+    Returns:
+        (rows, columns, 4) the step d, px.
+    """
+    d = np.empty_like(p)
+    _solve(eq, p, iterations, _SolverScratch.zeros(*p.shape[:2]), d)
+    return d
+
+
+@njit_noalloc
+def _solve(eq, p, iterations, scratch, d):
+    # Channels come first here, and rows of nodes are what loops go over at once.
+    rows, columns, channels = p.shape
+    smooth, ridge, beside, below, q = eq.smooth, eq.ridge, scratch.beside, scratch.below, scratch.q
+    A, P, vectors, node = scratch.blocks[0], scratch.blocks[1], scratch.vectors, scratch.node
+    r, found, Aq, z = vectors[0], vectors[1], vectors[2], vectors[3]
+    rough, sums, added, block = scratch.lines[0], scratch.lines[1], node[:4], node[4:]
+    for i in range(rows):
+        for j in range(columns):
+            beside[i, j + 1] = eq.across[i, j] if j < columns - 1 else np.float32(0)
+            below[i + 1, j] = eq.down[i, j] if i < rows - 1 else np.float32(0)
+            for c in range(channels):
+                q[c, i + 1, j + 1] = p[i, j, c]
+    for i in range(rows):
+        for c in range(channels):
+            _laplacian(q[c], beside, below, i, rough)
+            for j in range(columns):
+                pull = smooth[c] * rough[j] + ridge[c] * p[i, j, c]
+                r[i, c, j] = eq.b[i, j, c] - pull
+        for j in range(columns):
+            degree = beside[i, j] + beside[i, j + 1] + below[i, j] + below[i + 1, j]
+            for c in range(channels):
+                added[c] = smooth[c] * degree + ridge[c] + np.float32(1e-6)
+            _invert(eq.N[i, j], added, scratch.inverse, block)
+            for c in range(10):
+                P[c, i, j] = block[c]
+                A[c, i, j] = eq.N[i, j, c]
+    rz = 0.0
+    for turn in range(iterations + 1):
+        sums[:] = np.float32(0)
+        for i in range(rows):
+            _multiply(P, i, r[i], z[i])
+            for c in range(channels):
+                _add_product(r[i, c], z[i, c], sums)
+        following = 0.0
+        for j in range(columns):
+            following += sums[j]
+        share = np.float32(following / (rz + 1e-20)) if turn else np.float32(0)
+        rz = following
+        if turn == iterations:
+            break
+        for i in range(rows):
+            for c in range(channels):
+                if turn == 0:
+                    for j in range(columns):  # a slice would take longer to compile
+                        q[c, i + 1, j + 1] = z[i, c, j]
+                else:
+                    _scale_and_add(share, z[i, c], q[c, i + 1, 1:-1])
+        sums[:] = np.float32(0)
+        for i in range(rows):
+            _multiply(A, i, q[:, i + 1, 1:-1], Aq[i])
+            for c in range(channels):
+                _laplacian(q[c], beside, below, i, rough)
+                _add_scaled(smooth[c], rough, Aq[i, c])
+                _add_scaled(ridge[c], q[c, i + 1, 1:-1], Aq[i, c])
+                _add_product(q[c, i + 1, 1:-1], Aq[i, c], sums)
+        curvature = 0.0
+        for j in range(columns):
+            curvature += sums[j]
+        step = np.float32(rz / (curvature + 1e-20))
+        for i in range(rows):
+            for c in range(channels):
+                _add_scaled(step, q[c, i + 1, 1:-1], found[i, c])
+                _add_scaled(-step, Aq[i, c], r[i, c])
+    for i in range(rows):
+        for c in range(channels):
+            for j in range(columns):
+                d[i, j, c] = found[i, c, j]
+
+
+class MotionImages(NamedTuple):
+    """Images that motion is estimated from, for derivatives."""
+
+    L: Float[Numeric, "k h w"]  # log intensity
+    V: Float[Numeric, "k h w"]  # its variance, (ln I)^2
+    s: Float[Numeric, " k"]  # times relative to the target, -1..1
+    present: Float[Numeric, " k"]  # 1, or 0 of instants that only pad the number
+
+
+def _average_pixels(pixels: Array) -> Array:
+    """Average the 2 x 2 pixels (h, w, ...) of each node, (rows, columns, ...)."""
+    h, w = pixels.shape[:2]
+
+    def total(values: Array) -> Array:
+        widths = [(0, h % 2), (0, w % 2)] + [(0, 0)] * (values.ndim - 2)
+        padded = jnp.pad(values, widths)
+        return padded[::2, ::2] + padded[::2, 1::2] + padded[1::2, ::2] + padded[1::2, 1::2]
+
+    count = total(jnp.ones((h, w), pixels.dtype))
+    return total(pixels) / count.reshape(*count.shape, *[1] * (pixels.ndim - 2))
+
+
+def _smooth_nodes_jax(nodes: Array) -> Array:
+    """Blur nodes by (1, 6, 1) / 8."""
+    for axis in (0, 1):
+        padded, size = pad_edge(nodes, axis, 1), nodes.shape[axis]
+        a, b, c = (jax.lax.slice_in_dim(padded, i, i + size, axis=axis) for i in range(3))
+        nodes = (a + 6 * b + c) / 8
+    return nodes
+
+
+@full_precision
+def linearise_jax(p: Array, images: MotionImages, cost: CostParams) -> NormalEquations:
+    """Set up the normal equations at some trajectories of all instants; differentiable.
+
+    Args:
+        p: (rows, columns, 4) trajectories of nodes, px.
+        images: The images.
+        cost: Parameters of the cost.
+
+    Returns:
+        The equations, N as matrices (4, 4).
+    """
+    L, V, s, present = images
+    count, h, w = L.shape
+    Y, X = (one.astype(p.dtype) for one in positions(interpolate_paths_jax(p, h, w), s))
+    inside = is_inside(Y, X, h, w)
+    gx, gy = gradient_jax(L)
+    L, V, gx, gy = (sample(image, Y, X) for image in (L, V, gx, gy))
+    W = present[:, None, None] * jnp.where(inside, 1 / (V + cost.floor), OUTSIDE_INFORMATION)
+    s = s[:, None, None]
+    R = W * jnp.exp(-2 * s**2)
+    M = (R * L).sum(0) / R.sum(0)
+    for _ in range(2):
+        R = W / (1 + (L - M) ** 2 * W / cost.robust)
+        M = (R * L).sum(0) / R.sum(0)
+    mx, my = gradient_jax(M)
+    J = jnp.stack([(gx + mx) / 2 * s, (gy + my) / 2 * s])
+    J = jnp.concatenate([J, J * s])
+    J = J - (R * J).sum(1, keepdims=True) / R.sum(0)
+    N = jnp.einsum("khw,akhw,bkhw->hwab", R, J, J)
+    b = -jnp.einsum("khw,akhw,khw->hwa", R, J, L - M)
+    edge = _average_pixels(jnp.sqrt(mx**2 + my**2 + 1e-20))
+
+    def weights(axis: int) -> Array:
+        difference = jnp.diff(p[..., :2], axis=axis)
+        one, other = ((edge[:, :-1], edge[:, 1:]), (edge[:-1], edge[1:]))[axis == 0]
+        weight = cost.jump / jnp.sqrt((difference**2).sum(-1) + cost.jump**2)
+        return weight * (0.1 + 0.9 * jnp.exp(-(one + other) / 2 / cost.edge))
+
+    tiny = 1e-5 * cost.smooth
+    ridge = jnp.stack([tiny, tiny, cost.straight, cost.straight])
+    N, b = (_smooth_nodes_jax(_average_pixels(part)) for part in (N, b))
+    return NormalEquations(N, b, weights(1), weights(0), cost.smooth * jnp.ones(4, p.dtype), ridge)
+
+
+def _pull(eq: NormalEquations, q: Array) -> Array:
+    """Return (smooth Laplacian + ridge) q."""
+    x = eq.across[..., None] * jnp.diff(q, axis=1)
+    y = eq.down[..., None] * jnp.diff(q, axis=0)
+    rough = jnp.pad(x, [(0, 0), (1, 0), (0, 0)]) - jnp.pad(x, [(0, 0), (0, 1), (0, 0)])
+    rough = rough + jnp.pad(y, [(1, 0), (0, 0), (0, 0)]) - jnp.pad(y, [(0, 1), (0, 0), (0, 0)])
+    return eq.smooth * rough + eq.ridge * q
+
+
+def residual(p: Array, images: MotionImages, cost: CostParams) -> Array:
+    """Return the right-hand side of the normal equations, which vanishes at convergence.
+
+    Args:
+        p: (rows, columns, 4) trajectories of nodes, px.
+        images: The images.
+        cost: Parameters of the cost.
+
+    Returns:
+        F, (rows, columns, 4).
+    """
+    eq = linearise_jax(p, images, cost)
+    return eq.b - _pull(eq, p)
+
+
+@full_precision
+def _solve_jax(eq: NormalEquations, right: Array) -> Array:
+    degree = jnp.pad(eq.across, [(0, 0), (1, 0)]) + jnp.pad(eq.across, [(0, 0), (0, 1)])
+    degree = degree + jnp.pad(eq.down, [(1, 0), (0, 0)]) + jnp.pad(eq.down, [(0, 1), (0, 0)])
+    diagonal = eq.smooth * degree[..., None] + eq.ridge + 1e-6
+    blocks = jnp.linalg.inv(eq.N + diagonal[..., None] * jnp.eye(4, dtype=right.dtype))
+
+    def times(q: Array) -> Array:
+        return jnp.einsum("ijab,ijb->ija", eq.N, q) + _pull(eq, q)
+
+    def precondition(q: Array) -> Array:
+        return jnp.einsum("ijab,ijb->ija", blocks, q)
+
+    return cg(times, right, tol=1e-6, maxiter=CG_ITERATIONS, M=precondition)[0]
+
+
+@jax.custom_jvp
+def implicit_trajectories(p: Array, images: MotionImages, cost: CostParams) -> Array:
+    """Make converged trajectories a differentiable function of images and cost.
+
+    Derivatives are those of the fixpoint. Clipped steps and medians, which act away from it, have
+    none, and neither have instants and nodes, which are chosen by data.
+
+    Args:
+        p: (rows, columns, 4) converged trajectories of nodes, px.
+        images: The images.
+        cost: Parameters of the cost.
+
+    Returns:
+        p as it is.
+    """
+    return p
+
+
+@implicit_trajectories.defjvp
+def _differentiate(values: tuple, changes: tuple) -> tuple[Array, Array]:
+    p, images, cost = values
+    _, *changes_of_data = changes
+    eq = linearise_jax(p, images, cost)
+
+    def times(dp: Array) -> Array:
+        """Return A dp."""
+        return -jax.jvp(lambda q: residual(q, images, cost), (p,), (dp,))[1]
+
+    def solve_all(product: Callable[[Array], Array], right: Array) -> Array:
+        def precondition(other: Array) -> Array:
+            return _solve_jax(eq, other)
+
+        return bicgstab(product, right, tol=1e-5, maxiter=BICGSTAB_ITERATIONS, M=precondition)[0]
+
+    _, dF = jax.jvp(lambda *data: residual(p, *data), (images, cost), tuple(changes_of_data))
+    return p, jax.lax.custom_linear_solve(times, dF, solve_all, solve_all)
+
+
+__getattr__ = renamed_names(__name__)

@@ -1,0 +1,515 @@
+"""Robust mean of images along trajectories: in numba loops, and in JAX for derivatives."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
+from jaxevent.deprecated import renamed_names
+from jaxevent.reconstruction.compensated.instants import Instants
+from jaxevent.reconstruction.compensated.params import Params
+from jaxevent.reconstruction.compensated.warp import (
+    WarpedImages,
+    gradient,
+    gradient_jax,
+    pad_edge,
+)
+from jaxevent.reconstruction.features import Numeric
+
+SCATTER_TOLERANCE = 3.0  # squared residual of an instant that scatter hardly counts
+OUTSIDE_VARIANCE = 1e6  # (ln I)^2, beyond the image's border
+EXPECTED_SQUARE = 0.6  # squared difference of an image from the mean, in units of its variance
+RESIDUAL_SIGMA_PX, SCATTER_SIGMA_PX = 1.5, 2.0  # of the Gaussians that gather them
+N_NEAR = 5  # instants without frame next to the target
+
+
+class InstantLayout(NamedTuple):
+    """The instants of a target as arrays, padded to a common number."""
+
+    s: Float[Numeric, " k"]  # times relative to the target, -1..1
+    present: Float[Numeric, " k"]  # 1, or 0 of instants that only pad the number
+    framed: Float[Numeric, " k"]  # 1 where a frame was taken
+    near: Float[Numeric, " k"]  # 1 of the target and of those next to it without frame
+    target: Numeric  # (), index of the target
+    before: Numeric  # (), index of the frame before
+    after: Numeric  # (), index of the frame after
+    # Index of the frame that `before` is compared with: `after`, and where frames are on one side
+    # alone the next nearest; where there is none, `before`.
+    other: Numeric
+    rest: Numeric = np.float32(0)  # (), `Instants.rest`
+
+
+def make_layout(instants: Instants, clear: NDArray, count: int) -> InstantLayout:
+    """Lay out a target's instants as arrays.
+
+    Args:
+        instants: The instants.
+        clear: (K, h, w) 1 where a frame shows the pixel unclipped.
+        count: Number to which the instants are padded.
+
+    Returns:
+        The arrays.
+    """
+    framed: NDArray = clear.reshape(len(instants), -1).max(1) > 0
+    framed[[instants.before, instants.after]] |= instants.before != instants.after
+    target, other = instants.target, instants.after
+    order = np.argsort(np.abs(instants.t - instants.t[target]), kind="stable")
+    near = np.zeros(len(instants), bool)
+    near[[k for k in order if k == target or not framed[k]][:N_NEAR]] = True
+    near[target] = True
+    if instants.before == other:
+        other = next((k for k in order if framed[k] and k not in (target, other)), other)
+    indices = (np.asarray(k, np.int32) for k in (target, instants.before, instants.after, other))
+
+    def pad(values: NDArray, fill: float = 0) -> NDArray[np.float32]:
+        return np.pad(
+            np.asarray(values, np.float32), (0, count - len(values)), constant_values=fill
+        )
+
+    layout = pad(instants.s, 1), pad(np.ones(len(instants))), pad(framed), pad(near)
+    return InstantLayout(*layout, *indices, rest=np.float32(instants.rest))
+
+
+class RobustMean(NamedTuple):
+    """The robust mean of a target's images along trajectories, each (h, w), and its evidence."""
+
+    M: Float[Numeric, "h w"]  # log intensity
+    information: Float[Numeric, "h w"]  # 1 / (ln I)^2
+    scatter: Float[Numeric, "h w"]  # variance beyond that of the images, (ln I)^2
+    near_mean: Float[Numeric, "h w"]  # of the near instants
+    near_information: Float[Numeric, "h w"]
+    frame_information: Float[Numeric, "h w"]
+    activity: Float[Numeric, "h w"]  # squared changes in place over `activity_range`
+    shares: Float[Numeric, "3 h w"]  # in M: of frames before, frames after, all others
+    visible: Float[Numeric, "2 h w"]  # 1 where the frame before, after, sees the point, else 0
+    image_variance: Float[Numeric, "h w"]  # mean of the images, as in M, 0 of frames unclipped
+
+
+def gaussian_taps(sigma: float) -> NDArray[np.float32]:
+    """Return the taps of a Gaussian of `sigma` px, an odd number."""
+    reach = int(np.ceil(3 * sigma))
+    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    return (taps / taps.sum()).astype(np.float32)
+
+
+def blur_jax(image: Array, sigma: float) -> Array:
+    """Blur the last two axes by a Gaussian; differentiable.
+
+    Args:
+        image: (..., h, w).
+        sigma: Standard deviation, px.
+
+    Returns:
+        (..., h, w).
+    """
+    taps = gaussian_taps(sigma)
+    for axis in (image.ndim - 2, image.ndim - 1):
+        size = image.shape[axis]
+        padded = pad_edge(image, axis, len(taps) // 2)
+        moved = [jax.lax.slice_in_dim(padded, i, i + size, axis=axis) for i in range(len(taps))]
+        image = functools.reduce(
+            jnp.add, [float(tap) * one for tap, one in zip(taps, moved, strict=True)]
+        )
+    return image
+
+
+def squared_gradient(image: Array) -> Array:
+    """Return |grad|^2 of images (..., h, w), 1/px^2; differentiable."""
+    gx, gy = gradient_jax(image)
+    return gy**2 + gx**2
+
+
+def activity_range(layout: InstantLayout) -> tuple[Numeric, Numeric]:
+    """Return the indices between which changes are summed: the frames next to the target.
+
+    Both are left out. Where frames are on one side alone, the range is from there to the target,
+    which takes part.
+    """
+    a, b, target = layout.before, layout.after, layout.target
+    last = layout.s[a] <= 0  # no frame follows
+    low = jnp.where((a == b) & ~last, target - 1, a)
+    return low, jnp.where((a == b) & last, target + 1, b)
+
+
+def robust_mean_jax(
+    params: Params, L: Float[Array, "k h w"], warped: WarpedImages, layout: InstantLayout
+) -> RobustMean:
+    """Compute the robust mean of images along trajectories; differentiable.
+
+    It begins with the target's own image. An instant counts by its information, which is of V and
+    of the error of warping. Where it differs from the others by more than that, the point is hidden
+    there. Excess scatter shows that the motion is wrong.
+
+    Args:
+        params: Parameters of `mc`.
+        L: (K, h, w) log intensity in place.
+        warped: The images along trajectories.
+        layout: Their instants.
+
+    Returns:
+        The mean and its evidence.
+    """
+    p = params
+    count = len(layout.s)
+    s, present, framed = (v[:, None, None] for v in (layout.s, layout.present, layout.framed))
+    here = (jnp.arange(count) == layout.target)[:, None, None]
+    eta = (p.information + (1 - p.information) * warped.clear) * present
+    base = jnp.where(warped.inside > 0, warped.V + p.floor, OUTSIDE_VARIANCE)
+    steepness = squared_gradient(blur_jax(L[layout.target], 1.0))
+    variance, residual = base, base
+    visible = jnp.broadcast_to(jnp.exp(-2 * s**2), base.shape)  # near instants begin
+    for turn in range(3):
+        added = p.sigma_place**2 * steepness + p.sigma_between**2
+        variance = base + jnp.where(here, 0, added)
+        R = eta / variance * visible
+        M = (R * warped.L).sum(0) / R.sum(0)
+        steepness = squared_gradient(M)
+        residual = blur_jax((warped.L - M) ** 2 / variance, RESIDUAL_SIGMA_PX)
+        if turn == 0:
+            residual = jnp.where(here, jnp.minimum(residual, 1), residual)
+        visible = 1 / (1 + (residual / p.tolerance) ** 2)
+    W = eta / variance
+    R = W * visible
+    total = R.sum(0)
+    M = (R * warped.L).sum(0) / total
+    # Of all instants but the plainly hidden ones, whatever the tolerance.
+    plain = present / variance / (1 + (residual / SCATTER_TOLERANCE) ** 2)
+    excess = (plain * ((warped.L - M) ** 2 - EXPECTED_SQUARE * variance)).sum(0)
+    weight = blur_jax((plain * eta).sum(0), SCATTER_SIGMA_PX)
+    scatter = jnp.maximum(blur_jax(excess, SCATTER_SIGMA_PX) / weight, 0)
+    W = W * warped.inside
+    near_information = (W * layout.near[:, None, None]).sum(0)
+    near = (W * layout.near[:, None, None] * warped.L).sum(0) / jnp.maximum(near_information, 1e-9)
+    order = jnp.arange(count)
+    low, high = activity_range(layout)
+    between = ((order > low) & (order + 1 < high))[:-1, None, None]
+    share = R / total
+    shares = [(share * framed * side).sum(0) for side in (s < 0, s > 0)]
+    return RobustMean(
+        M,
+        total,
+        scatter,
+        near,
+        near_information,
+        (W * framed).sum(0),
+        ((L[1:] - L[:-1]) ** 2 * between).sum(0),
+        jnp.stack([*shares, (share * (1 - framed * (s != 0))).sum(0)]),
+        jnp.stack([visible[k] * warped.inside[k] for k in (layout.before, layout.after)]),
+        (R * (1 - warped.clear) * warped.V).sum(0) / total,
+    )
+
+
+def visibility(
+    params: Params, M: Float[Array, "h w"], warped: WarpedImages
+) -> Float[Array, "k h w"]:
+    """Estimate the visibility of an image's points in images along trajectories.
+
+    Args:
+        params: Parameters of `mc`.
+        M: (h, w) log intensity of the points.
+        warped: The images along trajectories.
+
+    Returns:
+        (K, h, w), 0 where a point is hidden, to 1.
+    """
+    p = params
+    V = warped.V + p.floor + p.sigma_place**2 * squared_gradient(M) + p.sigma_between**2
+    residual = blur_jax((warped.L - M) ** 2 / V, RESIDUAL_SIGMA_PX)
+    return warped.inside / (1 + (residual / p.tolerance) ** 2)
+
+
+@njit_noalloc_inlined
+def blur_along_x(row, taps, padded, out):
+    """Blur a row; the image's border goes on.
+
+    Args:
+        row: (w,) the row.
+        taps: (n,) the filter, n odd.
+        padded: (w + n,) scratch.
+        out: (w,) output.
+    """
+    w, reach = len(row), len(taps) // 2
+    for x in range(reach):
+        padded[x] = row[0]
+        padded[w + reach + x] = row[w - 1]
+    for x in range(w):
+        padded[reach + x] = row[x]
+        out[x] = np.float32(0)
+    for i in range(len(taps)):
+        tap = taps[i]
+        for x in range(w):
+            out[x] += tap * padded[i + x]
+
+
+@njit_noalloc_inlined
+def blur_along_y(image, y, taps, out):
+    """Blur an image along y, for one of its rows.
+
+    Args:
+        image: (h, w) the image.
+        y: The row.
+        taps: (n,) the filter, n odd.
+        out: (w,) output.
+    """
+    h, w = image.shape
+    for x in range(w):
+        out[x] = np.float32(0)
+    for i in range(len(taps)):
+        row, tap = image[min(max(y + i - len(taps) // 2, 0), h - 1)], taps[i]
+        for x in range(w):
+            out[x] += tap * row[x]
+
+
+@njit_noalloc
+def _blur_across(begin, end, image, taps, scratch, out):
+    for y in range(begin, end):
+        blur_along_x(image[y], taps, scratch[begin], out[y])
+
+
+@njit_noalloc
+def _blur_down(begin, end, image, taps, out):
+    for y in range(begin, end):
+        blur_along_y(image, y, taps, out[y])
+
+
+def blur_image(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    """Blur an image by a Gaussian, in loops.
+
+    Args:
+        image: (h, w).
+        sigma: Standard deviation, px.
+
+    Returns:
+        (h, w).
+    """
+    taps = gaussian_taps(sigma)
+    half, out = np.empty_like(image), np.empty_like(image)
+    scratch = row_scratch(len(image), image.shape[1] + len(taps))
+    run_over_rows(_blur_across, len(image), image, taps, scratch, half)
+    run_over_rows(_blur_down, len(image), half, taps, out)
+    return out
+
+
+class _MeanInputs(NamedTuple):
+    """Inputs of the kernels of `robust_mean`."""
+
+    L: NDArray[np.float32]  # (K, h, w), in place
+    warped: WarpedImages
+    layout: InstantLayout  # indices are int
+    weights: NDArray[np.float32]  # (K,), with which the mean begins
+    taps: NDArray[np.float32]
+    low: int  # range of activity
+    high: int
+    information: np.float32
+    floor: np.float32
+    place_variance: np.float32  # px^2, of the place of points
+    between_variance: np.float32  # (ln I)^2, between pixels
+    tolerance: np.float32
+
+
+class _MeanScratch(NamedTuple):
+    """Arrays that the kernels of `robust_mean` exchange, and scratch memory."""
+
+    residuals: NDArray[np.float32]  # (K, h, w), blurred along x
+    steepness: NDArray[np.float32]  # (h, w), |grad M|^2
+    excess: NDArray[np.float32]  # (h, w), of squared differences
+    weight: NDArray[np.float32]  # (h, w), that it is divided by
+    rows: NDArray[np.float32]  # (h, 10 + 2 K, w)
+    padded: NDArray[np.float32]  # (h, w + taps)
+
+
+@njit_noalloc_inlined
+def _fill_variance(inputs, k, y, steepness, out):
+    V, inside = inputs.warped.V[k, y], inputs.warped.inside[k, y]
+    here = k == inputs.layout.target
+    for x in range(len(V)):
+        added = inputs.place_variance * steepness[x] + inputs.between_variance
+        base = V[x] + inputs.floor if inside[x] > 0 else np.float32(OUTSIDE_VARIANCE)
+        out[x] = base if here else base + added
+
+
+@njit_noalloc_inlined
+def _fill_visibility(residual, tolerance, most, out):
+    one = np.float32(1)
+    for x in range(len(residual)):
+        ratio = min(residual[x], most) / tolerance
+        out[x] = one / (one + ratio * ratio)
+
+
+@njit_noalloc
+def _update_mean(begin, end, inputs, scratch, turn, means):
+    """Update the mean M of some rows; `means` holds the image to begin from and that to write."""
+    warped, rows, one = inputs.warped, scratch.rows[begin], np.float32(1)
+    count, h, w = warped.L.shape
+    before, M = means
+    variance, residual, visible, total, mean = rows[0], rows[1], rows[2], rows[3], rows[4]
+    for y in range(begin, end):
+        steepness = scratch.steepness[y]
+        for x in range(w):
+            gx, gy = gradient(before, y, x)
+            steepness[x] = gx * gx + gy * gy
+            total[x], mean[x] = np.float32(0), np.float32(0)
+        for k in range(count):
+            if turn == 0:
+                visible[:] = inputs.weights[k]
+            else:
+                blur_along_y(scratch.residuals[k], y, inputs.taps, residual)
+                most = np.float32(1 if turn == 1 and k == inputs.layout.target else np.inf)
+                _fill_visibility(residual, inputs.tolerance, most, visible)
+            _fill_variance(inputs, k, y, steepness, variance)
+            L, clear = warped.L[k, y], warped.clear[k, y]
+            for x in range(w):
+                eta = inputs.information + (one - inputs.information) * clear[x]
+                R = eta / variance[x] * visible[x]
+                total[x] += R
+                mean[x] += R * L[x]
+        for x in range(w):
+            M[y, x] = mean[x] / total[x]
+
+
+@njit_noalloc
+def _fill_residuals(begin, end, inputs, scratch, M):
+    """Write squared differences from M in units of their variances, blurred along x."""
+    count, h, w = inputs.warped.L.shape
+    variance, ratio, padded = scratch.rows[begin, 0], scratch.rows[begin, 1], scratch.padded[begin]
+    for y in range(begin, end):
+        for k in range(count):
+            _fill_variance(inputs, k, y, scratch.steepness[y], variance)
+            L = inputs.warped.L[k, y]
+            for x in range(w):
+                ratio[x] = (L[x] - M[y, x]) * (L[x] - M[y, x]) / variance[x]
+            blur_along_x(ratio, inputs.taps, padded, scratch.residuals[k, y])
+
+
+@njit_noalloc_inlined
+def _add_instant(inputs, k, y, visible, variance, sums):
+    """Add an instant to the sums (9, w) that means are made of."""
+    one, zero, layout, warped = np.float32(1), np.float32(0), inputs.layout, inputs.warped
+    near, framed = layout.near[k], layout.framed[k]
+    before = framed if layout.s[k] < 0 else zero
+    after = framed if layout.s[k] > 0 else zero
+    rest = one - before - after
+    L, V, clear, inside = warped.L[k, y], warped.V[k, y], warped.clear[k, y], warped.inside[k, y]
+    total, mean, near_total, near_mean = sums[0], sums[1], sums[2], sums[3]
+    frames, from_before, from_after, from_rest = sums[4], sums[5], sums[6], sums[7]
+    image_variance = sums[8]
+    for x in range(len(L)):
+        eta = inputs.information + (one - inputs.information) * clear[x]
+        W = eta / variance[x]
+        R = W * visible[x]
+        total[x] += R
+        mean[x] += R * L[x]
+        W = W * inside[x]
+        near_total[x] += W * near
+        near_mean[x] += W * near * L[x]
+        frames[x] += W * framed
+        from_before[x] += R * before
+        from_after[x] += R * after
+        from_rest[x] += R * rest
+        image_variance[x] += R * (one - clear[x]) * V[x]
+
+
+@njit_noalloc_inlined
+def _add_excess(inputs, k, y, residual, variance, sums):
+    """Add an instant to the excess of squared differences (w,), and to its weight."""
+    M, excess, weight = sums
+    one, tolerance = np.float32(1), np.float32(SCATTER_TOLERANCE)
+    L, clear = inputs.warped.L[k, y], inputs.warped.clear[k, y]
+    expected = np.float32(EXPECTED_SQUARE)
+    for x in range(len(L)):
+        eta = inputs.information + (one - inputs.information) * clear[x]
+        ratio = residual[x] / tolerance
+        plain = one / variance[x] / (one + ratio * ratio)
+        e = L[x] - M[x]
+        excess[x] += plain * (e * e - expected * variance[x])
+        weight[x] += plain * eta
+
+
+@njit_noalloc
+def _finish(begin, end, inputs, scratch, out):
+    """Write all but the scatter of some rows, and what the scatter is gathered from."""
+    layout, warped = inputs.layout, inputs.warped
+    count, _, w = warped.L.shape
+    rows, zero = scratch.rows[begin], np.float32(0)
+    visible, sums = rows[0], rows[1:10]
+    residual, variance = rows[10 : 10 + count], rows[10 + count :]
+    for y in range(begin, end):
+        excess, weight, activity = scratch.excess[y], scratch.weight[y], out.activity[y]
+        sums[:], excess[:], weight[:], activity[:] = zero, zero, zero, zero
+        for k in range(count):
+            blur_along_y(scratch.residuals[k], y, inputs.taps, residual[k])
+            _fill_visibility(residual[k], inputs.tolerance, np.float32(np.inf), visible)
+            _fill_variance(inputs, k, y, scratch.steepness[y], variance[k])
+            _add_instant(inputs, k, y, visible, variance[k], sums)
+            for side in range(2):
+                if k == (layout.before if side == 0 else layout.after):
+                    for x in range(w):
+                        out.visible[side, y, x] = visible[x] * warped.inside[k, y, x]
+            if inputs.low < k and k + 1 < inputs.high:
+                early, late = inputs.L[k, y], inputs.L[k + 1, y]
+                for x in range(w):
+                    activity[x] += (late[x] - early[x]) * (late[x] - early[x])
+        for x in range(w):
+            total = sums[0, x]
+            out.information[y, x], out.M[y, x] = total, sums[1, x] / total
+            out.near_information[y, x] = sums[2, x]
+            out.near_mean[y, x] = sums[3, x] / max(sums[2, x], np.float32(1e-9))
+            out.frame_information[y, x] = sums[4, x]
+            out.image_variance[y, x] = sums[8, x] / total
+            for n in range(3):
+                out.shares[n, y, x] = sums[5 + n, x] / total
+        for k in range(count):
+            found = (out.M[y], excess, weight)
+            _add_excess(inputs, k, y, residual[k], variance[k], found)
+
+
+def robust_mean(
+    params: Params, L: NDArray, warped: WarpedImages, layout: InstantLayout
+) -> RobustMean:
+    """Compute the robust mean as `robust_mean_jax` does, of instants that are all present.
+
+    Args:
+        params: Parameters of `mc`.
+        L: (K, h, w) float32, log intensity in place.
+        warped: The images along trajectories.
+        layout: Their instants.
+
+    Returns:
+        The mean and its evidence.
+    """
+    p = params
+    count, h, w = L.shape
+    target, taps = int(layout.target), gaussian_taps(RESIDUAL_SIGMA_PX)
+    weights = np.exp(-2 * layout.s**2).astype(np.float32)
+    low, high = (int(k) for k in activity_range(layout))
+    layout = layout._replace(target=target, before=int(layout.before), after=int(layout.after))
+    numbers = (p.information, p.floor, p.sigma_place**2, p.sigma_between**2, p.tolerance)
+    numbers = [np.float32(v) for v in numbers]
+    inputs = _MeanInputs(L, warped, layout, weights, taps, low, high, *numbers)
+    rows, padded = row_scratch(h, 10 + 2 * count, w), row_scratch(h, w + len(taps))
+    images = np.empty((3, h, w), np.float32)
+    scratch = _MeanScratch(np.empty((count, h, w), np.float32), *images, rows, padded)
+    out = RobustMean(
+        *np.empty((7, h, w), np.float32),
+        np.empty((3, h, w), np.float32),
+        np.empty((2, h, w), np.float32),
+        np.empty((h, w), np.float32),
+    )
+    before = blur_image(np.ascontiguousarray(L[target]), 1.0)
+    for turn in range(3):
+        run_over_rows(_update_mean, h, inputs, scratch, turn, (before, out.M))
+        run_over_rows(_fill_residuals, h, inputs, scratch, out.M)
+        before = out.M.copy()
+    run_over_rows(_finish, h, inputs, scratch, out)
+    excess, weight = (
+        blur_image(part, SCATTER_SIGMA_PX) for part in (scratch.excess, scratch.weight)
+    )
+    return out._replace(scatter=np.maximum(excess / weight, 0))
+
+
+__getattr__ = renamed_names(__name__)

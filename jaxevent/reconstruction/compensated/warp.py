@@ -1,0 +1,342 @@
+"""Paths of pixels, and images read along them: in numba loops, and in JAX for derivatives.
+
+A path holds the numbers (vx, vy, ax, ay) of a point that the target's image shows at the pixel x.
+At the instant s the point lies at x + v s + a s^2, s in -1..1. Paths are given at nodes, one for
+every 2 x 2 pixels, and bilinear between them. Functions whose names end in `_jax` are
+differentiable.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
+from jaxevent.reconstruction.features import Numeric
+
+CUBIC_SLOPE = -0.75  # derivative of the cubic kernel at 1 px, as in OpenCV
+
+
+class WarpedImages(NamedTuple):
+    """Images at K instants, read at the target's points."""
+
+    L: Float[Numeric, "k h w"]  # log intensity, bicubic
+    V: Float[Numeric, "k h w"]  # its variance, (ln I)^2, bilinear
+    clear: Float[Numeric, "k h w"]  # 1 where a frame shows the point unclipped, bilinear
+    inside: Float[Numeric, "k h w"]  # 1, or 0 beyond the image's border
+
+
+class RowScratch(NamedTuple):
+    """Scratch memory for the points of one row, for each row that a kernel begins with."""
+
+    path: NDArray[np.float32]  # (rows, 4, points)
+    x: NDArray[np.float32]  # (rows, points), px, at the target
+    pixel: NDArray[np.int32]  # (rows, 2, points), x and y of the pixel before each point
+    part: NDArray[np.float32]  # (rows, 2, points), distance from that pixel, px
+    inside: NDArray[np.float32]  # (rows, points), 1, or 0 beyond the image's border
+
+    @classmethod
+    def allocate(cls, rows: int, points: int) -> "RowScratch":
+        """Allocate scratch memory for `run_over_rows`."""
+        path, part = row_scratch(rows, 4, points), row_scratch(rows, 2, points)
+        x, inside = row_scratch(rows, points), row_scratch(rows, points)
+        return cls(path, x, np.empty((rows, 2, points), np.int32), part, inside)
+
+
+@njit_noalloc_inlined
+def gradient(image, y, x):
+    """Return the gradient along x and y at a pixel; five taps, exact up to degree 4."""
+    h, w = image.shape
+    up, down, up2, down2 = max(y - 1, 0), min(y + 1, h - 1), max(y - 2, 0), min(y + 2, h - 1)
+    left, right, left2, right2 = max(x - 1, 0), min(x + 1, w - 1), max(x - 2, 0), min(x + 2, w - 1)
+    eight, twelfth = np.float32(8), np.float32(1 / 12)
+    gx = eight * (image[y, right] - image[y, left]) - image[y, right2] + image[y, left2]
+    gy = eight * (image[down, x] - image[up, x]) - image[down2, x] + image[up2, x]
+    return gx * twelfth, gy * twelfth
+
+
+def pad_edge(images: Array, axis: int, size: int) -> Array:
+    """Pad images by `size` copies of the border at both ends of an axis."""
+    widths = [(0, 0)] * images.ndim
+    widths[axis] = (size, size)
+    return jnp.pad(images, widths, mode="edge")
+
+
+def gradient_jax(images: Array) -> tuple[Array, Array]:
+    """Return the gradients of images (..., h, w) along x and y, as `gradient` does."""
+
+    def along(axis: int) -> Array:
+        padded, size = pad_edge(images, axis, 2), images.shape[axis]
+        a, b, _, d, e = (jax.lax.slice_in_dim(padded, i, i + size, axis=axis) for i in range(5))
+        return (8 * (d - b) - e + a) / 12
+
+    return along(images.ndim - 1), along(images.ndim - 2)
+
+
+@njit_noalloc_inlined
+def bilinear_cell(X, Y, h, w):
+    """Return the four pixels around a point, or at the border: x0, y0, x1, y1, and fx, fy in it."""
+    zero = np.float32(0)
+    X = min(max(X, zero), np.float32(w - 1))
+    Y = min(max(Y, zero), np.float32(h - 1))
+    x0, y0 = min(int(X), max(w - 2, 0)), min(int(Y), max(h - 2, 0))
+    x1, y1 = min(x0 + 1, w - 1), min(y0 + 1, h - 1)
+    return x0, y0, x1, y1, X - np.float32(x0), Y - np.float32(y0)
+
+
+@njit_noalloc_inlined
+def bilinear_weights(fx, fy):
+    """Return the weights of the pixels (y0, x0), (y0, x1), (y1, x0) and (y1, x1) of a cell."""
+    one = np.float32(1)
+    return (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
+
+
+@njit_noalloc_inlined
+def blend_nodes(p, cell, out):
+    """Write the four numbers of a path between the nodes (rows, columns, 4) of a cell."""
+    j, i, j1, i1, fx, fy = cell
+    for c in range(4):
+        top = p[i, j, c] + fx * (p[i, j1, c] - p[i, j, c])
+        bottom = p[i1, j, c] + fx * (p[i1, j1, c] - p[i1, j, c])
+        out[c] = top + fy * (bottom - top)
+
+
+@njit_noalloc_inlined
+def interpolate_path(p, at_y, at_x, out):
+    """Write the path at a place between nodes, which is given in units of nodes."""
+    rows, columns, _ = p.shape
+    at_y = min(max(at_y, np.float32(0)), np.float32(rows - 1))
+    at_x = min(max(at_x, np.float32(0)), np.float32(columns - 1))
+    i, j = int(at_y), int(at_x)
+    i1, j1 = min(i + 1, rows - 1), min(j + 1, columns - 1)
+    blend_nodes(p, (j, i, j1, i1, at_x - np.float32(j), at_y - np.float32(i)), out)
+
+
+@njit_noalloc
+def _resample(begin, end, p, scale, factor, out):
+    ratio, half = np.float32(1) / scale, np.float32(0.5)
+    for i in range(begin, end):
+        at_y = (np.float32(i) + half) * ratio - half
+        for j in range(out.shape[1]):
+            interpolate_path(p, at_y, (np.float32(j) + half) * ratio - half, out[i, j])
+            for c in range(4):
+                out[i, j, c] *= factor
+
+
+def interpolate_paths(p: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """Interpolate the paths of nodes to all pixels.
+
+    Args:
+        p: (rows, columns, 4) paths of nodes, px.
+        size: Height and width of the image, px.
+
+    Returns:
+        (h, w, 4) paths of pixels, px.
+    """
+    out = np.empty((*size, 4), np.float32)
+    run_over_rows(_resample, size[0], p, np.float32(2), np.float32(1), out)
+    return out
+
+
+def resize_nodes(
+    p: NDArray[np.float32], shape: tuple[int, int], finer: bool
+) -> NDArray[np.float32]:
+    """Interpolate nodes to those of images of twice (`finer`) or half the resolution.
+
+    Args:
+        p: (rows, columns, 4) paths, in pixels of the present resolution.
+        shape: Rows and columns of the new nodes.
+        finer: Whether the new resolution is twice the present one, not half of it.
+
+    Returns:
+        (*shape, 4) paths, in pixels of the new resolution.
+    """
+    out, scale = np.empty((*shape, 4), np.float32), np.float32(2 if finer else 0.5)
+    run_over_rows(_resample, shape[0], p, scale, scale, out)
+    return out
+
+
+def interpolate_paths_jax(p: Array, height: int, width: int) -> Array:
+    """Interpolate the paths of nodes to all pixels, as `interpolate_paths` does."""
+    Y = jnp.broadcast_to(jnp.arange(height)[:, None] / 2 - 0.25, (4, height, width))
+    X = jnp.broadcast_to(jnp.arange(width) / 2 - 0.25, (4, height, width))
+    return jnp.moveaxis(sample(jnp.moveaxis(p, -1, 0), Y, X), 0, -1)
+
+
+@njit_noalloc_inlined
+def locate_points(y, s, size, count, row):
+    """Locate the first points of a row at an instant: write `pixel`, `part` and `inside`.
+
+    `row` holds the parts of a `RowScratch` for one row.
+    """
+    h, w = size
+    path, x, pixel, part, inside = row
+    one, zero, half = np.float32(1), np.float32(0), np.float32(0.5)
+    right, bottom = np.float32(w - 1), np.float32(h - 1)
+    last_x, last_y = np.int32(max(w - 2, 0)), np.int32(max(h - 2, 0))
+    for i in range(count):
+        X = x[i] + (path[0, i] + path[2, i] * s) * s
+        Y = y + (path[1, i] + path[3, i] * s) * s
+        here = (X >= -half) & (X <= right + half) & (Y >= -half) & (Y <= bottom + half)
+        inside[i] = one if here else zero
+        # So that what is no number becomes 0, too: it must not point outside.
+        X, Y = X if X > zero else zero, Y if Y > zero else zero
+        X, Y = min(X, right), min(Y, bottom)
+        x0, y0 = min(np.int32(X), last_x), min(np.int32(Y), last_y)
+        pixel[0, i], pixel[1, i] = x0, y0
+        part[0, i], part[1, i] = X - np.float32(x0), Y - np.float32(y0)
+
+
+@njit_noalloc_inlined
+def _cubic_weights(part, out):
+    """Write the weights (4, points) of the four pixels around each point along an axis."""
+    a, one, two, three = np.float32(CUBIC_SLOPE), np.float32(1), np.float32(2), np.float32(3)
+    for i in range(len(part)):
+        f = part[i]
+        far, rest = one + f, one - f
+        first = ((a * far - np.float32(5) * a) * far + np.float32(8) * a) * far
+        out[0, i] = first - np.float32(4) * a
+        out[1, i] = ((a + two) * f - (a + three)) * f * f + one
+        out[2, i] = ((a + two) * rest - (a + three)) * rest * rest + one
+        out[3, i] = one - out[0, i] - out[1, i] - out[2, i]
+
+
+@njit_noalloc_inlined
+def _read_bilinear(image, pixel, part, out):
+    h, w = image.shape
+    for i in range(len(out)):
+        x0, y0 = pixel[0, i], pixel[1, i]
+        x1 = min(x0 + 1, w - 1)
+        upper, lower = image[y0], image[min(y0 + 1, h - 1)]
+        a, b, c, d = bilinear_weights(part[0, i], part[1, i])
+        out[i] = a * upper[x0] + b * upper[x1] + c * lower[x0] + d * lower[x1]
+
+
+@njit_noalloc_inlined
+def _read_bicubic(image, pixel, weights, out):
+    h, w = image.shape
+    for i in range(len(out)):
+        x, y, total = int(pixel[0, i]) - 1, int(pixel[1, i]) - 1, np.float32(0)
+        if 0 <= x < w - 3 and 0 <= y < h - 3:
+            for n in range(4):
+                row = image[y + n]
+                part = weights[0, i] * row[x] + weights[1, i] * row[x + 1]
+                part = part + weights[2, i] * row[x + 2] + weights[3, i] * row[x + 3]
+                total += weights[4 + n, i] * part
+        else:  # the image's border goes on
+            for n in range(4):
+                row, part = image[min(max(y + n, 0), h - 1)], np.float32(0)
+                for m in range(4):
+                    part += weights[m, i] * row[min(max(x + m, 0), w - 1)]
+                total += weights[4 + n, i] * part
+        out[i] = total
+
+
+@njit_noalloc
+def _warp(begin, end, inputs, scratch, cubic, out):
+    L, V, clear, s, paths = inputs
+    count, h, w = L.shape
+    path, pixel, part = scratch.path[begin], scratch.pixel[begin], scratch.part[begin]
+    at, weights = scratch.x[begin], cubic[begin]
+    for x in range(w):
+        at[x] = np.float32(x)
+    for y in range(begin, end):
+        for x in range(w):
+            for c in range(4):
+                path[c, x] = paths[y, x, c]
+        for k in range(count):
+            row = (path, at, pixel, part, out.inside[k, y])
+            locate_points(np.float32(y), s[k], (h, w), w, row)
+            _cubic_weights(part[0], weights[:4])
+            _cubic_weights(part[1], weights[4:])
+            _read_bicubic(L[k], pixel, weights, out.L[k, y])
+            _read_bilinear(V[k], pixel, part, out.V[k, y])
+            _read_bilinear(clear[k], pixel, part, out.clear[k, y])
+
+
+def warp(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, paths: NDArray) -> WarpedImages:
+    """Read images along the paths of pixels.
+
+    Args:
+        L: (K, h, w) float32, log intensity.
+        V: (K, h, w) float32, its variance, (ln I)^2.
+        clear: (K, h, w) float32, 1 where a frame shows the pixel unclipped.
+        s: (K,) float32, times of the images relative to the target, -1..1.
+        paths: (h, w, 4) float32, px.
+
+    Returns:
+        The images at the target's points.
+    """
+    _, h, w = L.shape
+    out = WarpedImages(*(np.empty(L.shape, np.float32) for _ in range(4)))
+    inputs = (L, V, clear, s, paths)
+    run_over_rows(_warp, h, inputs, RowScratch.allocate(h, w), row_scratch(h, 8, w), out)
+    return out
+
+
+def displacements(paths: Array, s: Array) -> Array:
+    """Return the displacements (K, h, w, 2) along x and y (px) of paths (h, w, 4) at s (K,)."""
+    s = s[:, None, None, None]
+    return (paths[..., :2] + paths[..., 2:] * s) * s
+
+
+def squared_reach(paths: Numeric) -> Numeric:
+    """Return an upper bound (px^2) of the squared distance that points of paths (h, w, 4) go."""
+    return ((abs(paths[..., :2]) + abs(paths[..., 2:])) ** 2).sum(-1)
+
+
+def positions(paths: Array, s: Array) -> tuple[Array, Array]:
+    """Return y and x, (K, h, w) each, of the points of paths (h, w, 4) at s (K,)."""
+    height, width, _ = paths.shape
+    moved = displacements(paths, s)
+    return jnp.arange(height)[:, None] + moved[..., 1], jnp.arange(width) + moved[..., 0]
+
+
+def sample(images: Array, Y: Array, X: Array) -> Array:
+    """Read images (K, h, w) at the points Y and X (K, ...) of each, bilinear; differentiable."""
+    _, h, w = images.shape
+    Y, X = jnp.clip(Y, 0, h - 1), jnp.clip(X, 0, w - 1)
+    y0 = jnp.minimum(Y.astype(int), max(h - 2, 0))
+    x0 = jnp.minimum(X.astype(int), max(w - 2, 0))
+    y1, x1 = jnp.minimum(y0 + 1, h - 1), jnp.minimum(x0 + 1, w - 1)
+    fy, fx = Y - y0, X - x0
+    k = jnp.arange(len(images))[:, None, None]
+    top = (1 - fx) * images[k, y0, x0] + fx * images[k, y0, x1]
+    bottom = (1 - fx) * images[k, y1, x0] + fx * images[k, y1, x1]
+    return (1 - fy) * top + fy * bottom
+
+
+def is_inside(Y: Array, X: Array, height: int, width: int) -> Array:
+    """Return which points lie in an image of that size."""
+    return (X >= -0.5) & (X <= width - 0.5) & (Y >= -0.5) & (Y <= height - 0.5)
+
+
+def warp_jax(L: Array, V: Array, clear: Array, s: Array, paths: Array) -> WarpedImages:
+    """Read images along the paths of pixels, as `warp` does; differentiable."""
+    _, h, w = L.shape
+    Y, X = positions(paths, s)
+    inside = is_inside(Y, X, h, w)
+    V, clear = sample(V, Y, X), sample(clear, Y, X)
+    Y, X = jnp.clip(Y, 0, h - 1), jnp.clip(X, 0, w - 1)
+    y0 = jnp.minimum(Y.astype(int), max(h - 2, 0))
+    x0 = jnp.minimum(X.astype(int), max(w - 2, 0))
+    fy, fx = Y - y0, X - x0
+    k = jnp.arange(len(s))[:, None, None]
+    row = [jnp.clip(y0 + i, 0, h - 1) for i in range(-1, 3)]
+    column = [jnp.clip(x0 + j, 0, w - 1) for j in range(-1, 3)]
+
+    def cubic(f: Array) -> Array:
+        a = CUBIC_SLOPE
+        far, rest = 1 + f, 1 - f
+        first = ((a * far - 5 * a) * far + 8 * a) * far - 4 * a
+        second = ((a + 2) * f - (a + 3)) * f * f + 1
+        third = ((a + 2) * rest - (a + 3)) * rest * rest + 1
+        return jnp.stack([first, second, third, 1 - first - second - third])
+
+    # Around the points: (rows, columns, k, h, w).
+    taps = L[k, jnp.stack(row)[:, None], jnp.stack(column)]
+    bicubic = (cubic(fy)[:, None] * cubic(fx) * taps).sum((0, 1))
+    return WarpedImages(bicubic, V, clear, inside.astype(L.dtype))
