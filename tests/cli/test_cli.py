@@ -424,7 +424,7 @@ def test_info(tmp_path, capsys, monkeypatch):
     assert re.search(r"known\.h5: 6 events, 2 frames, 0\.\d MB\n", capsys.readouterr().out)
     assert cli.main(["info", str(path)]) == 0
     first = capsys.readouterr().out
-    monkeypatch.setattr(describe, "BLOCK", 2)
+    monkeypatch.setattr(describe, "BLOCK_EVENTS", 2)
     assert cli.main(["info", str(tmp_path / "known.h5")]) == 0
     assert capsys.readouterr().out.splitlines()[1:] == first.splitlines()[1:]
     lines = dict(re.split(r"  +", line, maxsplit=1) for line in first.splitlines())

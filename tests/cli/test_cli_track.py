@@ -153,7 +153,7 @@ def test_a_folder_of_everything(folder, capsys):
 
 @pytest.mark.slow
 def test_a_row_for_each_event(folder, capsys, monkeypatch):
-    monkeypatch.setattr(written, "_STRETCH", 300)
+    monkeypatch.setattr(written, "_BATCH_EVENTS", 300)
     argv = ["track", folder / "two.h5", *METHOD, "--params", folder / "mine.toml", "--at", "events"]
     path = folder / "events.csv"
     span = ["--start", "0.01", "--stop", "0.04"]
@@ -177,7 +177,7 @@ def test_a_row_for_each_event(folder, capsys, monkeypatch):
 @pytest.mark.slow
 def test_quantities_at_event_rate(folder, capsys, monkeypatch):
     """Two pairs and a range, stretch by stretch, against all events at once."""
-    monkeypatch.setattr(written, "_STRETCH", 300)
+    monkeypatch.setattr(written, "_BATCH_EVENTS", 300)
     out = folder / "out"
     argv = [
         *("track", folder / "two.h5", *METHOD, "--params", folder / "mine.toml", "--at", "events"),
