@@ -299,7 +299,7 @@ def test_nothing_found_is_an_empty_table(tmp_path, capsys, monkeypatch):
         ("a.csv", {"camera_moves": True}, "the camera moves, and no blob was found"),
         ("b.csv", {"full": True}, "no blob was found, and most of the image changes"),
     ):
-        nothing = functools.partial(blob.Found, (), (), 0, 1.0, **given)
+        nothing = functools.partial(blob.TargetSearchResult, (), (), 0, 1.0, **given)
         monkeypatch.setattr(blob, "find", lambda one, nothing=nothing, **_: nothing(one))
         assert cli.main([*map(str, argv[:-1]), str(tmp_path / name)]) == 0
         assert told in capsys.readouterr().out
