@@ -149,13 +149,18 @@ RENAMED: dict[str, str] = {
 }
 # Modules that have another name or are part of another one.
 MOVED_MODULES: dict[str, str] = {
+    "jaxevent.reconstruction.clock": "jaxevent.reconstruction.frames",
     "jaxevent.reconstruction.compensated.agreement": "jaxevent.reconstruction.compensated.robust_mean",
     "jaxevent.reconstruction.compensated.borders": "jaxevent.reconstruction.compensated.trajectories",
     "jaxevent.reconstruction.compensated.implicit": "jaxevent.reconstruction.compensated.normal_equations",
     "jaxevent.reconstruction.compensated.parameters": "jaxevent.reconstruction.compensated.params",
-    "jaxevent.reconstruction.clock": "jaxevent.reconstruction.frames",
     "jaxevent.reconstruction.prepared": "jaxevent.reconstruction.estimator",
     "jaxevent.sharing": "jaxevent.locks",
+    "jaxevent.show.motion_pictures": "jaxevent.show.motion_figures",
+    "jaxevent.show.notebook": "jaxevent.show.figures",
+    "jaxevent.show.report": "jaxevent.show.tables",
+    "jaxevent.show.track_pictures": "jaxevent.show.track_figures",
+    "jaxevent.show.track_plots": "jaxevent.show.track_figures",
     "jaxevent.shown": "jaxevent.display",
 }
 
