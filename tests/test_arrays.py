@@ -102,7 +102,7 @@ def test_units(unit, scale):
 def test_float32_times_that_cannot_be_told_apart():
     v = arrays()
     rest = [v[name] for name in "xyp"]
-    with pytest.raises(InputError, match=r"^t: float32 holds times near 1\.7e\+09 .*float64"):
+    with pytest.raises(InputError, match="^t: .* near 1.* s are 128 s apart; .*64-bit"):
         Recording.from_arrays(
             (v["t"] / 1e6 + 1.7e9).astype("f4"), *rest, width=WIDTH, height=HEIGHT, time_unit="s"
         )
@@ -132,7 +132,7 @@ def test_messages_name_the_argument_and_the_remedy():
     v = arrays()
     images = np.zeros((2, HEIGHT, WIDTH))
     for changes, message in (
-        ({"t": v["t"] / 1e6}, "t is float64, which tells no unit; give time_unit='s'"),
+        ({"t": v["t"] / 1e6}, "t is float64, which states no unit; give time_unit='s'"),
         ({"p": v["p"] * 255}, "polarity 255; it must be 1 for ON .* p > 0"),
         ({"x": v["x"] - 1}, r"x = -1; on the 64x48 sensor x is a whole number from 0 to 63"),
         ({"x": v["x"][:-5]}, "300, 295, 300 and 300 values; they must be equally long"),

@@ -267,7 +267,7 @@ def test_a_data_set_is_evaluated_and_fitted(tmp_path, monkeypatch):
     text = 'recordings = ["mvsec:set"]\n{}[[method]]\nname = "akf"\n'
     config = tmp_path / "run.toml"
     config.write_text(text.format(""))
-    with pytest.raises(InputError, match="two cameras, left and right; choose one"):
+    with pytest.raises(InputError, match="2 cameras, left, right; choose one"):
         jaxevent.evaluate(config)
     config.write_text(text.format('stream = "left"\n'))
     (row,) = jaxevent.evaluate(config, tmp_path / "out")

@@ -11,7 +11,7 @@ import jaxevent
 from jaxevent import events
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.events import parts
+from jaxevent.events import blocks as event_blocks
 from jaxevent.recording import Events, Frames, Recording
 
 WIDTH, HEIGHT = 7, 5
@@ -47,7 +47,7 @@ def rows(part: Events) -> list[tuple[int, int, int, bool]]:
 @pytest.fixture(autouse=True, params=[1 << 20, 33])
 def blocks(request, monkeypatch):
     """Results do not depend on the blocks in which events are read."""
-    monkeypatch.setattr(parts, "BLOCK", request.param)
+    monkeypatch.setattr(event_blocks, "BLOCK_EVENTS", request.param)
 
 
 def test_background_activity_is_what_no_neighbour_supports():

@@ -21,8 +21,7 @@ from jaxevent.egomotion.truth import Known, known
 from jaxevent.egomotion.twists import constant_between, from_poses, nearest_axes
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.estimator import Estimate
-from jaxevent.io.description import CLOCK
-from jaxevent.io.output import check_writable, complete, complete_hdf5
+from jaxevent.io.output import CLOCK_UNIT, check_writable, complete, complete_hdf5
 from jaxevent.metrics import MEANINGS
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
@@ -86,7 +85,7 @@ def write_motion(
 ) -> None:
     """Write the estimates as HDF5: t (us), mean, covariance, lost, lag (s), contrast and others.
 
-    The attributes are recording, model, components, units, and those of `jaxevent.io.description`.
+    The attributes are recording, model, components, units, and those of `jaxevent.io.output`.
 
     Args:
         path: File that is written.
@@ -96,7 +95,8 @@ def write_motion(
         params: Parameters of the method.
     """
     units = {
-        "t": CLOCK, "mean": "units", "covariance": "units[i] units[j]", "lost": "1", "lag": "s",
+        "t": CLOCK_UNIT, "mean": "units", "covariance": "units[i] units[j]", "lost": "1",
+        "lag": "s",
         "contrast": "1", "evidence": "1, of a natural logarithm", "cloud": "units",
         "agreement": "1",
     }  # fmt: skip
@@ -448,7 +448,7 @@ def _write_flow(path: Path, recording: Recording, motion: Motion, progress: bool
             known_count += int(known.sum())
             over += int((part.residual[known] > float(params.limit)).sum())
             row = stop
-        units = {"t": CLOCK, "u": "px/s, undistorted", "v": "px/s, undistorted", "valid": "1"}
+        units = {"t": CLOCK_UNIT, "u": "px/s, undistorted", "v": "px/s, undistorted", "valid": "1"}
         for name, unit in units.items():
             stored[name].attrs["unit"] = unit
         outliers = 100 * over / known_count if known_count else 0.0

@@ -14,7 +14,7 @@ from noise import ONE, small, write_config
 import jaxevent
 from jaxevent import cli
 from jaxevent.egomotion.truth import known
-from jaxevent.io import output, places
+from jaxevent.io import output
 from jaxevent.register.geometry import read_homography
 from jaxevent.runs import results
 from jaxevent.runs.blob_positions import read_positions
@@ -217,7 +217,7 @@ def test_what_another_process_writes_is_refused(folder, capsys):
     with output.complete(folder / "a.h5"):
         fails(capsys, ["convert", "source.h5", "a.h5", "--force"], "another process")
     assert state(folder).keys() == before.keys() | {folder / "a.h5"}
-    assert not places.partials(folder / "a.h5")
+    assert not output.partials(folder / "a.h5")
 
 
 def test_a_fit_has_its_folder_alone(folder, capsys):

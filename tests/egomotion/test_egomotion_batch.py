@@ -189,11 +189,9 @@ def test_the_motion_before_a_wall_is_found():
     heading, turn = found[0][0].path.twist(0.0)
     assert np.degrees(np.arccos(heading[0] @ T / np.linalg.norm(T))) < 1
     assert np.linalg.norm(turn[0] - OMEGA) < 0.02 * np.linalg.norm(OMEGA)
-    # Depths are the plane's; smaller than LEAST some were not.
-    (x, y), rho = (
-        windows.series(150_000, 0.15, hypotheses.HYPOTHESIS_EVENTS).places,
-        np.exp(found[0][0].path.log_rho),
-    )
+    # Depths are the plane's; those smaller than the least were not.
+    x, y = windows.series(150_000, 0.15, hypotheses.HYPOTHESIS_EVENTS).node_positions
+    rho = np.exp(found[0][0].path.log_rho)
     rays = np.stack([x / F, y / F, np.ones(len(x))], 1)
     ahead = rays @ normal > 0.3
     n = np.linalg.lstsq(rays[ahead], rho[ahead])[0]

@@ -93,7 +93,7 @@ def test_estimates_by_a_kernel():
 def test_what_has_no_kernel_is_refused():
     recording = moved(lambda at: np.array([130.0, -70.0]), 0.05, 120, seed=3)
     params = voting.Params.of({**SMALL, "likelihood": "literal"})
-    with pytest.raises(InputError, match="no kernel for voting.*literal"):
+    with pytest.raises(InputError, match="no kernel.*literal"):
         voting.estimate(recording, params, compiler="numba")
     with pytest.raises(InputError, match="no compiler 'gcc'"):
         voting.estimate(recording, params, compiler="gcc")

@@ -52,7 +52,7 @@ def test_strings_are_found_wherever_blocks_of_the_search_end(tmp_path, monkeypat
         monkeypatch.setattr(hdf5_files, "_BLOCK", block)
         hdf5_files.search_heaps.__wrapped__(good, ())
         for path in bad:
-            with pytest.raises(InputError, match="a string or its heap is damaged"):
+            with pytest.raises(InputError, match="a string or its heap is not valid"):
                 hdf5_files.search_heaps.__wrapped__(path, ())
 
 

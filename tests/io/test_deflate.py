@@ -4,7 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
-from jaxevent.io.deflate import shuffled
+from jaxevent.io.output import deflate_shuffled
 
 
 @pytest.mark.parametrize("kind", ["<f4", "<f8"])
@@ -15,7 +15,7 @@ def test_hdf5_reads_chunks_as_they_were(tmp_path, kind):
     images[2] = np.nan
     images[3] = np.rint(10 * images[0]) / 8  # whose mantissas are short
     images[4] = np.where(rng.random((70, 61)) < 0.5, -np.inf, 1e-30)
-    chunks = [shuffled(image) for image in images]
+    chunks = [deflate_shuffled(image) for image in images]
     assert len(chunks[2]) < 600 and len(chunks[3]) < images[3].nbytes / 2
     with h5py.File(tmp_path / "a.h5", "w") as file:
         options = {"compression": "gzip", "shuffle": True, "chunks": (1, 70, 61)}
@@ -32,5 +32,5 @@ def test_a_single_number(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         options = {"compression": "gzip", "shuffle": True, "chunks": (1,)}
         stored = file.create_dataset("one", (1,), "<f4", **options)
-        stored.id.write_direct_chunk((0,), shuffled(np.full(1, 0.3, np.float32)))
+        stored.id.write_direct_chunk((0,), deflate_shuffled(np.full(1, 0.3, np.float32)))
         assert stored[0] == np.float32(0.3)

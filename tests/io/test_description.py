@@ -17,8 +17,8 @@ from noise import STAMPS, small
 
 import jaxevent
 from jaxevent import cli
-from jaxevent.io import description, toml
-from jaxevent.io.description import Command
+from jaxevent.io import output, toml
+from jaxevent.io.output import Command
 from jaxevent.recording import Imu, Poses, Triggers
 
 words = st.text(st.characters(exclude_categories=["Cs"]))
@@ -91,7 +91,7 @@ def test_what_python_writes_says_the_version_alone(tmp_path):
     assert "jaxevent_version" in described(path)
     assert not {"command", "inputs", "method", "params"} & set(described(path))
     # Nothing of a command is left when it has ended, badly or well.
-    with pytest.raises(KeyError), description.running(Command(["jaxevent"], [])):
+    with pytest.raises(KeyError), output.running(Command(["jaxevent"], [])):
         jaxevent.save(whole(), path)
         assert described(path)["command"] == "jaxevent" and described(path)["inputs"] == {}
         raise KeyError
@@ -122,9 +122,11 @@ def test_inputs_of_each_kind(tmp_path, monkeypatch):
     (tmp_path / "large").write_bytes(bytes(11))
     (tmp_path / "small").write_bytes(bytes(10))
     os.mkfifo(tmp_path / "pipe")  # to open it would wait for ever
-    monkeypatch.setattr(description, "MOST_HASHED", 10)
+    monkeypatch.setattr(output, "_MAX_HASHED", 10)
     names = ["folder", "large", "small", "pipe", "gone", os.fsdecode(b"\xff")]
-    told = tomllib.loads(Command(["jaxevent"], [tmp_path / name for name in names]).read)
+    told = tomllib.loads(
+        Command(["jaxevent"], [tmp_path / name for name in names]).described_inputs
+    )
     told = {name.rpartition("/")[2]: about for name, about in told.items()}
     listed = hashlib.sha256(b"a\t3\nb\t2\nsub/c\t0\n").hexdigest()
     assert told["folder"] == {"files": 3, "bytes": 5, "sha256_names_sizes": listed}

@@ -26,7 +26,7 @@ def columns_of(t, seed=1):
 
 
 def examined(t, pieces=1, **options):
-    return disorder.examine(np.array_split(np.asarray(t, np.int64), pieces), **options)
+    return disorder.find_disorder(np.array_split(np.asarray(t, np.int64), pieces), **options)
 
 
 def mended(t, how, pieces=1):
@@ -42,7 +42,7 @@ def mended(t, how, pieces=1):
     def decode(state):
         yield from blocks[state or 0 :]
 
-    again = disorder.repaired(decode, found, repair)
+    again = disorder.repair_decoder(decode, found, repair)
     out = list(again(None))
     for state, (times, row, *_) in out:  # each block can be decoded by itself
         _, (same, same_row, *_) = next(again(state))

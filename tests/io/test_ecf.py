@@ -172,7 +172,7 @@ def test_damage_is_told(tmp_path):
     write(path, records_of(formats.events_of(0, 200, SIZE)), 96)
     with h5py.File(path, "r+") as file:
         file["CD/events"].id.write_direct_chunk((96,), b"\x08")
-    with pytest.raises(InputError, match="CD/events: the chunk of row 96 is damaged"):
+    with pytest.raises(InputError, match="CD/events: the chunk of row 96 cannot be decoded"):
         load(path)
     other = np.zeros(10, [("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<f8")])
     write(path, other, 10)

@@ -129,7 +129,7 @@ def test_images_and_times_of_timelens_that_do_not_fit(tmp_path, capsys):
     fails(capsys, ["info", folder], "timestamp.txt: has 4 times for 3 images")
     folder = timelens(tmp_path / "none")
     (folder / "images" / "timestamp.txt").unlink()
-    fails(capsys, ["info", folder], "no image in images tells the sensor's size", "--size")
+    fails(capsys, ["info", folder], "no image in images shows the sensor's size", "--size")
     recording = jaxevent.load(folder, size=SIZE)
     assert recording.frames is None
     assert "3 images without their times" in recording.left_out["frames"]
@@ -328,12 +328,12 @@ def test_two_columns_that_are_no_exposures(tmp_path, text):
 
 
 def test_exposures_of_a_stack(tmp_path):
-    from jaxevent.io.exposures import read_stack
+    from jaxevent.io.images import read_stack
 
     folder = pictures(tmp_path / "stack")
     (folder / "timestamps.txt").write_text(EXPOSED)
     _, seconds = read_stack(folder)
     np.testing.assert_allclose(seconds, [0.008, 0.008003, 0.008])
     (folder / "timestamps.txt").write_text("1\n2\n3\n")
-    with pytest.raises(InputError, match="does not tell its exposure time"):
+    with pytest.raises(InputError, match="does not state its exposure time"):
         read_stack(folder)

@@ -337,13 +337,13 @@ def test_triggers_of_evt2_and_evt21(tmp_path):
 
 def test_triggers_of_evt3_continue_over_the_clocks_end(tmp_path, monkeypatch):
     pytest.importorskip("evt3")
-    from jaxevent.io import prophesee
+    from jaxevent.io import decoded
 
     words = [0xA101, 0x8FFE, 0x6005, 0x0003, 0x2004, 0xA201, 0x8FFF, 0xA200]
     words += [0x8000, 0x6009, 0xA301, 0x2005]
     (tmp_path / "a.raw").write_bytes(b"% evt 3.0\n% end\n" + np.array(words, "<u2").tobytes())
     for block in (1, 2, 3, 1 << 20):
-        monkeypatch.setattr(prophesee, "BLOCK", block)
+        monkeypatch.setattr(decoded, "BLOCK", block)
         got = load(tmp_path / "a.raw", SIZE)
         assert got.triggers.t.tolist() == [0xFFE << 12 | 5, 0xFFF << 12, 1 << 24 | 9]
         assert got.triggers.edge.tolist() == [1, 0, 1]
@@ -352,7 +352,7 @@ def test_triggers_of_evt3_continue_over_the_clocks_end(tmp_path, monkeypatch):
 
 
 def test_triggers_of_dat_lie_beside_the_events(tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxevent.io.prophesee.BLOCK", 2)
+    monkeypatch.setattr("jaxevent.io.decoded.BLOCK", 2)
     head = b"% Data file containing trigger events.\n% Version 2\n"
     # The third comes after the end of the clock.
     signals = [(0xF0000000, 1 | 6 << 26), (0xFFFFFFFE, 0), (9, 1 | 63 << 26)]

@@ -15,8 +15,8 @@ from PIL import Image
 import jaxevent
 from jaxevent import cli
 from jaxevent.errors import InputError, InputWarning
+from jaxevent.io.checks import ReadOptions
 from jaxevent.io.images import read_times
-from jaxevent.io.options import ReadOptions
 from jaxevent.io.time_units import infer_unit, numbers_of_dates, to_microseconds, unit_of_name
 
 SIZE = (48, 32)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from jaxevent import dispatch
 from jaxevent.camera import PinholeCamera
-from jaxevent.codegen.expressions import Untranslatable
+from jaxevent.codegen.module import make_kernel
 from jaxevent.devices import make_mesh, shard
 from jaxevent.egomotion.candidates import Candidates, Expected, Gatherer
 from jaxevent.egomotion.estimator import COMMON, Batch, MotionEstimator, Stretch, truth_of
@@ -241,20 +241,8 @@ class Voting(MotionEstimator[Params]):
         self, params: Params, model: Model, compiler: str | None, events: int
     ) -> FusedRun | None:
         """The filter as a kernel; None where XLA compiles it."""
-        if compiler not in (None, "numba", "xla"):
-            raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
-        single = jnp.result_type(float) == np.float32
-        if compiler == "xla" or (compiler is None and not (single and events >= KERNEL_EVENTS)):
-            return None
-        try:
-            return FusedRun(params, model)
-        except Untranslatable as reason:
-            if compiler == "numba":
-                raise InputError(
-                    f"numba has no kernel for voting with these parameters ({reason}); leave out "
-                    "the compiler"
-                ) from reason
-            return None
+        serves = jnp.result_type(float) == np.float32 and events >= KERNEL_EVENTS
+        return make_kernel(self.name, compiler, serves, lambda: FusedRun(params, model))
 
     def follow(
         self,

@@ -692,7 +692,7 @@ class MotionCompensation(ImageEstimator[Params]):
         features, instants = prepare(recording, every, Timing.of(params), filtering=False)
         factors = trajectories.images.factors
         if factors is not None:
-            features, instants = features.weighted(factors), instants.weighted(factors)
+            features, instants = features.scale_counts(factors), instants.scale_counts(factors)
         size = (recording.height, recording.width)
         own = np.arange(recording.height * recording.width, dtype=np.int32).reshape(size)
         targets = []

@@ -8,20 +8,17 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen.expressions import Graph, Level, Node, Untranslatable
-from jaxevent.codegen.host import HostProgram
-from jaxevent.codegen.loops import (
-    MARK,
-    Function,
-    Kernels,
-    Loop,
-    LoopWriter,
-    Program,
-    leaves_of,
-    numbers_of,
-    translate,
+from jaxevent.codegen.graph import Graph, Level, Node, ParameterProgram, TranslationError
+from jaxevent.codegen.module import KernelCache
+from jaxevent.codegen.trace import (
+    ELEMENTS,
+    TracedFunction,
+    TracedProgram,
+    name_leaves,
+    name_numbers,
+    translate_function,
 )
-from jaxevent.codegen.text import Numbers, Place
+from jaxevent.codegen.write import Address, ElementLoop, ModuleText, Writer
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.particle_filter import filtering, likelihood
 from jaxevent.egomotion.particle_filter.engine.loop import BLOCK, CELLS, Functions
@@ -29,7 +26,7 @@ from jaxevent.egomotion.particle_filter.filtering import Passed, State, Told
 from jaxevent.egomotion.particle_filter.likelihood import Event
 from jaxevent.egomotion.particle_filter.parameters import Params
 
-FUNCTION = """@callback(types.void(CELLS, CELLS, NUMBERS, I), **HOW)
+FUNCTION = """@cfunc(types.void(CELLS, CELLS, NUMBERS, I), **OPTIONS)
 def {name}(cells, work, numbers, count):
     zero = 0
 {body}
@@ -37,7 +34,7 @@ def {name}(cells, work, numbers, count):
 
 """
 # Candidates fill their places from the first. `blocks` of `size` motions have ages in common.
-EVENT = """@callback(types.void(CELLS, CELLS, NUMBERS, CELLS, CELLS, WHOLE, I, I, I), **HOW)
+EVENT = """@cfunc(types.void(CELLS, CELLS, NUMBERS, CELLS, CELLS, WHOLE, I, I, I), **OPTIONS)
 def {name}(cells, work, numbers, d, ages, chosen, count, first, most):
     zero, begin, end = 0, 0, count
 {ask}
@@ -68,8 +65,8 @@ def {name}(cells, work, numbers, d, ages, chosen, count, first, most):
 
 
 """
-PARTICLES = Loop("i", "count", ("work", "numbers", "count"))
-LANES = Loop("i", f"begin * {BLOCK}, end * {BLOCK}", ("work", "numbers", "begin", "end"))
+PARTICLES = ElementLoop("i", "count", ("work", "numbers", "count"))
+LANES = ElementLoop("i", f"begin * {BLOCK}, end * {BLOCK}", ("work", "numbers", "begin", "end"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +78,7 @@ class Layout:
     truths: frozenset[str]
     room: int  # of a row
 
-    def places(self) -> dict[str, Place]:
+    def places(self) -> dict[str, Address]:
         """Where the numbers are read."""
         places = {name: ("work", "i", row * self.room) for name, row in self.rows.items()}
         return places | {name: ("cells", "zero", at) for name, at in self.cells.items()}
@@ -112,13 +109,13 @@ class Tracing:
 
     def __init__(self, params: Params, model: Model, dtype: np.dtype):
         self.params, self.model, self.dtype = params, model, dtype
-        self.graph, self.host = Graph(), HostProgram()
+        self.graph, self.host = Graph(), ParameterProgram()
         for leaf in jax.tree.leaves(params):
             self.host.add_input(np.asarray(leaf))
         self.cells = {name: at for at, name in enumerate(CELLS)}
         self.rows: dict[str, int] = {}
         self.truths: set[str] = set()
-        self.functions: dict[str, Function] = {}
+        self.functions: dict[str, TracedFunction] = {}
         self.f = self.shape()
 
     def shape(self, *size: int, kind: Any = None) -> jax.ShapeDtypeStruct:
@@ -140,19 +137,19 @@ class Tracing:
             trees.update(shapes)
             return made
 
-        made = translate(call, self.params, given, self.graph, self.host)
+        made = translate_function(call, self.params, given, self.graph, self.host)
         for key, tree in given.items():
             self._lay_out(key, tree)
         self.functions[name] = made
         return {key: self._lay_out(key, tree, made, alias) for key, tree in trees.items()}
 
     def _lay_out(
-        self, key: str, tree: Any, made: Function | None = None, alias: bool = False
+        self, key: str, tree: Any, made: TracedFunction | None = None, alias: bool = False
     ) -> Any:
         leaves = []
-        for name, leaf in leaves_of(key, tree).items():
-            names = numbers_of(name, leaf)
-            of_all = MARK in leaf.shape
+        for name, leaf in name_leaves(key, tree).items():
+            names = name_numbers(name, leaf)
+            of_all = ELEMENTS in leaf.shape
             if made is not None and of_all:
                 nodes = [made.results[number] for number in names]
                 of_all = any(node.level == Level.ELEMENT for node in nodes)
@@ -166,7 +163,7 @@ class Tracing:
                 where.setdefault(number, len(set(where.values())))
                 if leaf.dtype == bool:
                     self.truths.add(number)
-            leaves.append(leaf if of_all or MARK not in leaf.shape else self.shape())
+            leaves.append(leaf if of_all or ELEMENTS not in leaf.shape else self.shape())
         return jax.tree.unflatten(jax.tree.structure(tree), leaves)
 
     def _of_all(self, node: Node) -> Node:
@@ -176,13 +173,13 @@ class Tracing:
         return self.graph.node("max", (node, node), node.kind, Level.ELEMENT)
 
 
-def program_of(params: Params, model: Model, dtype: np.dtype) -> Program:
-    """Voting's functions, translated; raises `Untranslatable`."""
+def program_of(params: Params, model: Model, dtype: np.dtype) -> TracedProgram:
+    """Voting's functions, translated; raises `TranslationError`."""
     if params.likelihood == "literal":
-        raise Untranslatable('likelihood = "literal"')
+        raise TranslationError('likelihood = "literal"')
     trace = Tracing(params, model, dtype)
     shape, d = trace.shape, model.dimension
-    cloud, each, flag = shape(MARK, d), shape(MARK), shape(kind=bool)
+    cloud, each, flag = shape(ELEMENTS, d), shape(ELEMENTS), shape(kind=bool)
     # Classes that check what they are given take shapes in a trace.
     state, passed, event, told = jax.eval_shape(
         lambda cloud, each, flag, one, two, four: (
@@ -214,7 +211,7 @@ def program_of(params: Params, model: Model, dtype: np.dtype) -> Program:
     trace.add("restart", restart, {"cloud": cloud})
     room = BLOCK * -(-params.particles // BLOCK)
     layout = Layout(trace.cells, trace.rows, frozenset(trace.truths), room)
-    return Program(trace.functions, trace.host, layout, dtype)
+    return TracedProgram(trace.functions, trace.host, layout, dtype)
 
 
 def _add_event(
@@ -248,13 +245,13 @@ def _add_event(
     trace.add(f"{name}_answer", answer, given)
 
 
-def write(program: Program) -> tuple[str, Numbers]:
+def write(program: TracedProgram) -> ModuleText:
     """The text of a program's module."""
     layout = program.layout
     places, stores = layout.places(), layout.stores()
-    writer, out = LoopWriter(places), []
+    writer, out = Writer(program, places), []
 
-    def body(name: str, indent: int = 4, loop: Loop = LANES) -> str:
+    def body(name: str, indent: int = 4, loop: ElementLoop = LANES) -> str:
         function = program.functions[name]
         changed = {
             key: stores[key]
@@ -284,7 +281,7 @@ def write(program: Program) -> tuple[str, Numbers]:
             )
         )
     about = "The functions of voting (`jaxevent.egomotion.particle_filter.engine`)."
-    return writer.module(about, program, out)
+    return writer.module(about, out, layout)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -296,16 +293,14 @@ class Kernel:
     numbers: NDArray[np.float64]
 
 
-_kernels = Kernels(Functions, write, most=6000)
+_kernels = KernelCache(Functions, write, max_nodes=6000)
 
 
 def kernel_of(params: Params, model: Model, dtype: np.dtype) -> Kernel:
-    """The kernel of a model with its parameters; raises `Untranslatable`."""
+    """The kernel of a model with its parameters; raises `TranslationError`."""
     tree = jax.tree.structure(params)
     own, kind = jax.tree.flatten(_with_f(model, 1.0))
     if own:
-        raise Untranslatable("numbers that the model holds")
-    program, functions, numbers = _kernels.get(
-        (kind, tree, dtype), params, lambda: program_of(params, model, dtype)
-    )
-    return Kernel(functions, program.layout, numbers)
+        raise TranslationError("numbers that the model holds")
+    made = _kernels.get((kind, tree, dtype), params, lambda: program_of(params, model, dtype))
+    return Kernel(made.functions, made.places, made.numbers)

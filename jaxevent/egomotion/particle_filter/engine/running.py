@@ -21,7 +21,7 @@ from jaxevent.egomotion.particle_filter.parameters import Params
 
 
 class FusedRun:
-    """The filter by a model's kernel; raises `Untranslatable`."""
+    """The filter by a model's kernel; raises `TranslationError`."""
 
     def __init__(self, params: Params, model: Model):
         self.dtype = np.dtype(jnp.result_type(float))

@@ -7,7 +7,7 @@ from numba.core import types
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
-from jaxevent.codegen.blocks import block
+from jaxevent.codegen.write import block
 
 LINES = """
 v1:f = read numbers k 1

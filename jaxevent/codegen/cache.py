@@ -32,34 +32,34 @@ if support.HAS_INTERNALS:
 _HASH = 32  # bytes at the beginning of a file
 
 
-def compiled(function: Callable, **options: Any) -> Any:
+def njit_cached(function: Callable, **options: Any) -> Any:
     """`numba.njit` with these options, kept; the function itself where there is no numba."""
     if not support.HAS_NUMBA:
         return function
     made: Any = numba.njit(**options)(function)
     files = _files_of(function)
-    return internals.keep(made, files) if files is not None else made
+    return internals.use_signature_cache(made, files) if files is not None else made
 
 
-def callback(signature: Any, **options: Any) -> Callable[[Callable], Any]:
+def cfunc(signature: Any, **options: Any) -> Callable[[Callable], Any]:
     """`numba.cfunc` with these options, kept."""
 
     def compile_one(function: Callable) -> Any:
         files = _files_of(function)
         if files is None:
             return numba.cfunc(signature, **options)(function)
-        return internals.kept_callback(function, signature, options, files)
+        return internals.cached_cfunc(function, signature, options, files)
 
     return compile_one
 
 
-def _files_of(function: Callable) -> "Files | None":
+def _files_of(function: Callable) -> "SignatureFiles | None":
     """The files of a function's signatures; None where nothing is kept."""
     folder = cache.folder_for_compiled() if support.HAS_INTERNALS else None
-    return None if folder is None else Files(folder, function)
+    return None if folder is None else SignatureFiles(folder, function)
 
 
-def source_of(function: Callable) -> str:
+def hash_source(function: Callable) -> str:
     """A hash of all that a function is compiled from: files, and numbers of other files."""
     parts: dict[str, list[str]] = {}
     waiting: list[Any] = [function]
@@ -91,7 +91,7 @@ def _content(path: str) -> str:
         return path
 
 
-class Files:
+class SignatureFiles:
     """The files of one function's signatures, in a folder of the user's own.
 
     Their names hold the function's and those of its file and of Python's version, so that
@@ -107,7 +107,7 @@ class Files:
 
     @functools.cached_property
     def _about(self) -> str:
-        return repr((numba.__version__, source_of(self._function)))
+        return repr((numba.__version__, hash_source(self._function)))
 
     def flush(self) -> None:
         """Forget all signatures."""

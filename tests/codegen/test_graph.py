@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from jaxevent.codegen.expressions import ELEMENTWISE, Graph, Level, Node
+from jaxevent.codegen.graph import ELEMENTWISE, Graph, Level, Node
 
 
 def value(node: Node, given: dict[str, float]) -> float:

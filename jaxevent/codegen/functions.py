@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxevent.codegen import kept
+from jaxevent.codegen import cache
 from jaxevent.codegen.support import intrinsic, ir, types
 
 F = np.float32
@@ -19,19 +19,19 @@ INFINITE, NAN = F(np.inf), F(np.nan)
 ROOT = F(0.5**0.5)  # mantissas are taken between it and its double
 
 
-def part(function: Callable) -> Any:
+def compile_function(function: Callable) -> Any:
     """Compile for kernels: divisions by zero are infinite, products are fused to sums."""
     plain = inspect.unwrap(function)
-    return kept.compiled(plain, error_model="numpy", fastmath={"contract"})
+    return cache.njit_cached(plain, error_model="numpy", fastmath={"contract"})
 
 
-def operation(function: Callable) -> Any:
+def make_intrinsic(function: Callable) -> Any:
     """An operation of the compiler's own."""
     plain = inspect.unwrap(function)
     return plain if intrinsic is None else intrinsic(plain)
 
 
-@operation
+@make_intrinsic
 def _as_real(context: Any, x: Any):
     """The float32 with the bits of an int32."""
 
@@ -41,7 +41,7 @@ def _as_real(context: Any, x: Any):
     return types.float32(types.int32), make
 
 
-@operation
+@make_intrinsic
 def _as_bits(context: Any, x: Any):
     """The bits of a float32 as an int32."""
 
@@ -51,7 +51,7 @@ def _as_bits(context: Any, x: Any):
     return types.int32(types.float32), make
 
 
-@operation
+@make_intrinsic
 def _choose(context: Any, truth: Any, one: Any, other: Any):
     """One number or another, without a branch: of those, a wait at each costs more than both."""
 
@@ -64,7 +64,7 @@ def _choose(context: Any, truth: Any, one: Any, other: Any):
     return one(types.boolean, one, one), make
 
 
-@part
+@compile_function
 def exp32(x):
     n = np.floor(x * F(1.44269504) + F(0.5))
     n = _choose(n > F(-126), n, F(-126))
@@ -83,7 +83,7 @@ def exp32(x):
     return _choose(x == x, p, x)
 
 
-@part
+@compile_function
 def log32(x):
     bits = _as_bits(x)
     n = (bits - _as_bits(ROOT)) >> np.int32(23)
@@ -106,19 +106,19 @@ def log32(x):
     return _choose(x >= F(0), p, NAN)
 
 
-@part
+@compile_function
 def log1p32(x):
     y = F(1) + x
     lost = (x - (y - F(1))) / y
     return log32(y) + _choose((y > F(0)) & (y < INFINITE), lost, F(0))
 
 
-@part
+@compile_function
 def logistic32(x):
     return F(1) / (F(1) + exp32(-x))
 
 
-@part
+@compile_function
 def _reduced(x):
     """x less whole quarter turns, and their number."""
     n = np.floor(x * F(0.636619772) + F(0.5))
@@ -126,7 +126,7 @@ def _reduced(x):
     return r, np.int32(n)
 
 
-@part
+@compile_function
 def _sine(r):
     z = r * r
     p = F(-1.9515295891e-4) * z + F(8.3321608736e-3)
@@ -134,7 +134,7 @@ def _sine(r):
     return p * z * r + r
 
 
-@part
+@compile_function
 def _cosine(r):
     z = r * r
     p = F(2.443315711809948e-5) * z - F(1.388731625493765e-3)
@@ -142,7 +142,7 @@ def _cosine(r):
     return p * z * z - F(0.5) * z + F(1)
 
 
-@part
+@compile_function
 def sin32(x):
     if not abs(x) < F(8000):  # the reduction loses digits
         return np.sin(x)
@@ -151,7 +151,7 @@ def sin32(x):
     return _choose((n & 2) != 0, -value, value)
 
 
-@part
+@compile_function
 def cos32(x):
     if not abs(x) < F(8000):
         return np.cos(x)
@@ -160,51 +160,51 @@ def cos32(x):
     return _choose(((n + 1) & 2) != 0, -value, value)
 
 
-@part
+@compile_function
 def sin64(x):
     return np.sin(x)
 
 
-@part
+@compile_function
 def cos64(x):
     return np.cos(x)
 
 
-@part
+@compile_function
 def exp64(x):
     return np.exp(x)
 
 
-@part
+@compile_function
 def log64(x):
     return np.log(x)
 
 
-@part
+@compile_function
 def log1p64(x):
     return np.log1p(x)
 
 
-@part
+@compile_function
 def logistic64(x):
     return 1 / (1 + np.exp(-x))
 
 
-@part
+@compile_function
 def erf32(x):
     return F(math.erf(x))
 
 
-@part
+@compile_function
 def erfc32(x):
     return F(math.erfc(x))
 
 
-@part
+@compile_function
 def erf64(x):
     return math.erf(x)
 
 
-@part
+@compile_function
 def erfc64(x):
     return math.erfc(x)

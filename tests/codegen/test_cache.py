@@ -12,7 +12,8 @@ import pytest
 from numba.core import types
 
 from jaxevent import cache, codegen
-from jaxevent.codegen import kept, modules
+from jaxevent.codegen import cache as kernel_cache
+from jaxevent.codegen import module as kernel_module
 
 
 @pytest.fixture
@@ -23,7 +24,7 @@ def half(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "halves", raising=False)
     function = importlib.import_module("halves").half
-    return lambda: kept.compiled(function)
+    return lambda: kernel_cache.njit_cached(function)
 
 
 def files_of(folder: Path) -> list[Path]:
@@ -59,9 +60,9 @@ def test_what_a_function_calls_or_reads_may_change(changed, tmp_path, monkeypatc
         for name in ("caller", "parts"):
             monkeypatch.delitem(sys.modules, name, raising=False)
         monkeypatch.setattr(sys, "dont_write_bytecode", True)
-        kept._content.cache_clear()
+        kernel_cache._content.cache_clear()
         importlib.invalidate_caches()
-        return kept.compiled(importlib.import_module("caller").share)
+        return kernel_cache.njit_cached(importlib.import_module("caller").share)
 
     assert fresh()(12.0) == 4
     again = fresh()
@@ -174,9 +175,11 @@ def test_a_file_that_another_user_signed_is_not_unpickled(half, tmp_path, monkey
     (path,) = files_of(tmp_path)
     mark = tmp_path / "ran"
     seen = []
-    hash_of = kept.Files._hash
+    hash_of = kernel_cache.SignatureFiles._hash
     with monkeypatch.context() as watched:
-        watched.setattr(kept.Files, "_hash", lambda *a: seen.append(a) or hash_of(*a))
+        watched.setattr(
+            kernel_cache.SignatureFiles, "_hash", lambda *a: (seen.append(a), hash_of(*a))[1]
+        )
         assert half()(5) == 2.5
     files, key, _ = seen[-1]
     forged = pickle.dumps(Intruder(mark))
@@ -193,7 +196,7 @@ def test_a_file_that_another_user_signed_is_not_unpickled(half, tmp_path, monkey
 
 
 def test_what_depends_on_addresses_is_not_kept(half, tmp_path):
-    apply = kept.compiled(lambda f, x: f(x))
+    apply = kernel_cache.njit_cached(lambda f, x: f(x))
     files = apply._cache._files
     key = (types.Dispatcher(half()), "x")
     files.save(key, "data")
@@ -204,9 +207,9 @@ TEXT = """
 import numpy as np
 from numba import types
 
-from jaxevent.codegen.kept import callback
+from jaxevent.codegen.cache import cfunc
 
-@callback(types.float64(types.float64), error_model="numpy")
+@cfunc(types.float64(types.float64), error_model="numpy")
 def third(x):
     return x / 3 + {number}
 """
@@ -215,17 +218,17 @@ def third(x):
 def test_a_module_of_text_is_made_again_from_damaged_files(tmp_path, monkeypatch):
     monkeypatch.setenv("JAXEVENT_CACHE", str(tmp_path))
     text = TEXT.format(number=0.25)
-    module = modules.module_of(text)
+    module = kernel_module.make_module(text)
     assert module.third.ctypes(6) == 2.25
     path = Path(module.__file__)
     (compiled,) = files_of(path.parent)
     content = path.read_bytes(), compiled.read_bytes()
-    assert modules.module_of(text).third.cache_hits == 1
+    assert kernel_module.make_module(text).third.cache_hits == 1
     for spoilt in (path, compiled):
         spoilt.write_bytes(spoilt.read_bytes()[:100])
-    assert modules.module_of(text).third.ctypes(6) == 2.25
+    assert kernel_module.make_module(text).third.ctypes(6) == 2.25
     assert path.read_bytes() == content[0]
-    assert modules.module_of(text).third.cache_hits == 1
+    assert kernel_module.make_module(text).third.cache_hits == 1
 
 
 def _double(x):
