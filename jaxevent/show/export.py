@@ -67,7 +67,7 @@ def within(
     if not len(chosen):
         span = f"from {times[0] / 1e6:g} to {times[-1] / 1e6:g} s" if len(times) else "none"
         raise InputError(
-            f"{name}: no image is asked for from --start to --stop; its times are {span}, so "
+            f"{name}: there is no image from --start to --stop; its times are {span}, so "
             "choose others"
         )
     return chosen
@@ -249,8 +249,8 @@ def _batches(
 ) -> Iterator[tuple[NDArray, dict[str, NDArray]]]:
     """Yield times and images in batches, by their names in HDF5."""
     if colours is None:
-        for batch, told in video.batches(times):
-            yield batch, {"image": told.mean, "variance": told.covariance}
+        for batch, estimate in video.batches(times):
+            yield batch, {"image": estimate.mean, "variance": estimate.covariance}
         return
     rows = range(0, len(times), BATCH)
     for row in bar(rows, desc="images", unit="batch", progress=video.progress):

@@ -38,7 +38,7 @@ from jaxevent.show.tables import align_cells
 
 
 def write_motion_table(
-    path: str | Path, model: str | type[Model], times: NDArray[np.int64], told: Estimate
+    path: str | Path, model: str | type[Model], times: NDArray[np.int64], estimated: Estimate
 ) -> None:
     """Write a motion as CSV: t (s), the components, sigma_<component>, lost (0 or 1).
 
@@ -48,9 +48,9 @@ def write_motion_table(
         path: File that is written.
         model: Motion model, or its name.
         times: (T,) us.
-        told: The motion at these times.
+        estimated: The motion at these times.
     """
-    _write_csv(path, table_columns(model, times, told))
+    _write_csv(path, table_columns(model, times, estimated))
 
 
 def write_known(
@@ -122,16 +122,16 @@ def write_motion(
                 file[name].attrs["units"] = motion.model.units
 
 
-def write_errors(folder: Path, found: Comparison) -> None:
+def write_errors(folder: Path, errors: Comparison) -> None:
     """Write errors.csv (figure, value, unit) and errors.json into a folder."""
-    rows = found.rows()
+    rows = errors.rows()
     _write_csv(folder / "errors.csv", dict(zip(("figure", "value", "unit"), zip(*rows, strict=True),
                                                strict=True)))  # fmt: skip
     table = {
         name: {"value": _plain(value), "unit": unit, "meaning": MEANINGS[name]}
         for name, value, unit in rows
     }
-    about = {"times": found.count, "truth": found.truth}
+    about = {"times": errors.count, "truth": errors.truth}
     with complete(folder / "errors.json") as partial:
         partial.write_text(json.dumps({"figures": table, **about}, indent=2) + "\n")
 
@@ -189,12 +189,12 @@ def measured_rotation(truth: Known, motion: Motion, unbiased: bool, turned: bool
         unbiased: Whether the bias is known and subtracted.
         turned: Whether the rotation to the camera is known and applied.
     """
-    told = motion(truth.t, centred=True, extrapolate=True)
-    rows = told.valid & np.isfinite(told.mean).all(1)
+    estimated = motion(truth.t, centred=True, extrapolate=True)
+    rows = estimated.valid & np.isfinite(estimated.mean).all(1)
     words, notes = "the gyro", []
     if not rows.any():
         return Truth(truth, words)
-    estimate, measured = told.mean[rows], truth.values[rows]
+    estimate, measured = estimated.mean[rows], truth.values[rows]
     axes = None if turned else nearest_axes(estimate, measured)
     if axes is not None:
         notes.append(
@@ -316,20 +316,20 @@ class Output:
         start, stop = span_of(recording)
         count = math.floor((stop - start) * self.rate / 1e6 + 1e-9) + 1
         times = start + np.rint(np.arange(count) * (1e6 / self.rate)).astype(np.int64)
-        told = motion(times, centred=self.centred)
+        estimated = motion(times, centred=self.centred)
         true = None if truth is None else truth(motion)
-        found = None
+        errors = None
         if true is not None:
-            found = compare(
+            errors = compare(
                 motion, true.known, times, start=start, centred=self.centred, named=true.words
             )
-            found = dataclasses.replace(found, notes=true.notes)
+            errors = dataclasses.replace(errors, notes=true.notes)
         outliers = None
         with complete(self.path, directory=True) as folder:
-            write_motion_table(folder / "motion.csv", motion.model, times, told)
+            write_motion_table(folder / "motion.csv", motion.model, times, estimated)
             write_motion(folder / "motion.h5", motion, about, method, params)
-            if found is not None:
-                write_errors(folder, found)
+            if errors is not None:
+                write_errors(folder, errors)
             if self.flow:
                 outliers = _write_flow(folder / "flow.h5", recording, motion, progress)
             left_out = None
@@ -343,7 +343,7 @@ class Output:
                 save_figure(figure, folder / "motion.png", dpi=130)
                 self._draw_window(folder, recording, motion)
             files = sorted(path.name for path in folder.iterdir())
-        return WrittenMotion(files, times, told, motion, found, outliers, left_out)
+        return WrittenMotion(files, times, estimated, motion, errors, outliers, left_out)
 
     def _draw_window(self, folder: Path, recording: Recording, motion: Motion) -> None:
         """Draw the events of a short window before and after warping, and in colours of flow."""
@@ -362,7 +362,7 @@ class WrittenMotion:
 
     files: list[str]
     times: NDArray[np.int64]
-    told: Estimate
+    estimated: Estimate
     motion: Motion
     errors: Comparison | None
     outliers: float | None  # percentage of events, where flow was asked for
@@ -381,7 +381,7 @@ class WrittenMotion:
         return f"{number:,} {plural('estimate', number)}"
 
     def _describe_motion(self) -> list[str]:
-        lost = ~self.told.valid
+        lost = ~self.estimated.valid
         first = np.flatnonzero(~lost)
         if not len(first):
             lines = [f"{self._count()}: the motion was never found"]
@@ -394,24 +394,24 @@ class WrittenMotion:
         lines = [
             f"{self._count()}, found after {since:.3f} s, then lost {100 * later:.2f} % of the time"
         ]
-        mean = self.told.mean[first]
-        sigma = np.sqrt(np.diagonal(self.told.covariance[first], axis1=1, axis2=2).clip(0))
+        mean = self.estimated.mean[first]
+        sigma = np.sqrt(np.diagonal(self.estimated.covariance[first], axis1=1, axis2=2).clip(0))
         cells = [["", "mean", "least", "most", "sigma", ""]]
         model = self.motion.model
-        told = decided(model, self.told.covariance[first])
+        observable = decided(model, self.estimated.covariance[first])
         for i, (name, unit) in enumerate(zip(model.components, model.units, strict=True)):
-            column = mean[told[:, i], i]
+            column = mean[observable[:, i], i]
             numbers = (column.mean(), column.min(), column.max()) if len(column) else ()
-            said = [f"{number:.4g}" for number in numbers] or ["not told", "", ""]
+            texts = [f"{number:.4g}" for number in numbers] or ["unobservable", "", ""]
             usual = f"{np.median(sigma[:, i]):.4g}"
-            cells.append([name, *said, usual, "" if unit == "1" else unit])
+            cells.append([name, *texts, usual, "" if unit == "1" else unit])
         lines += align_cells(cells)
         lines.append(
             "mean, least and most over the times found; sigma: median of the standard deviations"
         )
         for part in model.parts:
             if part.direction:
-                unknown = ~told[:, part.rows].all(1)
+                unknown = ~observable[:, part.rows].all(1)
                 if unknown.any():
                     lines.append(
                         f"translation is not observable {100 * unknown.mean():.0f} % of the time: "

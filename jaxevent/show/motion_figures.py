@@ -55,10 +55,10 @@ def motion_figure(
     figure = new_figure()
     if len(times) > _MAX_TIMES:
         times = times[np.linspace(0, len(times) - 1, _MAX_TIMES).astype(int)]
-    told = motion(times, centred=centred)
+    estimated = motion(times, centred=centred)
     model, seconds = motion.model, times * 1e-6
-    errors = _errors(model, times, told, truth)
-    trust = np.where(told.valid[:, None] & decided(model, told.covariance), 1.0, np.nan)
+    errors = _errors(model, times, estimated, truth)
+    trust = np.where(estimated.valid[:, None] & decided(model, estimated.covariance), 1.0, np.nan)
     extra = errors or _contrasts(motion, times)
     sizes = [len(model.components[part.rows]) for part in model.parts]
     rows, columns = max(sizes), len(sizes)  # a column for each part
@@ -69,11 +69,11 @@ def motion_figure(
         for column, part in enumerate(model.parts)
         for row, i in enumerate(range(len(model.components))[part.rows])
     }
-    sigma = np.sqrt(np.diagonal(told.covariance, axis1=1, axis2=2).clip(0))
+    sigma = np.sqrt(np.diagonal(estimated.covariance, axis1=1, axis2=2).clip(0))
     for i, name in enumerate(model.components):
         row, column, part = order[i]
         axis = grid[row, column]
-        value = told.mean[:, i] * trust[:, i]
+        value = estimated.mean[:, i] * trust[:, i]
         _cloud(axis, motion, i, centred)
         low, high = value - 2 * sigma[:, i], value + 2 * sigma[:, i]
         axis.fill_between(seconds, low, high, color=_ESTIMATE, alpha=0.25, lw=0)
@@ -89,11 +89,13 @@ def motion_figure(
         axis.set_ylabel(name if unit == "1" else f"{name} ({unit})")
         if part.direction:
             axis.set_ylim(-1.08, 1.08)
-            _mark_unobservable(axis, seconds, told.valid & np.isnan(value))
+            _mark_unobservable(axis, seconds, estimated.valid & np.isnan(value))
         elif any(map(len, seen)):
             # A component that hardly changes is not enlarged until its noise fills the axis.
             low, high = np.concatenate(seen).min(), np.concatenate(seen).max()
-            half = max(0.6 * (high - low), 0.08 * np.abs(told.mean[told.valid]).max(initial=0))
+            half = max(
+                0.6 * (high - low), 0.08 * np.abs(estimated.mean[estimated.valid]).max(initial=0)
+            )
             axis.set_ylim((low + high) / 2 - half - 1e-9, (low + high) / 2 + half + 1e-9)
     for k, (label, series) in enumerate(extra):
         axis = grid[rows, min(k, columns - 1)]
@@ -110,9 +112,9 @@ def motion_figure(
         axis.tick_params(labelbottom=True)
         axis.set_xlabel("t (s)")
     for axis in figure.axes:
-        for begin, end in _spans(seconds, ~told.valid):
+        for begin, end in _spans(seconds, ~estimated.valid):
             axis.axvspan(begin, end, color=_LOST, alpha=0.4, lw=0)
-        if not told.valid.any():
+        if not estimated.valid.any():
             axis.text(0.5, 0.5, "never found", transform=axis.transAxes, ha="center", va="center")
         axis.spines[["top", "right"]].set_visible(False)
         axis.set_xlim(seconds[0], max(seconds[-1], seconds[0] + 1e-6))
@@ -123,15 +125,15 @@ def motion_figure(
 
 
 def _errors(
-    model: type[Model], times: NDArray[np.int64], told: Estimate, truth: Known | None
+    model: type[Model], times: NDArray[np.int64], estimated: Estimate, truth: Known | None
 ) -> list[tuple[str, NDArray[np.float64]]]:
     """Compute errors over time, with the labels of their axes."""
     if truth is None:
         return []
-    inside = truth.within(times) & told.valid
+    inside = truth.within(times) & estimated.valid
     if not inside.any():
         return []
-    true, mean = truth(times[inside]), told.mean[inside]
+    true, mean = truth(times[inside]), estimated.mean[inside]
 
     def spread(values: NDArray) -> NDArray[np.float64]:
         series = np.full(len(times), np.nan)
@@ -183,7 +185,7 @@ def _mark_unobservable(axis: Any, seconds: NDArray, rows: NDArray[np.bool_]) -> 
         axis.axvspan(begin, end, fc="none", ec=_LOST, hatch="///", lw=0)
     if rows.any():
         place = float(seconds[rows].mean())
-        axis.text(place, 0, "not told", ha="center", va="center", backgroundcolor="white")
+        axis.text(place, 0, "not observable", ha="center", va="center", backgroundcolor="white")
 
 
 def _spans(seconds: NDArray, rows: NDArray[np.bool_]) -> Iterator[tuple[float, float]]:
@@ -219,13 +221,13 @@ def window_of(recording: Recording, motion: Motion) -> Window:
     good = motion.t[motion.valid]
     if len(good) and not motion(middle, extrapolate=True).valid[0]:
         middle = int(good[np.argmin(np.abs(good - middle))])
-    told = motion(middle, extrapolate=True)
+    estimated = motion(middle, extrapolate=True)
     span = _DEFAULT_WINDOW_S
-    if told.valid[0] and np.isfinite(told.mean).all():
+    if estimated.valid[0] and np.isfinite(estimated.mean).all():
         xi, f = coordinates(recording.width, recording.height, recording.camera)
         xi = xi[::8, ::8].reshape(-1, 2)
         U = _linear_flow(
-            motion.model(f), xi, np.broadcast_to(told.mean, (len(xi), told.mean.shape[1]))
+            motion.model(f), xi, np.broadcast_to(estimated.mean, (len(xi), estimated.mean.shape[1]))
         )
         speed = float(np.median(np.hypot(*U.T)))
         span = _WINDOW_WAY_PX / max(speed, 1e-9)
@@ -337,8 +339,8 @@ def plot_warped(
         warped_events(recording, motion, events, part.reference, moved),
     )
     sign = _padded(sign)
-    told = [_image(_padded(xy), sign, shape) for xy in places]
-    images, sharp = [np.asarray(one[0]) for one in told], [float(one[1]) for one in told]
+    drawn = [_image(_padded(xy), sign, shape) for xy in places]
+    images, sharp = [np.asarray(one[0]) for one in drawn], [float(one[1]) for one in drawn]
     limit = max(np.percentile(np.abs(images[1]), 99.7), 1e-9)
     figure = new_figure()
     wide = 5.2

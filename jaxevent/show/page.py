@@ -28,6 +28,7 @@ from jaxevent.show.tables import (
     mean_of,
     means,
     short_names,
+    value_at,
 )
 
 PICTURE_PX = 360  # px of the longer side of a picture
@@ -217,20 +218,19 @@ def _means(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> Tabl
     measures = [column for column in columns if column[1] in found[0]]
     unmarked = WORK.union(*(row.get("own_metrics", ()) for row in rows))
     most = max(one["recordings"] for one in found)
+    best = {}
+    for _, place, _, _ in measures:
+        values = [one[place] for one in found if one["recordings"] == most]
+        values = [value for value in values if value is not None]
+        if len(values) > 1 and place not in unmarked:
+            best[place] = (max if place in HIGHER_IS_BETTER else min)(values)
     lines = []
     for one in found:
         cells = [Cell(one["method"], "left"), Cell(str(one["recordings"]))]
-        for _, place, factor, digits in measures:
-            value = one[place]
-            others = [
-                other[place]
-                for other in found
-                if other[place] is not None and other["recordings"] == most
-            ]
-            best = others and value == (max if place in HIGHER_IS_BETTER else min)(others)
-            marked = best and len(others) > 1 and one["recordings"] == most
-            cell = format_number({"mean": value}, "mean", factor, digits)
-            cells.append(Cell(cell, "best" if marked and place not in unmarked else ""))
+        for column in measures:
+            place, value = column[1], one[column[1]]
+            marked = value is not None and value == best.get(place) and one["recordings"] == most
+            cells.append(Cell(format_number(value, column), "best" if marked else ""))
         lines.append(cells)
     return ["method", "recordings", *(title for title, _, _, _ in measures)], lines, 1
 
@@ -245,7 +245,8 @@ def _table(
         if "error" in row:
             cells.append(Cell(row["error"], "wrap", len(columns)))
         else:
-            cells += [Cell(format_number(row, *column[1:])) for column in columns]
+            for column in columns:
+                cells.append(Cell(format_number(value_at(row, column[1]), column)))
         lines.append(cells)
     return ["recording", "method", *(title for title, _, _, _ in columns)], lines, 2
 

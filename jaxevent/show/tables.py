@@ -159,10 +159,7 @@ def _table_of_means(rows: Sequence[Mapping[str, Any]]) -> str:
     columns = [column for column in columns_of(rows) if column[1] in found[0]]
     table = [["mean of", "recordings", *(title for title, _, _, _ in columns)]]
     for row in found:
-        numbers = [
-            format_number({"mean": row[place]}, "mean", factor, digits)
-            for _, place, factor, digits in columns
-        ]
+        numbers = [format_number(row[column[1]], column) for column in columns]
         table.append([row["method"], str(row["recordings"]), *numbers])
     return "\n" + lay_out(table, (0,))
 
@@ -195,10 +192,8 @@ def results_table(rows: Iterable[Mapping[str, Any]], columns: Sequence[Column]) 
     names = short_names(row["recording"] for row in rows)
     table = [["recording", "method", *(title for title, _, _, _ in columns)]]
     for row in rows:
-        cells = [names[row["recording"]], row["method"]]
-        for _, place, factor, digits in columns:
-            cells.append(format_number(row, place, factor, digits))
-        table.append(cells)
+        numbers = [format_number(value_at(row, column[1]), column) for column in columns]
+        table.append([names[row["recording"]], row["method"], *numbers])
     return lay_out(table, (0, 1))
 
 
@@ -229,12 +224,10 @@ def align_cells(table: Sequence[Sequence[str]]) -> list[str]:
     ]
 
 
-def format_number(row: Mapping[str, Any], place: str, factor: float | int, digits: int) -> str:
-    """Format a number of a row times `factor`; "-" if it is None, NaN or absent."""
-    value = value_at(row, place)
-    if value is None or math.isnan(value):
-        return "-"
-    return f"{factor * value:.{digits}f}"
+def format_number(value: float | int | None, column: Column) -> str:
+    """Format a number of a column; "-" if it is None or NaN."""
+    _, _, factor, digits = column
+    return "-" if value is None or math.isnan(value) else f"{factor * value:.{digits}f}"
 
 
 def value_at(row: Mapping[str, Any], path: str) -> Any:

@@ -236,8 +236,8 @@ def write_track_plot(
     sizes = filled[..., 4:6], np.diagonal(filled_P, axis1=2, axis2=3)[..., 4:6]
     grows &= _changes_scale(*sizes, valid)
 
-    asked = [_TTC] * bool(grows.any() or len(pairs)) + [_RANGE] * (extent is not None)
-    names = [_SIZE, *asked] if valid.any() else []
+    further = [_TTC] * bool(grows.any() or len(pairs)) + [_RANGE] * (extent is not None)
+    names = [_SIZE, *further] if valid.any() else []
     high = 7.0 * min(recording.height / recording.width, 1.2)
     figure = new_figure(8, high + 2.2 * len(names))
     grid = figure.add_gridspec(1 + len(names), 1, height_ratios=[high, *([2.2] * len(names))])

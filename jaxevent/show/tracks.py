@@ -244,17 +244,17 @@ class Output:
 
         if self.extent is not None:
             k, i = now.row, now.place
-            told = states.mean[k, i], states.covariance[k, i]
+            arrays = states.mean[k, i], states.covariance[k, i]
             scale = self.extent, self.focal, self._factor()
-            value, deviation = _evaluate(lambda m, P: _ranges(m, P, *scale), *told)
+            value, deviation = _evaluate(lambda m, P: _ranges(m, P, *scale), *arrays)
             nothing = np.full(len(k), np.nan)
             yield columns(k, states.id[i], -1, nothing, nothing, value, deviation)
         for pair in self.pairs:
             a, b = (int(np.flatnonzero(states.id == one)[0]) for one in pair)
             k = now.row[np.isin(now.place, [a, b])]
             k = k[states.valid[k, a] & states.valid[k, b]]
-            told = (array[k, i] for i in (a, b) for array in (states.mean, states.covariance))
-            value, deviation = _evaluate(_closing, *told)
+            arrays = (array[k, i] for i in (a, b) for array in (states.mean, states.covariance))
+            value, deviation = _evaluate(_closing, *arrays)
             nothing = np.full(len(k), np.nan)
             yield columns(k, pair[0], pair[1], value, deviation, nothing, nothing)
 
@@ -446,8 +446,8 @@ def _per_event(tracks: Tracks, progress: bool | None) -> Iterator[_EventStates]:
             until = min(row + _BATCH_EVENTS, last)
             begin = int(events[row : row + 1].t[0])
             stop = end if until == last else max(int(events[until : until + 1].t[0]), begin + 1)
-            told = list(tracks.events(begin, stop))
-            held = [(one.t[one.id >= 0], one.id[one.id >= 0]) for one in told]
+            batches = list(tracks.events(begin, stop))
+            held = [(one.t[one.id >= 0], one.id[one.id >= 0]) for one in batches]
             none = np.empty(0, np.int64)
             t, number = (np.concatenate(x) for x in zip((none, none), *held, strict=True))
             for now, states in tracks.batches(np.unique(t)):

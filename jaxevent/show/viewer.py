@@ -239,17 +239,17 @@ def _send_video(video: ImageSequence, recording: Recording, send: _Sender, name:
 
 def _table_of_tracks(tracks: Tracks) -> pd.DataFrame:
     times = np.arange(tracks.start, tracks.stop, STEP_US)
-    told = tracks(times)
-    row, column = np.nonzero(told.valid)
-    states = np.asarray(told.mean)[row, column]
+    states = tracks(times)
+    row, column = np.nonzero(states.valid)
+    mean = np.asarray(states.mean)[row, column]
     known = {"t": times[row] / 1e6, "id": tracks.id[column]}
-    return pd.DataFrame(known | dict(zip(COLUMNS, states.T, strict=True)))
+    return pd.DataFrame(known | dict(zip(COLUMNS, mean.T, strict=True)))
 
 
 def _table_of_motion(motion: Motion) -> pd.DataFrame:
     times = np.arange(motion.t[0], motion.t[-1] + 1, STEP_US) if len(motion) else motion.t
-    told = motion(times)
-    values = np.where(told.valid[:, None], told.mean, np.nan)
+    estimated = motion(times)
+    values = np.where(estimated.valid[:, None], estimated.mean, np.nan)
     return pd.DataFrame(
         {"t": times / 1e6} | dict(zip(motion.model.components, values.T, strict=True))
     )
