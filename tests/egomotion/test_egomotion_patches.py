@@ -25,8 +25,8 @@ from jaxevent.egomotion.patches import (
 )
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Imu, Poses, Recording
-from jaxevent.show.motion import Written
-from jaxevent.show.motion_pictures import motion_figure
+from jaxevent.show.motion import WrittenMotion
+from jaxevent.show.motion_figures import motion_figure
 
 WIDTH, HEIGHT, F = 120, 96, 100.0
 CAMERA = PinholeCamera(F, F, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
@@ -189,7 +189,7 @@ def test_unobservable_heading_is_reported():
         motion = dataclasses.replace(
             MotionEstimate.from_arrays("general", t, mean, covariance), n_extended=1
         )
-        lines = Written([], t, motion(t), motion, None, None, None).summary()
+        lines = WrittenMotion([], t, motion(t), motion, None, None, None).summary()
         assert lines[0].startswith("1 estimate, found")  # the other one holds it
         assert ("not observable" in " ".join(lines)) == ("not told" in lines[2]) == said
         # Nor is a heading drawn that is not told, or a panel without anything.
