@@ -234,7 +234,7 @@ ARRAYS: dict[str, Callable[..., Any]] = {
 }
 
 
-def evaluate_arrays(
+def evaluate_nodes(
     nodes: list[Node], known: Callable[[str], Any], values: list[Any], dtype: np.dtype
 ) -> list[Any]:
     """Expressions for arrays in place of numbers; `known(name)` gives inputs."""

@@ -80,15 +80,17 @@ class KernelCache:
         """Find the program for some parameters, and translate it if there is none yet.
 
         Args:
-            key: All that `translate` depends on beside the numbers of `params`.
+            key: All that `translate` depends on beside `params`.
             params: Pytree of the numbers that the program's `host` begins with.
             translate: Makes the program; raises `TranslationError`.
 
         Returns:
             The program, its modules, and the values of its `host` for these parameters.
         """
-        inputs = [np.asarray(leaf) for leaf in jax.tree.leaves(params)]
-        programs = get_or_make(self._programs, key, list)
+        leaves, tree = jax.tree.flatten(params)
+        inputs = [np.asarray(leaf) for leaf in leaves]
+        shapes = tuple(array.shape for array in inputs)
+        programs = get_or_make(self._programs, (key, tree, shapes), list)
         found = _match(programs, inputs)
         if found is None:
             with _lock:
@@ -105,7 +107,7 @@ class KernelCache:
         """Compile the program for some parameters, if it is not yet; see `find_program`.
 
         Args:
-            key: All that `translate` depends on beside the numbers of `params`.
+            key: All that `translate` depends on beside `params`.
             params: Pytree of the numbers that the program's `host` begins with.
             translate: Makes the program; raises `TranslationError`.
             layout: Further arguments of `write`.

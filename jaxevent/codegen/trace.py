@@ -516,41 +516,79 @@ def name_numbers(name: str, leaf: Any, elements: bool = True) -> list[str]:
     return [f"{name}.{k}" for k in range(int(np.prod(shape)))]
 
 
+@dataclasses.dataclass(frozen=True)
+class Trace:
+    """The jaxpr of a function of parameters and named inputs."""
+
+    jaxpr: Any
+    inputs: dict[str, jax.ShapeDtypeStruct]  # beside the parameters
+    outputs: dict[str, jax.ShapeDtypeStruct]
+
+    def translate(self, translation: Translation, values: list[Value]) -> dict[str, Node]:
+        """Translate the function for values of its parameters and inputs: results by name."""
+        made = iter(translation.run(self.jaxpr, values))
+        results: dict[str, Node] = {}
+        for name, leaf in self.outputs.items():
+            nodes = np.ravel(translation.nodes(next(made)))
+            results |= dict(zip(name_numbers(name, leaf), nodes, strict=True))
+        return results
+
+
+def trace_function(function: Callable, params: Any, given: Mapping[str, Any]) -> Trace:
+    """Trace `function(params, **given)`, which returns a dict.
+
+    Args:
+        function: A function of pytrees.
+        params: Its parameters.
+        given: Trees of shapes, by the names of the other arguments.
+
+    Raises:
+        TranslationError: The function fails, whatever it raises.
+    """
+    try:
+        call = lambda p, v: function(p, **v)  # noqa: E731
+        closed, shapes = jax.make_jaxpr(call, return_shape=True)(params, dict(given))
+    except Exception as error:
+        about = f"its functions fail for one pixel or target: {error}"
+        raise TranslationError(about.partition("\n")[0]) from error
+    inputs, outputs = (
+        {leaf: v for name in sorted(trees) for leaf, v in name_leaves(name, trees[name]).items()}
+        for trees in (given, shapes)
+    )
+    return Trace(closed, inputs, outputs)
+
+
 def translate_function(
     function: Callable,
     params: Any,
     given: Mapping[str, Any],
     graph: Graph,
     host: ParameterProgram,
+    *,
     single: bool = False,
     seeds: int = 0,
     zeros: Collection[str] = (),
 ) -> TracedFunction:
-    """`function(params, **given)`, which returns a dict; raises `TranslationError`.
+    """Translate `function(params, **given)`, which returns a dict.
 
-    `given` are trees of shapes by name. Arrays with an axis of `ELEMENTS` are elements. `host` has
-    the leaves of the parameters as its inputs; the last `seeds` are derivatives, mostly 0.
-    `zeros` are names of single numbers that are always 0.
+    Args:
+        function: A function of pytrees.
+        params: Its parameters.
+        given: Trees of shapes, by the names of the other arguments; an axis of `ELEMENTS` has
+            elements.
+        graph: Graph to which the expressions are added.
+        host: Program whose inputs are the leaves of the parameters.
+        single: Whether there is one element only.
+        seeds: Number of the last leaves of the parameters that are derivatives, mostly 0.
+        zeros: Names of single numbers that are always 0.
+
+    Raises:
+        TranslationError: There is no translation.
     """
-    try:
-        call = lambda p, v: function(p, **v)  # noqa: E731
-        closed, shape = jax.make_jaxpr(call, return_shape=True)(params, dict(given))
-    except Exception as error:  # whatever a function raises
-        about = f"its functions fail in a trace: {error}"
-        raise TranslationError(about.partition("\n")[0]) from error
-    known = len(jax.tree.leaves(params))
+    trace, known = trace_function(function, params, given), len(jax.tree.leaves(params))
     values: list[Value] = [ParameterValue(k, k >= known - seeds) for k in range(known)]
-    for name in sorted(given):
-        for leaf_name, leaf in name_leaves(name, given[name]).items():
-            values.append(_inputs(graph, leaf_name, leaf, single, zeros))
-    translation = ElementTranslation(graph, host, single)
-    made = iter(translation.run(closed, values))
-    results: dict[str, Node] = {}
-    for name in sorted(shape):
-        for leaf_name, leaf in name_leaves(name, shape[name]).items():
-            nodes = np.ravel(translation.nodes(next(made)))
-            results |= dict(zip(name_numbers(leaf_name, leaf), nodes, strict=True))
-    return TracedFunction(results)
+    values += [_inputs(graph, n, leaf, single, zeros) for n, leaf in trace.inputs.items()]
+    return TracedFunction(trace.translate(ElementTranslation(graph, host, single), values))
 
 
 def _inputs(graph: Graph, name: str, leaf: Any, single: bool, zeros: Collection[str]) -> Value:
