@@ -6,6 +6,7 @@ import os
 import sys
 import tempfile
 import threading
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -193,7 +194,7 @@ def make_module(text: str) -> ModuleType:
     """Make a module from its text, in a file with its compiled functions beside it (`cache`).
 
     Raises:
-        TranslationError: numba cannot be imported.
+        TranslationError: numba cannot be imported, or does not compile the module.
     """
     if numba is None:
         raise TranslationError("numba cannot be imported")
@@ -209,7 +210,13 @@ def make_module(text: str) -> ModuleType:
     module.__file__ = str(path)
     sys.modules[name] = module
     # Not by an import: Python keeps bytecode beside a file, and a part of that ends the process.
-    exec(compile(text, path, "exec"), module.__dict__)
+    try:
+        exec(compile(text, path, "exec"), module.__dict__)
+    except Exception as error:  # a release of numba may fail in any way
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        about = f"numba {numba.__version__} does not compile it: {reason}"
+        warnings.warn(f"a kernel is left to XLA, which is slower, as {about}", stacklevel=2)
+        raise TranslationError(about) from error
     return module
 
 

@@ -115,21 +115,13 @@ def n_pieces(exposed: bool) -> int:
     return 2 * N_ROWS + 1 if exposed else N_ROWS + 1
 
 
-def trace_filter(
-    method: FilterMethod,
-    known: tuple[Any, ...],
-    exposed: bool,
-    dtype: Any,
-    directions: Directions,
-) -> Trace:
+def trace_filter(method: FilterMethod, known: tuple[Any, ...], kind: KernelKind) -> Trace:
     """Trace a method at one pixel, between three frames.
 
     Args:
         method: The filter.
         known: See `Directions.inputs`.
-        exposed: Whether exposures are known.
-        dtype: Kind of real numbers.
-        directions: Numbers by which derivatives are taken.
+        kind: Properties of the recording, and derivatives that are wanted.
 
     Returns:
         The jaxpr of `start`, the state at the recording's start, of `state` after an event, and of
@@ -138,6 +130,7 @@ def trace_filter(
     Raises:
         TranslationError: The functions fail for so little.
     """
+    exposed, dtype, _, directions = kind
 
     def array(*shape: int, kind: Any = dtype) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct(shape, kind)
@@ -302,14 +295,18 @@ class PixelTranslation(Translation):
         return self.graph.input(f"total.{self.excess.index(node)}.{row}", "f", Level.TABLE)
 
 
-def translate_filter(
-    trace: Trace, known: tuple[Any, ...], exposed: bool, dtype: np.dtype, directions: Directions
-) -> FilterProgram:
+def translate_filter(trace: Trace, known: tuple[Any, ...], kind: KernelKind) -> FilterProgram:
     """Translate a traced method; see `trace_filter`.
+
+    Args:
+        trace: The traced method.
+        known: See `Directions.inputs`.
+        kind: Properties of the recording, and derivatives that are wanted.
 
     Raises:
         TranslationError: There is no translation.
     """
+    exposed, dtype, _, directions = kind
     graph, host = Graph(), ParameterProgram()
     count, first_seed = len(directions.numbers), len(jax.tree.leaves(known[:2]))
     moving = {leaf for leaf, _ in directions.numbers}
@@ -780,7 +777,6 @@ def _request(
     known = directions.inputs(params, fixed)
 
     def translate() -> FilterProgram:
-        trace = trace_filter(method, known, exposed, dtype, directions)
-        return translate_filter(trace, known, exposed, dtype, directions)
+        return translate_filter(trace_filter(method, known, kind), known, kind)
 
     return (method, exposed, dtype, directions), known, translate
