@@ -130,7 +130,7 @@ def linear_factors(result: Node, changes: set[Node], graph: Graph) -> dict[Node,
 
 
 def _passed(node: Node, at: Node, moving: set[Node], graph: Graph) -> list[tuple[Node, Node]]:
-    """The factors of a node's arguments, of its own."""
+    """Return the factors of a node's arguments, from the node's own."""
     apply, args = graph.apply, node.args
     minus = apply("neg", (at,), "f")
     if node.op in ("add", "sub"):
@@ -161,13 +161,19 @@ Sum = tuple[int, tuple[Term, ...]]  # where it is written to, and what is added 
 
 
 def vector_sums(lanes: int, sums: tuple[Sum, ...]) -> Any:
-    """A function for kernels: sums of products of numbers and vectors of `lanes` numbers.
+    """Make a function for kernels: sums of products of numbers and vectors of `lanes` numbers.
 
     `function(out, to, cells, at, numbers, factors)` writes the sums behind the place `to` of `out`.
     Vectors lie in `cells` behind the place `at`, or in `numbers`. All are read before any is
     written.
+
+    Args:
+        lanes: Numbers of a vector.
+        sums: For each sum where it goes, and its terms: which factor, whether the vector is of
+            `numbers`, and where it begins.
     """
 
+    # numba's typing context comes first of the arguments.
     @make_intrinsic
     def function(context: Any, out: Any, to: Any, cells: Any, at: Any, numbers: Any, factors: Any):
         def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -192,7 +198,7 @@ def vector_sums(lanes: int, sums: tuple[Sum, ...]) -> Any:
 
 
 class _Vectors:
-    """Operations on vectors, in the compiler's language."""
+    """Instructions of LLVM on vectors."""
 
     def __init__(self, builder: Any, real: Any, lanes: int):
         self.builder, self.lanes = builder, lanes
@@ -225,7 +231,7 @@ class _Vectors:
 
 @dataclasses.dataclass(frozen=True)
 class ChangeVector:
-    """A vector of changes, 0 along directions that are not named."""
+    """Vector of changes, 0 along directions that are not named."""
 
     kind: str  # of a "state", of a "table" (what frames say), or of a "number"
     state: str  # its name
@@ -234,7 +240,7 @@ class ChangeVector:
 
 @dataclasses.dataclass(frozen=True)
 class Derivatives:
-    """Derivatives of results as sums of factors times vectors of changes."""
+    """Derivatives of results, as sums of factors times vectors of changes."""
 
     changes: list[ChangeVector]
     factors: dict[str, list[tuple[Node, int]]]  # by the result's name: factor, place in `changes`

@@ -281,7 +281,7 @@ def test_numbers_of_parameters_are_found_without_compiling():
     program = ParameterProgram()
     first = program.add_input(np.asarray(2.0))
     greater = jax.make_jaxpr(lambda x: x > 1)(2.0).eqns[0]
-    program.decided += program.add(greater, [first, np.asarray(1.0)])
+    program.conditions += program.add(greater, [first, np.asarray(1.0)])
     assert program.evaluate([np.asarray(3.0)]) is not None
     assert program.evaluate([np.asarray(0.5)]) is None
 

@@ -321,13 +321,20 @@ def _take_steps(steps, begin, end, given, band, memory):
             count_events(bands, band, (left, right), cells, at, of)
 
 
-@njit_noalloc
-def filter_events(begin, end, given, memory, enter, until, times, images):
-    """Pass over the events before `until` (us) of some bands, and make images at `times` (us).
+class PassRequest(NamedTuple):
+    """Extent of a pass over a window, and the images that it makes."""
 
-    Before that the bands enter a window at the time `enter[1]`, in the interval `enter[0]`, unless
-    this is -1.
-    """
+    # Interval and time (us) at which the bands enter the window first; -1: they are in it.
+    enter: tuple[int, int]
+    until: int  # us; events before it are passed over
+    times: NDArray[np.int64]  # of images, sorted, us
+    images: ImageBuffers
+
+
+@njit_noalloc
+def filter_events(begin, end, given, memory, request):
+    """Pass over the events of some bands, and make images."""
+    enter, until, times, images = request
     bands, line, functions, steps = given.bands, given.line, given.functions, given.steps.step
     first, edges, starts, ends = bands.first, bands.edges, line.start, given.steps.end
     width, weighted = np.int64(bands.width), np.int64(len(bands.weights) > 0)
@@ -455,7 +462,7 @@ class FilterPasses:
             until: Time, us since the recording's start.
             times: Sorted times of images before `until`, us since the recording's start.
             images: Where the images are written.
-            enter: See `filter_events`.
+            enter: See `PassRequest`.
         """
         places, kernel = self.fields.places, self.kernel
         assert kernel is not None
@@ -468,7 +475,8 @@ class FilterPasses:
         if times is None or images is None:
             times, images = np.empty(0, np.int64), self.image_buffers(0, 0)
         n_bands = self.recording.layout.bands
-        run_over_rows(filter_events, n_bands, given, self._memory, enter, until, times, images)
+        request = PassRequest(enter, until, times, images)
+        run_over_rows(filter_events, n_bands, given, self._memory, request)
 
     def image_buffers(self, times: int, pixels: int) -> ImageBuffers:
         """Make buffers for images, and for derivatives of those that have any."""
