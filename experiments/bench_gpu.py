@@ -1,9 +1,8 @@
 """A GPU against the CPU's kernels, by the clock: `python experiments/bench.py gpu`.
 
 Images of the filter and the smoother from memory, a loss with 8 gradients, a tracker of 64 targets
-and voting, each by XLA on JAX's default device and by a kernel on all cores of the CPU; and windows
-prepared there (`reconstruction/on_device.py`) and by loops. The table is M events per second, files
-apart. Without a GPU the default device is the CPU, and the table tells what XLA makes of it.
+and voting, each by XLA on JAX's default device and by a kernel on all cores of the CPU. The table
+is in M events per second, without files. Without a GPU the default device is the CPU.
 """
 
 import functools
@@ -12,28 +11,15 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import numpy as np
 from bench_images import images, losses, stream
 
 import jaxevent
 from jaxevent.blob import moment
 from jaxevent.egomotion import voting
-from jaxevent.reconstruction.on_device import DeviceWindows
-from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.simulate import Line, Target, motion_scene, simulate_blobs
 
 REPEAT = 3  # of which the first compiles
 EVENTS = 5_000_000
-
-
-def prepare(recording: Any, compiler: str) -> None:
-    """Windows of a recording, and images looked up in them."""
-    kind = DeviceWindows if compiler == "xla" else WindowedRecording
-    for window, _ in kind(recording, reuse=True):
-        begin = recording.start if window.start is None else window.start
-        end = recording.stop if window.stop is None else window.stop - 1
-        times = np.linspace(begin, end, 8).astype(np.int64)
-        jax.block_until_ready(window.reader(8)(times))
 
 
 def targets() -> tuple[Any, list[tuple[float, float, float]]]:
@@ -65,7 +51,6 @@ def tasks(events: int) -> dict[str, tuple[int, Callable[[str], object]]]:
         "akf, 100 Hz images": (events, made(jaxevent.akf)),
         "aks, 100 Hz images": (events, made(jaxevent.aks)),
         "akf, loss and 8 gradients": (events, lambda compiler: of_losses[f"{compiler} gradient"]()),
-        "windows prepared": (events, functools.partial(prepare, recording)),
         "moment, 64 targets": (len(many.events), track),
         "voting, rotation": (len(scene.events), vote),
     }

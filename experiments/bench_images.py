@@ -23,7 +23,7 @@ from timing import cpu_seconds, least_cpu
 import jaxevent
 from jaxevent.io import load, save
 from jaxevent.io.hdf5_files import search_heaps
-from jaxevent.reconstruction.filtering import Observation, Observer, State, Trajectory
+from jaxevent.reconstruction.filtering import FrameModel, Observation, PixelState, Trajectory
 from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import Events, Frames, Recording
 
@@ -134,7 +134,7 @@ def event_loop(t, x, y, p, u, rate, near, L, P, last, c, Q_proc, Q_iso, Q_ref, r
         last[a, b] = t[i]
 
 
-class Given(Observer):
+class Given(FrameModel):
     """Observations that are already there, carried in place of the points' weights."""
 
     def __call__(self, points):
@@ -161,12 +161,12 @@ def loop_seconds(recording: Recording, search: bool) -> float:
 def filter_seconds(recording: Recording) -> float:
     """All windows' filters, with what the frames say and the features already on the device."""
     params = jaxevent.akf.Params()
-    look = jax.jit(lambda observer, tiles: observer(tiles.points))
+    look = jax.jit(lambda frame_model, tiles: frame_model(tiles.points))
     windows = []
     for _, features in WindowedRecording(recording):
         features = jax.device_put(features)
-        observer = jaxevent.akf.observe(params, features.frames)
-        known = look(observer, features.tiles)
+        frame_model = jaxevent.akf.frame_model(params, features.frames)
+        known = look(frame_model, features.tiles)
         tiles = eqx.tree_at(
             lambda t: (t.points.weight, t.points.blend), features.tiles, (known.level, known.rate)
         )
@@ -178,7 +178,7 @@ def filter_seconds(recording: Recording) -> float:
         return Trajectory(Given(), state, path).at(last), path
 
     pixels = WIDTH * HEIGHT
-    first = State(jax.numpy.zeros(pixels), jax.numpy.full(pixels, 0.09))
+    first = PixelState(jax.numpy.zeros(pixels), jax.numpy.full(pixels, 0.09))
 
     def run():
         state = first

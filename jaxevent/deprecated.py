@@ -5,6 +5,7 @@
 """
 # ruff: noqa: E501, one entry of the table is one line
 
+import functools
 import importlib
 import importlib.abc
 import importlib.machinery
@@ -12,10 +13,14 @@ import sys
 import types
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar, cast
+
+T = TypeVar("T")
 
 # The full name until this release, and the one from now on.
 RENAMED: dict[str, str] = {
+    "jaxevent.arrays.find": "jaxevent.arrays.find_fields",
+    "jaxevent.arrays.grey_of": "jaxevent.arrays.to_grey",
     "jaxevent.blob.Found": "jaxevent.blob.TargetSearchResult",
     "jaxevent.confidence.Finding": "jaxevent.confidence.ParameterInterval",
     "jaxevent.confidence.Findings": "jaxevent.confidence.FitIntervals",
@@ -27,10 +32,78 @@ RENAMED: dict[str, str] = {
     "jaxevent.devices.along": "jaxevent.devices.shard",
     "jaxevent.devices.local": "jaxevent.devices.local_devices",
     "jaxevent.devices.mesh": "jaxevent.devices.make_mesh",
+    "jaxevent.egomotion.Known": "jaxevent.egomotion.truth.KnownMotion",
+    "jaxevent.egomotion.Motion": "jaxevent.egomotion.motion.MotionEstimate",
+    "jaxevent.egomotion.candidates.Batches": "jaxevent.egomotion.candidates.CandidateBatches",
+    "jaxevent.egomotion.candidates.Expected": "jaxevent.egomotion.candidates.ExpectedFlow",
+    "jaxevent.egomotion.candidates.Gatherer": "jaxevent.egomotion.candidates.CandidateSampler",
+    "jaxevent.egomotion.candidates.coordinates": "jaxevent.egomotion.candidates.pixel_coordinates",
+    "jaxevent.egomotion.field": "jaxevent.egomotion.flow",
+    "jaxevent.egomotion.flow.iterate": "jaxevent.egomotion.flow.iterate_flow",
+    "jaxevent.egomotion.geometry.contrast": "jaxevent.egomotion.geometry.image_variance",
+    "jaxevent.egomotion.geometry.energy": "jaxevent.egomotion.geometry.sum_of_squares",
+    "jaxevent.egomotion.geometry.undistorted": "jaxevent.egomotion.geometry.undistort",
+    "jaxevent.egomotion.model_selection.Choice": "jaxevent.egomotion.model_selection.ModelSelection",
+    "jaxevent.egomotion.model_selection.choose": "jaxevent.egomotion.model_selection.select_model",
+    "jaxevent.egomotion.model_selection.decide": "jaxevent.egomotion.model_selection.select_by_z",
+    "jaxevent.egomotion.motion.Calibration": "jaxevent.egomotion.motion.CovarianceCalibration",
+    "jaxevent.egomotion.motion.Motion": "jaxevent.egomotion.motion.MotionEstimate",
+    "jaxevent.egomotion.motion.decided": "jaxevent.egomotion.motion.is_observable",
+    "jaxevent.egomotion.motion.left_by_lens": "jaxevent.egomotion.motion.lens_error",
+    "jaxevent.egomotion.patches.Layers": "jaxevent.egomotion.patches.FlowConsistency",
+    "jaxevent.egomotion.patches.Look": "jaxevent.egomotion.patches.PatchSharpness",
+    "jaxevent.egomotion.patches.Speed": "jaxevent.egomotion.patches.ImageSpeed",
+    "jaxevent.egomotion.patches.edges_with_events": "jaxevent.egomotion.patches.edge_event_fraction",
+    "jaxevent.egomotion.patches.layers": "jaxevent.egomotion.patches.flow_consistency",
+    "jaxevent.egomotion.patches.look": "jaxevent.egomotion.patches.measure_sharpness",
+    "jaxevent.egomotion.patches.middles": "jaxevent.egomotion.patches.spread_times",
+    "jaxevent.egomotion.patches.stands_still": "jaxevent.egomotion.patches.is_camera_static",
+    "jaxevent.egomotion.patches.tried": "jaxevent.egomotion.patches.describe_windows",
+    "jaxevent.egomotion.patches.usual_speed": "jaxevent.egomotion.patches.measure_image_speed",
+    "jaxevent.egomotion.truth.Known": "jaxevent.egomotion.truth.KnownMotion",
+    "jaxevent.egomotion.truth.constant_between": "jaxevent.egomotion.truth.fit_gyro_bias",
+    "jaxevent.egomotion.truth.known": "jaxevent.egomotion.truth.known_motion",
+    "jaxevent.egomotion.truth.motion_of": "jaxevent.egomotion.truth.motion_from_table",
+    "jaxevent.egomotion.truth.nearest_axes": "jaxevent.egomotion.truth.find_imu_axes",
+    "jaxevent.egomotion.twists": "jaxevent.egomotion.truth",
     "jaxevent.estimator.Described": "jaxevent.estimator.ShortRepr",
+    "jaxevent.io.aedat2.read": "jaxevent.io.aedat.read_aedat2",
+    "jaxevent.io.aedat4.read": "jaxevent.io.aedat.read_aedat4",
+    "jaxevent.io.calibrated": "jaxevent.io.checks.make_supported_camera",
+    "jaxevent.io.check_unfolded": "jaxevent.io.checks.check_unfolded",
+    "jaxevent.io.checked_events": "jaxevent.io.checks.check_events",
+    "jaxevent.io.columns.find": "jaxevent.io.columns.find_fields",
+    "jaxevent.io.columns.read_npy": "jaxevent.io.tables.read_npy",
+    "jaxevent.io.columns.read_text": "jaxevent.io.tables.read_text",
+    "jaxevent.io.ecf.MOST": "jaxevent.io.ecf.MAX_EVENTS",
+    "jaxevent.io.event_stream.read": "jaxevent.io.atis.read_event_stream",
+    "jaxevent.io.evimo.read": "jaxevent.io.folders.read_evimo",
+    "jaxevent.io.evreal.read": "jaxevent.io.folders.read_evreal",
+    "jaxevent.io.find_event_texts": "jaxevent.io.text.find_event_texts",
+    "jaxevent.io.most_unfolded": "jaxevent.io.checks.max_unfolded",
+    "jaxevent.io.n_caltech.read": "jaxevent.io.atis.read_n_caltech",
+    "jaxevent.io.npz.read": "jaxevent.io.tables.read_npz",
+    "jaxevent.io.parquet.read": "jaxevent.io.tables.read_parquet",
+    "jaxevent.io.pinhole": "jaxevent.io.checks.make_camera",
+    "jaxevent.io.ros_events.event_topic": "jaxevent.io.ros.open_event_topic",
+    "jaxevent.io.timelens.read": "jaxevent.io.folders.read_timelens",
+    "jaxevent.io.whole_number": "jaxevent.io.checks.whole_number",
     "jaxevent.parameters.Share": "jaxevent.parameters.UnitInterval",
     "jaxevent.parameters.nearest": "jaxevent.parameters.suggest_name",
     "jaxevent.parameters.shown": "jaxevent.parameters.format_value",
+    "jaxevent.reconstruction.augment.Augmented": "jaxevent.reconstruction.augment.AugmentedFrame",
+    "jaxevent.reconstruction.augment.BetweenFrames": "jaxevent.reconstruction.augment.FrameInterpolation",
+    "jaxevent.reconstruction.augment.Blended": "jaxevent.reconstruction.augment.LinearBlend",
+    "jaxevent.reconstruction.augment.Greys": "jaxevent.reconstruction.augment.GreyFrames",
+    "jaxevent.reconstruction.augment.Held": "jaxevent.reconstruction.augment.ZeroOrderHold",
+    "jaxevent.reconstruction.augment.Level": "jaxevent.reconstruction.augment.LogIntensityModel",
+    "jaxevent.reconstruction.augment.Nothing": "jaxevent.reconstruction.augment.NoFrames",
+    "jaxevent.reconstruction.augment.belief": "jaxevent.reconstruction.augment.effective_certainty",
+    "jaxevent.reconstruction.augment.believed_rate": "jaxevent.reconstruction.augment.frame_information",
+    "jaxevent.reconstruction.augment.bounded_ratio": "jaxevent.reconstruction.augment.bound_ratio",
+    "jaxevent.reconstruction.augment.brightness": "jaxevent.reconstruction.augment.integrate_counts",
+    "jaxevent.reconstruction.augment.deblurred": "jaxevent.reconstruction.augment.deblur_level",
+    "jaxevent.reconstruction.augment.unclipped": "jaxevent.reconstruction.augment.unclipped_weight",
     "jaxevent.reconstruction.compensated.MotionCompensated": "jaxevent.reconstruction.compensated.MotionCompensation",
     "jaxevent.reconstruction.compensated.estimator.Followed": "jaxevent.reconstruction.compensated.estimator.TrajectoryEstimate",
     "jaxevent.reconstruction.compensated.estimator.Follower": "jaxevent.reconstruction.compensated.estimator.TrajectoryEstimator",
@@ -93,9 +166,50 @@ RENAMED: dict[str, str] = {
     "jaxevent.reconstruction.compensated.trajectories.stages": "jaxevent.reconstruction.compensated.trajectories.plan_stages",
     "jaxevent.reconstruction.compensated.trajectories.step": "jaxevent.reconstruction.compensated.trajectories.gauss_newton_step",
     "jaxevent.reconstruction.compensated.trajectories.weigh": "jaxevent.reconstruction.compensated.normal_equations.fill_information",
+    "jaxevent.reconstruction.complementary.Pull": "jaxevent.reconstruction.complementary.ConstantRateModel",
+    "jaxevent.reconstruction.complementary.advance": "jaxevent.reconstruction.complementary.predict",
+    "jaxevent.reconstruction.complementary.jump": "jaxevent.reconstruction.complementary.event_update",
+    "jaxevent.reconstruction.direct.Direct": "jaxevent.reconstruction.direct.DirectFrameModel",
+    "jaxevent.reconstruction.direct.advance": "jaxevent.reconstruction.direct.predict",
     "jaxevent.reconstruction.engine.images.FusedImages": "jaxevent.reconstruction.engine.images.KernelImages",
     "jaxevent.reconstruction.engine.images.FusedVideo": "jaxevent.reconstruction.engine.images.FilterVideo",
     "jaxevent.reconstruction.engine.images.SmoothedVideo": "jaxevent.reconstruction.engine.images.SmootherVideo",
+    "jaxevent.reconstruction.filtering.Observer": "jaxevent.reconstruction.filtering.FrameModel",
+    "jaxevent.reconstruction.filtering.Place": "jaxevent.reconstruction.filtering.LaneBlock",
+    "jaxevent.reconstruction.filtering.State": "jaxevent.reconstruction.filtering.PixelState",
+    "jaxevent.reconstruction.filtering.log_intensity": "jaxevent.reconstruction.filtering.readout_log_intensity",
+    "jaxevent.reconstruction.filtering.without_variance": "jaxevent.reconstruction.filtering.init_without_variance",
+    "jaxevent.reconstruction.kalman.Augmentation": "jaxevent.reconstruction.kalman.AugmentedFrameModel",
+    "jaxevent.reconstruction.kalman.advance": "jaxevent.reconstruction.kalman.predict",
+    "jaxevent.reconstruction.kalman.initial": "jaxevent.reconstruction.kalman.init",
+    "jaxevent.reconstruction.kalman.jump": "jaxevent.reconstruction.kalman.event_update",
+    "jaxevent.reconstruction.kalman.noise": "jaxevent.reconstruction.kalman.process_noise",
+    "jaxevent.reconstruction.kalman.within": "jaxevent.reconstruction.kalman.refractory_indicator",
+    "jaxevent.reconstruction.smoother.Link": "jaxevent.reconstruction.smoother.MessageMap",
+    "jaxevent.reconstruction.smoother.Measured": "jaxevent.reconstruction.smoother.FrameMeasurements",
+    "jaxevent.reconstruction.smoother.Passage": "jaxevent.reconstruction.smoother.SmoothedWindow",
+    "jaxevent.reconstruction.smoother.Rows": "jaxevent.reconstruction.smoother.FrameSteps",
+    "jaxevent.reconstruction.smoother.Sided": "jaxevent.reconstruction.smoother.CensoredPixels",
+    "jaxevent.reconstruction.smoother.compose_links": "jaxevent.reconstruction.smoother.compose_message_maps",
+    "jaxevent.reconstruction.smoother.counts_around": "jaxevent.reconstruction.smoother.adjacent_counts",
+    "jaxevent.reconstruction.smoother.information": "jaxevent.reconstruction.smoother.state_to_message",
+    "jaxevent.reconstruction.smoother.initial": "jaxevent.reconstruction.smoother.init",
+    "jaxevent.reconstruction.smoother.join": "jaxevent.reconstruction.smoother.combine",
+    "jaxevent.reconstruction.smoother.make_rows": "jaxevent.reconstruction.smoother.make_frame_steps",
+    "jaxevent.reconstruction.smoother.measure": "jaxevent.reconstruction.smoother.frame_update",
+    "jaxevent.reconstruction.smoother.one_pixel": "jaxevent.reconstruction.smoother.single_pixel_frame",
+    "jaxevent.reconstruction.smoother.share_events": "jaxevent.reconstruction.smoother.redistribute_images",
+    "jaxevent.reconstruction.smoother.shared": "jaxevent.reconstruction.smoother.redistribute_events",
+    "jaxevent.reconstruction.smoother.step_between": "jaxevent.reconstruction.smoother.change_between",
+    "jaxevent.register.Warped": "jaxevent.register.ResampledImages",
+    "jaxevent.register.by_triggers": "jaxevent.register.stamp_by_triggers",
+    "jaxevent.register.registered": "jaxevent.register.apply_registration",
+    "jaxevent.register.seen": "jaxevent.register.coverage",
+    "jaxevent.simulate.Motion": "jaxevent.simulate.TargetMotion",
+    "jaxevent.simulate.blobs.Motion": "jaxevent.simulate.blobs.TargetMotion",
+    "jaxevent.simulate.hybrid.response_of": "jaxevent.simulate.hybrid.sensor_response",
+    "jaxevent.simulate.motion.texture_of": "jaxevent.simulate.motion.make_texture",
+    "jaxevent.simulate.texture_of": "jaxevent.simulate.make_texture",
     "jaxevent.tuning.Believed": "jaxevent.tuning.LossWithPrior",
     "jaxevent.tuning.Fitted": "jaxevent.tuning.FitResult",
     "jaxevent.tuning.Weighted": "jaxevent.tuning.WeightedBatch",
@@ -104,6 +218,24 @@ RENAMED: dict[str, str] = {
 }
 # Modules that have another name or are part of another one.
 MOVED_MODULES: dict[str, str] = {
+    "jaxevent.egomotion.choice": "jaxevent.egomotion.model_selection",
+    "jaxevent.egomotion.field": "jaxevent.egomotion.flow",
+    "jaxevent.egomotion.layers": "jaxevent.egomotion.patches",
+    "jaxevent.egomotion.still": "jaxevent.egomotion.patches",
+    "jaxevent.egomotion.twists": "jaxevent.egomotion.truth",
+    "jaxevent.egomotion.warped": "jaxevent.egomotion.geometry",
+    "jaxevent.io.aedat2": "jaxevent.io.aedat",
+    "jaxevent.io.aedat4": "jaxevent.io.aedat",
+    "jaxevent.io.event_stream": "jaxevent.io.atis",
+    "jaxevent.io.evimo": "jaxevent.io.folders",
+    "jaxevent.io.evreal": "jaxevent.io.folders",
+    "jaxevent.io.exposures": "jaxevent.io.images",
+    "jaxevent.io.n_caltech": "jaxevent.io.atis",
+    "jaxevent.io.npz": "jaxevent.io.tables",
+    "jaxevent.io.parquet": "jaxevent.io.tables",
+    "jaxevent.io.ros_events": "jaxevent.io.ros",
+    "jaxevent.io.timelens": "jaxevent.io.folders",
+    "jaxevent.reconstruction.clock": "jaxevent.reconstruction.frames",
     "jaxevent.reconstruction.compensated.agreement": "jaxevent.reconstruction.compensated.robust_mean",
     "jaxevent.reconstruction.compensated.borders": "jaxevent.reconstruction.compensated.trajectories",
     "jaxevent.reconstruction.compensated.implicit": "jaxevent.reconstruction.compensated.normal_equations",
@@ -111,6 +243,7 @@ MOVED_MODULES: dict[str, str] = {
     "jaxevent.reconstruction.fused": "jaxevent.reconstruction.engine",
     "jaxevent.reconstruction.fused.images": "jaxevent.reconstruction.engine.images",
     "jaxevent.reconstruction.fused.video": "jaxevent.reconstruction.engine.images",
+    "jaxevent.reconstruction.prepared": "jaxevent.reconstruction.estimator",
     "jaxevent.sharing": "jaxevent.locks",
     "jaxevent.shown": "jaxevent.display",
 }
@@ -165,6 +298,65 @@ class RenamedAttribute:
         return getattr(owner if instance is None else instance, self.new)
 
 
+def renamed_fields(**names: str) -> Callable[[type[T]], type[T]]:
+    """Make a decorator that lets a dataclass take and give fields by their old names too.
+
+    Args:
+        names: The new name of each field by its old one.
+
+    Returns:
+        The decorator of the dataclass.
+    """
+
+    def decorate(cls: Any) -> Any:
+        init = cls.__init__
+
+        @functools.wraps(init)
+        def __init__(self: Any, *args: Any, **values: Any) -> None:
+            for old, new in names.items():
+                if old in values:
+                    warn_renamed(f"{cls.__name__}.{old}", f"{cls.__name__}.{new}")
+                    values[new] = values.pop(old)
+            init(self, *args, **values)
+
+        cls.__init__ = __init__
+        for old, new in names.items():
+            attribute = RenamedAttribute(new)
+            attribute.__set_name__(cls, old)
+            setattr(cls, old, attribute)
+        return cls
+
+    return decorate
+
+
+def renamed_methods(**names: str) -> Callable[[type[T]], type[T]]:
+    """Make a decorator that lets methods be called, and overridden in subclasses, by old names too.
+
+    Args:
+        names: The new name of each method or property by its old one.
+
+    Returns:
+        The decorator of the class.
+    """
+
+    def decorate(cls: Any) -> Any:
+        def __init_subclass__(sub: type, **options: Any) -> None:
+            super(cls, cast(Any, sub)).__init_subclass__(**options)
+            for old, new in names.items():
+                if old in vars(sub) and new not in vars(sub):
+                    warn_renamed(f"{sub.__name__}.{old}", f"{sub.__name__}.{new}")
+                    setattr(sub, new, vars(sub)[old])
+
+        cls.__init_subclass__ = classmethod(__init_subclass__)
+        for old, new in names.items():
+            attribute = RenamedAttribute(new)
+            attribute.__set_name__(cls, old)
+            setattr(cls, old, attribute)
+        return cls
+
+    return decorate
+
+
 class RenamedModules(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     """Finder of modules by their old names, which gives the modules that took their place."""
 
@@ -180,7 +372,14 @@ class RenamedModules(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         new = MOVED_MODULES[spec.name]
         warn_renamed(spec.name, new)
         module = types.ModuleType(spec.name, f"The old name of `{new}`.")
-        vars(module)["__getattr__"] = lambda name: getattr(importlib.import_module(new), name)
+        renamed = renamed_names(spec.name)
+
+        def __getattr__(name: str) -> Any:
+            if f"{spec.name}.{name}" in RENAMED:
+                return renamed(name)
+            return getattr(importlib.import_module(new), name)
+
+        vars(module)["__getattr__"] = __getattr__
         return module
 
     def exec_module(self, module: types.ModuleType) -> None:

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxevent.parameters import Positive, UnitInterval
-from jaxevent.reconstruction.augment import FrameParams, Held, event_change
-from jaxevent.reconstruction.filtering import Event, Filter, Observation, Observer
+from jaxevent.reconstruction.augment import FrameParams, ZeroOrderHold, event_change
+from jaxevent.reconstruction.filtering import Event, Filter, FrameModel, Observation
 
 
 class Params(FrameParams):
@@ -26,30 +26,30 @@ class State(eqx.Module):
     n: Array
 
 
-class Frames(Observer):
-    level: Held
+class Frames(FrameModel):
+    level: ZeroOrderHold
     alpha: Array
 
     def __init__(self, params: Params, frames):
-        self.level, self.alpha = Held(params, frames), params.alpha
+        self.level, self.alpha = ZeroOrderHold(params, frames), params.alpha
 
     def __call__(self, points):
         u = self.level(points)
         return Observation(u, jnp.broadcast_to(self.alpha, u.shape))
 
 
-def initial(params: Params, level: Array) -> State:
+def init(params: Params, level: Array) -> State:
     return State(level, jnp.zeros_like(level), jnp.zeros_like(level, int))
 
 
-def advance(params: Params, state: State, dt: Array, frame: Observation) -> State:
+def predict(params: Params, state: State, dt: Array, frame: Observation) -> State:
     fading = jnp.exp(-dt / params.tau)
     L = state.L + state.D * params.tau * (1 - fading)
     decay = jnp.exp(-frame.rate * dt)
     return State(L * decay + frame.level * (1 - decay), state.D * fading, state.n)
 
 
-def jump(params: Params, state: State, event: Event) -> State:
+def event_update(params: Params, state: State, event: Event) -> State:
     change = event_change(params, event.polarity, event.since)
     slope = change / jnp.maximum(event.since, 1e-3)
     D = state.D + params.gain * (slope - state.D)
@@ -57,11 +57,11 @@ def jump(params: Params, state: State, event: Event) -> State:
     return State(state.L + change, jnp.where(real, D, state.D), state.n + jnp.where(real, 1, 0))
 
 
-def tell(params: Params, state: State) -> tuple[Array, Array]:
+def readout(params: Params, state: State) -> tuple[Array, Array]:
     return state.L, 0.01 / (1 + state.n)
 
 
 trend = Filter(
-    "trend", Params, Frames, initial, advance, jump, tell, needs_frames=True,
+    "trend", Params, Frames, init, predict, event_update, readout, needs_frames=True,
     about="A filter that predicts slopes.",
 )  # fmt: skip

@@ -14,7 +14,7 @@ import jaxevent
 from jaxevent import codegen, progress
 from jaxevent.codegen import module as kernel_module
 from jaxevent.errors import InputError
-from jaxevent.io import prophesee
+from jaxevent.io import decoded
 from jaxevent.locks import TurnLock
 
 pytestmark = [
@@ -107,7 +107,7 @@ def test_recordings_in_files(tmp_path, monkeypatch, kind):
     if kind == "h5":
         jaxevent.save(recording, path)
     else:
-        monkeypatch.setattr(prophesee, "BLOCK", 500)
+        monkeypatch.setattr(decoded, "BLOCK", 500)
         path.write_bytes(formats.dat(recording.events, size))
     events = jaxevent.load(path, size, in_memory=False).events
     assert_equal([events[:1300].t], [recording.events.t[:1300]])  # on the way through the file

@@ -67,7 +67,7 @@ def test_errors_of_many_parameters(scope):
 def test_own_scan(scope):
     """A loop over the pixel's events gives what the scan gives."""
     params = scope["params"]
-    state = jaxevent.akf.initial(params, scope["level"])
+    state = jaxevent.akf.init(params, scope["level"])
     assert len(scope["L"]) == scope["here"].sum() > 10
     event = scope["Event"]
     for k, (since, polarity) in enumerate(zip(scope["since"], scope["polarity"], strict=True)):

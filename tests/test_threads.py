@@ -17,7 +17,7 @@ import jaxevent
 from jaxevent.codegen import module as kernel_module
 from jaxevent.codegen import run_over_rows
 from jaxevent.errors import InputError
-from jaxevent.io import prophesee
+from jaxevent.io import decoded
 from jaxevent.reconstruction.engine import filter_loop, filter_program, smoother_program
 from jaxevent.reconstruction.engine import images as image_module
 
@@ -191,7 +191,7 @@ def written(tmp_path, monkeypatch, kind: str):
         frames = recording.frames
         path.write_bytes(formats.event_utils(recording.events, size, frames.images, frames.t))
     else:
-        monkeypatch.setattr(prophesee, "BLOCK", 500)
+        monkeypatch.setattr(decoded, "BLOCK", 500)
         path.write_bytes(formats.dat(recording.events, size))
     return jaxevent.load(path, size, in_memory=False), jaxevent.load(path, size)
 

@@ -532,7 +532,7 @@ class Trace:
     outputs: dict[str, jax.ShapeDtypeStruct]
 
     def translate(self, translation: Translation, values: list[Value]) -> dict[str, Node]:
-        """Translate the function for values of its parameters and inputs; return results by name."""
+        """Translate the function for values of its parameters and inputs: results by name."""
         made = iter(translation.run(self.jaxpr, values))
         results: dict[str, Node] = {}
         for name, leaf in self.outputs.items():

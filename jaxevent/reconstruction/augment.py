@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
+from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision
 from jaxevent.parameters import Choice, Number, Parameters, Positive
 from jaxevent.reconstruction.features import FrameFeatures, Points
@@ -73,7 +74,7 @@ class AugmentParams(CertaintyParams):
     )
 
 
-def brightness(params: FrameParams, on: Array, off: Array) -> Array:
+def integrate_counts(params: FrameParams, on: Array, off: Array) -> Array:
     """Change of log intensity that events report: the sum of s c over them."""
     return params.c_on * on - params.c_off * off
 
@@ -86,11 +87,11 @@ def event_change(params: FrameParams, polarity: Array, since: Array) -> Array:
     rho = params.rho_ref
     near = since <= 1.5 * rho
     events = jnp.where(near, 3, since / jnp.where(near, 1, since - rho))
-    return brightness(params, polarity > 0, polarity < 0) * jnp.where(rho > 0, events, 1)
+    return integrate_counts(params, polarity > 0, polarity < 0) * jnp.where(rho > 0, events, 1)
 
 
 @runtime_checkable
-class Greys(Protocol):
+class GreyFrames(Protocol):
     """Frames as the camera gave them, as `FrameFeatures` has them."""
 
     @property
@@ -103,7 +104,7 @@ class Greys(Protocol):
     def gain(self) -> Any: ...
 
 
-def unclipped(params: CertaintyParams, frames: Greys) -> Float[Array, "frames pixels"]:
+def unclipped_weight(params: CertaintyParams, frames: GreyFrames) -> Float[Array, "frames pixels"]:
     """1 where a grey value says what the intensity was, 0 where it is black or white.
 
     A clipped pixel with noise reads a few grey values from the end; the edge at `margin` is soft, a
@@ -123,26 +124,28 @@ def certainty(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "f
     if len(knots) == 1:
         w = w * knots[0]
     else:
-        table = jnp.exp(_spline(len(knots)) @ jnp.log(knots))
-        place = jnp.asarray(frames.grey) * (SPLINE - 1)
-        below = jnp.clip(place.astype(int), 0, SPLINE - 2)
+        table = jnp.exp(_spline_matrix(len(knots)) @ jnp.log(knots))
+        place = jnp.asarray(frames.grey) * (SPLINE_POINTS - 1)
+        below = jnp.clip(place.astype(int), 0, SPLINE_POINTS - 2)
         part = place - below
         w = w * ((1 - part) * table[below] + part * table[below + 1])
     return jnp.maximum(w, params.w_min)
 
 
-def belief(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
+def effective_certainty(
+    params: CertaintyParams, frames: FrameFeatures
+) -> Float[Array, "frames pixels"]:
     """w of every frame and pixel, at least `w_min`, which is that of clipped ones."""
-    clear = unclipped(params, frames)
+    clear = unclipped_weight(params, frames)
     return clear * certainty(params, frames) + (1 - clear) * params.w_min
 
 
-def clipped_side(params: CertaintyParams, frames: Greys) -> Float[Array, "frames pixels"]:
+def clipped_side(params: CertaintyParams, frames: GreyFrames) -> Float[Array, "frames pixels"]:
     """+1 where a frame is clipped at white, -1 where at black, 0 where it is not."""
-    return jnp.where(jnp.asarray(frames.grey) > 0.5, 1, -1) * (1 - unclipped(params, frames))
+    return jnp.where(jnp.asarray(frames.grey) > 0.5, 1, -1) * (1 - unclipped_weight(params, frames))
 
 
-def clipping_bound(params: CertaintyParams, frames: Greys) -> Float[Array, "frames pixels"]:
+def clipping_bound(params: CertaintyParams, frames: GreyFrames) -> Float[Array, "frames pixels"]:
     """The log intensity at which pixels begin to clip: that of a grey `margin` from the end."""
     greys, response = jnp.arange(256), jnp.asarray(frames.response)
     margin = jnp.clip(params.margin, 0, 127)
@@ -154,18 +157,18 @@ def clipping_bound(params: CertaintyParams, frames: Greys) -> Float[Array, "fram
     return jnp.where(jnp.asarray(frames.grey) > 0.5, bright, dark)
 
 
-SPLINE = 256
+SPLINE_POINTS = 256
 
 
 @functools.lru_cache
-def _spline(knots: int) -> NDArray[np.floating]:
+def _spline_matrix(knots: int) -> NDArray[np.floating]:
     """The natural cubic spline through evenly spaced knots, at SPLINE places: a matrix."""
     from scipy.interpolate import CubicSpline
 
     if knots < 3:
-        return np.linspace([1.0, 0.0], [0.0, 1.0], SPLINE)
+        return np.linspace([1.0, 0.0], [0.0, 1.0], SPLINE_POINTS)
     kind = CubicSpline(np.linspace(0, 1, knots), np.eye(knots), bc_type="natural")
-    return kind(np.linspace(0, 1, SPLINE))
+    return kind(np.linspace(0, 1, SPLINE_POINTS))
 
 
 def clock_lag(params: FrameParams, frames: FrameFeatures) -> Float[Array, ""]:
@@ -175,10 +178,10 @@ def clock_lag(params: FrameParams, frames: FrameFeatures) -> Float[Array, ""]:
 
 def segment_excess(params: FrameParams, share: Array, on: Array, off: Array) -> Array:
     """What a segment of an exposure adds to m - 1, see `deblur_frames`."""
-    return share * jnp.expm1(brightness(params, on, off))
+    return share * jnp.expm1(integrate_counts(params, on, off))
 
 
-def deblurred(params: FrameParams, level: Array, total: Array) -> Array:
+def deblur_level(params: FrameParams, level: Array, total: Array) -> Array:
     """Log intensity at mid-exposure from the mean's, with the `total` of `segment_excess`."""
     return level - jnp.log1p(total) * params.deblur
 
@@ -200,25 +203,27 @@ def deblur_frames(
     s = frames.segments
     excess = segment_excess(params, s.share + clock_lag(params, frames) * s.edge, s.on, s.off)
     total = jax.ops.segment_sum(excess, s.frame_cell, level.size).reshape(level.shape)
-    level = deblurred(params, level, total)
+    level = deblur_level(params, level, total)
     return (
-        level - brightness(params, frames.head[0], frames.head[1]),
-        level + brightness(params, frames.tail[0], frames.tail[1]),
+        level - integrate_counts(params, frames.head[0], frames.head[1]),
+        level + integrate_counts(params, frames.tail[0], frames.tail[1]),
     )
 
 
-def _lagging(lag: Array, here: Array, there: Array) -> tuple[Array, Array]:
+def _shift_endpoints(lag: Array, here: Array, there: Array) -> tuple[Array, Array]:
     """Ends whose blend with weight w is that of `here` and `there` with weight w - lag."""
     drift = lag * (here - there)
     return here + drift, there + drift
 
 
-def believed_rate(params: AugmentParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
+def frame_information(
+    params: AugmentParams, frames: FrameFeatures
+) -> Float[Array, "frames pixels"]:
     """w (I + I0)^2: how well each frame tells the log intensity, in units of kappa."""
-    return belief(params, frames) * (frames.intensity + params.I0) ** 2
+    return effective_certainty(params, frames) * (frames.intensity + params.I0) ** 2
 
 
-class Level(eqx.Module):
+class LogIntensityModel(eqx.Module):
     """A model of the log intensity at any time, from what the frames say."""
 
     Params: ClassVar[type[FrameParams]] = FrameParams
@@ -230,7 +235,7 @@ class Level(eqx.Module):
         raise NotImplementedError
 
 
-def bounded_ratio(params: AugmentParams, ratio: Array, known: Array) -> Array:
+def bound_ratio(params: AugmentParams, ratio: Array, known: Array) -> Array:
     """Replace calibrated over nominal thresholds by 1 where out of bounds or not known (10).
 
     Within `ratio_width` / 2 of a bound a ratio r becomes 1 + w (r - 1), with the weight
@@ -254,7 +259,7 @@ def bounded_ratio(params: AugmentParams, ratio: Array, known: Array) -> Array:
     return jnp.where(known & (weight > 0), 1 + weight * (ratio - 1), 1)
 
 
-class Augmented(Level):
+class AugmentedFrame(LogIntensityModel):
     """L^A(t), (8)-(11): between two deblurred frames, integrated from both with c calibrated.
 
     Each piece blends two lines base + ratio S, S the nominal integral of events since the left edge
@@ -281,13 +286,15 @@ class Augmented(Level):
         shift: Float[Array, "frames pixels"] | float = 0.0,
     ):
         left, right = deblur_frames(params, frames, shift)
-        span = brightness(params, frames.span[0], frames.span[1])  # row f: from frame f to f + 1
+        span = integrate_counts(
+            params, frames.span[0], frames.span[1]
+        )  # row f: from frame f to f + 1
         following = jnp.roll(right, -1, axis=0)
         ratio = (following - left) / jnp.where(span == 0, 1, span)
-        ratio = bounded_ratio(params, ratio, (span != 0) & params.calibrate)
+        ratio = bound_ratio(params, ratio, (span != 0) & params.calibrate)
 
         # Before the first exposure: backwards from its right edge with the nominal threshold.
-        first = right[0] - brightness(params, frames.before[0], frames.before[1])
+        first = right[0] - integrate_counts(params, frames.before[0], frames.before[1])
         one = jnp.ones_like(first)
         before = (first, one, first, one)
         # In the gap after frame f: forwards from its left edge (8), backwards from the next one's
@@ -300,7 +307,7 @@ class Augmented(Level):
             # line of the one after it (11).
             back = jnp.concatenate([one[None], ratio[:-1]])
             own = frames.head + frames.tail
-            inside = (right - back * brightness(params, own[0], own[1]), back, left, ratio)
+            inside = (right - back * integrate_counts(params, own[0], own[1]), back, left, ratio)
             rows = [
                 jnp.concatenate([b[None], jnp.stack([e, g], 1).reshape(-1, len(first))])
                 for b, e, g in zip(before, inside, gap, strict=True)
@@ -310,7 +317,7 @@ class Augmented(Level):
         self.lag = clock_lag(params, frames) * frames.weight_rate
         self.tilt = None
         if params.weighting == "certainty":
-            trust = believed_rate(params, frames)
+            trust = frame_information(params, frames)
             q = jnp.roll(trust, -1, axis=0) / trust
             one = jnp.ones_like(q)
             between = [q] if frames.head is None else [one, q]
@@ -319,23 +326,23 @@ class Augmented(Level):
             self.from_ratio, self.to_ratio = from_ratio, to_ratio
         else:
             lag = self.lag[:, None]
-            self.from_base, self.to_base = _lagging(lag, from_base, to_base)
-            self.from_ratio, self.to_ratio = _lagging(lag, from_ratio, to_ratio)
+            self.from_base, self.to_base = _shift_endpoints(lag, from_base, to_base)
+            self.from_ratio, self.to_ratio = _shift_endpoints(lag, from_ratio, to_ratio)
 
     def __call__(self, points: Points) -> Float[Array, "*points"]:
-        S = brightness(self.params, points.on, points.off)
+        S = integrate_counts(self.params, points.on, points.off)
         u = points.weight
         if self.tilt is not None:
             pixels = self.tilt.shape[1]
-            u = u - points.of_piece_alone(self.lag, pixels)
-            toward = u * points.of_piece(self.tilt)
+            u = u - points.gather_piece_value(self.lag, pixels)
+            toward = u * points.gather_piece(self.tilt)
             u = toward / (1 - u + toward)
-        forward = points.of_piece(self.from_base) + points.of_piece(self.from_ratio) * S
-        backward = points.of_piece(self.to_base) + points.of_piece(self.to_ratio) * S
+        forward = points.gather_piece(self.from_base) + points.gather_piece(self.from_ratio) * S
+        backward = points.gather_piece(self.to_base) + points.gather_piece(self.to_ratio) * S
         return (1 - u) * forward + u * backward
 
 
-class EventIntegral(Level):
+class EventIntegral(LogIntensityModel):
     """EDI alone: the latest deblurred frame plus the events since, thresholds nominal."""
 
     params: FrameParams
@@ -343,16 +350,16 @@ class EventIntegral(Level):
 
     def __init__(self, params: FrameParams, frames: FrameFeatures):
         left, right = deblur_frames(params, frames)
-        first = right[0] - brightness(params, frames.before[0], frames.before[1])
+        first = right[0] - integrate_counts(params, frames.before[0], frames.before[1])
         if frames.head is not None:  # an exposure and the gap after it are two pieces
             left = jnp.repeat(left, 2, axis=0)
         self.params, self.base = params, jnp.concatenate([first[None], left])
 
     def __call__(self, points: Points) -> Float[Array, "*points"]:
-        return points.of_piece(self.base) + brightness(self.params, points.on, points.off)
+        return points.gather_piece(self.base) + integrate_counts(self.params, points.on, points.off)
 
 
-class Held(Level):
+class ZeroOrderHold(LogIntensityModel):
     """The last frame whose mid-exposure has passed (zero-order hold); before, the first one."""
 
     level: Float[Array, "frames pixels"]
@@ -361,24 +368,24 @@ class Held(Level):
         self.level = jnp.log(frames.intensity + params.I0)
 
     def __call__(self, points: Points) -> Float[Array, "*points"]:
-        return points.of_frame(self.level)
+        return points.gather_frame(self.level)
 
 
-class Blended(Level):
+class LinearBlend(LogIntensityModel):
     """Intensity linear in time between two frames."""
 
     I0: Float[Array, ""]
-    image: "BetweenFrames"
+    image: "FrameInterpolation"
 
     def __init__(self, params: FrameParams, frames: FrameFeatures):
         self.I0 = params.I0
-        self.image = BetweenFrames(params, frames, jnp.asarray(frames.intensity))
+        self.image = FrameInterpolation(params, frames, jnp.asarray(frames.intensity))
 
     def __call__(self, points: Points) -> Float[Array, "*points"]:
         return jnp.log(self.image(points) + self.I0)
 
 
-class Nothing(Level):
+class NoFrames(LogIntensityModel):
     """No frames at all: log intensity 0."""
 
     def __init__(self, params: FrameParams, frames: FrameFeatures):
@@ -388,7 +395,7 @@ class Nothing(Level):
         return jnp.zeros(points.on.shape, points.weight.dtype)
 
 
-class BetweenFrames(eqx.Module):
+class FrameInterpolation(eqx.Module):
     """A quantity known at mid-exposures: linear in time between them, constant outside."""
 
     here: Float[Array, "frames pixels"]
@@ -398,8 +405,11 @@ class BetweenFrames(eqx.Module):
         self, params: FrameParams, frames: FrameFeatures, table: Float[Array, "frames pixels"]
     ):
         lag = clock_lag(params, frames) * frames.blend_rate[:, None]
-        self.here, self.there = _lagging(lag, table, jnp.roll(table, -1, axis=0))
+        self.here, self.there = _shift_endpoints(lag, table, jnp.roll(table, -1, axis=0))
 
     def __call__(self, points: Points) -> Float[Array, "*points"]:
         v = points.blend
-        return (1 - v) * points.of_frame(self.here) + v * points.of_frame(self.there)
+        return (1 - v) * points.gather_frame(self.here) + v * points.gather_frame(self.there)
+
+
+__getattr__ = renamed_names(__name__)

@@ -10,24 +10,25 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxevent.deprecated import renamed_names
 from jaxevent.parameters import Positive
 from jaxevent.reconstruction.augment import (
-    Augmented,
+    AugmentedFrame,
     AugmentParams,
     FrameParams,
-    Held,
-    Level,
-    Nothing,
+    LogIntensityModel,
+    NoFrames,
+    ZeroOrderHold,
     event_change,
 )
 from jaxevent.reconstruction.features import FrameFeatures, Points
 from jaxevent.reconstruction.filtering import (
     Event,
     Filter,
+    FrameModel,
     Observation,
-    Observer,
-    State,
-    without_variance,
+    PixelState,
+    init_without_variance,
 )
 
 
@@ -43,10 +44,10 @@ class AugmentedParams(AugmentParams):
     alpha = Positive(15.0, "rad/s", "cut-off frequency")
 
 
-class Pull(Observer):
+class ConstantRateModel(FrameModel):
     """A model of the log intensity, believed at the rate alpha."""
 
-    level: Level
+    level: LogIntensityModel
     alpha: Float[Array, ""]
 
     def __call__(self, points: Points) -> Observation:
@@ -54,30 +55,30 @@ class Pull(Observer):
         return Observation(u, jnp.broadcast_to(self.alpha, u.shape))
 
 
-def advance(params: FrameParams, state: State, dt: Array, frame: Observation) -> State:
+def predict(params: FrameParams, state: PixelState, dt: Array, frame: Observation) -> PixelState:
     """L <- L e^(-alpha dt) + u (1 - e^(-alpha dt))."""
     decay = jnp.exp(-frame.rate * dt)
-    return State(state.L * decay + frame.level * (1 - decay), state.P)
+    return PixelState(state.L * decay + frame.level * (1 - decay), state.P)
 
 
-def jump(params: FrameParams, state: State, event: Event) -> State:
+def event_update(params: FrameParams, state: PixelState, event: Event) -> PixelState:
     """L <- L + s c."""
-    return State(state.L + event_change(params, event.polarity, event.since), state.P)
+    return PixelState(state.L + event_change(params, event.polarity, event.since), state.P)
 
 
 def _filter(
-    name: str, model: type[Level], params: type[FrameParams], about: str, **more: Any
+    name: str, model: type[LogIntensityModel], params: type[FrameParams], about: str, **more: Any
 ) -> Filter:
-    def observe(values: Any, frames: FrameFeatures) -> Pull:
-        return Pull(model(values, frames), values.alpha)
+    def frame_model(values: Any, frames: FrameFeatures) -> ConstantRateModel:
+        return ConstantRateModel(model(values, frames), values.alpha)
 
     return Filter(
         name,
         params,
-        observe,
-        without_variance,
-        advance,
-        jump,
+        frame_model,
+        init_without_variance,
+        predict,
+        event_update,
         has_covariance=False,
         about=f"{about} (Scheerlinck et al., ACCV 2018): a constant gain, no variance.",
         **more,
@@ -85,19 +86,25 @@ def _filter(
 
 
 cf = _filter(
-    "cf", Held, Params, "The complementary filter of events and the last frame", needs_frames=True
+    "cf",
+    ZeroOrderHold,
+    Params,
+    "The complementary filter of events and the last frame",
+    needs_frames=True,
 )
 cf_augmented = _filter(
     "cf-augmented",
-    Augmented,
+    AugmentedFrame,
     AugmentedParams,
     "The complementary filter of events and the augmented frame",
     needs_frames=True,
 )
 high_pass = _filter(
     "high-pass",
-    Nothing,
+    NoFrames,
     Params,
     "The high-pass filter of events alone, whose images have no absolute brightness",
     fuses=False,
 )
+
+__getattr__ = renamed_names(__name__)

@@ -5,48 +5,49 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxevent.deprecated import renamed_names
 from jaxevent.reconstruction.augment import (
-    Augmented,
-    Blended,
+    AugmentedFrame,
     EventIntegral,
     FrameParams,
-    Held,
-    Level,
+    LinearBlend,
+    LogIntensityModel,
+    ZeroOrderHold,
 )
 from jaxevent.reconstruction.features import FrameFeatures, Points
 from jaxevent.reconstruction.filtering import (
     Filter,
+    FrameModel,
     Observation,
-    Observer,
-    State,
-    without_variance,
+    PixelState,
+    init_without_variance,
 )
 
 
-class Direct(Observer):
+class DirectFrameModel(FrameModel):
     """A model of the log intensity, believed at once."""
 
-    level: Level
+    level: LogIntensityModel
 
     def __call__(self, points: Points) -> Observation:
         u = self.level(points)
         return Observation(u, jnp.full_like(u, jnp.inf))
 
 
-def advance(params: FrameParams, state: State, dt: Array, frame: Observation) -> State:
-    return State(frame.level, jnp.broadcast_to(state.P, frame.level.shape))
+def predict(params: FrameParams, state: PixelState, dt: Array, frame: Observation) -> PixelState:
+    return PixelState(frame.level, jnp.broadcast_to(state.P, frame.level.shape))
 
 
-def _direct(name: str, model: type[Level], about: str, **more: Any) -> Filter:
-    def observe(values: Any, frames: FrameFeatures) -> Direct:
-        return Direct(model(values, frames))
+def _direct(name: str, model: type[LogIntensityModel], about: str, **more: Any) -> Filter:
+    def frame_model(values: Any, frames: FrameFeatures) -> DirectFrameModel:
+        return DirectFrameModel(model(values, frames))
 
     return Filter(
         name,
         model.Params,
-        observe,
-        without_variance,
-        advance,
+        frame_model,
+        init_without_variance,
+        predict,
         needs_frames=True,
         has_covariance=False,
         about=about,
@@ -62,11 +63,13 @@ edi = _direct(
 )
 augmented = _direct(
     "augmented",
-    Augmented,
+    AugmentedFrame,
     "The augmented frame of the AKF, read directly: two deblurred frames, and the events between "
     "them with a threshold calibrated for each pixel.",
 )
 blend = _direct(
-    "blend", Blended, "The frames before and after, blended by time; no events.", fuses=False
+    "blend", LinearBlend, "The frames before and after, blended by time; no events.", fuses=False
 )
-last_frame = _direct("last-frame", Held, "The last frame, held; no events.", fuses=False)
+last_frame = _direct("last-frame", ZeroOrderHold, "The last frame, held; no events.", fuses=False)
+
+__getattr__ = renamed_names(__name__)

@@ -2,18 +2,60 @@
 
 import abc
 import dataclasses
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
+import equinox as eqx
+from numpy.typing import NDArray
+
+from jaxevent.deprecated import renamed_methods
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator
 from jaxevent.events.clocks import check_clocks
-from jaxevent.reconstruction.clock import Timing, time_span
 from jaxevent.reconstruction.features import Features, ReadOut
+from jaxevent.reconstruction.frames import Timing, time_span
 from jaxevent.reconstruction.live import LiveVideo
-from jaxevent.reconstruction.prepared import PreparedImages, ScannedImages
 from jaxevent.reconstruction.video import ImageSequence, P, Video
 from jaxevent.reconstruction.windows import prepare
 from jaxevent.recording import Recording, Times, check_times
+
+
+@runtime_checkable
+class PreparedImages(Protocol):
+    """Images at the times that were prepared: `mean, variance, valid = images(params)`.
+
+    A pytree, pure: it jits, maps over `params` and differentiates. Each array is (times, pixels).
+    """
+
+    def __call__(self, params: Any, *, variance: bool = True) -> Estimate:
+        """The images; without `variance` there is none, and no derivatives of it."""
+        ...
+
+    def take(self, rows: NDArray) -> "PreparedImages":
+        """Those at some of the times, in that order."""
+        ...
+
+    def over(self, devices: Sequence[Any]) -> "PreparedImages":
+        """The same on several devices, pixels shared out."""
+        ...
+
+
+class ScannedImages(eqx.Module):
+    """`PreparedImages` by a method's `run` and `read`."""
+
+    features: Any
+    out: Any
+    method: Any = eqx.field(static=True)
+
+    def __call__(self, params: Any, *, variance: bool = True) -> Estimate:
+        trajectory, _ = self.method.run(params, self.features)
+        return self.method.read(params, trajectory, self.out)
+
+    def take(self, rows: NDArray) -> "ScannedImages":
+        return ScannedImages(self.features, self.out.take(rows), self.method)
+
+    def over(self, devices: Sequence[Any]) -> "ScannedImages":
+        return ScannedImages(self.features.over(devices), self.out.over(devices), self.method)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -89,6 +131,7 @@ class ImageEstimator(Estimator[P]):
         return ScannedImages(features, out, self)
 
 
+@renamed_methods(filters="is_event_driven", looks_ahead="needs_future", start="init_state")
 @dataclasses.dataclass(frozen=True, repr=False)
 class PixelEstimator(ImageEstimator[P]):
     """A reconstruction method to which every pixel is one of its own, in windows of events."""
@@ -99,16 +142,16 @@ class PixelEstimator(ImageEstimator[P]):
 
     @property
     @abc.abstractmethod
-    def filters(self) -> bool:
+    def is_event_driven(self) -> bool:
         """Whether it passes over single events."""
 
     @property
-    def looks_ahead(self) -> bool:
+    def needs_future(self) -> bool:
         """Whether `run` needs what later windows say."""
         return False
 
     @abc.abstractmethod
-    def start(self, params: P, features: Features) -> Any:
+    def init_state(self, params: P, features: Features) -> Any:
         """The state at the recording's start, from the features of its first window."""
 
     @abc.abstractmethod
@@ -145,7 +188,7 @@ class PixelEstimator(ImageEstimator[P]):
         self.check_clocks(recording, params)
         if not extrapolate:
             self.check_span(recording, times, params)
-        return prepare(recording, times, Timing.of(params), filtering=self.filters)
+        return prepare(recording, times, Timing.of(params), filtering=self.is_event_driven)
 
     def estimate(
         self, recording: Recording, params: P | None = None, **options: Any
@@ -167,7 +210,7 @@ class PixelEstimator(ImageEstimator[P]):
         a recording's further arrays, for a camera response. Raises `InputError` for a method that
         looks ahead.
         """
-        if self.looks_ahead:
+        if self.needs_future:
             raise InputError(f"the method {self.name!r} needs what comes later; use akf")
         self.check_options(**options)
         params = self.Params() if params is None else params

@@ -18,6 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
 from jaxevent.devices import loop_unroll
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.reconstruction.augment import FrameParams
@@ -27,8 +28,10 @@ from jaxevent.reconstruction.engine.images import (
     images_from_kernel,
     video_from_kernel,
 )
-from jaxevent.reconstruction.estimator import P, PixelEstimator
+from jaxevent.reconstruction.estimator import P, PixelEstimator, PreparedImages
 from jaxevent.reconstruction.features import (
+    SHAPES,
+    SLOTS,
     Features,
     FrameFeatures,
     Numeric,
@@ -36,15 +39,13 @@ from jaxevent.reconstruction.features import (
     ReadOut,
     Tiles,
 )
-from jaxevent.reconstruction.layout import SHAPES, SLOTS
-from jaxevent.reconstruction.prepared import PreparedImages
 from jaxevent.reconstruction.video import ImageSequence, Video
 from jaxevent.recording import Recording, Times
 
 UNROLLED = 8  # ranks of a tile that a GPU passes over at once
 
 
-class State(eqx.Module):
+class PixelState(eqx.Module):
     """Log intensity L = ln(I + I0) of a pixel and its variance P (NaN if not estimated).
 
     The usual state of a `Filter`, whose own may be any pytree of numbers per pixel.
@@ -54,9 +55,9 @@ class State(eqx.Module):
     P: Float[Numeric, "*pixels"]
 
 
-def without_variance(params: FrameParams, level: Array) -> State:
+def init_without_variance(params: FrameParams, level: Array) -> PixelState:
     """The initial state of methods that estimate no variance."""
-    return State(level, jnp.full_like(level, jnp.nan))
+    return PixelState(level, jnp.full_like(level, jnp.nan))
 
 
 class Observation(eqx.Module):
@@ -78,20 +79,21 @@ class Event(eqx.Module):
     frame: Observation  # just before the event
 
 
-class Place(eqx.Module):
+class LaneBlock(eqx.Module):
     """Which lanes tiles serve, and in which shape (`features.Tiles`)."""
 
     kind: Int[Array, " tiles"]
     lane: Int[Array, " tiles"]
 
 
-class Observer(eqx.Module):
+@renamed_methods(outset="initial_level")
+class FrameModel(eqx.Module):
     """What the frames say anywhere in a window: tables made once, looked up at points."""
 
     @abc.abstractmethod
     def __call__(self, points: Points) -> Observation: ...
 
-    def outset(self, points: Points) -> Float[Array, "..."]:
+    def initial_level(self, points: Points) -> Float[Array, "..."]:
         """The log intensity from which a filter starts."""
         return self(points).level
 
@@ -99,7 +101,7 @@ class Observer(eqx.Module):
 class Trajectory(ShortRepr):
     """A filtered window: enough to read an image at any time inside it."""
 
-    observer: Observer
+    frame_model: FrameModel
     start: Any  # state (pixels,), after each pixel's last event before the window
     path: Any  # state (slots,), after every event, in the order of the features' slots; or None
 
@@ -114,34 +116,42 @@ class Trajectory(ShortRepr):
         return jax.tree.map(look, self.start, self.path)
 
 
-def log_intensity(params: FrameParams, state: Any) -> tuple[Array, Array]:
-    """Log intensity and its variance of a pixel whose state is a `State`."""
+def readout_log_intensity(params: FrameParams, state: Any) -> tuple[Array, Array]:
+    """Log intensity and its variance of a pixel whose state is a `PixelState`."""
     return state.L, state.P
 
 
+@renamed_methods(at_pixel="step_and_readout", initial_state="init_from_frames")
+@renamed_fields(
+    observe="frame_model", initial="init", advance="predict", jump="event_update", tell="readout"
+)
 @dataclasses.dataclass(frozen=True, repr=False)
 class Filter(PixelEstimator[P]):
     """A causal method, made of pure functions of one pixel.
 
-    `observe(params, frames)` makes the window's `Observer`. `initial(params, level)` is the state
-    at the recording's start, where the frames say `level`: any pytree of numbers. `advance(params,
-    state, dt, observation)` brings a state dt seconds on without events, `jump(params, state,
-    event)` adds an event to it. `tell(params, state)` is the log intensity and its variance. A
-    method with `jump=None` keeps no state: its image is the observation.
+    Attributes:
+        frame_model: `frame_model(params, frames)` makes the `FrameModel` of a window.
+        init: `init(params, level)` returns the state at the recording's start, any pytree of
+            numbers; `level` is the log intensity of the frames there.
+        predict: `predict(params, state, dt, observation)` returns the state dt seconds later,
+            without events.
+        event_update: `event_update(params, state, event)` returns the state after an event. A
+            method without it keeps no state: its image is the observation.
+        readout: `readout(params, state)` returns the log intensity and its variance.
     """
 
-    observe: Callable[[P, FrameFeatures], "Observer"]
-    initial: Callable[[P, Array], Any]
-    advance: Callable[[P, Any, Array, Observation], Any]
-    jump: Callable[[P, Any, Event], Any] | None = None
-    tell: Callable[[P, Any], tuple[Array, Array]] = log_intensity
+    frame_model: Callable[[P, FrameFeatures], "FrameModel"]
+    init: Callable[[P, Array], Any]
+    predict: Callable[[P, Any, Array, Observation], Any]
+    event_update: Callable[[P, Any, Event], Any] | None = None
+    readout: Callable[[P, Any], tuple[Array, Array]] = readout_log_intensity
     options: frozenset[str] = dataclasses.field(
         default=frozenset({"window_events", "devices", "compiler"}), kw_only=True
     )
 
     @property
-    def filters(self) -> bool:
-        return self.jump is not None
+    def is_event_driven(self) -> bool:
+        return self.event_update is not None
 
     def estimate(
         self,
@@ -192,15 +202,17 @@ class Filter(PixelEstimator[P]):
 
     def step(self, params: P, state: Any, event: Event) -> Any:
         """The state of a pixel after an event: advance to it, then jump."""
-        assert self.jump is not None
-        return self.jump(params, self.advance(params, state, event.since, event.frame), event)
+        assert self.event_update is not None
+        return self.event_update(
+            params, self.predict(params, state, event.since, event.frame), event
+        )
 
     def image(self, params: P, state: Any, since: Array, frame: Observation) -> tuple[Array, Array]:
         """Intensity and variance of a pixel `since` seconds after its last event."""
-        L, P = self.tell(params, self.advance(params, state, since, frame))
+        L, P = self.readout(params, self.predict(params, state, since, frame))
         return jnp.exp(L) - params.I0, P
 
-    def at_pixel(
+    def step_and_readout(
         self,
         params: P,
         frame: Observation,
@@ -211,52 +223,52 @@ class Filter(PixelEstimator[P]):
     ) -> tuple[Any, Array, Array]:
         """The state after an event; intensity and variance at its time without it."""
         after = state
-        if self.jump is not None:
+        if self.event_update is not None:
             after = self.step(params, state, Event(since, near, polarity, frame))
         return after, *self.image(params, state, since, frame)
 
-    def initial_state(self, params: P, observer: Observer, points: Points) -> Any:
+    def init_from_frames(self, params: P, frame_model: FrameModel, points: Points) -> Any:
         """The state of the pixels at the recording's start."""
-        level = observer.outset(points)[0]
-        return jax.vmap(functools.partial(self.initial, params))(level)
+        level = frame_model.initial_level(points)[0]
+        return jax.vmap(functools.partial(self.init, params))(level)
 
-    def start(self, params: P, features: Features) -> Any:
-        observer = self.observe(params, features.frames)
-        return self.initial_state(params, observer, features.start)
+    def init_state(self, params: P, features: Features) -> Any:
+        frame_model = self.frame_model(params, features.frames)
+        return self.init_from_frames(params, frame_model, features.start)
 
     def run(
         self, params: P, features: Features, state: Any = None, future: None = None
     ) -> tuple[Trajectory, Any]:
         """As `PixelEstimator.run`; the state is (pixels,), after each pixel's last event."""
-        features = features.at(params.rho_ref)
-        observer = self.observe(params, features.frames)
+        features = features.at_dead_time(params.rho_ref)
+        frame_model = self.frame_model(params, features.frames)
         if state is None:
-            state = self.initial_state(params, observer, features.start)
+            state = self.init_from_frames(params, frame_model, features.start)
         if features.tiles is None:
-            return Trajectory(observer, state, None), state
-        path = self.scan(params, observer, features.tiles, state)
-        trajectory = Trajectory(observer, state, path)
+            return Trajectory(frame_model, state, None), state
+        path = self.scan(params, frame_model, features.tiles, state)
+        trajectory = Trajectory(frame_model, state, path)
         return trajectory, trajectory.at(jnp.asarray(features.last))
 
-    def scan(self, params: P, observer: Observer, tiles: Tiles, state: Any) -> Any:
+    def scan(self, params: P, frame_model: FrameModel, tiles: Tiles, state: Any) -> Any:
         """The states after every event, (slots,)."""
-        path = tiles.each(self._scan, params, observer, state)
+        path = tiles.map_shards(self._scan, params, frame_model, state)
         return jax.tree.map(jnp.ravel, path)
 
-    def _scan(self, tiles: Tiles, params: P, observer: Observer, state: Any) -> Any:
+    def _scan(self, tiles: Tiles, params: P, frame_model: FrameModel, state: Any) -> Any:
         """The states after every event, (tiles, slots)."""
-        frame = observer(tiles.points)
+        frame = frame_model(tiles.points)
         events = Event(
             jnp.asarray(tiles.since), jnp.asarray(tiles.near), jnp.asarray(tiles.polarity), frame
         )
-        place = Place(jnp.asarray(tiles.kind), jnp.asarray(tiles.lane))
+        place = LaneBlock(jnp.asarray(tiles.kind), jnp.asarray(tiles.lane))
         lanes = jax.tree.map(lambda s: s[tiles.pixel], state)
         return _path(self, params, events, lanes, place)
 
     def read(self, params: P, trajectory: Trajectory, out: ReadOut) -> Estimate:
-        out = out.at(params.rho_ref)
+        out = out.at_dead_time(params.rho_ref)
         before = trajectory.at(jnp.asarray(out.slot))
-        since, frame = jnp.asarray(out.since), trajectory.observer(out.points)
+        since, frame = jnp.asarray(out.since), trajectory.frame_model(out.points)
 
         frame = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, since.shape), frame)
         one = functools.partial(self.image, params)
@@ -265,7 +277,7 @@ class Filter(PixelEstimator[P]):
         return Estimate(image, P, jnp.isfinite(image))
 
 
-def _over_tiles(step: Callable, lanes: Any, place: Place, slots: Any) -> Any:
+def _over_tiles(step: Callable, lanes: Any, place: LaneBlock, slots: Any) -> Any:
     """Scan the tiles in order, and in each its ranks: `step(lanes, slots) -> lanes, output`.
 
     `lanes` are arrays (lanes,), `slots` (tiles, slots). Returns the outputs, (tiles, slots). Of
@@ -290,7 +302,7 @@ def _over_tiles(step: Callable, lanes: Any, place: Place, slots: Any) -> Any:
 
     # Branches see a tile's lanes, not all: XLA copies what goes through a branch. With all lanes
     # the filter took 22 ms for a million events, with a tile's 9 ms.
-    def body(lanes: Any, tile: tuple[Place, Any]) -> tuple[Any, Any]:
+    def body(lanes: Any, tile: tuple[LaneBlock, Any]) -> tuple[Any, Any]:
         where, slots = tile
         lane = where.lane if share == 1 else where.lane // share
         mine = jax.tree.map(lambda s: lax.dynamic_slice(s, (lane,), (widest,)), lanes)
@@ -302,7 +314,7 @@ def _over_tiles(step: Callable, lanes: Any, place: Place, slots: Any) -> Any:
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _path(method: Filter, params: Any, events: Event, lanes: Any, place: Place) -> Any:
+def _path(method: Filter, params: Any, events: Event, lanes: Any, place: LaneBlock) -> Any:
     """The states after every event, (tiles, slots), from those of lanes, (lanes,)."""
 
     def step(at: Any, event: Event) -> tuple[Any, Any]:
@@ -403,3 +415,6 @@ def _as_tangent(state: Any, real: list[Array]) -> Any:
             for leaf in leaves
         ],
     )
+
+
+__getattr__ = renamed_names(__name__)

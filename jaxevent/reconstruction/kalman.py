@@ -8,19 +8,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxevent.deprecated import renamed_names
 from jaxevent.parameters import Choice, Number, Positive
 from jaxevent.reconstruction.augment import (
-    Augmented,
+    AugmentedFrame,
     AugmentParams,
-    BetweenFrames,
-    belief,
-    believed_rate,
+    FrameInterpolation,
     clipped_side,
     clipping_bound,
+    effective_certainty,
     event_change,
+    frame_information,
 )
 from jaxevent.reconstruction.features import FrameFeatures, Points
-from jaxevent.reconstruction.filtering import Event, Filter, Observation, Observer, State
+from jaxevent.reconstruction.filtering import Event, Filter, FrameModel, Observation, PixelState
 
 
 class Params(AugmentParams):
@@ -75,7 +76,7 @@ class Params(AugmentParams):
         return found
 
 
-MOST_BIAS = 0.5  # ln I; the expansion holds for small noise
+MAX_LOG_BIAS = 0.5  # ln I; the expansion holds for small noise
 
 
 def noise_bias(params: Params, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
@@ -83,14 +84,14 @@ def noise_bias(params: Params, frames: FrameFeatures) -> Float[Array, "frames pi
 
     Of a noisy I with the variance V the log is too low by V / (2 (I + I0)^2) on average, to second
     order; V is the density Rbar times the frame rate. (6) subtracts Rbar / (2 (I + I0)^2) "to
-    compensate", which doubles what it means to undo. At most `MOST_BIAS` is added.
+    compensate", which doubles what it means to undo. At most `MAX_LOG_BIAS` is added.
     """
-    Rbar = 1 / (params.kappa * belief(params, frames))
+    Rbar = 1 / (params.kappa * effective_certainty(params, frames))
     bias = params.log_bias * Rbar / (2 * (jnp.asarray(frames.intensity) + params.I0) ** 2)
-    return jnp.asarray(frames.present) * jnp.clip(bias, -MOST_BIAS, MOST_BIAS)
+    return jnp.asarray(frames.present) * jnp.clip(bias, -MAX_LOG_BIAS, MAX_LOG_BIAS)
 
 
-class Augmentation(Observer):
+class AugmentedFrameModel(FrameModel):
     """L^A, and 1/R with R = Rbar / (I + I0)^2, Rbar and I linear between frames (4), (5), (7).
 
     Paper (4) writes sigma_im^2 = 7e5 as a multiplier; it is the reciprocal of the density.
@@ -99,9 +100,9 @@ class Augmentation(Observer):
     certainty fades over the gap instead of vanishing at its beginning.
     """
 
-    level: Augmented
-    image: BetweenFrames | None
-    density: BetweenFrames
+    level: AugmentedFrame
+    image: FrameInterpolation | None
+    density: FrameInterpolation
     I0: Float[Array, ""]
     present: Float[Array, ""]
     clipped: Float[Array, "frames pixels"]
@@ -110,16 +111,16 @@ class Augmentation(Observer):
     push: Float[Array, "frames pixels"] | None
 
     def __init__(self, params: Params, frames: FrameFeatures):
-        self.level = Augmented(params, frames, noise_bias(params, frames))
+        self.level = AugmentedFrame(params, frames, noise_bias(params, frames))
         self.I0, self.present = params.I0, jnp.asarray(frames.present)
         if params.weighting == "certainty":
             self.image = None
-            trust = params.kappa * believed_rate(params, frames)
-            self.density = BetweenFrames(params, frames, trust)
+            trust = params.kappa * frame_information(params, frames)
+            self.density = FrameInterpolation(params, frames, trust)
         else:
-            Rbar = 1 / (params.kappa * belief(params, frames))
-            self.image = BetweenFrames(params, frames, jnp.asarray(frames.intensity))
-            self.density = BetweenFrames(params, frames, Rbar)
+            Rbar = 1 / (params.kappa * effective_certainty(params, frames))
+            self.image = FrameInterpolation(params, frames, jnp.asarray(frames.intensity))
+            self.density = FrameInterpolation(params, frames, Rbar)
         side = clipped_side(params, frames)
         # A clipped value tells its side, no more: dark ones differ by how noise is rounded.
         edge = clipping_bound(params, frames)
@@ -140,19 +141,19 @@ class Augmentation(Observer):
             rate = self.present * (self.image(points) + self.I0) ** 2 / self.density(points)
         if self.bound is None or self.push is None:
             return Observation(self.level(points), rate)
-        push = self.present * points.of_frame(self.push)
-        return Observation(self.level(points), rate, points.of_frame(self.bound), push)
+        push = self.present * points.gather_frame(self.push)
+        return Observation(self.level(points), rate, points.gather_frame(self.bound), push)
 
-    def outset(self, points: Points) -> Array:
+    def initial_level(self, points: Points) -> Array:
         level = self.level(points)
-        return level + points.of_frame(self.clipped) * (points.of_frame(self.begin) - level)
+        return level + points.gather_frame(self.clipped) * (points.gather_frame(self.begin) - level)
 
 
-def initial(params: Params, level: Array) -> State:
-    return State(level, jnp.broadcast_to(params.P0, level.shape))
+def init(params: Params, level: Array) -> PixelState:
+    return PixelState(level, jnp.broadcast_to(params.P0, level.shape))
 
 
-def advance(params: Params, state: State, dt: Array, frame: Observation) -> State:
+def predict(params: Params, state: PixelState, dt: Array, frame: Observation) -> PixelState:
     """Towards the augmented frame over dt: (18) and (16).
 
     The line before (17) of the paper must read P' = -P^2 / R + Q. One-sided evidence of clipped
@@ -166,17 +167,17 @@ def advance(params: Params, state: State, dt: Array, frame: Observation) -> Stat
         u = u + (frame.bound - u) * push / jnp.where(total > 0, total, 1)
         rate = total
     gain = 1 / (1 + state.P * dt * rate)
-    return State((state.L - u) * gain + u, state.P * gain)
+    return PixelState((state.L - u) * gain + u, state.P * gain)
 
 
-def noise(params: Params, event: Event) -> Array:
+def process_noise(params: Params, event: Event) -> Array:
     """Q of an event (2): process, isolated-pixel and refractory-period noise."""
     Q_proc = params.sigma_proc**2 * event.since
     Q_iso = params.sigma_iso**2 * event.near
-    return Q_proc + Q_iso + params.sigma_ref**2 * within(params, event.since)
+    return Q_proc + Q_iso + params.sigma_ref**2 * refractory_indicator(params, event.since)
 
 
-def within(params: Params, since: Array) -> Array:
+def refractory_indicator(params: Params, since: Array) -> Array:
     """1 within the bound rho on the refractory period, 0 after it.
 
     The comparison has no derivative by rho; with a width the step is relaxed to
@@ -190,20 +191,22 @@ def within(params: Params, since: Array) -> Array:
     return jnp.where(sharp, jnp.where(since <= params.rho, 1.0, 0.0), soft)
 
 
-def jump(params: Params, state: State, event: Event) -> State:
+def event_update(params: Params, state: PixelState, event: Event) -> PixelState:
     """At an event: L moves by the nominal threshold (14), P grows by Q (19)."""
     L = state.L + event_change(params, event.polarity, event.since)
-    return State(L, state.P + jnp.where(event.polarity == 0, 0, noise(params, event)))
+    return PixelState(L, state.P + jnp.where(event.polarity == 0, 0, process_noise(params, event)))
 
 
 akf = Filter(
     "akf",
     Params,
-    Augmentation,
-    initial,
-    advance,
-    jump,
+    AugmentedFrameModel,
+    init,
+    predict,
+    event_update,
     about="The asynchronous Kalman filter (Wang et al., ICCV 2021), equations corrected. Per pixel "
     "it estimates the log intensity and its variance: events move it by their threshold and make "
     "it less certain, and between events the augmented frame pulls it.",
 )
+
+__getattr__ = renamed_names(__name__)

@@ -18,9 +18,8 @@ from jaxevent.errors import InputError, require
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.locks import synchronized
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.clock import Clock, Timing
 from jaxevent.reconstruction.estimator import ImageEstimator
-from jaxevent.reconstruction.frames import FrameImages
+from jaxevent.reconstruction.frames import Clock, FrameImages, Timing
 from jaxevent.reconstruction.video import BATCH, ImageSequence
 from jaxevent.recording import Recording, Times, microseconds
 

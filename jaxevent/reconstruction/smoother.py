@@ -31,19 +31,20 @@ from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
+from jaxevent.deprecated import renamed_methods, renamed_names
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.parameters import Choice, Positive
 from jaxevent.reconstruction.augment import (
     CertaintyParams,
-    brightness,
     certainty,
     clipped_side,
     clipping_bound,
     clock_lag,
     deblur_frames,
-    deblurred,
+    deblur_level,
+    integrate_counts,
     segment_excess,
-    unclipped,
+    unclipped_weight,
 )
 from jaxevent.reconstruction.engine.images import (
     SmootherImages,
@@ -51,7 +52,7 @@ from jaxevent.reconstruction.engine.images import (
     images_from_kernel,
     video_from_kernel,
 )
-from jaxevent.reconstruction.estimator import PixelEstimator
+from jaxevent.reconstruction.estimator import PixelEstimator, PreparedImages
 from jaxevent.reconstruction.features import (
     Features,
     FrameFeatures,
@@ -59,7 +60,6 @@ from jaxevent.reconstruction.features import (
     Numeric,
     ReadOut,
 )
-from jaxevent.reconstruction.prepared import PreparedImages
 from jaxevent.reconstruction.video import ImageSequence, Video
 from jaxevent.recording import Recording, Times
 
@@ -110,7 +110,7 @@ class Message(eqx.Module):
     h: Float[Numeric, "*pixels"]
     J: Float[Numeric, "*pixels"]
 
-    def earlier(self, S: Array, q: Array) -> "Message":
+    def propagate_back(self, S: Array, q: Array) -> "Message":
         """The same about L before it moved by S with variance q."""
         fade = 1 / (1 + q * self.J)
         return Message((self.h - self.J * S) * fade, self.J * fade)
@@ -119,7 +119,8 @@ class Message(eqx.Module):
         return Message(self.h + other.h, self.J + other.J)
 
 
-class Link(eqx.Module):
+@renamed_methods(before="apply", then="compose")
+class MessageMap(eqx.Module):
     """How a message after several frames becomes one before them (Sarkka & Garcia-Fernandez 2021).
 
     h' = h + A (h_later - J_later b) / (1 + C J_later), J' = J + A^2 J_later / (1 + C J_later).
@@ -131,10 +132,10 @@ class Link(eqx.Module):
     h: Float[Numeric, "*pixels"]
     J: Float[Numeric, "*pixels"]
 
-    def then(self, after: "Link") -> "Link":
+    def compose(self, after: "MessageMap") -> "MessageMap":
         """Both links in one, this one being the earlier."""
         D = 1 + self.C * after.J
-        return Link(
+        return MessageMap(
             self.A * after.A / D,
             after.A * (self.b + self.C * after.h) / D + after.b,
             after.A**2 * self.C / D + after.C,
@@ -142,14 +143,14 @@ class Link(eqx.Module):
             self.A**2 * after.J / D + self.J,
         )
 
-    def before(self, later: Message) -> Message:
+    def apply(self, later: Message) -> Message:
         D = 1 + self.C * later.J
         return Message(
             self.h + self.A * (later.h - later.J * self.b) / D, self.J + self.A**2 * later.J / D
         )
 
 
-class Measured(eqx.Module):
+class FrameMeasurements(eqx.Module):
     """What frames measure."""
 
     z: Float[Array, "*frames pixels"]  # deblurred log intensity
@@ -160,17 +161,17 @@ class Measured(eqx.Module):
     bound: Float[Array, "*frames pixels"]
 
 
-class Rows(eqx.Module):
+class FrameSteps(eqx.Module):
     """The frames of a window as measurements, and the steps from each to the next."""
 
-    measured: Measured
+    measured: FrameMeasurements
     S: Float[Array, "frames pixels"]  # sum of s c until the next frame
     q: Float[Array, "frames pixels"]  # variance that is added until then
 
 
 @runtime_checkable
-class Sided(Protocol):
-    """Clipped pixels, as `Rows` has them."""
+class CensoredPixels(Protocol):
+    """Clipped pixels, as `FrameSteps` has them."""
 
     @property
     def side(self) -> Any: ...
@@ -179,7 +180,7 @@ class Sided(Protocol):
     def bound(self) -> Any: ...
 
 
-class Passage(ShortRepr):
+class SmoothedWindow(ShortRepr):
     """A smoothed window: enough to read an image at any time inside it."""
 
     past: Gaussian  # [frames, pixels], after the frame
@@ -188,17 +189,19 @@ class Passage(ShortRepr):
     events: Float[Array, "2 frames pixels"]  # ON, OFF, from the frame to the next
     frames: FrameFeatures
     kept: Any  # [frames, pixels], what else images need to know of frames
-    link: Link  # from the last frame of this window to the last one of the window before
+    link: MessageMap  # from the last frame of this window to the last one of the window before
     last: Message  # (pixels,), of the last frame and all later ones
     log_likelihood: Float[Array, " frames"]  # of the frames, a sum over pixels
 
 
-def measure_frames(params: Params, frames: FrameFeatures, z: Array, exists: Array) -> Measured:
+def measure_frames(
+    params: Params, frames: FrameFeatures, z: Array, exists: Array
+) -> FrameMeasurements:
     """Frames as measurements; `z` is the deblurred log intensity."""
     noise = params.sigma_frame / certainty(params, frames) / (frames.intensity + params.I0)
-    clear = unclipped(params, frames)
+    clear = unclipped_weight(params, frames)
     side = clipped_side(params, frames) * params.one_sided
-    return Measured(
+    return FrameMeasurements(
         z,
         noise**2 + params.sigma_floor**2,
         clear * exists,
@@ -208,32 +211,32 @@ def measure_frames(params: Params, frames: FrameFeatures, z: Array, exists: Arra
     )
 
 
-def step_between(params: Params, on: Array, off: Array, seconds: Array) -> tuple[Array, Array]:
+def change_between(params: Params, on: Array, off: Array, seconds: Array) -> tuple[Array, Array]:
     """The sum of s c over events, and the variance that they and time add."""
-    return brightness(params, on, off), added_variance(params, on, off, seconds)
+    return integrate_counts(params, on, off), added_variance(params, on, off, seconds)
 
 
-def make_rows(
+def make_frame_steps(
     params: Params, frames: FrameFeatures
-) -> tuple[Rows, Float[Array, "2 frames pixels"]]:
+) -> tuple[FrameSteps, Float[Array, "2 frames pixels"]]:
     """Measurements and steps; and the counts of ON and OFF events between mid-exposures."""
     z, counts = jnp.log(frames.intensity + params.I0), frames.span
     if frames.head is not None and frames.tail is not None:
         left, _ = deblur_frames(params, frames)
-        z = left + brightness(params, frames.head[0], frames.head[1])
+        z = left + integrate_counts(params, frames.head[0], frames.head[1])
         counts = frames.span - frames.head - jnp.roll(frames.tail, -1, axis=1)
     rate = jnp.asarray(frames.blend_rate)
     follows = (rate > 0)[:, None]  # another frame follows
     exists = jnp.concatenate([jnp.asarray(frames.present)[None], (rate > 0)[:-1]])[:, None]
     counts = jnp.where(follows, counts, 0)
-    moves = share_events(params, frames, counts)
+    moves = redistribute_images(params, frames, counts)
     gap = jnp.where(follows, 1 / jnp.where(follows, rate[:, None], 1), 0)
-    S, q = step_between(params, moves[0], moves[1], gap)
+    S, q = change_between(params, moves[0], moves[1], gap)
     measured = measure_frames(params, frames, z, exists)
-    return Rows(measured, S, jnp.broadcast_to(q, z.shape)), counts
+    return FrameSteps(measured, S, jnp.broadcast_to(q, z.shape)), counts
 
 
-def share_events(params: Params, frames: FrameFeatures, counts: Array) -> Array:
+def redistribute_images(params: Params, frames: FrameFeatures, counts: Array) -> Array:
     """Event counts [..., pixels] of which each pixel gives the part `share` to its neighbours.
 
     Between two events of a pixel its intensity moves by less than a threshold, unseen; events
@@ -253,10 +256,10 @@ def share_events(params: Params, frames: FrameFeatures, counts: Array) -> Array:
         return three(three(values, values.ndim - 1), values.ndim - 2) - values
 
     given = around(jnp.ones(image.shape[-2:], image.dtype)) / 8
-    return shared(params, image, around(image), given).reshape(counts.shape)
+    return redistribute_events(params, image, around(image), given).reshape(counts.shape)
 
 
-def shared(params: Params, own: Array, around: Array, given: Array) -> Array:
+def redistribute_events(params: Params, own: Array, around: Array, given: Array) -> Array:
     """Events of a pixel of which the part `given` of the neighbours get their share.
 
     `around` are those of its neighbours.
@@ -270,7 +273,7 @@ def added_variance(params: Params, on: Array, off: Array, seconds: Array) -> Arr
     return params.sigma_event**2 * events + params.sigma_bg**2 * seconds
 
 
-def one_sided_message(state: Gaussian, row: Sided, floor: Array) -> tuple[Message, Array]:
+def one_sided_message(state: Gaussian, row: CensoredPixels, floor: Array) -> tuple[Message, Array]:
     """One-sided evidence as the message that keeps the first two moments; its log likelihood.
 
     L is above the bound (side 1) with probability Phi(d), d = (m - bound) / sqrt(P + floor). The
@@ -294,7 +297,9 @@ def one_sided_message(state: Gaussian, row: Sided, floor: Array) -> tuple[Messag
     return Message(weight * (m / P - state.m / state.P), weight * J), weight * log_Phi
 
 
-def measure(params: Params, state: Gaussian, row: Measured) -> tuple[Gaussian, Message, Array]:
+def frame_update(
+    params: Params, state: Gaussian, row: FrameMeasurements
+) -> tuple[Gaussian, Message, Array]:
     """The state after a frame, what the frame says, and the log likelihood of that."""
     # A half clear pixel counts half: its variance is doubled.
     J = row.clear / row.r
@@ -310,18 +315,18 @@ def measure(params: Params, state: Gaussian, row: Measured) -> tuple[Gaussian, M
     return Gaussian(m, P), said, row.clear * log_gauss + log_side
 
 
-def initial(params: Params) -> Gaussian:
+def init(params: Params) -> Gaussian:
     """The state before the first frame."""
     mean = jnp.log(params.start + params.I0)
     return Gaussian(mean, jnp.broadcast_to(params.P_start, mean.shape))
 
 
-def information(state: Gaussian) -> Message:
+def state_to_message(state: Gaussian) -> Message:
     """A state as a message."""
     return Message(state.m / state.P, 1 / state.P)
 
 
-def one_pixel(gain: Array, fixed: dict[str, Any], **image: Array) -> FrameFeatures:
+def single_pixel_frame(gain: Array, fixed: dict[str, Any], **image: Array) -> FrameFeatures:
     """One frame of one pixel: grey value, intensity and certainty."""
     none = jnp.zeros((2, 1, 1), gain.dtype)
     return FrameFeatures(
@@ -341,27 +346,27 @@ def one_pixel(gain: Array, fixed: dict[str, Any], **image: Array) -> FrameFeatur
     )
 
 
-def join(m: Array, precision: Array, later: Message) -> Gaussian:
+def combine(m: Array, precision: Array, later: Message) -> Gaussian:
     """What is known from before, with its precision 1 / P, and from later."""
     P = 1 / (precision + later.J)
     return Gaussian(m + P * (later.h - later.J * m), P)
 
 
-def filter_forward(params: Params, rows: Rows, state: Gaussian) -> tuple[Any, ...]:
+def filter_forward(params: Params, rows: FrameSteps, state: Gaussian) -> tuple[Any, ...]:
     """Kalman filter over frames, arrays [frames, pixels].
 
     Returns the states before and after each frame, what each says, and its log likelihood.
     """
 
-    def step(at: Gaussian, row: Rows) -> tuple[Gaussian, Any]:
-        after, said, log_likelihood = measure(params, at, row.measured)
+    def step(at: Gaussian, row: FrameSteps) -> tuple[Gaussian, Any]:
+        after, said, log_likelihood = frame_update(params, at, row.measured)
         return Gaussian(after.m + row.S, after.P + row.q), (at, after, said, log_likelihood)
 
     return lax.scan(step, state, rows)[1]
 
 
 def filter_backward(
-    rows: Rows, said: Message, last: Message, number: Any
+    rows: FrameSteps, said: Message, last: Message, number: Any
 ) -> tuple[Message, Message]:
     """Information filter over frames: what is said before the first frame, and after each.
 
@@ -370,7 +375,7 @@ def filter_backward(
 
     def step(later: Message, row: Any) -> tuple[Message, Message]:
         i, own, S, q = row
-        here = later.earlier(S, q) + own
+        here = later.propagate_back(S, q) + own
         return jax.tree.map(lambda a, b: jnp.where(i == number - 1, a, b), last, here), later
 
     zero = jnp.zeros_like(rows.S[0])
@@ -378,22 +383,22 @@ def filter_backward(
     return lax.scan(step, Message(zero, zero), steps, reverse=True)
 
 
-def compose_links(rows: Rows, said: Message, anchor: Any, number: Any) -> Link:
+def compose_message_maps(rows: FrameSteps, said: Message, anchor: Any, number: Any) -> MessageMap:
     """The link from the last of the `number` frames to the frame `anchor`."""
 
-    def step(link: Link, row: Any) -> tuple[Link, None]:
+    def step(link: MessageMap, row: Any) -> tuple[MessageMap, None]:
         i, own, S, q = row
-        longer = link.then(Link(one, S, q, own.h, own.J))
+        longer = link.compose(MessageMap(one, S, q, own.h, own.J))
         inside = (i >= anchor) & (i < number - 1)
         return jax.tree.map(lambda a, b: jnp.where(inside, a, b), longer, link), None
 
     zero, one = jnp.zeros_like(rows.S[0]), jnp.ones_like(rows.S[0])
     steps = (jnp.arange(len(rows.S)), said, rows.S, rows.q)
-    return lax.scan(step, Link(one, zero, zero, zero, zero), steps)[0]
+    return lax.scan(step, MessageMap(one, zero, zero, zero, zero), steps)[0]
 
 
-def counts_around(
-    params: Params, passage: "Passage", points: ImagePoints
+def adjacent_counts(
+    params: Params, passage: "SmoothedWindow", points: ImagePoints
 ) -> tuple[Array, Array, Array, Array]:
     """ON and OFF events [2, times, pixels] since the frame before and until the frame after.
 
@@ -419,13 +424,14 @@ def counts_around(
     gap = jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), 0)
     seconds = jnp.where(behind, -elapsed, jnp.where(rate > 0, gap - elapsed, 0))
     return (
-        share_events(params, frames, since),
-        share_events(params, frames, until),
+        redistribute_images(params, frames, since),
+        redistribute_images(params, frames, until),
         elapsed,
         seconds,
     )
 
 
+@renamed_methods(keep="frame_info", tell="readout")
 @dataclasses.dataclass(frozen=True, repr=False)
 class Smoother(PixelEstimator[Params]):
     """The estimator of this module."""
@@ -436,28 +442,30 @@ class Smoother(PixelEstimator[Params]):
     )
 
     @property
-    def filters(self) -> bool:
+    def is_event_driven(self) -> bool:
         return False
 
     @property
-    def looks_ahead(self) -> bool:
+    def needs_future(self) -> bool:
         return True
 
-    def keep(self, params: Params, frames: FrameFeatures, measured: Measured, events: Any) -> Any:
+    def frame_info(
+        self, params: Params, frames: FrameFeatures, measured: FrameMeasurements, events: Any
+    ) -> Any:
         """What images need to know of frames beside the messages: arrays [frames, pixels].
 
         `events` [frames, pixels] lie within exposures; None where no exposure is known.
         """
         return ()
 
-    def tell(self, params: Params, state: Gaussian, kept: Any, here: Array) -> Estimate:
+    def readout(self, params: Params, state: Gaussian, kept: Any, here: Array) -> Estimate:
         """Images of smoothed states; `here`: at the middle of the exposure of the frame before."""
         image = jnp.exp(state.m) - params.I0
         return Estimate(image, state.P, jnp.isfinite(image))
 
-    def start(self, params: Params, features: Features) -> Gaussian:
+    def init_state(self, params: Params, features: Features) -> Gaussian:
         pixels = features.last.shape
-        return jax.tree.map(lambda v: jnp.broadcast_to(v, pixels), initial(params))
+        return jax.tree.map(lambda v: jnp.broadcast_to(v, pixels), init(params))
 
     def run(
         self,
@@ -465,52 +473,54 @@ class Smoother(PixelEstimator[Params]):
         features: Features,
         state: Gaussian | None = None,
         future: Message | None = None,
-    ) -> tuple[Passage, Gaussian]:
+    ) -> tuple[SmoothedWindow, Gaussian]:
         """As `PixelEstimator.run`; the state is (pixels,), before the next window's first frame."""
-        frames = features.at(params.rho_ref).frames
-        rows, counts = make_rows(params, frames)
-        state = self.start(params, features) if state is None else state
+        frames = features.at_dead_time(params.rho_ref).frames
+        rows, counts = make_frame_steps(params, frames)
+        state = self.init_state(params, features) if state is None else state
         number, anchor, onward = frames.rows
         ahead, past, said, likelihood = filter_forward(params, rows, state)
         last = jax.tree.map(lambda v: v[number - 1], said) if future is None else future
         first, later = filter_backward(rows, said, last, number)
-        link = compose_links(rows, said, anchor, number)
-        first = first + information(state)
+        link = compose_message_maps(rows, said, anchor, number)
+        first = first + state_to_message(state)
         events = None
         if frames.head is not None and frames.tail is not None:
             events = (jnp.asarray(frames.head) + frames.tail).sum(0)
-        kept = self.keep(params, frames, rows.measured, events)
-        passage = Passage(past, later, first, counts, frames, kept, link, last, likelihood.sum(1))
+        kept = self.frame_info(params, frames, rows.measured, events)
+        passage = SmoothedWindow(
+            past, later, first, counts, frames, kept, link, last, likelihood.sum(1)
+        )
         return passage, jax.tree.map(lambda v: v.at[onward].get(mode="clip"), ahead)
 
-    def read(self, params: Params, trajectory: Passage, out: ReadOut) -> Estimate:
-        points = out.at(params.rho_ref).points
+    def read(self, params: Params, trajectory: SmoothedWindow, out: ReadOut) -> Estimate:
+        points = out.at_dead_time(params.rho_ref).points
         f, behind = jnp.asarray(points.frame), jnp.asarray(points.elapsed)[:, None] < 0
-        since, until, elapsed, seconds = counts_around(params, trajectory, points)
+        since, until, elapsed, seconds = adjacent_counts(params, trajectory, points)
 
         later = jax.tree.map(lambda v: v[f], trajectory.future)
         later = jax.tree.map(lambda a, b: jnp.where(behind, a, b), trajectory.first, later)
-        later = later.earlier(*step_between(params, until[0], until[1], seconds))
-        S, q = step_between(params, since[0], since[1], elapsed)
+        later = later.propagate_back(*change_between(params, until[0], until[1], seconds))
+        S, q = change_between(params, since[0], since[1], elapsed)
         # Before the first frame there is no past: its variance is without bound.
         m = jnp.where(behind, 0, trajectory.past.m[f] + S)
         precision = jnp.where(behind, 0, 1 / jnp.where(behind, 1, trajectory.past.P[f] + q))
         # Times are whole microseconds, the middle of an exposure may lie up to one before.
         here = ~behind & (jnp.asarray(points.elapsed)[:, None] < 1e-6)
         kept = jax.tree.map(lambda v: v[f], trajectory.kept)
-        return self.tell(params, join(m, precision, later), kept, here)
+        return self.readout(params, combine(m, precision, later), kept, here)
 
-    def held_by_pixel(self, number: Array) -> dict[str, Any]:
-        """The trees of numbers that `of_pixel` speaks of, all as the one given."""
+    def pixel_state_spec(self, number: Array) -> dict[str, Any]:
+        """The trees of numbers that `pixel_functions` speaks of, all as the one given."""
         state, said = Gaussian(number, number), Message(number, number)
-        return {"state": state, "said": said, "link": Link(*[number] * 5)}
+        return {"state": state, "said": said, "link": MessageMap(*[number] * 5)}
 
-    def through(self, link: NDArray, later: NDArray) -> NDArray:
+    def apply_message_map(self, link: NDArray, later: NDArray) -> NDArray:
         """Numbers of the message before several frames, from those of their link and the later."""
-        message = Link(*link).before(Message(*later))
+        message = MessageMap(*link).apply(Message(*later))
         return np.stack([message.h, message.J])
 
-    def of_pixel(self, exposed: bool) -> dict[str, Callable[..., dict[str, Any]]]:
+    def pixel_functions(self, exposed: bool) -> dict[str, Callable[..., dict[str, Any]]]:
         """What `run` and `read` do at one pixel, for kernels (`engine.smoother_program`).
 
         Functions of parameters, what is known with them, and numbers that kernels keep by name.
@@ -520,51 +530,55 @@ class Smoother(PixelEstimator[Params]):
             return known[0].clock_offset - known[1]["clock_offset"]
 
         def counted(params, on, off, around_on, around_off, given):
-            return shared(params, on, around_on, given), shared(params, off, around_off, given)
+            return redistribute_events(params, on, around_on, given), redistribute_events(
+                params, off, around_off, given
+            )
 
         def frame(known, clipped, exists, gain, total, inside, state, **image):
             params, fixed = known
-            frames = one_pixel(gain, fixed, **image)
+            frames = single_pixel_frame(gain, fixed, **image)
             z = jnp.log(frames.intensity + params.I0)
-            z = deblurred(params, z, total) if exposed else z
+            z = deblur_level(params, z, total) if exposed else z
             measured = measure_frames(params, frames, z, exists)
-            kept = self.keep(params, frames, measured, inside if exposed else None)
+            kept = self.frame_info(params, frames, measured, inside if exposed else None)
             side = measured.side
             if not clipped:
                 measured = dataclasses.replace(measured, side=jnp.zeros_like(side))
-            past, said, _ = measure(params, state, measured)
+            past, said, _ = frame_update(params, state, measured)
             return {"past": past, "said": said, "kept": kept, "side": side}
 
         def move(known, past, seconds, **counts):
             on, off = counted(known[0], **counts)
-            S, q = step_between(known[0], on, off, seconds)
+            S, q = change_between(known[0], on, off, seconds)
             return {"moved_on": on, "moved_off": off, "state": Gaussian(past.m + S, past.P + q)}
 
         def link(known, link, said, moved_on, moved_off, seconds):
-            S, q = step_between(known[0], moved_on, moved_off, seconds)
-            return {"link": link.then(Link(jnp.ones_like(S), S, q, said.h, said.J))}
+            S, q = change_between(known[0], moved_on, moved_off, seconds)
+            return {"link": link.compose(MessageMap(jnp.ones_like(S), S, q, said.h, said.J))}
 
         def back(known, later, said, moved_on, moved_off, seconds):
-            here = later.earlier(*step_between(known[0], moved_on, moved_off, seconds)) + said
+            here = (
+                later.propagate_back(*change_between(known[0], moved_on, moved_off, seconds)) + said
+            )
             return {"said": later, "later": here}
 
         def show(known, past, said, moved_on, moved_off, kept, elapsed, seconds, here, **counts):
             on, off = counted(known[0], **counts)
             rest = jnp.where(seconds > 0, seconds + lag(known), 0)
-            left = step_between(known[0], moved_on - on, moved_off - off, rest)
-            S, q = step_between(known[0], on, off, elapsed - lag(known))
-            state = join(past.m + S, 1 / (past.P + q), said.earlier(*left))
-            return {"image": self.tell(known[0], state, kept, here)}
+            left = change_between(known[0], moved_on - on, moved_off - off, rest)
+            S, q = change_between(known[0], on, off, elapsed - lag(known))
+            state = combine(past.m + S, 1 / (past.P + q), said.propagate_back(*left))
+            return {"image": self.readout(known[0], state, kept, here)}
 
         def before(known, later, kept, seconds, **counts):
-            left = step_between(known[0], *counted(known[0], **counts), seconds + lag(known))
-            first = later + information(initial(known[0]))
+            left = change_between(known[0], *counted(known[0], **counts), seconds + lag(known))
+            first = later + state_to_message(init(known[0]))
             zero = jnp.zeros_like(later.h)
-            state = join(zero, zero, first.earlier(*left))
-            return {"image": self.tell(known[0], state, kept, zero > 0)}
+            state = combine(zero, zero, first.propagate_back(*left))
+            return {"image": self.readout(known[0], state, kept, zero > 0)}
 
         def start(known):
-            return {"state": initial(known[0])}
+            return {"state": init(known[0])}
 
         def excess(known, share, edge, on, off):
             return {"total": segment_excess(known[0], share + lag(known) * edge, on, off)}
@@ -636,3 +650,5 @@ aks = Smoother(
     "frames and events, earlier and later ones, with its variance; an event's change is shared "
     "with the neighbours, and the frames' likelihood can be fitted.",
 )
+
+__getattr__ = renamed_names(__name__)

@@ -20,12 +20,16 @@ from jaxevent.estimator import Estimate
 from jaxevent.locks import TurnLock, refuse_to_pickle
 from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.clock import Timing
 from jaxevent.reconstruction.consistency import events_contradict_frames
 from jaxevent.reconstruction.features import Features, ReadOut, over_pixels, pixel_mesh
-from jaxevent.reconstruction.reading import ImageReader
+from jaxevent.reconstruction.frames import Timing
 from jaxevent.reconstruction.stream import StreamState
-from jaxevent.reconstruction.windows import WINDOW_EVENTS, EventWindow, WindowedRecording
+from jaxevent.reconstruction.windows import (
+    WINDOW_EVENTS,
+    EventWindow,
+    ImageReader,
+    WindowedRecording,
+)
 from jaxevent.recording import Recording, Times, microseconds
 
 P = TypeVar("P", bound=FrameParams)
@@ -58,12 +62,12 @@ class PixelMethod(ImageMethod, Protocol):
     """What a video needs of its estimator; see `estimator.PixelEstimator`."""
 
     @property
-    def filters(self) -> bool: ...
+    def is_event_driven(self) -> bool: ...
 
     @property
-    def looks_ahead(self) -> bool: ...
+    def needs_future(self) -> bool: ...
 
-    def start(self, params: Any, features: Features) -> Any: ...
+    def init_state(self, params: Any, features: Features) -> Any: ...
 
     def run(
         self, params: Any, features: Features, state: Any = None, future: Any = None
@@ -75,7 +79,7 @@ class PixelMethod(ImageMethod, Protocol):
 # jax.jit returns before the result is there; eqx.filter_jit waits for it.
 @functools.partial(jax.jit, static_argnums=0)
 def _start(estimator: PixelMethod, params, features: Features):
-    return estimator.start(params, features)
+    return estimator.init_state(params, features)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -248,18 +252,6 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
                 shown.update(len(batch))
 
 
-def _windows_of(
-    recording: Recording, timing: Timing, devices: int, **options: Any
-) -> WindowedRecording:
-    """A recording in windows: prepared on a GPU where images are made on one, else on the host."""
-    if has_accelerator() and devices < 2:
-        from jaxevent.reconstruction.on_device import DeviceWindows  # others need not load it
-
-        if DeviceWindows.serves(timing):
-            return DeviceWindows(recording, timing, **options)
-    return WindowedRecording(recording, timing, **options)
-
-
 class Video(ImageSequence[P]):
     """Images of a reconstruction: `image, variance, valid = video(times)`.
 
@@ -288,11 +280,10 @@ class Video(ImageSequence[P]):
         self._devices, self._factors = devices, factors
         self._mesh = pixel_mesh(devices)
         self._batch = DEVICE_BATCH if has_accelerator() else BATCH
-        self._windows = _windows_of(
+        self._windows = WindowedRecording(
             recording,
             Timing.of(params),
-            len(devices),
-            filtering=estimator.filters,
+            filtering=estimator.is_event_driven,
             events=window_events,
             reuse=True,
         )
@@ -341,7 +332,7 @@ class Video(ImageSequence[P]):
 
     def _place(self, part: Any) -> Any:
         """Weight features or a read-out, and put them on the devices."""
-        part = part if self._factors is None else part.weighted(self._factors)
+        part = part if self._factors is None else part.scale_counts(self._factors)
         return part if self._mesh is None else part.over(self._devices)
 
     def _share_out(self, state: Any) -> Any:
@@ -350,7 +341,7 @@ class Video(ImageSequence[P]):
 
     def _window_of(self, time: int) -> FilteredWindow:
         """The filtered window that contains `time`; windows on the way are filtered in order."""
-        if self.estimator.looks_ahead and self._future is None:
+        if self.estimator.needs_future and self._future is None:
             self._look_ahead()
         if self._open is not None and self._open.contains(time):
             return self._open
@@ -370,7 +361,7 @@ class Video(ImageSequence[P]):
     def grow(self, recording: Recording) -> None:
         """Go on with the same recording of which more is known, after its end."""
         self.recording = recording
-        self._windows.grow(recording)
+        self._windows.extend(recording)
         self._open, self._begins = None, self._begins[:1]
 
     def settle(self, frames: bool) -> tuple[int, int]:
@@ -379,7 +370,7 @@ class Video(ImageSequence[P]):
         Returns the first row of the events and the first frame that are needed from then on. With
         `frames` more of these will come, else only events.
         """
-        begin, final = self._begins[0], self._windows.final(frames)
+        begin, final = self._begins[0], self._windows.final_time(frames)
         while True:
             self._open = None
             _, following = self._filter(begin)
@@ -387,7 +378,7 @@ class Video(ImageSequence[P]):
                 break
             begin = following
         self._begins = [begin]
-        return self._windows.needed(begin.start, begin.before)
+        return self._windows.first_needed(begin.start, begin.before)
 
     def _look_ahead(self) -> None:
         """Pass over all windows once, to know at each what later ones say."""
@@ -400,12 +391,12 @@ class Video(ImageSequence[P]):
                 starts.append(begin.start)
                 filtered, begin = self._filter(begin)
                 links.append((filtered.trajectory.link, filtered.trajectory.last))
-                shown.update(filtered.window.events)
+                shown.update(filtered.window.inputs.n_events)
                 if filtered.window.stop is None:
                     break
         message, future = links[-1][1], {starts[-1]: None}
         for place in range(len(starts) - 1, 0, -1):
-            message = links[place][0].before(message)
+            message = links[place][0].apply(message)
             future[starts[place - 1]] = message
         self._future = future
         self._open = filtered  # the last window has nothing later to know of

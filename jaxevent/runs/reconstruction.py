@@ -23,10 +23,9 @@ from jaxevent.devices import REMOTE
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.clock import Timing
-from jaxevent.reconstruction.estimator import ImageEstimator
+from jaxevent.reconstruction.estimator import ImageEstimator, PreparedImages
 from jaxevent.reconstruction.features import Numeric, over_pixels, pixel_mesh
-from jaxevent.reconstruction.prepared import PreparedImages
+from jaxevent.reconstruction.frames import Timing
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.config import NAME, NOT_NEGATIVE, POSITIVE, check_choice, is_number
 from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources

@@ -224,11 +224,11 @@ def test_which_compiler_serves(float32):
     with jax.enable_x64(True):
         assert type(blend.estimate(recording)) is Video
     # Where a function has no translation the scan serves.
-    for advance, reason in (
+    for predict, reason in (
         (lambda p, s, dt, f: dataclasses.replace(s, L=jnp.sinh(f.level)), "'sinh'"),
         (lambda p, s, dt, f: 1 / 0, "fail for one pixel"),
     ):
-        odd = dataclasses.replace(jaxevent.cf, advance=advance)
+        odd = dataclasses.replace(jaxevent.cf, predict=predict)
         assert type(odd.estimate(recording)) is Video
         with pytest.raises(jaxevent.InputError, match=reason):
             odd.estimate(recording, compiler="numba")

@@ -18,7 +18,7 @@ from jaxevent.methods import names
 from jaxevent.reconstruction import video
 from jaxevent.reconstruction.compensated.images import InstantImages
 from jaxevent.reconstruction.estimator import PixelEstimator
-from jaxevent.reconstruction.filtering import Event, Observation, State
+from jaxevent.reconstruction.filtering import Event, Observation, PixelState
 from jaxevent.recording import Events, Frames, Recording
 
 PARAMS = {
@@ -382,7 +382,7 @@ def recorded(path):
         before.append((L[at], P[at]))
         path.append(row)
         L[at], P[at] = row["L_after"], row.get("P_after", par["p_ini"])
-    state = State(*(jnp.asarray(v) for v in zip(*before, strict=True)))
+    state = PixelState(*(jnp.asarray(v) for v in zip(*before, strict=True)))
     rows = {k: jnp.asarray([row[k] for row in path]) for k in columns}
     assert len(path) == 1257
     return par, float(z["in_ct"]), state, rows
@@ -456,7 +456,7 @@ def test_step_maps_over_pixels():
     rng = np.random.default_rng(0)
     L, P, dt, near, u, rate = rng.uniform(0.1, 1, (6, 5))
     polarity = np.array([1, -1, 1, 0, -1])
-    pixels, events = State(L, P), Event(dt, near, polarity, Observation(u, rate))
+    pixels, events = PixelState(L, P), Event(dt, near, polarity, Observation(u, rate))
     mapped = jax.jit(jax.vmap(jaxevent.akf.step, (None, 0, 0)))(params, pixels, events)
     alone = jax.jit(jaxevent.akf.step)
     for i in range(5):

@@ -19,7 +19,7 @@ from jaxevent.estimator import Estimate
 from jaxevent.io.output import values_of
 from jaxevent.methods import METHODS
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.filtering import Filter, State
+from jaxevent.reconstruction.filtering import Filter, PixelState
 from jaxevent.recording import Events
 from jaxevent.runs.evaluate import evaluate
 from jaxevent.runs.scores import score, subset
@@ -82,9 +82,9 @@ def test_hidden_frames_are_never_seen(monkeypatch):
 
 def test_what_is_not_a_number_is_none():
     def broken(params, state, dt, frame):
-        return State(frame.level * np.nan, frame.level)
+        return PixelState(frame.level * np.nan, frame.level)
 
-    row = score(small(), dataclasses.replace(METHODS["blend"], advance=broken))
+    row = score(small(), dataclasses.replace(METHODS["blend"], predict=broken))
     assert row["mse"] is None and row["ssim"] is None
     assert row["per_frame"]["mse"] == [None] * 3
     json.dumps(row, allow_nan=False)
@@ -213,12 +213,12 @@ def test_a_failure_leaves_earlier_results(folder):
 def brighter(factor: float = 4.0, variance: float = np.nan, method: str = "blend"):
     """A method that knows: the frames, linear between them, times `factor`; and a variance."""
 
-    def advance(params, state, dt, frame):
+    def predict(params, state, dt, frame):
         image = factor * (jnp.exp(frame.level) - params.I0)
         image = image.clip(1e-9 - params.I0)
-        return State(jnp.log(image + params.I0), jnp.full_like(frame.level, variance))
+        return PixelState(jnp.log(image + params.I0), jnp.full_like(frame.level, variance))
 
-    return dataclasses.replace(METHODS[method], advance=advance)
+    return dataclasses.replace(METHODS[method], predict=predict)
 
 
 def numbers(tree) -> list:

@@ -32,9 +32,8 @@ from jaxevent import cli
 from jaxevent.estimator import Estimate
 from jaxevent.methods import HOMES, METHODS
 from jaxevent.parameters import Number, Parameters, Positive
-from jaxevent.reconstruction.estimator import PixelEstimator
+from jaxevent.reconstruction.estimator import PixelEstimator, ScannedImages
 from jaxevent.reconstruction.filtering import Filter
-from jaxevent.reconstruction.prepared import ScannedImages
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.runs.fit import fit
 from jaxevent.runs.protocols import Reference, held_out
@@ -342,10 +341,10 @@ class HtmlRepr(PixelEstimator):
     """A method whose images are what it is given to read, with the variance 0.3."""
 
     @property
-    def filters(self):
+    def is_event_driven(self):
         return False
 
-    def start(self, params, features):
+    def init_state(self, params, features):
         return None
 
     def run(self, params, features, state=None, future=None):

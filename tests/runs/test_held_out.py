@@ -105,7 +105,7 @@ def test_a_method_that_breaks_has_no_numbers():
     def broken(params, state, dt, frame):
         return dataclasses.replace(state, L=jnp.full_like(frame.level, jnp.nan))
 
-    row = score(longer(), dataclasses.replace(certain(), advance=broken), params, moving=True)
+    row = score(longer(), dataclasses.replace(certain(), predict=broken), params, moving=True)
     for name in ("mse", "z2", "z2_median"):
         assert row[name] is None
     assert row["moving"]["mse"] is None and row["moving"]["share"] > 0

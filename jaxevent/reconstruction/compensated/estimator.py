@@ -25,7 +25,6 @@ from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.locks import synchronized
-from jaxevent.reconstruction.clock import Clock, Timing, time_span
 from jaxevent.reconstruction.compensated.exposures import (
     AdjacentExposures,
     AdjacentFrames,
@@ -100,7 +99,7 @@ from jaxevent.reconstruction.compensated.warp import (
 )
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.features import Features, Numeric, ReadOut
-from jaxevent.reconstruction.frames import FrameImages
+from jaxevent.reconstruction.frames import Clock, FrameImages, Timing, time_span
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.reconstruction.windows import WINDOW_EVENTS, prepare
 from jaxevent.recording import Recording, Times, microseconds
@@ -493,7 +492,7 @@ class CompensatedVideo(ImageSequence[Params]):
         params: Its parameters.
         window_events: Events per window of the smoother.
         motion: Flow that trajectories start from, for instance of a rigid scene
-            (`jaxevent.egomotion.field.RigidFlow`). Where it is not finite, motion is sought from
+            (`jaxevent.egomotion.flow.RigidFlow`). Where it is not finite, motion is sought from
             nothing.
         refine: Whether images may correct `motion`.
         progress: Whether to show progress; None: on a terminal.
@@ -693,7 +692,7 @@ class MotionCompensation(ImageEstimator[Params]):
         features, instants = prepare(recording, every, Timing.of(params), filtering=False)
         factors = trajectories.images.factors
         if factors is not None:
-            features, instants = features.weighted(factors), instants.weighted(factors)
+            features, instants = features.scale_counts(factors), instants.scale_counts(factors)
         size = (recording.height, recording.width)
         own = np.arange(recording.height * recording.width, dtype=np.int32).reshape(size)
         targets = []

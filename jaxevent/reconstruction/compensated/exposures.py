@@ -22,8 +22,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, run_over_rows
-from jaxevent.reconstruction.augment import clipped_side, clipping_bound, unclipped
-from jaxevent.reconstruction.clock import Clock, Timing
+from jaxevent.reconstruction.augment import clipped_side, clipping_bound, unclipped_weight
 from jaxevent.reconstruction.compensated.fusion import FusedImage
 from jaxevent.reconstruction.compensated.instants import Instants
 from jaxevent.reconstruction.compensated.params import Params
@@ -40,6 +39,7 @@ from jaxevent.reconstruction.compensated.warp import (
     sample,
 )
 from jaxevent.reconstruction.features import Numeric
+from jaxevent.reconstruction.frames import Clock, Timing
 from jaxevent.reconstruction.smoother import Gaussian, Message, one_sided_message
 from jaxevent.recording import Recording
 
@@ -270,7 +270,7 @@ def _frame_evidence(
     return _FrameEvidence(
         read(jnp.log(light)),
         (params.sigma_pixel * read(1 / light)) ** 2 + 1e-4,
-        read(unclipped(params, frames)) * inside * blurred,
+        read(unclipped_weight(params, frames)) * inside * blurred,
         jax.tree.map(lambda part: jnp.where(side == 0, 0, part), message),
     )
 

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.codegen.graph import TranslationError
 from jaxevent.errors import InputError
-from jaxevent.reconstruction.clock import Timing
-from jaxevent.reconstruction.frames import FrameImages
-from jaxevent.reconstruction.stream import Stream, StreamState, weigh
+from jaxevent.reconstruction.frames import FrameImages, Timing
+from jaxevent.reconstruction.stream import Stream, StreamState, event_weights
 from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import ColumnSource, EventColumns, Recording
 
@@ -314,18 +313,20 @@ class PartitionedRecording:
         """
         windows, source = self.windows, self.recording.events
         weight = np.empty(0, self.dtype)
-        plain = state.last_then is None and self._factors is None
+        plain = state.context_last is None and self._factors is None
         if plain and isinstance(source, ColumnSource):
             self._stored = source.columns(slice(begin, end), self._stored)
             bands = None if self._stored is None else self._bands_of(self._stored, weight)
             if bands is not None:
                 return bands, state
         events = source[begin:end]  # raises `InputError` for what is not valid
-        if state.last_then is not None:
+        if state.context_last is not None:
             state = windows.move_context(state, begin)
-            assert state.last_then is not None
+            assert state.context_last is not None
             stream = Stream.of(events, self.recording.width)
-            weight = weigh(stream, state.last_then.copy(), windows.dead).astype(self.dtype)
+            weight = event_weights(stream, state.context_last.copy(), windows.dead).astype(
+                self.dtype
+            )
         if self._factors is not None:
             pixel = events.y.astype(np.int64) * self.recording.width + events.x
             factors = self._factors[np.where(events.p, 0, 1), pixel]

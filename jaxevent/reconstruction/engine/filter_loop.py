@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, run_over_rows
 from jaxevent.codegen.derivative import Directions, parse_derivative
 from jaxevent.codegen.module import CompiledProgram
-from jaxevent.reconstruction.clock import Clock, rates
 from jaxevent.reconstruction.engine.bands import (
     NEVER,
     Bands,
@@ -41,7 +40,8 @@ from jaxevent.reconstruction.engine.filter_program import (
     n_pieces,
     variants,
 )
-from jaxevent.reconstruction.memory import aligned
+from jaxevent.reconstruction.features import allocate_aligned
+from jaxevent.reconstruction.frames import Clock, rates
 from jaxevent.reconstruction.stream import StreamState
 
 
@@ -437,7 +437,7 @@ class FilterPasses:
         places, stride = fields.places, self.kind.stride
         scratch = max(places.table_scratch, (places.factors + 1) * stride)
         self._memory = BandMemory(
-            aligned((bands, fields.size), dtype),
+            allocate_aligned((bands, fields.size), dtype),
             np.zeros((bands, max(len(fields.whole), 1) * stride), np.int64),
             np.zeros((bands, stride)),
             np.zeros((bands, 2), np.int64),

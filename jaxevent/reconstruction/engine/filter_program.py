@@ -65,11 +65,11 @@ class FilterMethod(Protocol):
     @property
     def name(self) -> str: ...
 
-    def observe(self, params: Any, frames: Any) -> Any: ...
+    def frame_model(self, params: Any, frames: Any) -> Any: ...
 
-    def initial_state(self, params: Any, observer: Any, points: Any) -> Any: ...
+    def init_from_frames(self, params: Any, frame_model: Any, points: Any) -> Any: ...
 
-    def at_pixel(
+    def step_and_readout(
         self, params: Any, frame: Any, state: Any, since: Any, near: Any, polarity: Any
     ) -> tuple[Any, Any, Any]: ...
 
@@ -159,22 +159,22 @@ def trace_filter(method: FilterMethod, known: tuple[Any, ...], kind: KernelKind)
         counts = (on, off) if counted else (none, none)
         return ImagePoints(weight, blend, *counts, v["piece"][None], v["frame"][None], none[0])
 
-    def start(params: Any, observer: Any, v: dict[str, Any]) -> Any:
-        state = method.initial_state(params, observer, image_points(v, False))
+    def start(params: Any, frame_model: Any, v: dict[str, Any]) -> Any:
+        state = method.init_from_frames(params, frame_model, image_points(v, False))
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (1,))[0], state)
 
     def at_start(known: tuple[Any, ...], v: dict[str, Any]) -> Any:
         v = known[1] | v
-        return start(known[0], method.observe(known[0], frame_features(v)), v)
+        return start(known[0], method.frame_model(known[0], frame_features(v)), v)
 
     def at_point(known: tuple[Any, Any], *, state: Any, **v: Any) -> dict[str, Any]:
         params, v = known[0], known[1] | v
-        observer = method.observe(params, frame_features(v))
+        frame_model = method.frame_model(params, frame_features(v))
         frame = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (1, 1))[0, 0], observer(image_points(v, True))
+            lambda leaf: jnp.broadcast_to(leaf, (1, 1))[0, 0], frame_model(image_points(v, True))
         )
-        first = start(params, observer, v)
-        after, mean, variance = method.at_pixel(
+        first = start(params, frame_model, v)
+        after, mean, variance = method.step_and_readout(
             params, frame, state, **{name: v[name] for name in EVENT}
         )
         return {"start": first, "state": after, "mean": mean, "variance": variance}

@@ -32,7 +32,6 @@ from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.locks import TurnLock
 from jaxevent.progress import bar
-from jaxevent.reconstruction.clock import Clock, Timing
 from jaxevent.reconstruction.engine.bands import (
     NEVER,
     BufferPool,
@@ -57,6 +56,7 @@ from jaxevent.reconstruction.engine.smoother_loop import (
 )
 from jaxevent.reconstruction.engine.smoother_program import LATER, LINK, STATE, SmoothingMethod
 from jaxevent.reconstruction.features import Numeric
+from jaxevent.reconstruction.frames import Clock, Timing
 from jaxevent.reconstruction.stream import StreamState
 from jaxevent.reconstruction.video import BEGINS, ImageSequence, P
 from jaxevent.reconstruction.windows import sorted_times
@@ -106,7 +106,7 @@ class FilterVideo(ImageSequence[P]):
     ):
         super().__init__(estimator, recording, params, progress=progress)
         self._partitioned = PartitionedRecording(
-            recording, Timing.of(params), estimator.filters, window_events
+            recording, Timing.of(params), estimator.is_event_driven, window_events
         )
         # Divided for the parameters' own clock: the lag is exactly 0.
         self._passes = FilterPasses(self._partitioned, estimator, params, params.clock_offset)
@@ -307,7 +307,7 @@ class SmootherVideo(ImageSequence[P]):
         assert given is not None
         later = [np.zeros_like(states[0])]
         while len(links) > 1:
-            later.insert(0, self._method.through(links.pop(), later[0]))
+            later.insert(0, self._method.apply_message_map(links.pop(), later[0]))
         self._states, self._later = states, later
         self._smooth(last, given)
 
@@ -370,7 +370,7 @@ class ImageKernel(abc.ABC):
     """
 
     def __init__(self, method: Any, recording: Recording, times: NDArray[np.int64], params: Any):
-        self.recording = PartitionedRecording(recording, Timing.of(params), method.filters)
+        self.recording = PartitionedRecording(recording, Timing.of(params), method.is_event_driven)
         self.method, self.dtype = method, self.recording.dtype
         self.pixels = recording.width * recording.height
         self.clock_offset = np.asarray(params.clock_offset)

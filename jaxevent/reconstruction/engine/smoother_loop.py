@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.codegen.derivative import Directions
-from jaxevent.reconstruction.clock import Clock
 from jaxevent.reconstruction.engine.bands import (
     BandLayout,
     Bands,
@@ -39,6 +38,7 @@ from jaxevent.reconstruction.engine.smoother_program import (
     SmoothingMethod,
     smoother_kernel,
 )
+from jaxevent.reconstruction.frames import Clock
 from jaxevent.reconstruction.stream import StreamState
 
 

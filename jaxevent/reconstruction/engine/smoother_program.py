@@ -1,8 +1,8 @@
 """Kernels of smoothers: functions of one pixel, traced, translated and written as a module.
 
-A smoother has functions of one pixel by name (`Smoother.of_pixel`). They read and write the pixel's
-numbers: those of the frame that a pass has come to (`WORK`), and those that are stored for every
-frame (`ROW`, and what images need beside them).
+A smoother has functions of one pixel by name (`Smoother.pixel_functions`). They read and write the
+pixel's numbers: those of the frame that a pass has come to (`WORK`), and those that are stored for
+every frame (`ROW`, and what images need beside them).
 """
 
 import dataclasses
@@ -63,11 +63,11 @@ UNIFORM = {
 class SmoothingMethod(ImageMethod, Protocol):
     """A method that a kernel is made of; see `smoother.Smoother`."""
 
-    def held_by_pixel(self, number: Any) -> dict[str, Any]: ...
+    def pixel_state_spec(self, number: Any) -> dict[str, Any]: ...
 
-    def through(self, link: NDArray, later: NDArray) -> NDArray: ...
+    def apply_message_map(self, link: NDArray, later: NDArray) -> NDArray: ...
 
-    def of_pixel(self, exposed: bool) -> dict[str, Callable[..., dict[str, Any]]]: ...
+    def pixel_functions(self, exposed: bool) -> dict[str, Callable[..., dict[str, Any]]]: ...
 
 
 class SmootherFunctions(NamedTuple):
@@ -130,14 +130,14 @@ def translate_smoother(
     for leaf in jax.tree.leaves(known):
         host.add_input(np.asarray(leaf))
     shape = jax.ShapeDtypeStruct((1, 1), kind.dtype)
-    functions, made = method.of_pixel(kind.exposed), dict[str, TracedFunction]()
+    functions, made = method.pixel_functions(kind.exposed), dict[str, TracedFunction]()
 
     def tree(*names: str) -> dict[str, Any]:
         return dict.fromkeys(names, shape)
 
     counts, moved, seconds = tree(*COUNTS), tree("moved_on", "moved_off"), tree("seconds")
     given: dict[str, Any] = tree(*IMAGE_FIELDS, "gain", "exists", "total", "inside")
-    held = jax.eval_shape(method.held_by_pixel, shape)
+    held = jax.eval_shape(method.pixel_state_spec, shape)
     state, said = held["state"], held["said"]
     try:
         frame = functools.partial(functions["frame"], known[:2])
