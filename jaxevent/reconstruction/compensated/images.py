@@ -33,7 +33,7 @@ from jaxevent.reconstruction.compensated.robust_mean import InstantLayout
 from jaxevent.reconstruction.compensated.warp import positions, sample
 from jaxevent.reconstruction.features import FrameFeatures, Numeric
 from jaxevent.reconstruction.frames import FrameImages
-from jaxevent.reconstruction.smoother import Gaussian, FrameMeasurements, Smoother
+from jaxevent.reconstruction.smoother import FrameMeasurements, Gaussian, Smoother
 from jaxevent.recording import Recording
 
 N_CACHED_IMAGES = 96  # of instants, in a video
