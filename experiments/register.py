@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 import jaxevent
 from jaxevent import register
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion.geometry import undistorted
+from jaxevent.egomotion.geometry import undistort
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate import (
     SENSORS,
@@ -83,7 +83,7 @@ class View:
 
     def __post_init__(self) -> None:
         y, x = np.mgrid[: self.size[1], : self.size[0]].reshape(2, -1)
-        at, f = undistorted(self.camera, x, y)
+        at, f = undistort(self.camera, x, y)
         ray = np.concatenate([at / f, np.ones((len(at), 1))], 1) @ self.rotation
         object.__setattr__(self, "_ray", ray)
 
@@ -192,7 +192,7 @@ def naive(recording: Recording, other: Recording) -> Recording:
     grid = register.homography_grid(
         scale, (recording.width, recording.height), (other.width, other.height)
     )
-    return register.registered(recording, other, register.Registration(grid, 0.0, scale))
+    return register.apply_registration(recording, other, register.Registration(grid, 0.0, scale))
 
 
 def main() -> None:
@@ -211,7 +211,7 @@ def main() -> None:
                 continue
             size, seen = (recording.width, recording.height), (other.width, other.height)
             true = register.homography_grid(H, size, seen)
-            after = register.registered(recording, other, found)
+            after = register.apply_registration(recording, other, found)
             covered = after.extra["covered"]
             before = reconstruction_error(naive(recording, other), covered)
             later = reconstruction_error(after, covered)
@@ -228,7 +228,7 @@ def main() -> None:
         size, seen = (recording.width, recording.height), (other.width, other.height)
         grid = rig.grid(size, seen, plane=(0, 0, 1, 2.0))
         found = register.estimate(recording, other, grid)
-        after = register.registered(recording, other, found)
+        after = register.apply_registration(recording, other, found)
         covered = after.extra["covered"]
         before = reconstruction_error(naive(recording, other), covered)
         later = reconstruction_error(after, covered)

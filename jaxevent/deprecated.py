@@ -19,6 +19,8 @@ T = TypeVar("T")
 
 # The full name until this release, and the one from now on.
 RENAMED: dict[str, str] = {
+    "jaxevent.arrays.find": "jaxevent.arrays.find_fields",
+    "jaxevent.arrays.grey_of": "jaxevent.arrays.to_grey",
     "jaxevent.blob.Found": "jaxevent.blob.TargetSearchResult",
     "jaxevent.confidence.Finding": "jaxevent.confidence.ParameterInterval",
     "jaxevent.confidence.Findings": "jaxevent.confidence.FitIntervals",
@@ -30,7 +32,62 @@ RENAMED: dict[str, str] = {
     "jaxevent.devices.along": "jaxevent.devices.shard",
     "jaxevent.devices.local": "jaxevent.devices.local_devices",
     "jaxevent.devices.mesh": "jaxevent.devices.make_mesh",
+    "jaxevent.egomotion.Known": "jaxevent.egomotion.truth.KnownMotion",
+    "jaxevent.egomotion.Motion": "jaxevent.egomotion.motion.MotionEstimate",
+    "jaxevent.egomotion.candidates.Batches": "jaxevent.egomotion.candidates.CandidateBatches",
+    "jaxevent.egomotion.candidates.Expected": "jaxevent.egomotion.candidates.ExpectedFlow",
+    "jaxevent.egomotion.candidates.Gatherer": "jaxevent.egomotion.candidates.CandidateSampler",
+    "jaxevent.egomotion.candidates.coordinates": "jaxevent.egomotion.candidates.pixel_coordinates",
+    "jaxevent.egomotion.field": "jaxevent.egomotion.flow",
+    "jaxevent.egomotion.flow.iterate": "jaxevent.egomotion.flow.iterate_flow",
+    "jaxevent.egomotion.geometry.contrast": "jaxevent.egomotion.geometry.image_variance",
+    "jaxevent.egomotion.geometry.energy": "jaxevent.egomotion.geometry.sum_of_squares",
+    "jaxevent.egomotion.geometry.undistorted": "jaxevent.egomotion.geometry.undistort",
+    "jaxevent.egomotion.model_selection.Choice": "jaxevent.egomotion.model_selection.ModelSelection",
+    "jaxevent.egomotion.model_selection.choose": "jaxevent.egomotion.model_selection.select_model",
+    "jaxevent.egomotion.model_selection.decide": "jaxevent.egomotion.model_selection.select_by_z",
+    "jaxevent.egomotion.motion.Calibration": "jaxevent.egomotion.motion.CovarianceCalibration",
+    "jaxevent.egomotion.motion.Motion": "jaxevent.egomotion.motion.MotionEstimate",
+    "jaxevent.egomotion.motion.decided": "jaxevent.egomotion.motion.is_observable",
+    "jaxevent.egomotion.motion.left_by_lens": "jaxevent.egomotion.motion.lens_error",
+    "jaxevent.egomotion.patches.Layers": "jaxevent.egomotion.patches.FlowConsistency",
+    "jaxevent.egomotion.patches.Look": "jaxevent.egomotion.patches.PatchSharpness",
+    "jaxevent.egomotion.patches.Speed": "jaxevent.egomotion.patches.ImageSpeed",
+    "jaxevent.egomotion.patches.edges_with_events": "jaxevent.egomotion.patches.edge_event_fraction",
+    "jaxevent.egomotion.patches.layers": "jaxevent.egomotion.patches.flow_consistency",
+    "jaxevent.egomotion.patches.look": "jaxevent.egomotion.patches.measure_sharpness",
+    "jaxevent.egomotion.patches.middles": "jaxevent.egomotion.patches.spread_times",
+    "jaxevent.egomotion.patches.stands_still": "jaxevent.egomotion.patches.is_camera_static",
+    "jaxevent.egomotion.patches.tried": "jaxevent.egomotion.patches.describe_windows",
+    "jaxevent.egomotion.patches.usual_speed": "jaxevent.egomotion.patches.measure_image_speed",
+    "jaxevent.egomotion.truth.Known": "jaxevent.egomotion.truth.KnownMotion",
+    "jaxevent.egomotion.truth.constant_between": "jaxevent.egomotion.truth.fit_gyro_bias",
+    "jaxevent.egomotion.truth.known": "jaxevent.egomotion.truth.known_motion",
+    "jaxevent.egomotion.truth.motion_of": "jaxevent.egomotion.truth.motion_from_table",
+    "jaxevent.egomotion.truth.nearest_axes": "jaxevent.egomotion.truth.find_imu_axes",
+    "jaxevent.egomotion.twists": "jaxevent.egomotion.truth",
     "jaxevent.estimator.Described": "jaxevent.estimator.ShortRepr",
+    "jaxevent.io.aedat2.read": "jaxevent.io.aedat.read_aedat2",
+    "jaxevent.io.aedat4.read": "jaxevent.io.aedat.read_aedat4",
+    "jaxevent.io.calibrated": "jaxevent.io.checks.make_supported_camera",
+    "jaxevent.io.check_unfolded": "jaxevent.io.checks.check_unfolded",
+    "jaxevent.io.checked_events": "jaxevent.io.checks.check_events",
+    "jaxevent.io.columns.find": "jaxevent.io.columns.find_fields",
+    "jaxevent.io.columns.read_npy": "jaxevent.io.tables.read_npy",
+    "jaxevent.io.columns.read_text": "jaxevent.io.tables.read_text",
+    "jaxevent.io.ecf.MOST": "jaxevent.io.ecf.MAX_EVENTS",
+    "jaxevent.io.event_stream.read": "jaxevent.io.atis.read_event_stream",
+    "jaxevent.io.evimo.read": "jaxevent.io.folders.read_evimo",
+    "jaxevent.io.evreal.read": "jaxevent.io.folders.read_evreal",
+    "jaxevent.io.find_event_texts": "jaxevent.io.text.find_event_texts",
+    "jaxevent.io.most_unfolded": "jaxevent.io.checks.max_unfolded",
+    "jaxevent.io.n_caltech.read": "jaxevent.io.atis.read_n_caltech",
+    "jaxevent.io.npz.read": "jaxevent.io.tables.read_npz",
+    "jaxevent.io.parquet.read": "jaxevent.io.tables.read_parquet",
+    "jaxevent.io.pinhole": "jaxevent.io.checks.make_camera",
+    "jaxevent.io.ros_events.event_topic": "jaxevent.io.ros.open_event_topic",
+    "jaxevent.io.timelens.read": "jaxevent.io.folders.read_timelens",
+    "jaxevent.io.whole_number": "jaxevent.io.checks.whole_number",
     "jaxevent.parameters.Share": "jaxevent.parameters.UnitInterval",
     "jaxevent.parameters.nearest": "jaxevent.parameters.suggest_name",
     "jaxevent.parameters.shown": "jaxevent.parameters.format_value",
@@ -141,6 +198,10 @@ RENAMED: dict[str, str] = {
     "jaxevent.reconstruction.smoother.share_events": "jaxevent.reconstruction.smoother.redistribute_images",
     "jaxevent.reconstruction.smoother.shared": "jaxevent.reconstruction.smoother.redistribute_events",
     "jaxevent.reconstruction.smoother.step_between": "jaxevent.reconstruction.smoother.change_between",
+    "jaxevent.register.Warped": "jaxevent.register.ResampledImages",
+    "jaxevent.register.by_triggers": "jaxevent.register.stamp_by_triggers",
+    "jaxevent.register.registered": "jaxevent.register.apply_registration",
+    "jaxevent.register.seen": "jaxevent.register.coverage",
     "jaxevent.simulate.Motion": "jaxevent.simulate.TargetMotion",
     "jaxevent.simulate.blobs.Motion": "jaxevent.simulate.blobs.TargetMotion",
     "jaxevent.simulate.hybrid.response_of": "jaxevent.simulate.hybrid.sensor_response",
@@ -154,6 +215,23 @@ RENAMED: dict[str, str] = {
 }
 # Modules that have another name or are part of another one.
 MOVED_MODULES: dict[str, str] = {
+    "jaxevent.egomotion.choice": "jaxevent.egomotion.model_selection",
+    "jaxevent.egomotion.field": "jaxevent.egomotion.flow",
+    "jaxevent.egomotion.layers": "jaxevent.egomotion.patches",
+    "jaxevent.egomotion.still": "jaxevent.egomotion.patches",
+    "jaxevent.egomotion.twists": "jaxevent.egomotion.truth",
+    "jaxevent.egomotion.warped": "jaxevent.egomotion.geometry",
+    "jaxevent.io.aedat2": "jaxevent.io.aedat",
+    "jaxevent.io.aedat4": "jaxevent.io.aedat",
+    "jaxevent.io.event_stream": "jaxevent.io.atis",
+    "jaxevent.io.evimo": "jaxevent.io.folders",
+    "jaxevent.io.evreal": "jaxevent.io.folders",
+    "jaxevent.io.exposures": "jaxevent.io.images",
+    "jaxevent.io.n_caltech": "jaxevent.io.atis",
+    "jaxevent.io.npz": "jaxevent.io.tables",
+    "jaxevent.io.parquet": "jaxevent.io.tables",
+    "jaxevent.io.ros_events": "jaxevent.io.ros",
+    "jaxevent.io.timelens": "jaxevent.io.folders",
     "jaxevent.reconstruction.clock": "jaxevent.reconstruction.frames",
     "jaxevent.reconstruction.compensated.agreement": "jaxevent.reconstruction.compensated.robust_mean",
     "jaxevent.reconstruction.compensated.borders": "jaxevent.reconstruction.compensated.trajectories",
@@ -288,7 +366,14 @@ class RenamedModules(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         new = MOVED_MODULES[spec.name]
         warn_renamed(spec.name, new)
         module = types.ModuleType(spec.name, f"The old name of `{new}`.")
-        vars(module)["__getattr__"] = lambda name: getattr(importlib.import_module(new), name)
+        renamed = renamed_names(spec.name)
+
+        def __getattr__(name: str) -> Any:
+            if f"{spec.name}.{name}" in RENAMED:
+                return renamed(name)
+            return getattr(importlib.import_module(new), name)
+
+        vars(module)["__getattr__"] = __getattr__
         return module
 
     def exec_module(self, module: types.ModuleType) -> None:

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.io.bayer import PATTERNS as PATTERNS
-from jaxevent.io.bayer import demosaic, sites
+from jaxevent.io.images import BAYER_PATTERNS, bayer_sites, demosaic
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Events, Frames, Recording, Times, microseconds
 
+PATTERNS = BAYER_PATTERNS
 REC709 = (0.2126, 0.7152, 0.0722)  # luminance of linear red, green and blue; the sum is 1
 _HIDDEN = 1e-3  # what a frame counts where it does not show a point, so that something does
 _SHOULDER = 0.02  # of white: colours fade to grey over the last 2 % below it
@@ -159,7 +159,7 @@ def split_channels(recording: Recording, pattern: str = "RGGB") -> dict[str, Rec
     `rgb` is left out, others are kept. Raises `InputError` for other patterns and for a sensor of
     odd width or height.
     """
-    places = sites(pattern)
+    places = bayer_sites(pattern)
     if recording.width % 2 or recording.height % 2:
         raise InputError(
             f"{recording.name}: the {recording.width}x{recording.height} sensor has an odd side, "
@@ -213,7 +213,7 @@ def join_channels(images: Mapping[str, NDArray], pattern: str = "RGGB") -> NDArr
     2 or 4 nearest sites, at the border of those there are. Raises `InputError` for other patterns,
     missing channels and shapes that differ.
     """
-    places = sites(pattern)
+    places = bayer_sites(pattern)
     missing = [name for name in places if name not in images]
     if missing:
         raise InputError(f"the channel {missing[0]} is missing; give R, G1, G2 and B")

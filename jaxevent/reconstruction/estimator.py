@@ -52,7 +52,7 @@ class ScannedImages(eqx.Module):
         return self.method.read(params, trajectory, self.out)
 
     def take(self, rows: NDArray) -> "ScannedImages":
-        return ScannedImages(self.features, self.out.images(rows), self.method)
+        return ScannedImages(self.features, self.out.take(rows), self.method)
 
     def over(self, devices: Sequence[Any]) -> "ScannedImages":
         return ScannedImages(self.features.over(devices), self.out.over(devices), self.method)

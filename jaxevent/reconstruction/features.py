@@ -1,13 +1,15 @@
-"""Features: all that estimators need to know of a recording's events and frames, as pytrees.
+"""Features: the prepared events and frames of a recording, as pytrees that estimators run on.
 
-Events lie in tiles of 32768 slots, [ranks, lanes] (`layout`). Each slot holds what depends on data
-alone: times since the pixel's and the neighbourhood's last event, polarity, and where the event
-lies among the frames. The frames cut time into *pieces*: before the first exposure, within exposure
-f, in the gap after it. In each piece the augmented frame is a blend of two integrations of events
-(`augment`), and a piece's event counts start at the left edge of its exposure.
+Events lie in tiles of 32768 slots, [ranks, lanes] (`tiles`): a lane is a pixel, a rank the number
+of an event at that pixel. Each slot holds what depends on data alone: times since the last event of
+the pixel and of its neighbourhood, polarity, and the position of the event among the frames.
 
-On several devices (`Features.over`) each has a share of the lanes of every block of 64, which all
-kinds of tile are made of: as much work for each, and none waits for another.
+The frames cut time into *pieces*: before the first exposure, within exposure f, in the gap after
+it. In each piece the augmented frame is a blend of two integrals of events (`augment`). Event
+counts of a piece start at the left edge of its exposure.
+
+On several devices (`Features.over`) each device has an equal part of the lanes of every block of
+`LANES`. All kinds of tile consist of such blocks, so no device waits for another.
 """
 
 import abc
@@ -28,9 +30,9 @@ from jaxevent.deprecated import renamed_methods
 from jaxevent.devices import AXIS, make_mesh, shard
 from jaxevent.estimator import ShortRepr
 
-SHAPES = ((8, 4096), (64, 512), (512, 64))  # ranks, lanes of the three kinds of tile
-SLOTS = 8 * 4096
-LANES = 64  # of the narrowest tile; on several devices each has a part of every so many lanes
+SHAPES = ((8, 4096), (64, 512), (512, 64))  # ranks and lanes of the three kinds of tile
+SLOTS = 8 * 4096  # of every tile
+LANES = 64  # of the narrowest tile
 
 # Prepared on the host, where they stay until a jitted function takes them.
 if TYPE_CHECKING:
@@ -43,7 +45,7 @@ else:
     of_frame="gather_frame", of_piece="gather_piece", of_piece_alone="gather_piece_value"
 )
 class Points(eqx.Module):
-    """Where points lie among the frames, and how to look a table [rows, pixels] up at them."""
+    """Positions of points among the frames, which look up tables [rows, pixels]."""
 
     weight: Float[Numeric, "*#points"]  # position in the piece, 0 to 1
     blend: Float[Numeric, "*#points"]  # position between the mid-exposures of two frames, 0 to 1
@@ -52,17 +54,17 @@ class Points(eqx.Module):
 
     @abc.abstractmethod
     def gather_piece(self, table: Float[Array, "pieces pixels"]) -> Float[Array, "..."]:
-        """The table's entries for the points' pieces and pixels."""
+        """Return the table's entries for the points' pieces and pixels."""
 
     @abc.abstractmethod
     def gather_frame(self, table: Float[Array, "frames pixels"]) -> Float[Array, "..."]:
-        """The table's entries for the frames before the points."""
+        """Return the table's entries for the frames before the points."""
 
     @abc.abstractmethod
     def gather_piece_value(
         self, values: Float[Array, " pieces"], pixels: int
     ) -> Float[Array, "..."]:
-        """The values of the points' pieces, equal for all pixels."""
+        """Return the values of the points' pieces, equal for all pixels."""
 
 
 class EventPoints(Points):
@@ -84,7 +86,7 @@ class EventPoints(Points):
 
 
 class ImagePoints(Points):
-    """All pixels at a few times; weights are (times, 1)."""
+    """All pixels at a few times; `weight` and `blend` are (times, 1)."""
 
     piece: Int[Numeric, " times"]
     frame: Int[Numeric, " times"]  # the frame before
@@ -103,14 +105,14 @@ class ImagePoints(Points):
 
 
 class Tiles(ShortRepr):
-    """The events of a window; slots without an event have polarity 0 and change nothing.
+    """Events of a window; slots without an event have polarity 0 and change nothing.
 
-    Shared out over a mesh, the arrays' last axis is cut into blocks of `LANES`, which become the
-    last axis, and that is what is shared out.
+    On several devices the last axis of the arrays is cut into blocks of `LANES`. The positions in a
+    block become the last axis, which is sharded.
     """
 
     pixel: Int[Numeric, "*lanes"]  # the pixel of each lane
-    kind: Int[Numeric, " tiles"]  # place in `layout.SHAPES`; their number: the tile is not used
+    kind: Int[Numeric, " tiles"]  # index in `SHAPES`; len(SHAPES): the tile is not used
     lane: Int[Numeric, " tiles"]  # the tile's first lane
     points: EventPoints
     since: Float[Numeric, "tiles *slots"]  # s since the pixel's previous event
@@ -119,7 +121,7 @@ class Tiles(ShortRepr):
     mesh: Mesh | None = eqx.field(static=True, default=None)
 
     def over(self, mesh: Mesh) -> "Tiles":
-        """The same, lanes shared out over a mesh whose size divides `LANES`."""
+        """Shard the lanes over a mesh whose size divides `LANES`."""
 
         def put(leaf: Any, spec: PartitionSpec) -> Any:
             if len(spec):
@@ -130,7 +132,7 @@ class Tiles(ShortRepr):
         return dataclasses.replace(placed, mesh=mesh)
 
     def _specs(self) -> Any:
-        """How every array is shared out; empty: not at all."""
+        """Return the partition of every array; empty: whole on every device."""
         slots = PartitionSpec(None, None, AXIS)
         others = {
             "kind": PartitionSpec(),
@@ -141,47 +143,54 @@ class Tiles(ShortRepr):
             lambda path, _: others.get(path[0].name, slots), self
         )
 
-    def each(self, function: Callable[..., Any], *whole: Any) -> Any:
-        """`function(tiles, *whole)`, arrays (tiles, slots), on every device with its lanes.
+    def map_shards(self, function: Callable[..., Any], *replicated: Any) -> Any:
+        """Call `function(tiles, *replicated)` on every device with its part of the lanes.
 
-        Nothing passes between devices but, backwards, the sum of derivatives by `whole`.
+        Nothing passes between devices but, backwards, the sum of derivatives by `replicated`.
+
+        Args:
+            function: Function of `Tiles` and other pytrees that returns arrays (tiles, slots).
+            *replicated: Further arguments, whole on every device.
+
+        Returns:
+            The results, sharded as the slots are.
         """
         if self.mesh is None:
-            return function(self, *whole)
+            return function(self, *replicated)
 
-        def here(tiles: Tiles, *whole: Any) -> Any:
-            def flat(leaf: Array, spec: PartitionSpec) -> Array:
+        def run_shard(tiles: Tiles, *replicated: Any) -> Any:
+            def flatten(leaf: Array, spec: PartitionSpec) -> Array:
                 return leaf.reshape(*leaf.shape[:-2], -1) if len(spec) else leaf
 
-            mine = jax.tree.map(flat, tiles, tiles._specs())
-            out = function(dataclasses.replace(mine, mesh=None), *whole)
+            flat = jax.tree.map(flatten, tiles, tiles._specs())
+            out = function(dataclasses.replace(flat, mesh=None), *replicated)
             return jax.tree.map(lambda v: v.reshape(*v.shape[:-1], -1, lanes), out)
 
         lanes = LANES // self.mesh.size
         return jax.shard_map(
-            here,
+            run_shard,
             mesh=self.mesh,
-            in_specs=(self._specs(), *[PartitionSpec()] * len(whole)),
+            in_specs=(self._specs(), *[PartitionSpec()] * len(replicated)),
             out_specs=PartitionSpec(None, None, AXIS),
             check_vma=False,  # branches that skip a tile give zeros, which are the same everywhere
-        )(self, *whole)
+        )(self, *replicated)
 
 
 class Segments(eqx.Module):
     """Events inside exposures: each bounds one segment of constant brightness (EDI)."""
 
     frame_cell: Int[Numeric, " segments"]  # frame * pixels + pixel
-    share: Float[Numeric, " segments"]  # of the exposure that the segment fills
-    edge: Float[Numeric, " segments"]  # growth of `share` per second of later frame clock
+    share: Float[Numeric, " segments"]  # fraction of the exposure that the segment fills
+    edge: Float[Numeric, " segments"]  # d share / d clock_offset, 1/s
     on: Float[Numeric, " segments"]  # ON events from mid-exposure to the segment, negative before
     off: Float[Numeric, " segments"]
 
 
 class FrameFeatures(ShortRepr):
-    """Frames of a window and the event counts that tie them together; spare rows repeat the last.
+    """Frames of a window and the event counts between them; spare rows repeat the last frame.
 
     Counts are [frames, pixels]: `head` from the left edge to mid-exposure, `tail` from there to the
-    right edge, `span` from the left edge to the right edge of the next exposure; `before` counts
+    right edge, `span` from the left edge to the right edge of the next exposure. `before` counts
     from the window's start to the first right edge.
     """
 
@@ -204,150 +213,145 @@ class FrameFeatures(ShortRepr):
 
 
 class DeadTimeDerivative(eqx.Module):
-    """Derivatives of event counts with respect to the dead time `rho_ref` (1/s), array by array.
+    """Derivatives of event counts with respect to the dead time `rho_ref`, array by array.
 
     Counts are made for one dead time; around it they are continued linearly.
     """
 
-    counts: list[Float[Numeric, "..."]]
+    counts: list[Float[Numeric, "..."]]  # 1/s
     rho_ref: Float[Numeric, ""]  # s, for which the counts were made
 
 
-class Features(ShortRepr):
-    """All that `run` needs to know about a window of a recording; a pytree of arrays."""
+C = TypeVar("C", bound="EventCounts")
+
+
+class EventCounts(ShortRepr):
+    """Prepared arrays of which some count events, perhaps with derivatives by the dead time."""
+
+    derivative: DeadTimeDerivative | None = eqx.field(default=None, kw_only=True)
+
+    @abc.abstractmethod
+    def counts(self) -> list[Any]:
+        """Return the arrays that count events."""
+
+    def at_dead_time(self: C, rho_ref: Array) -> C:
+        """Continue the counts linearly to a dead time (s) near the one that they were made for."""
+        derivative = self.derivative
+        if derivative is None:
+            return self
+        change = rho_ref - derivative.rho_ref
+        pairs = zip(self.counts(), derivative.counts, strict=True)
+        return eqx.tree_at(lambda c: c.counts(), self, [n + change * g for n, g in pairs])
+
+    def _scale(self: C, factors: list[Any]) -> C:
+        """Multiply every array of counts, and its derivative, by a factor."""
+
+        def times(counts: list[Any]) -> list[Any]:
+            return [n * factor for n, factor in zip(counts, factors, strict=True)]
+
+        scaled = eqx.tree_at(lambda c: c.counts(), self, times(self.counts()))
+        if self.derivative is None:
+            return scaled
+        derivative = DeadTimeDerivative(times(self.derivative.counts), self.derivative.rho_ref)
+        return dataclasses.replace(scaled, derivative=derivative)
+
+
+class Features(EventCounts):
+    """A window of a recording, prepared for `run`."""
 
     frames: FrameFeatures
-    tiles: Tiles | None  # None where the estimator does not filter
+    tiles: Tiles | None  # None for estimators that do not pass over single events
     start: ImagePoints  # every pixel at the recording's start
     last: Int[Numeric, " pixels"]  # the slot of each pixel's last event, -1 if it has none
-    growth: DeadTimeDerivative | None = None
 
     def counts(self) -> list[Any]:
-        """The arrays that count events."""
         f, s = self.frames, self.frames.segments
         tiles = [] if self.tiles is None else [self.tiles.points.on, self.tiles.points.off]
         exposed = [] if s is None else [f.head, f.tail, s.on, s.off]
         return [f.span, f.before, *exposed, *tiles]
 
-    def at(self, rho_ref: Array) -> "Features":
-        """The features for a dead time near the one that they were made for."""
-        return _grown(self, rho_ref)
-
-    def weighted(self, factors: Float[Numeric, "2 pixels"]) -> "Features":
-        """The same with every pixel's ON and OFF events times its factor; without tiles."""
+    def scale_counts(self, factors: Float[Numeric, "2 pixels"]) -> "Features":
+        """Multiply the ON and OFF events of every pixel by its factors; without tiles."""
         if self.tiles is not None:
             raise ValueError("the events of tiles cannot be weighted")
         segments = self.frames.segments
         cell = None if segments is None else segments.frame_cell % self.last.shape[0]
         by_frame = factors[:, None]
         exposed = [] if cell is None else [by_frame, by_frame, factors[0][cell], factors[1][cell]]
-        return _weighted(self, [by_frame, factors, *exposed])
+        return self._scale([by_frame, factors, *exposed])
 
     def over(self, devices: Sequence[Any]) -> "Features":
-        """The features on several devices: lanes of tiles and pixels of images shared out."""
+        """Put the features on several devices: lanes of tiles and pixels of images are sharded."""
         mesh = pixel_mesh(devices)
         if mesh is None:
             return self
-        pixels = self.last.shape[0]
-        growth = self.growth
-        if growth is not None:
-            counts = list(growth.counts)
-            if self.tiles is not None:
-                at = eqx.tree_at(lambda t: (t.points.on, t.points.off), self.tiles, counts[-2:])
-                points = at.over(mesh).points
-                counts[-2:] = [points.on, points.off]
-                counts[:-2] = over_pixels(counts[:-2], mesh, pixels)
-            else:
-                counts = over_pixels(counts, mesh, pixels)
-            growth = DeadTimeDerivative(counts, over_pixels(growth.rho_ref, mesh, pixels))
         rest = (self.frames, self.start, self.last)
-        frames, start, last = over_pixels(rest, mesh, pixels)
+        frames, start, last = over_pixels(rest, mesh, self.last.shape[0])
         tiles = None if self.tiles is None else self.tiles.over(mesh)
-        return Features(frames, tiles, start, last, growth)
+        placed = Features(frames, tiles, start, last)
+        if self.derivative is None:
+            return placed
+        counts = [
+            jax.device_put(derivative.reshape(count.shape), count.sharding)
+            for derivative, count in zip(self.derivative.counts, placed.counts(), strict=True)
+        ]
+        derivative = DeadTimeDerivative(counts, shard(mesh, self.derivative.rho_ref))
+        return dataclasses.replace(placed, derivative=derivative)
 
 
-class ReadOut(ShortRepr):
-    """Images to be read: one time each, and for every pixel its last event before it."""
+class ReadOut(EventCounts):
+    """Times of images to read, with the last event of every pixel before each."""
 
     points: ImagePoints
     slot: Int[Numeric, "times pixels"]  # of the pixel's last event in the window, -1 if none
     since: Float[Numeric, "times pixels"]  # s since the pixel's last event
-    growth: DeadTimeDerivative | None = None
 
     def counts(self) -> list[Any]:
-        """The arrays that count events."""
         return [self.points.on, self.points.off]
 
-    def images(self, rows: NDArray) -> "ReadOut":
-        """Those of its images, in that order; chosen on the host."""
-        parts = (self.points, self.slot, self.since)
-        counts = None if self.growth is None else self.growth.counts
+    def take(self, rows: NDArray) -> "ReadOut":
+        """Choose some of the images, in the order of `rows`; on the host."""
+        rho_ref = None if self.derivative is None else self.derivative.rho_ref
         # JAX takes 4 ms of CPU for each array, a quarter of a fit that searches.
-        chosen, counts = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (parts, counts))
-        growth = None if self.growth is None else DeadTimeDerivative(counts, self.growth.rho_ref)
-        points, slot, since = chosen
-        return ReadOut(points, slot, since, growth)
+        return jax.tree.map(lambda v: v if v is rho_ref else np.asarray(v)[rows], self)
 
-    def at(self, rho_ref: Array) -> "ReadOut":
-        """The read-out for a dead time near the one that it was made for."""
-        return _grown(self, rho_ref)
-
-    def weighted(self, factors: Float[Numeric, "2 pixels"]) -> "ReadOut":
-        """The same with every pixel's ON and OFF events times its factor."""
-        return _weighted(self, list(factors))
+    def scale_counts(self, factors: Float[Numeric, "2 pixels"]) -> "ReadOut":
+        """Multiply the ON and OFF events of every pixel by its factors."""
+        return self._scale(list(factors))
 
     def over(self, devices: Sequence[Any]) -> "ReadOut":
-        """The read-out on several devices, pixels shared out."""
+        """Put the read-out on several devices, pixels sharded."""
         mesh = pixel_mesh(devices)
         return self if mesh is None else over_pixels(self, mesh, self.slot.shape[1])
 
 
 def pixel_mesh(devices: Sequence[Any]) -> Mesh | None:
-    """The mesh that pixels are shared out over; None where there is but one device."""
+    """Make the mesh over which pixels are sharded, or return None for a single device."""
     return make_mesh(devices, LANES)
 
 
-def over_pixels(tree: Any, mesh: Mesh, pixels: int) -> Any:
-    """Arrays [..., pixels] shared out along pixels, all others whole on every device."""
+def over_pixels(tree: Any, mesh: Mesh, n_pixels: int) -> Any:
+    """Shard arrays [..., n_pixels] along their last axis; put all others whole on every device."""
 
     def put(leaf: Any) -> Any:
-        return shard(mesh, leaf, -1 if np.shape(leaf)[-1:] == (pixels,) else None)
+        return shard(mesh, leaf, -1 if np.shape(leaf)[-1:] == (n_pixels,) else None)
 
     return jax.tree.map(put, tree)
-
-
-Counting = TypeVar("Counting", Features, ReadOut)
-
-
-def _grown(counting: Counting, rho_ref: Array) -> Counting:
-    growth = counting.growth
-    if growth is None:
-        return counting
-    change = rho_ref - growth.rho_ref
-    moved = [n + change * g for n, g in zip(counting.counts(), growth.counts, strict=True)]
-    return eqx.tree_at(lambda c: c.counts(), counting, moved)
-
-
-def _weighted(counting: Counting, factors: list[Any]) -> Counting:
-    def times(counts: list[Any]) -> list[Any]:
-        return [n * factor for n, factor in zip(counts, factors, strict=True)]
-
-    growth = counting.growth
-    weighted = eqx.tree_at(lambda c: c.counts(), counting, times(counting.counts()))
-    if growth is None:
-        return weighted
-    return dataclasses.replace(
-        weighted, growth=DeadTimeDerivative(times(growth.counts), growth.rho_ref)
-    )
 
 
 _count_arrays = itertools.count()
 
 
-def aligned(shape: tuple[int, ...], dtype: Any, empty: bool = False) -> NDArray:
-    """An array of zeros (or anything) whose data start at a multiple of 64 bytes.
+def allocate_aligned(shape: tuple[int, ...], dtype: Any, empty: bool = False) -> NDArray:
+    """Allocate an array that XLA takes without a copy: its data start at a multiple of 64 bytes.
 
-    XLA takes it without a copy.
+    Args:
+        shape: Shape of the array.
+        dtype: Type of its numbers.
+        empty: Leave the memory as it is; else it is zero.
+
+    Returns:
+        The array.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     # Large arrays all begin at the same place of a memory page. Written side by side they would

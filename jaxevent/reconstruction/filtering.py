@@ -236,7 +236,7 @@ class Filter(PixelEstimator[P]):
         self, params: P, features: Features, state: Any = None, future: None = None
     ) -> tuple[Trajectory, Any]:
         """As `PixelEstimator.run`; the state is (pixels,), after each pixel's last event."""
-        features = features.at(params.rho_ref)
+        features = features.at_dead_time(params.rho_ref)
         frame_model = self.frame_model(params, features.frames)
         if state is None:
             state = self.init_from_frames(params, frame_model, features.start)
@@ -248,7 +248,7 @@ class Filter(PixelEstimator[P]):
 
     def scan(self, params: P, frame_model: FrameModel, tiles: Tiles, state: Any) -> Any:
         """The states after every event, (slots,)."""
-        path = tiles.each(self._scan, params, frame_model, state)
+        path = tiles.map_shards(self._scan, params, frame_model, state)
         return jax.tree.map(jnp.ravel, path)
 
     def _scan(self, tiles: Tiles, params: P, frame_model: FrameModel, state: Any) -> Any:
@@ -262,7 +262,7 @@ class Filter(PixelEstimator[P]):
         return _path(self, params, events, lanes, place)
 
     def read(self, params: P, trajectory: Trajectory, out: ReadOut) -> Estimate:
-        out = out.at(params.rho_ref)
+        out = out.at_dead_time(params.rho_ref)
         before = trajectory.at(jnp.asarray(out.slot))
         since, frame = jnp.asarray(out.since), trajectory.frame_model(out.points)
 

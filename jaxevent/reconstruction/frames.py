@@ -7,80 +7,83 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit
-from jaxevent.codegen.host import evaluated
-from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Segments, aligned
+from jaxevent.codegen.graph import evaluate_function
+from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Segments, allocate_aligned
 from jaxevent.reconstruction.stream import EdgeCounts, Stream
 from jaxevent.recording import Recording
 
+MIN_SEGMENTS = 1 << 14  # for which memory is allocated; eightfold until it suffices
+
 
 class Timing(NamedTuple):
-    """What preparation compares event times with (s); parameters of that name of every estimator.
+    """Parameters of every estimator that preparation compares event times with, s.
 
-    `clock_offset` is added to the frames' time stamps, `exposure` is that of frames whose own is
-    not known, `rho_ref` a pixel's dead time after an event. An event after the gap dt at its pixel
-    stands for min(dt / (dt - rho_ref), 3) events: what happened in the dead time is lost.
+    An event after the gap dt at its pixel stands for min(dt / (dt - rho_ref), 3) events: what
+    happened in the dead time is lost.
 
-    An event is late: the intensity has been moving since the pixel's last one. Where no more than
-    `spread` lies between the two, the second's change is spread evenly over that time, which needs
-    later events and is for methods that do not filter.
+    An event is late: the intensity has been moving since the pixel's last one. If `spread` or less
+    lies between the two, the second's change is spread evenly over that time. This needs later
+    events and is for methods that do not pass over single events.
     """
 
-    clock_offset: float = 0.0
-    exposure: float = 0.0
-    rho_ref: float = 0.0
+    clock_offset: float = 0.0  # added to the frames' time stamps
+    exposure: float = 0.0  # of frames whose own is not known
+    rho_ref: float = 0.0  # dead time of a pixel after an event
     spread: float = 0.0
 
     @classmethod
     def of(cls, params: Any) -> "Timing":
-        """From an estimator's parameters, rounded to 10 ns: 7.5 ms is 7500 us in float32 too."""
+        """Read an estimator's parameters, rounded to 10 ns: float32 has 7.5 ms as 7500 us too."""
         return cls(**{n: round(float(getattr(params, n, 0.0)), 8) for n in cls._fields})
 
 
 def time_span(recording: Recording, clock_offset: Any = 0.0) -> tuple[int, int]:
-    """The times (us) between which images rest on data.
+    """Return the first and last time at which images rest on data.
 
-    They reach from the first event or frame to the last, frames on the events' clock as well as
-    stamped.
+    Args:
+        recording: Events and frames.
+        clock_offset: Added to the frames' time stamps, s.
+
+    Returns:
+        Times of the first and last event or frame, us, with frames both as stamped and on the
+        events' clock.
     """
     late = 0 if recording.frames is None else round(float(clock_offset) * 1e6)
     return recording.start + min(late, 0), recording.stop + max(late, 0)
 
 
 class FrameTimes(NamedTuple):
-    """Times (us from the recording's start) of the frames that a window uses, for loops.
-
-    Whether an exposure is `aligned`: its left edge begins a piece, so that the counts there are
-    those of the stream.
-    """
+    """Times of the frames of a window, us from the recording's start, for compiled loops."""
 
     origin: int  # us, the recording's start
     breaks: NDArray[np.floating]  # ends of pieces
-    weight_rate: NDArray[np.floating]  # 1/us
+    weight_rate: NDArray[np.floating]  # 1 / length of each piece, 1/us
     mids: NDArray[np.floating]  # mid-exposures
-    blend_rate: NDArray[np.floating]  # 1/us
-    aligned: NDArray[np.bool_]
+    blend_rate: NDArray[np.floating]  # 1 / time to the next mid-exposure, 1/us
+    begins_piece: NDArray[np.bool_]  # whether a piece begins at the left edge of the exposure
     exposed: bool  # whether exposures are pieces of their own
 
 
 @dataclasses.dataclass(frozen=True)
 class Clock:
-    """The frames in time: float64 microseconds from the recording's start, offset applied.
+    """Times of the frames, float64 microseconds from the recording's start, offset applied.
 
     `breaks` are the times at which pieces end. Exposures that overlap (a jittering stamp) share the
     overlap as their gap, clipped to the two mid-exposures, so that the augmented frame stays
-    continuous; exposures that do not overlap are used as they are.
+    continuous. Exposures that do not overlap are used as they are.
     """
 
     mid: NDArray[np.floating]
     left: NDArray[np.floating]
     right: NDArray[np.floating]
     breaks: NDArray[np.floating]
-    exposed: bool
+    exposed: bool  # whether exposures are pieces of their own
     offset: float  # s
     origin: int  # us, the recording's start
 
     @classmethod
     def of(cls, recording: Recording, timing: Timing) -> "Clock":
+        """Read the times of a recording's frames."""
         offset = round(timing.clock_offset * 1e8) / 100
         frames, origin = recording.frames, recording.start
         if frames is None:
@@ -101,30 +104,31 @@ class Clock:
         return len(self.mid)
 
     def frame(self, piece: Any) -> Any:
-        """The frame whose left edge pieces count events from; -1 before the first exposure."""
+        """Return the frame from whose left edge pieces count events; -1: before any exposure."""
         return (piece - 1) // 2 if self.exposed else piece - 1
 
     def first_piece(self, first_frame: int) -> int:
-        """The piece that is 0 in a window: it stands for everything before the first frame."""
+        """Return the piece that is 0 in a window, which stands for all before `first_frame`."""
         return (2 if self.exposed else 1) * first_frame
 
     def locate(self, time: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Piece, frame before, weight in the piece and blend between frames, at times in us."""
+        """Find times (us from the recording's start) among the frames.
+
+        Returns:
+            For each time the piece, the frame before (0 if none is), the position in the piece and
+            the position between the mid-exposures of two frames, both 0 to 1.
+        """
         piece = np.searchsorted(self.breaks, time, "right")
         frame = np.searchsorted(self.mid, time, "right") - 1
-        return (
-            piece,
-            np.maximum(frame, 0),
-            _position(self.breaks, piece - 1, time),
-            _position(self.mid, frame, time),
-        )
+        weight, blend = _position(self.breaks, piece - 1, time), _position(self.mid, frame, time)
+        return piece, np.maximum(frame, 0), weight, blend
 
     def elapsed(self, time: NDArray, frame: NDArray) -> NDArray:
-        """Seconds from the middle of frames to times in us; 0 without frames."""
+        """Return the seconds from the middle of frames to times in us; 0 without frames."""
         return (time - self.mid[frame]) * 1e-6 if len(self) else np.zeros(len(time))
 
     def used(self, start: int | None, stop: int | None) -> slice:
-        """The frames that tell what happens from start to stop (us), one more on each side."""
+        """Return the frames around the time from `start` to `stop` (us), one more on each side."""
         span = np.array(
             [
                 -np.inf if start is None else start - self.origin,
@@ -135,30 +139,31 @@ class Clock:
         return slice(max(int(first) - 1, 0), min(max(int(last), 0) + 2, len(self)))
 
     def edges(self, used: slice) -> list[NDArray[np.int64]]:
-        """Left edge, middle and right edge of exposures (us): events with t < edge are before it.
+        """Return left edge, middle and right edge of exposures, us on the recording's clock.
 
-        Half microseconds are rounded up, which says the same of whole ones.
+        An event with t < edge is before the edge. Half microseconds are rounded up, which orders
+        whole ones alike.
         """
         edges = (self.left, self.mid, self.right)
         return [np.ceil(edge[used]).astype(np.int64) + self.origin for edge in edges]
 
     def times_from(self, first_frame: int) -> FrameTimes:
-        """The times of the frames from `first_frame` on."""
+        """Return the times of the frames from `first_frame` on."""
         breaks, mids = self.breaks[self.first_piece(first_frame) :], self.mid[first_frame:]
-        aligned = self.left[first_frame:] == (breaks[::2] if self.exposed else breaks)
+        begins_piece = self.left[first_frame:] == (breaks[::2] if self.exposed else breaks)
         return FrameTimes(
-            self.origin, breaks, rates(breaks), mids, rates(mids), aligned, self.exposed
+            self.origin, breaks, rates(breaks), mids, rates(mids), begins_piece, self.exposed
         )
 
 
 def rates(breaks: NDArray) -> NDArray:
-    """1 / length (1/us) of the stretches between breaks, 0 for empty ones."""
+    """Return 1 / length (1/us) of the intervals between breaks, 0 for empty ones."""
     length = np.diff(breaks)
     return np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)
 
 
 def _position(breaks: NDArray, i: NDArray, time: NDArray) -> NDArray:
-    """How far `time` lies between breaks i and i + 1, 0 outside the first and last."""
+    """Return the position of `time` between breaks i and i + 1, 0 outside the first and last."""
     inside = (i >= 0) & (i < len(breaks) - 1)
     if not inside.any():
         return np.zeros(len(time))
@@ -175,30 +180,38 @@ class FrameImages:
         self._tables = (lambda grey: grey, response.intensity, response.certainty)
 
     def response(self) -> NDArray:
-        """Intensities of 256 evenly spaced grey values."""
-        return evaluated(self._tables[1], np.linspace(0, 1, 256)).astype(self.dtype)
+        """Return the intensities of 256 evenly spaced grey values."""
+        return evaluate_function(self._tables[1], np.linspace(0, 1, 256)).astype(self.dtype)
 
     def tables(self) -> NDArray:
-        """Grey values, intensities and certainties of the levels that whole numbers stand for."""
+        """Return grey value, intensity and certainty of every whole number of an image."""
         assert self.recording.frames is not None
         kind = self.recording.frames.images.dtype
         levels = 1 + (np.iinfo(kind).max if kind.kind in "iu" else 0)
         return self.values(np.arange(levels) / max(levels - 1, 1))
 
     def values(self, images: NDArray) -> NDArray:
-        """Grey values, intensities and certainties [3, ...] of images in [0, 1]."""
-        made = [evaluated(table, images).astype(self.dtype) for table in self._tables]
+        """Return grey values, intensities and certainties [3, ...] of images in [0, 1]."""
+        made = [evaluate_function(table, images).astype(self.dtype) for table in self._tables]
         return np.stack(made)
 
-    def read(self, used: slice, room: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Grey values, intensities, certainties [room, pixels] and gains of a range of frames.
+    def read(self, used: slice, capacity: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Read a range of frames.
 
-        Spare rows repeat the last; without frames all is 0.5, certainties 0.
+        Args:
+            used: Range of the recording's frames.
+            capacity: Rows of the results. Spare rows repeat the last frame.
+
+        Returns:
+            Grey values, intensities and certainties, each [capacity, pixels], and gains
+            [capacity]. Without frames grey values and intensities are 0.5, certainties 0.
         """
         pixels, n = self.recording.width * self.recording.height, used.stop - used.start
-        grey, intensity, certainty = (aligned((room, pixels), self.dtype) for _ in range(3))
+        grey, intensity, certainty = (
+            allocate_aligned((capacity, pixels), self.dtype) for _ in range(3)
+        )
         grey[:], intensity[:] = 0.5, 0.5
-        gain = np.ones(room, self.dtype)
+        gain = np.ones(capacity, self.dtype)
         if n:
             assert self.recording.frames is not None
             images = np.asarray(self.recording.frames[used].images).reshape(n, pixels)
@@ -222,40 +235,51 @@ def make_frame_features(
     clock: Clock,
     used: slice,
     rows: NDArray[np.int32],
-    room: int,
     counts: EdgeCounts,
+    *,
     segments: Segments | None,
+    capacity: int,
 ) -> FrameFeatures:
-    """Features of the frames `used`, with room for `room`; `rows` are those of the features."""
+    """Prepare a range of frames.
+
+    Args:
+        images: Frames of the recording.
+        clock: Times of all its frames.
+        used: Range of frames.
+        rows: The numbers `FrameFeatures.rows`.
+        counts: Events before the edges of the exposures.
+        segments: Segments within the exposures, where these are known.
+        capacity: Frames for which memory is allocated.
+
+    Returns:
+        The features.
+    """
     dtype, n, pixels = images.dtype, len(counts.mid), counts.base.start.shape[1]
-    grey, intensity, certainty, gain = images.read(used, room)
-    span, before = aligned((2, room, pixels), dtype), np.zeros((2, pixels), dtype)
+    grey, intensity, certainty, gain = images.read(used, capacity)
+    shape = (2, capacity, pixels)
+    span, before = allocate_aligned(shape, dtype), np.zeros((2, pixels), dtype)
     if n:
         span[:, : n - 1] = (counts.right[1:] - counts.base.left[:-1]).swapaxes(0, 1)
         before[:] = counts.right[0] - (counts.base.start if used.start == 0 else 0)
     head = tail = None
     if clock.exposed:
-        head, tail = (aligned((2, room, pixels), dtype) for _ in range(2))
+        head, tail = allocate_aligned(shape, dtype), allocate_aligned(shape, dtype)
         head[:, :n] = (counts.mid - counts.base.left).swapaxes(0, 1)
         tail[:, :n] = (counts.right - counts.mid).swapaxes(0, 1)
 
-    present = np.asarray(float(used.stop > used.start), images.dtype)
-    return FrameFeatures(
-        grey, intensity, certainty, images.response(), gain, span, before, head, tail, segments,
-        *_piece_rates(clock, used, len(gain), images.dtype),
-        present, rows, np.asarray(clock.offset, images.dtype), images.recording.width,
-    )  # fmt: skip
-
-
-def _piece_rates(clock: Clock, used: slice, room: int, dtype: np.dtype) -> tuple[NDArray, NDArray]:
-    """How fast weights grow in each piece and blends after each frame of `used`, 1/s."""
-    pieces = (2 if clock.exposed else 1) * room + 1
+    pieces = (2 if clock.exposed else 1) * capacity + 1
     breaks = clock.breaks[clock.first_piece(used.start) :]
-    weight_rate, blend_rate = np.zeros(pieces, dtype), np.zeros(room, dtype)
+    weight_rate, blend_rate = np.zeros(pieces, dtype), np.zeros(capacity, dtype)
     for out, times in ((weight_rate[1:], breaks), (blend_rate, clock.mid[used])):
         rate = 1e6 * rates(times)[: len(out)]
         out[: len(rate)] = rate
-    return weight_rate, blend_rate
+
+    present = np.asarray(float(used.stop > used.start), dtype)
+    return FrameFeatures(
+        grey, intensity, certainty, images.response(), gain, span, before, head, tail, segments,
+        weight_rate, blend_rate, present, rows, np.asarray(clock.offset, dtype),
+        images.recording.width,
+    )  # fmt: skip
 
 
 def make_segments(
@@ -266,9 +290,18 @@ def make_segments(
     counts: EdgeCounts,
     dtype: np.dtype,
 ) -> Segments:
-    """Segments of constant brightness within the exposures of the frames `used`.
+    """Cut the exposures of a range of frames into segments of constant brightness.
 
-    `stream` are the events of all exposures, `weight` what each stands for.
+    Args:
+        clock: Times of the frames.
+        used: Range of frames.
+        stream: Events of all their exposures.
+        weight: (events,) number of events that each event stands for.
+        counts: Events before the edges of the exposures; here only their shape and type.
+        dtype: Type of the results.
+
+    Returns:
+        The segments, with memory for more.
     """
     exact = np.stack([clock.left[used], clock.mid[used], clock.right[used]], axis=1)
     parts = []
@@ -279,12 +312,12 @@ def make_segments(
             count = np.zeros_like(counts.base.start)
             parts.append(_cut_exposure(part, weight[i:j], middle - i, row, exact[row], count))
     total = sum(len(part[0]) for part in parts)
-    room = 1 << 14
-    while room < total:
-        room *= 8
+    capacity = MIN_SEGMENTS
+    while capacity < total:
+        capacity *= 8
     fields = []
     for f, kind in enumerate((np.int32, dtype, dtype, dtype, dtype)):
-        field = aligned((room,), kind)
+        field = allocate_aligned((capacity,), kind)
         if parts:
             field[:total] = np.concatenate([part[f] for part in parts])
         fields.append(field)
@@ -292,7 +325,7 @@ def make_segments(
 
 
 def make_start(clock: Clock, pixels: int, dtype: np.dtype) -> ImagePoints:
-    """The recording's start, where no event has happened; only the first window uses it."""
+    """Prepare the recording's start, before any event; the first window alone uses it."""
     piece, frame, weight, blend = clock.locate(np.zeros(1))
     counts = np.zeros((1, pixels), dtype)
     return ImagePoints(
@@ -308,7 +341,10 @@ def make_start(clock: Clock, pixels: int, dtype: np.dtype) -> ImagePoints:
 
 @njit
 def _cut_exposure(stream, weight, middle, row, edges, count):
-    """Segments of constant brightness within one exposure; events `middle` on lie after its mid."""
+    """Cut one exposure into segments; events from row `middle` on lie after its middle.
+
+    Returns the fields of `Segments`, one number for each event. `count` is (2, pixels) of zeros.
+    """
     t, x, y, p = stream.t, stream.x, stream.y, stream.p
     n, pixels = len(t), count.shape[1]
     length = edges[2] - edges[0]

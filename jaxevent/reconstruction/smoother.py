@@ -473,7 +473,7 @@ class Smoother(PixelEstimator[Params]):
         future: Message | None = None,
     ) -> tuple[SmoothedWindow, Gaussian]:
         """As `PixelEstimator.run`; the state is (pixels,), before the next window's first frame."""
-        frames = features.at(params.rho_ref).frames
+        frames = features.at_dead_time(params.rho_ref).frames
         rows, counts = make_frame_steps(params, frames)
         state = self.init_state(params, features) if state is None else state
         number, anchor, onward = frames.rows
@@ -492,7 +492,7 @@ class Smoother(PixelEstimator[Params]):
         return passage, jax.tree.map(lambda v: v.at[onward].get(mode="clip"), ahead)
 
     def read(self, params: Params, trajectory: SmoothedWindow, out: ReadOut) -> Estimate:
-        points = out.at(params.rho_ref).points
+        points = out.at_dead_time(params.rho_ref).points
         f, behind = jnp.asarray(points.frame), jnp.asarray(points.elapsed)[:, None] < 0
         since, until, elapsed, seconds = adjacent_counts(params, trajectory, points)
 

@@ -1,7 +1,7 @@
-"""The stream of events: what is remembered of it from window to window, and what is counted.
+"""Counts over the stream of events, and the state that passes from window to window.
 
-With a dead time an event stands for more than one (`Timing`): counts are then weighted. With
-`growth` of a `DeadTime` all counts are derivatives by the dead time, in 1/s.
+With a dead time an event stands for more than one (`frames.Timing`): counts are then weighted. With
+`DeadTime.derivative` all counts are derivatives by the dead time, in 1/s.
 """
 
 import dataclasses
@@ -15,9 +15,9 @@ from jaxevent.recording import Events, Recording
 
 
 class Stream(NamedTuple):
-    """Events in order of time, as loops see them, of a sensor `width` pixels wide."""
+    """Events in order of time, as compiled loops take them, of a sensor `width` pixels wide."""
 
-    t: NDArray[np.int64]
+    t: NDArray[np.int64]  # us
     x: NDArray[np.uint16]
     y: NDArray[np.uint16]
     p: NDArray[np.bool_]
@@ -28,40 +28,42 @@ class Stream(NamedTuple):
         return cls(events.t, events.x, events.y, events.p, width)
 
     def part(self, begin: int, end: int) -> "Stream":
-        """The events of a range of rows."""
+        """Return the events of the rows [begin, end)."""
         rows = slice(begin, end)
         return Stream(self.t[rows], self.x[rows], self.y[rows], self.p[rows], self.width)
 
 
 @dataclasses.dataclass
 class StreamState:
-    """What the stream before a window leaves behind: times of the last event (us)."""
+    """Times of the last events (us) before a window."""
 
     last: NDArray[np.int64]  # at each pixel
-    near: NDArray[np.int64]  # in each pixel's neighbourhood, with a border of one pixel
-    # The first event of which the frames tell, and `last` before it; kept where events are weighted
-    # by the gap to the one before.
+    near: NDArray[np.int64]  # in each pixel's 3x3 neighbourhood, with a border of one pixel
+    # The first row of the events in the frames' exposures, and `last` before it. Kept where events
+    # are weighted by the gap to the one before.
     context: int = 0
-    last_then: NDArray[np.int64] | None = None
-    frames: int = 1  # how many frames of the recording windows have used
+    context_last: NDArray[np.int64] | None = None
+    frames: int = 1  # number of frames of the recording that windows have used
 
     @classmethod
     def initial(cls, recording: Recording, weighted: bool = False) -> "StreamState":
+        """Return the state before the first event."""
         pixels = recording.width * recording.height
         border = (recording.width + 2) * (recording.height + 2)
         last = np.full(pixels, recording.start)
-        then = last.copy() if weighted else None
-        return cls(last, np.full(border, recording.start), 0, then)
+        context_last = last.copy() if weighted else None
+        return cls(last, np.full(border, recording.start), 0, context_last)
 
     def copy(self) -> "StreamState":
+        """Copy the state, to be updated in place."""
         return dataclasses.replace(self, last=self.last.copy(), near=self.near.copy())
 
 
 class DeadTime(NamedTuple):
-    """A pixel's dead time after an event (us), and whether to count or to differentiate by it."""
+    """Dead time of a pixel after an event, and whether counts or their derivatives are made."""
 
-    rho: float
-    growth: bool
+    rho: float  # us
+    derivative: bool
 
 
 class BaseCounts(NamedTuple):
@@ -72,7 +74,7 @@ class BaseCounts(NamedTuple):
 
 
 class EdgeCounts(NamedTuple):
-    """The same, and before the other edges of exposures."""
+    """ON and OFF events of each pixel before all edges of exposures."""
 
     base: BaseCounts
     mid: NDArray  # [frames, 2, pixels], middles
@@ -81,7 +83,7 @@ class EdgeCounts(NamedTuple):
 
 @njit
 def count_events(x, y, width, pixels):
-    """The number of events at each pixel, (pixels,)."""
+    """Count the events at each pixel, (pixels,)."""
     counts = np.zeros(pixels, np.int32)
     for i in range(len(x)):
         counts[np.int64(y[i]) * width + x[i]] += 1
@@ -89,65 +91,85 @@ def count_events(x, y, width, pixels):
 
 
 @njit_noalloc_inlined
-def equivalent(gap, dead):
-    """How many events one after the gap (us) at its pixel stands for."""
+def event_weight(gap, dead):
+    """Return the number of events that one event stands for, `gap` us after its pixel's last."""
     if dead.rho == 0:
         return 1.0
     if gap <= 1.5 * dead.rho:
-        return 0.0 if dead.growth else 3.0
+        return 0.0 if dead.derivative else 3.0
     rest = gap - dead.rho
-    return 1e6 * gap / (rest * rest) if dead.growth else gap / rest
+    return 1e6 * gap / (rest * rest) if dead.derivative else gap / rest
 
 
 @njit_noalloc
-def note_latest(stream, last):
-    """Bring the times of each pixel's last event, `last`, to the stream's end."""
+def update_last_times(stream, last):
+    """Update the times of each pixel's last event to the stream's end, in place."""
     t, x, y = stream.t, stream.x, stream.y
     for i in range(len(t)):
         last[np.int64(y[i]) * stream.width + x[i]] = t[i]
 
 
-def weigh(stream: Stream, last: NDArray[np.int64], dead: DeadTime) -> NDArray[np.float64]:
-    """What each event stands for; `last` holds the times of the events before, at each pixel."""
+def event_weights(stream: Stream, last: NDArray[np.int64], dead: DeadTime) -> NDArray[np.float64]:
+    """Return the number of events that each event stands for.
+
+    Args:
+        stream: Events.
+        last: (pixels,) time of each pixel's last event before the stream, us; updated in place.
+        dead: The dead time.
+
+    Returns:
+        (events,).
+    """
     out = np.empty(len(stream.t))
-    _weigh(stream, last, dead, out)
+    _event_weights(stream, last, dead, out)
     return out
 
 
 @njit_noalloc
-def _weigh(stream, last, dead, out):
+def _event_weights(stream, last, dead, out):
     t, x, y = stream.t, stream.x, stream.y
     for i in range(len(t)):
         pixel = np.int64(y[i]) * stream.width + x[i]
-        out[i] = equivalent(t[i] - last[pixel], dead)
+        out[i] = event_weight(t[i] - last[pixel], dead)
         last[pixel] = t[i]
 
 
-def count_before(stream: Stream, weight: NDArray, edges: NDArray, now: NDArray) -> NDArray:
-    """ON and OFF events of each pixel earlier than each edge: [edges, 2, pixels].
+def count_before(stream: Stream, weight: NDArray, edges: NDArray, counts: NDArray) -> NDArray:
+    """Count the ON and OFF events of each pixel that are earlier than each edge.
 
-    `now` (2, pixels) are the counts at the stream's beginning, and is brought to the last edge.
+    Args:
+        stream: Events.
+        weight: (events,) number of events that each event stands for.
+        edges: Sorted times, us.
+        counts: (2, pixels) counts before the stream; updated in place to the last edge.
+
+    Returns:
+        (edges, 2, pixels).
     """
-    out = np.empty((len(edges), *now.shape), now.dtype)
-    _count_before(stream, weight, edges, now, out)
+    out = np.empty((len(edges), *counts.shape), counts.dtype)
+    _count_before(stream, weight, edges, counts, out)
     return out
 
 
 @njit_noalloc
-def _count_before(stream, weight, edges, now, out):
+def _count_before(stream, weight, edges, counts, out):
     t, x, y, p = stream.t, stream.x, stream.y, stream.p
     i = 0
     for e in range(len(edges)):
         while i < len(t) and t[i] < edges[e]:
-            now[0 if p[i] else 1, np.int64(y[i]) * stream.width + x[i]] += weight[i]
+            counts[0 if p[i] else 1, np.int64(y[i]) * stream.width + x[i]] += weight[i]
             i += 1
-        for pixel in range(now.shape[1]):  # one by one: numba takes 1.5 s to compile a slice
-            out[e, 0, pixel], out[e, 1, pixel] = now[0, pixel], now[1, pixel]
+        for pixel in range(counts.shape[1]):  # one by one: numba takes 1.5 s to compile a slice
+            out[e, 0, pixel], out[e, 1, pixel] = counts[0, pixel], counts[1, pixel]
 
 
 @njit
 def add_spread(stream, weight, edges, origin, reach, out):
-    """Add to the counts at each edge the part of the pixel's next event that has happened."""
+    """Add to the counts at each edge the fraction of the pixel's next event that has happened.
+
+    The change of an event is spread evenly over the time since the pixel's event before, if that is
+    at most `reach` us and not the recording's start, `origin`.
+    """
     t, x, y, p = stream.t, stream.x, stream.y, stream.p
     last = np.full(out.shape[2], origin)
     for i in range(len(t)):

@@ -1,9 +1,9 @@
-"""Where the events of a window lie: tiles of 32768 slots, [ranks, lanes].
+"""Tiles of a window: its events sorted by pixel and written into slots [ranks, lanes].
 
-A lane is a pixel, a rank the number of the event at that pixel. There are three kinds of tile, wide
-ones for pixels with few events and narrow ones for pixels with many; within a kind the busiest
-pixels come first, so that a round of ranks needs only the first blocks of lanes. Tiles run in
-order. How many are used is data, how many there is room for comes from a fixed ladder, so another
+A lane is a pixel, a rank the number of the event at that pixel. There are three kinds of tile: wide
+ones for pixels with few events, narrow ones for pixels with many. Within a kind the busiest pixels
+come first, so that a round of ranks needs only the first blocks of lanes. Tiles run in order. How
+many are used is data; for how many memory is allocated comes from a fixed ladder, so that another
 window or recording of the same sensor compiles nothing.
 """
 
@@ -16,126 +16,108 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit, njit_noalloc, njit_noalloc_inlined
-from jaxevent.reconstruction.features import SHAPES, SLOTS, EventPoints, Tiles, aligned
+from jaxevent.reconstruction.features import SHAPES, SLOTS, EventPoints, Tiles, allocate_aligned
 from jaxevent.reconstruction.frames import FrameTimes
-from jaxevent.reconstruction.stream import BaseCounts, DeadTime, Stream, StreamState, equivalent
+from jaxevent.reconstruction.stream import BaseCounts, DeadTime, Stream, StreamState, event_weight
 
-THRESHOLDS = (128, 1024)  # events at a pixel from which the next, narrower kind serves it
+KIND_EVENTS = (128, 1024)  # events at a pixel from which the next, narrower kind of tile serves it
+WORKERS = min(4, os.cpu_count() or 1)
 
 
 class SlotMap(NamedTuple):
-    """The arrays of a layout, for loops over events: the slot of a pixel's event of any rank."""
+    """The slot of a pixel's event of any rank, as arrays for compiled loops."""
 
-    known: bool  # whether there is a layout
-    kind: NDArray[np.int8]
-    lane: NDArray[np.int32]
-    round_tile: NDArray[np.int32]
-    round_first: NDArray[np.int64]
+    known: bool  # whether there are tiles
+    kind: NDArray[np.int8]  # per pixel: index in `SHAPES`
+    lane: NDArray[np.int32]  # per pixel, within its kind
+    round_tile: NDArray[np.int32]  # per kind and round of ranks: the first tile
+    round_first: NDArray[np.int64]  # per kind: index of its first round in `round_tile`
     shapes: NDArray[np.int64]
 
     @classmethod
-    def none(cls, pixels: int) -> "SlotMap":
-        """Where there are no tiles."""
-        zeros, kinds = np.zeros(pixels, np.int32), len(SHAPES)
-        return cls(
-            False,
-            zeros.astype(np.int8),
-            zeros,
-            np.zeros(kinds, np.int32),
-            np.zeros(kinds, np.int64),
-            np.array(SHAPES),
-        )
+    def empty(cls, n_pixels: int) -> "SlotMap":
+        """Return the map of a window without tiles."""
+        lane, kinds = np.zeros(n_pixels, np.int32), len(SHAPES)
+        rounds = np.zeros(kinds, np.int32), np.zeros(kinds, np.int64)
+        return cls(False, lane.astype(np.int8), lane, *rounds, np.array(SHAPES))
 
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Which tile, rank and lane each event of a window takes."""
+    """Tile, rank and lane of each event of a window."""
 
-    kind: NDArray[np.int8]  # per pixel: its place in SHAPES
-    lane: NDArray[np.int32]  # per pixel, within its kind
+    slot_map: SlotMap
     lanes: list[NDArray[np.int32]]  # per kind: pixels, busiest first
     counts: NDArray[np.int32]  # events per pixel
-    round_tile: NDArray[np.int32]  # per kind and round of ranks: the first tile
-    round_first: NDArray[np.int64]  # per kind: where its rounds start in round_tile
-    room: int  # tiles, from the ladder
+    capacity: int  # tiles, from the ladder
     ordinary: bool  # whether the first rung sufficed
 
     @classmethod
-    def of(cls, counts: NDArray[np.int32], events: int) -> "Layout":
-        """Lay out a window; room is for `events` of ordinary skew, doubled until it suffices."""
+    def of(cls, counts: NDArray[np.int32], n_events: int) -> "Layout":
+        """Lay out a window.
+
+        Args:
+            counts: (pixels,) events of each pixel.
+            n_events: Events of ordinary skew for which tiles are allocated; doubled until they
+                suffice.
+        """
         pixels = len(counts)
         order = _busiest_first(counts)
-        ends = [int(np.searchsorted(-counts[order], -limit, "right")) for limit in THRESHOLDS]
+        ends = [int(np.searchsorted(-counts[order], -limit, "right")) for limit in KIND_EVENTS]
         bounds = [pixels, *ends, 0]  # wide tiles serve the tail of the order, narrow its head
         kind, lane = np.zeros(pixels, np.int8), np.zeros(pixels, np.int32)
         lanes, rounds, tiles = [], [], 0
         for k, (ranks, width) in enumerate(SHAPES):
-            mine = order[bounds[k + 1] : bounds[k]]
-            kind[mine] = k
-            lane[mine] = np.arange(len(mine))
-            lanes.append(mine)
-            busy = counts[mine]
-            reach = -(-int(busy[0]) // ranks) if len(mine) else 0
-            active = np.searchsorted(-busy, -ranks * np.arange(reach), "left")
+            own = order[bounds[k + 1] : bounds[k]]
+            kind[own] = k
+            lane[own] = np.arange(len(own))
+            lanes.append(own)
+            busy = counts[own]
+            n_rounds = -(-int(busy[0]) // ranks) if len(own) else 0
+            active = np.searchsorted(-busy, -ranks * np.arange(n_rounds), "left")
             first = tiles + np.concatenate([[0], np.cumsum(-(-active // width))])
             rounds.append(first[:-1].astype(np.int32))
             tiles = int(first[-1])
         # Full tiles, one partly used block of lanes per round, one partly used rank per block.
-        spare = 32 if events > SLOTS else 8
-        room = events // SLOTS + -(-pixels // SHAPES[0][1]) + spare
-        ordinary = tiles <= room
-        while room < tiles:
-            room *= 2
-        starts = np.cumsum([0] + [len(r) for r in rounds[:-1]])
-        first_tile = np.concatenate([*rounds, np.zeros(1, np.int32)])  # never empty
-        return cls(kind, lane, lanes, counts, first_tile, starts, room, ordinary)
+        spare = 32 if n_events > SLOTS else 8
+        capacity = n_events // SLOTS + -(-pixels // SHAPES[0][1]) + spare
+        ordinary = tiles <= capacity
+        while capacity < tiles:
+            capacity *= 2
+        round_first = np.cumsum([0] + [len(r) for r in rounds[:-1]])
+        round_tile = np.concatenate([*rounds, np.zeros(1, np.int32)])  # never empty
+        slot_map = SlotMap(True, kind, lane, round_tile, round_first, np.array(SHAPES))
+        return cls(slot_map, lanes, counts, capacity, ordinary)
 
     def lane_begins(self) -> list[int]:
-        """Where the lanes of each kind begin among those of all kinds, and where they end."""
+        """Return the first lane of each kind among those of all kinds, and the number of lanes."""
         sizes = [-(-len(self.counts) // width) * width for _, width in SHAPES]
         return [sum(sizes[:k]) for k in range(len(SHAPES) + 1)]
 
     def lane_pixels(self) -> NDArray[np.int32]:
-        """The pixels of the lanes of all kinds."""
+        """Return the pixels of the lanes of all kinds."""
         *begins, end = self.lane_begins()
-        # Room at the end, so that as many lanes as the widest tile has can be cut out anywhere.
+        # Zeros at the end, so that as many lanes as the widest tile has can be cut out anywhere.
         out = np.zeros(end + SHAPES[0][1], np.int32)
-        for begin, mine in zip(begins, self.lanes, strict=True):
-            out[begin : begin + len(mine)] = mine
+        for begin, own in zip(begins, self.lanes, strict=True):
+            out[begin : begin + len(own)] = own
         return out
 
-    def tiles(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """The kind and the first lane of every tile; kind 3, with room, of those not used."""
-        kinds, lanes = np.full(self.room, len(SHAPES), np.int32), np.zeros(self.room, np.int32)
-        begins = self.lane_begins()
-        for k, (ranks, width) in enumerate(SHAPES):
-            busy, first = self.counts[self.lanes[k]], self.round_first[k]
-            for turn in range(-(-int(busy[0]) // ranks) if len(busy) else 0):
-                blocks = np.arange(-(-int((busy > turn * ranks).sum()) // width))
-                tile = self.round_tile[first + turn] + blocks
-                kinds[tile], lanes[tile] = k, begins[k] + blocks * width
-        return kinds, lanes
-
-    def slots(self) -> NDArray[np.int32]:
-        """The slot of each pixel's last event, -1 if it has none."""
-        ranks, width = np.array(SHAPES)[self.kind].T
+    def last_slots(self) -> NDArray[np.int32]:
+        """Return the slot of each pixel's last event, -1 if it has none."""
+        kind, lane = self.slot_map.kind, self.slot_map.lane
+        ranks, width = np.array(SHAPES)[kind].T
         rank = np.maximum(self.counts - 1, 0)
         busy = self.counts > 0
-        rounds = np.where(busy, self.round_first[self.kind] + rank // ranks, 0)
-        tile = self.round_tile[rounds] + self.lane // width
-        slot = tile * SLOTS + rank % ranks * width + self.lane % width
+        rounds = np.where(busy, self.slot_map.round_first[kind] + rank // ranks, 0)
+        tile = self.slot_map.round_tile[rounds] + lane // width
+        slot = tile * SLOTS + rank % ranks * width + lane % width
         return np.where(busy, slot, -1).astype(np.int32)
-
-    def slot_map(self) -> SlotMap:
-        """Its arrays, for loops over events."""
-        return SlotMap(
-            True, self.kind, self.lane, self.round_tile, self.round_first, np.array(SHAPES)
-        )
 
 
 @njit
 def _busiest_first(counts):
-    """Pixels by falling count, equal counts in pixel order: a counting sort."""
+    """Sort pixels by falling count, equal counts in pixel order: a counting sort."""
     top = counts.max() if len(counts) else 0
     at = np.zeros(top + 2, np.int64)
     for c in counts:
@@ -151,47 +133,54 @@ def _busiest_first(counts):
 
 
 class TileMemory:
-    """Memory for the fields of tiles, by name.
+    """Memory for the arrays of tiles, by name.
 
-    With `reuse` a window's tiles are written over the last one's: fresh memory costs
-    time. Without, it is fresh and cleared.
+    With `reuse` a window's tiles are written over the last one's, as fresh memory costs time. Else
+    memory is fresh and cleared.
     """
 
     def __init__(self, reuse: bool, dtype: np.dtype):
         self.dtype = dtype  # of real numbers
-        self._fields: dict[str, NDArray] | None = {} if reuse else None
+        self._arrays: dict[str, NDArray] | None = {} if reuse else None
 
-    def field(self, name: str, shape: tuple[int, ...], dtype: Any) -> NDArray:
-        if self._fields is None:
-            return aligned(shape, dtype)
-        if name not in self._fields or self._fields[name].shape != shape:
-            self._fields[name] = aligned(shape, dtype, empty=True)
-        return self._fields[name]
-
-
-WORKERS = min(4, os.cpu_count() or 1)
+    def array(self, name: str, shape: tuple[int, ...], dtype: Any) -> NDArray:
+        """Return the array of that name, allocated anew if its shape changed."""
+        if self._arrays is None:
+            return allocate_aligned(shape, dtype)
+        if name not in self._arrays or self._arrays[name].shape != shape:
+            self._arrays[name] = allocate_aligned(shape, dtype, empty=True)
+        return self._arrays[name]
 
 
 class EventOrder(NamedTuple):
-    """Events in pixel order."""
+    """Events in the order of lanes."""
 
     key: NDArray[np.int64]  # time since the origin (us), shifted by one, and polarity
     near: NDArray  # s since the 3x3 neighbourhood's previous event
 
 
-class TileKind(NamedTuple):
-    """The tiles of one kind: what their lanes and rounds hold."""
+class TileInputs(NamedTuple):
+    """Inputs of the loop that writes tiles."""
 
-    place: int  # in SHAPES
+    order: EventOrder
+    times: FrameTimes  # of the window's frames
+    counts: BaseCounts
+    dead: DeadTime
+
+
+class TileKind(NamedTuple):
+    """Lanes and rounds of the tiles of one kind."""
+
+    index: int  # in `SHAPES`
     ranks: int
     width: int  # lanes
     offset: int  # of its lanes among those of all kinds
     pixels: NDArray[np.int32]  # of the lanes
-    first: NDArray[np.int64]  # where each lane's events begin, and one entry more
+    first: NDArray[np.int64]  # index of each lane's first event, and one entry more
     round_tile: NDArray[np.int32]  # the first tile of each round of ranks
 
 
-class Slots(NamedTuple):
+class TileArrays(NamedTuple):
     """The arrays of `Tiles` that `_fill` writes: two per tile, the others [tiles, slots]."""
 
     kind: NDArray[np.int32]
@@ -200,31 +189,30 @@ class Slots(NamedTuple):
     near: NDArray
     weight: NDArray
     blend: NDArray
-    piece_cell: NDArray[np.int32]
-    frame_cell: NDArray[np.int32]
     on: NDArray
     off: NDArray
+    piece_cell: NDArray[np.int32]
+    frame_cell: NDArray[np.int32]
     polarity: NDArray[np.int8]
 
     @classmethod
-    def of(cls, tiles: int, memory: TileMemory) -> "Slots":
-        """Room for a number of tiles, none of them used.
+    def allocate(cls, tiles: int, memory: TileMemory) -> "TileArrays":
+        """Allocate a number of tiles, none of them used.
 
         `_fill` clears what used tiles leave empty, unused tiles are skipped. (Derivatives are taken
-        of all tiles, where nothing but numbers may lie: then memory is fresh, so cleared.)
+        of all tiles, which must then hold numbers: memory is fresh, so cleared.)
         """
-        shape, real = (tiles, SLOTS), ("since", "near", "weight", "blend", "on", "off")
-        fields: dict[str, Any] = {name: memory.dtype for name in real}
-        fields |= {"piece_cell": np.int32, "frame_cell": np.int32, "polarity": np.int8}
+        reals = dict.fromkeys(("since", "near", "weight", "blend", "on", "off"), memory.dtype)
+        kinds = reals | {"piece_cell": np.int32, "frame_cell": np.int32, "polarity": np.int8}
         return cls(
             np.full(tiles, len(SHAPES), np.int32),
             np.zeros(tiles, np.int32),
-            **{name: memory.field(name, shape, kind) for name, kind in fields.items()},
+            **{name: memory.array(name, (tiles, SLOTS), kind) for name, kind in kinds.items()},
         )
 
 
 class LaneStates(NamedTuple):
-    """What `_fill` remembers of each of 64 lanes while it passes over their events."""
+    """State of each of 64 lanes while `_fill` passes over their events."""
 
     piece: NDArray[np.int64]
     frame: NDArray[np.int64]
@@ -241,29 +229,39 @@ def make_tiles(
     times: FrameTimes,
     counts: BaseCounts,
     state: StreamState,
+    *,
     dead: DeadTime,
-    room: int,
+    capacity: int,
     memory: TileMemory,
 ) -> Tiles:
-    """The tiles of a window's events; `state` is brought to the window's end in place.
+    """Write the events of a window into tiles.
 
-    `times` and `counts` are of the frames that the window uses, `room` is for how many events
-    memory is taken.
+    Args:
+        stream: Events of the window.
+        layout: Their tiles, ranks and lanes.
+        times: Times of the frames that the window uses.
+        counts: Events before the times from which pieces count.
+        state: State before the window; updated in place to its end.
+        dead: The dead time.
+        capacity: Events for which memory is allocated.
+        memory: Memory of the tiles.
+
+    Returns:
+        The tiles.
     """
     first = np.zeros(len(layout.counts) + 1, np.int64)
     np.cumsum(layout.counts[np.concatenate(layout.lanes)], out=first[1:])
-    size = (max(len(stream.t), room),)
-    order = EventOrder(
-        memory.field("key", size, np.int64), memory.field("order near", size, memory.dtype)
-    )
-    slots = Slots.of(layout.room, memory)
+    size = (max(len(stream.t), capacity),)
+    key, near = memory.array("key", size, np.int64), memory.array("order", size, memory.dtype)
+    inputs = TileInputs(EventOrder(key, near), times, counts, dead)
+    out = TileArrays.allocate(layout.capacity, memory)
     with ThreadPoolExecutor(WORKERS) as pool:
-        _sort_events(pool, stream, layout, first, state.near, times.origin, order)
-        lanes = _fill_tiles(pool, layout, first, order, times, counts, state.last, dead, slots)
-    points = EventPoints(
-        slots.weight, slots.blend, slots.on, slots.off, slots.piece_cell, slots.frame_cell
+        _sort_events(pool, stream, layout, first, state.near, inputs)
+        _fill_tiles(pool, layout, first, inputs, state.last, out)
+    points = EventPoints(out.weight, out.blend, out.on, out.off, out.piece_cell, out.frame_cell)
+    return Tiles(
+        layout.lane_pixels(), out.kind, out.lane, points, out.since, out.near, out.polarity
     )
-    return Tiles(lanes, slots.kind, slots.lane, points, slots.since, slots.near, slots.polarity)
 
 
 def _sort_events(
@@ -272,17 +270,17 @@ def _sort_events(
     layout: Layout,
     first: NDArray[np.int64],
     latest: NDArray[np.int64],
-    origin: int,
-    order: EventOrder,
+    inputs: TileInputs,
 ) -> None:
-    """Write events in the order of lanes, whose events begin at `first`, to `order`."""
+    """Write events in the order of lanes, whose events begin at `first`, to `inputs.order`."""
     pixels = len(layout.counts)
     cursor = np.empty(pixels, np.int64)
     cursor[np.concatenate(layout.lanes)] = first[:-1]
     bands = np.linspace(0, pixels // stream.width, WORKERS + 1).astype(int)
 
     def sort(worker: int) -> None:
-        _sort(stream, bands[worker], bands[worker + 1], origin, cursor, latest, order)
+        band = bands[worker], bands[worker + 1]
+        _sort(stream, band, inputs.times.origin, cursor, latest, inputs.order)
 
     list(pool.map(sort, range(WORKERS)))
 
@@ -291,40 +289,37 @@ def _fill_tiles(
     pool: ThreadPoolExecutor,
     layout: Layout,
     first: NDArray[np.int64],
-    order: EventOrder,
-    times: FrameTimes,
-    counts: BaseCounts,
+    inputs: TileInputs,
     last: NDArray[np.int64],
-    dead: DeadTime,
-    slots: Slots,
-) -> NDArray[np.int32]:
-    """Write events in the order of lanes to slots; the pixels of all lanes."""
-    begin = 0
-    for place, (ranks, width) in enumerate(SHAPES):
-        mine, offset = layout.lanes[place], layout.lane_begins()[place]
-        rounds = layout.round_tile[layout.round_first[place] :]
-        lane_first = first[begin : begin + len(mine) + 1]
-        kind = TileKind(place, ranks, width, offset, mine, lane_first, rounds)
+    out: TileArrays,
+) -> None:
+    """Write events in the order of lanes to slots, and update the `last` times of pixels."""
+    begin, slot_map = 0, layout.slot_map
+    for index, (ranks, width) in enumerate(SHAPES):
+        own, offset = layout.lanes[index], layout.lane_begins()[index]
+        rounds = slot_map.round_tile[slot_map.round_first[index] :]
+        lane_first = first[begin : begin + len(own) + 1]
+        kind = TileKind(index, ranks, width, offset, own, lane_first, rounds)
 
         def fill(worker: int, kind: TileKind = kind) -> None:
-            _fill(worker, WORKERS, kind, order, times, counts, last, dead, slots)
+            _fill(worker, WORKERS, kind, inputs, last, out)
 
         list(pool.map(fill, range(WORKERS)))
-        begin += len(mine)
-    return layout.lane_pixels()
+        begin += len(own)
 
 
 @njit_noalloc
-def _sort(stream, top, bottom, origin, cursor, latest, order):
-    """Events into pixel order, with the time since the 3x3 neighbourhood's previous event.
+def _sort(stream, band, origin, cursor, latest, order):
+    """Sort events by lane, with the time since the 3x3 neighbourhood's previous event.
 
-    Serves the rows top <= y < bottom, so that several can work side by side. Writing an event's
-    time to the nine pixels that it neighbours replaces a search over nine: the stream is sorted,
-    so the latest write is the maximum.
+    Serves the rows of `band`, top <= y < bottom, so that several can work side by side. Writing an
+    event's time to the nine pixels that it neighbours replaces a search over nine: the stream is
+    sorted, so the latest write is the maximum.
     """
     t, x, y, p = stream.t, stream.x, stream.y, stream.p
     key, near = order.key, order.near
     width = stream.width
+    top, bottom = band
     padded = width + 2
     for i in range(len(t)):
         line = np.int64(y[i])
@@ -345,9 +340,10 @@ def _sort(stream, top, bottom, origin, cursor, latest, order):
 
 
 @njit
-def _fill(worker, workers, kind, order, times, counts, last, dead, slots):
+def _fill(worker, workers, kind, inputs, last, out):
     """Write the slots of 64 lanes at a time: 64 sequential streams in, whole cache lines out."""
-    lane_count, counted, integer = len(kind.pixels), counts.start.dtype, np.int64
+    start, origin = inputs.counts.start, inputs.times.origin
+    lane_count, counted, integer = len(kind.pixels), start.dtype, np.int64
     lanes = LaneStates(
         np.empty(64, integer), np.empty(64, integer), np.empty(64, integer),
         np.empty(64, counted), np.empty(64, counted),
@@ -360,23 +356,25 @@ def _fill(worker, workers, kind, order, times, counts, last, dead, slots):
         for k, pixel in enumerate(mine):
             lanes.piece[k] = -1
             lanes.frame[k] = -1
-            lanes.on[k], lanes.off[k] = counts.start[0, pixel], counts.start[1, pixel]
-            lanes.before[k] = last[pixel] - times.origin
-        _fill_lanes(lane0, mine, lanes, kind, order, times, counts, dead, slots)
+            lanes.on[k], lanes.off[k] = start[0, pixel], start[1, pixel]
+            lanes.before[k] = last[pixel] - origin
+        _fill_lanes(lane0, mine, lanes, kind, inputs, out)
         for k, pixel in enumerate(mine):
-            last[pixel] = lanes.before[k] + times.origin
+            last[pixel] = lanes.before[k] + origin
 
 
 @njit_noalloc_inlined
-def _fill_lanes(lane0, mine, lanes, kind, order, times, counts, dead, slots):
-    """Write the slots of the lanes from `lane0` on, of the pixels `mine`, and bring `lanes` on."""
+def _fill_lanes(lane0, mine, lanes, kind, inputs, out):
+    """Write the slots of the lanes from `lane0` on, of the pixels `mine`, and update `lanes`."""
     # Arrays get names of their own: reading them from tuples in the loop takes four times as long.
-    since, near, weight, blend = slots.since, slots.near, slots.weight, slots.blend
-    piece_cell, frame_cell, polarity = slots.piece_cell, slots.frame_cell, slots.polarity
-    on, off, key, gap = slots.on, slots.off, order.key, order.near
+    order, times, counts, dead = inputs
+    since, near, weight, blend = out.since, out.near, out.weight, out.blend
+    piece_cell, frame_cell, polarity = out.piece_cell, out.frame_cell, out.polarity
+    on, off, key, gap = out.on, out.off, order.key, order.near
     piece_at, frame_at, before = lanes.piece, lanes.frame, lanes.before
     count_on, count_off, own_on, own_off = lanes.on, lanes.off, lanes.own_on, lanes.own_off
-    breaks, mids, aligned, exposed = times.breaks, times.mids, times.aligned, times.exposed
+    breaks, mids, exposed = times.breaks, times.mids, times.exposed
+    begins_piece = times.begins_piece
     weight_rate, blend_rate = times.weight_rate, times.blend_rate
     first, start, left, pixels = kind.first, counts.start, counts.left, counts.start.shape[1]
     block = lane0 // kind.width
@@ -385,8 +383,8 @@ def _fill_lanes(lane0, mine, lanes, kind, order, times, counts, dead, slots):
     for rank in range(rounds * kind.ranks):
         tile = kind.round_tile[rank // kind.ranks] + block
         if rank % kind.ranks == 0:
-            slots.kind[tile] = kind.place
-            slots.lane[tile] = kind.offset + block * kind.width
+            out.kind[tile] = kind.index
+            out.lane[tile] = kind.offset + block * kind.width
         base = rank % kind.ranks * kind.width + lane0 - block * kind.width
         for k in range(64):
             slot = base + k
@@ -410,7 +408,7 @@ def _fill_lanes(lane0, mine, lanes, kind, order, times, counts, dead, slots):
                 new = (piece - 1) // 2 if exposed else piece - 1
                 if new < 0:
                     own_on[k], own_off[k] = start[0, pixel], start[1, pixel]
-                elif fresh or not aligned[new]:
+                elif fresh or not begins_piece[new]:
                     own_on[k], own_off[k] = left[new, 0, pixel], left[new, 1, pixel]
                 elif new != own:
                     own_on[k], own_off[k] = count_on[k], count_off[k]
@@ -419,7 +417,7 @@ def _fill_lanes(lane0, mine, lanes, kind, order, times, counts, dead, slots):
                 frame += 1
             frame_at[k] = frame
             since[tile, slot] = (now - before[k]) * 1e-6
-            events = equivalent(now - before[k], dead)
+            events = event_weight(now - before[k], dead)
             before[k] = now
             near[tile, slot] = gap[event]
             w = 0.0

@@ -332,7 +332,7 @@ class Video(ImageSequence[P]):
 
     def _place(self, part: Any) -> Any:
         """Weight features or a read-out, and put them on the devices."""
-        part = part if self._factors is None else part.weighted(self._factors)
+        part = part if self._factors is None else part.scale_counts(self._factors)
         return part if self._mesh is None else part.over(self._devices)
 
     def _share_out(self, state: Any) -> Any:
@@ -361,7 +361,7 @@ class Video(ImageSequence[P]):
     def grow(self, recording: Recording) -> None:
         """Go on with the same recording of which more is known, after its end."""
         self.recording = recording
-        self._windows.grow(recording)
+        self._windows.extend(recording)
         self._open, self._begins = None, self._begins[:1]
 
     def settle(self, frames: bool) -> tuple[int, int]:
@@ -370,7 +370,7 @@ class Video(ImageSequence[P]):
         Returns the first row of the events and the first frame that are needed from then on. With
         `frames` more of these will come, else only events.
         """
-        begin, final = self._begins[0], self._windows.final(frames)
+        begin, final = self._begins[0], self._windows.final_time(frames)
         while True:
             self._open = None
             _, following = self._filter(begin)
@@ -378,7 +378,7 @@ class Video(ImageSequence[P]):
                 break
             begin = following
         self._begins = [begin]
-        return self._windows.needed(begin.start, begin.before)
+        return self._windows.first_needed(begin.start, begin.before)
 
     def _look_ahead(self) -> None:
         """Pass over all windows once, to know at each what later ones say."""
@@ -391,7 +391,7 @@ class Video(ImageSequence[P]):
                 starts.append(begin.start)
                 filtered, begin = self._filter(begin)
                 links.append((filtered.trajectory.link, filtered.trajectory.last))
-                shown.update(filtered.window.events)
+                shown.update(filtered.window.inputs.n_events)
                 if filtered.window.stop is None:
                     break
         message, future = links[-1][1], {starts[-1]: None}

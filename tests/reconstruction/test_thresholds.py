@@ -119,6 +119,6 @@ def test_weighted_events_are_those_of_other_thresholds(rho):
         return smoother.read(p, smoother.run(p, features)[0], out)
 
     factors = np.repeat([[1.3], [0.8]], PIXELS, 1).astype(np.float32)
-    weighted = read(chosen, features.weighted(factors), out.weighted(factors))
+    weighted = read(chosen, features.scale_counts(factors), out.scale_counts(factors))
     expected = read(chosen.replace(c_on=1.3 * C_ON, c_off=0.8 * C_OFF), features, out)
     np.testing.assert_allclose(weighted.mean, expected.mean, rtol=1e-4, atol=1e-5)

@@ -490,7 +490,7 @@ class CompensatedVideo(ImageSequence[Params]):
         params: Its parameters.
         window_events: Events per window of the smoother.
         motion: Flow that trajectories start from, for instance of a rigid scene
-            (`jaxevent.egomotion.field.RigidFlow`). Where it is not finite, motion is sought from
+            (`jaxevent.egomotion.flow.RigidFlow`). Where it is not finite, motion is sought from
             nothing.
         refine: Whether images may correct `motion`.
         progress: Whether to show progress; None: on a terminal.
@@ -690,7 +690,7 @@ class MotionCompensation(ImageEstimator[Params]):
         features, instants = prepare(recording, every, Timing.of(params), filtering=False)
         factors = trajectories.images.factors
         if factors is not None:
-            features, instants = features.weighted(factors), instants.weighted(factors)
+            features, instants = features.scale_counts(factors), instants.scale_counts(factors)
         size = (recording.height, recording.width)
         own = np.arange(recording.height * recording.width, dtype=np.int32).reshape(size)
         targets = []

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from jaxevent.reconstruction.compensated.params import Params
-from jaxevent.reconstruction.stream import DeadTime, Stream, count_before, weigh
+from jaxevent.reconstruction.stream import DeadTime, Stream, count_before, event_weights
 from jaxevent.recording import Recording
 
 N_CHANGES = 8  # between pairs of images that are evenly spaced over a recording
@@ -109,7 +109,7 @@ def _count_events(recording: Recording, begin: int, end: int, rho: float) -> NDA
     rows = slice(source.index(2 * begin - end), source.index(end))
     stream = Stream.of(source[rows], recording.width)
     pixels = recording.width * recording.height
-    weight = weigh(stream, np.full(pixels, recording.start), DeadTime(rho, False))
+    weight = event_weights(stream, np.full(pixels, recording.start), DeadTime(rho, False))
     before, after = count_before(stream, weight, np.array([begin, end]), np.zeros((2, pixels)))
     return after - before
 
