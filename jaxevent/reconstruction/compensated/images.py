@@ -33,7 +33,7 @@ from jaxevent.reconstruction.compensated.robust_mean import InstantLayout
 from jaxevent.reconstruction.compensated.warp import positions, sample
 from jaxevent.reconstruction.features import FrameFeatures, Numeric
 from jaxevent.reconstruction.frames import FrameImages
-from jaxevent.reconstruction.smoother import Gaussian, Measured, Smoother
+from jaxevent.reconstruction.smoother import FrameMeasurements, Gaussian, Smoother
 from jaxevent.recording import Recording
 
 N_CACHED_IMAGES = 96  # of instants, in a video
@@ -66,8 +66,8 @@ class InstantSmoother(Smoother):
     (sigma_pixel / (I + I0))^2 + 1e-4, deblurred as far as events determine it.
     """
 
-    def keep(
-        self, params: Params, frames: FrameFeatures, measured: Measured, events: Any
+    def frame_info(
+        self, params: Params, frames: FrameFeatures, measured: FrameMeasurements, events: Any
     ) -> FrameLevels:
         z, V = measured.z, (params.sigma_pixel * measured.slope) ** 2 + 1e-4
         if events is not None:
@@ -80,7 +80,7 @@ class InstantSmoother(Smoother):
             z, V = blurred + trust * change, V + trust * error
         return FrameLevels(z, V, measured.clear)
 
-    def tell(self, params: Params, state: Gaussian, kept: FrameLevels, here: Array) -> Estimate:
+    def readout(self, params: Params, state: Gaussian, kept: FrameLevels, here: Array) -> Estimate:
         L = jnp.log(jnp.maximum(jnp.exp(state.m) - params.I0, 0) + params.I0)
         shown = here & (kept.clear > 0.5)
         V = jnp.where(shown, jnp.minimum(state.P, kept.V), state.P)
