@@ -26,7 +26,7 @@ WINDOW_EVENTS = 1 << 17  # filtered together, and at most so many anew for an im
 
 
 class TailImages:
-    """An `ImageSource` of which only the last images are held."""
+    """An `ImageSource` that holds the last images only."""
 
     def __init__(self, images: NDArray, dropped: int = 0):
         self.images, self.dropped = images, dropped
@@ -43,19 +43,28 @@ class TailImages:
         raise IndexError("frames that are gone cannot be read")
 
     def grown(self, image: NDArray) -> "TailImages":
+        """Return the images with one more at the end."""
         return TailImages(np.concatenate([self.images, image[None]]), self.dropped)
 
     def dropping(self, row: int) -> "TailImages":
+        """Return the images without those before a row."""
         return TailImages(self.images[max(row - self.dropped, 0) :].copy(), row)
 
 
 class LiveVideo:
     """Images of all that has been added so far: `image, variance, valid = live(times)`.
 
-    `add` takes events and `add_frame` frames, each in order of time. With `frames` a moment is
-    settled when the second frame after it, and the events of its exposure, have come: until then
-    images between frames may change, as those of a recording that ends there do. One thread may add
-    what another reads.
+    With frames a moment is settled when the second frame after it, and the events of its exposure,
+    have come. Until then images between frames may change, as those of a recording that ends there
+    do. One thread may add while another reads.
+
+    Args:
+        estimator: The method.
+        size: Width and height of the sensor, px.
+        params: Its parameters.
+        frames: Whether frames will come.
+        window_events: Events that are filtered together.
+        extra: Further arrays of a recording, for a camera response.
     """
 
     def __init__(
@@ -90,7 +99,7 @@ class LiveVideo:
     @property
     @synchronized
     def start(self) -> int:
-        """The first time (us) of which images can still be had."""
+        """First time (us) of which images can still be read."""
         self._check()
         settled = None if self._video is None else self._video.settled
         return self._recording.start if settled is None else settled
@@ -98,7 +107,7 @@ class LiveVideo:
     @property
     @synchronized
     def stop(self) -> int:
-        """The time (us) of the last event or frame."""
+        """Time (us) of the last event or frame."""
         self._check()
         return self._recording.stop
 
@@ -111,7 +120,16 @@ class LiveVideo:
 
     @synchronized
     def add_frame(self, time: Times, image: NDArray, exposure: int | float = 0) -> None:
-        """Add a frame (H, W): mid-exposure time and length of the exposure, us or s."""
+        """Add a frame.
+
+        Args:
+            time: Mid-exposure, integer us or float s, after the frame before.
+            image: (H, W), whole numbers or floats in [0, 1].
+            exposure: Length of the exposure, integer us or float s; 0 if unknown.
+
+        Raises:
+            InputError: No frames were expected, or the frame is not valid or not later.
+        """
         if not self._expects_frames:
             raise InputError("frames were not expected; make the live video with frames=True")
         r, t = self._recording, int(microseconds(time))
@@ -140,7 +158,7 @@ class LiveVideo:
 
     @synchronized
     def __call__(self, times: Times) -> Estimate:
-        """Images at `times`, from `start` to `stop`, as `Video` gives them."""
+        """Return the images at `times`, from `start` to `stop`, as `Video` does."""
         us = np.atleast_1d(microseconds(times))
         start, stop = self.start, self.stop
         if len(us) and not start <= us.min() <= us.max() <= stop:
@@ -155,7 +173,7 @@ class LiveVideo:
             raise InputError("nothing has been added yet; add events or a frame first")
 
     def _following(self) -> Video:
-        """The video of all that has been added."""
+        """Return the video of all that has been added."""
         if self._video is None:
             self._video = Video(
                 self.estimator, self._recording, self.params,
@@ -167,7 +185,7 @@ class LiveVideo:
         return self._video
 
     def _settle(self) -> None:
-        """Filter what can no longer change, once it is a window's worth, and forget it."""
+        """Filter events that no addition changes, once they are a window's worth, and drop them."""
         tail, frames = self._events, self._recording.frames
         waiting = tail.count - tail.dropped
         pictures = 0

@@ -28,11 +28,11 @@ OUTLIERS = 1e-3  # of the greys of two frames, at either end, that do not set th
 
 
 class Params(FrameParams):
-    """Parameters of `flow`; of them only `clock_offset` acts."""
+    """Parameters of `flow`, of which `clock_offset` alone acts."""
 
 
 class FrameSeries(ShortRepr):
-    """Frames in time: what `run` is given."""
+    """Frames in time, the features that `run` takes."""
 
     mid: NDArray[np.floating]  # (frames,), mid-exposures, us from the recording's start
     grey: NDArray[np.floating]  # (frames, H, W), in [0, 1]
@@ -42,14 +42,14 @@ class FrameSeries(ShortRepr):
 
 
 class Moments(NamedTuple):
-    """What `read` is given: the frames before times, and how far these are to the next."""
+    """Times of images among the frames, prepared for `read`."""
 
     frame: NDArray[np.int64]
     share: NDArray[np.floating]
 
 
 class Pair(NamedTuple):
-    """Two frames that follow each other (H, W), and the flows (H, W, 2) there and back, pixels."""
+    """Two successive frames (H, W), and the flows (H, W, 2) from each to the other, px."""
 
     before: NDArray[np.floating]
     after: NDArray[np.floating]
@@ -57,7 +57,7 @@ class Pair(NamedTuple):
     back: NDArray[np.float32]
 
     def at(self, share: float | int) -> NDArray[np.floating]:
-        """The image at that share of the time from one to the other."""
+        """Return the image at a fraction `share` of the time from one frame to the other."""
         s = float(share)
         if s == 0:
             return self.before
@@ -65,12 +65,12 @@ class Pair(NamedTuple):
         return (1 - s) * moved[0] + s * moved[1]
 
     def flow(self, share: float | int) -> NDArray[np.floating]:
-        """The flow (H, W, 2) at that time, pixels from the one frame to the other."""
+        """Return the flow (H, W, 2) at a fraction of the time, px from frame to frame."""
         return (1 - share) * self.there - share * self.back
 
 
 def _warp(image: NDArray[np.floating], flow: NDArray[np.float32]) -> NDArray[np.floating]:
-    """The image with every pixel fetched from where the flow at it comes from."""
+    """Sample an image at the source of the flow of every pixel."""
     cv2 = require("cv2", "vision")
     y, x = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float32)
     return cv2.remap(
@@ -79,7 +79,15 @@ def _warp(image: NDArray[np.floating], flow: NDArray[np.float32]) -> NDArray[np.
 
 
 def make_pair(frames: FrameSeries, first: int) -> Pair:
-    """The frames `first` and `first + 1`, and the flows between them."""
+    """Find the flows between a frame and the next.
+
+    Args:
+        frames: Frames in time.
+        first: Index of the first of the two.
+
+    Returns:
+        The two frames with the flows.
+    """
     cv2 = require("cv2", "vision")
     two = slice(first, first + 2)
     one, other = _levels(frames.grey[two], frames.intensity[two], frames.gain[two], frames.response)
@@ -109,14 +117,14 @@ def _levels(
 
 
 class _Frames:
-    """A recording's frames, read a few at a time."""
+    """Reader of a recording's frames, a few at a time."""
 
     def __init__(self, recording: Recording, clock: Clock):
         self.recording, self.mid = recording, clock.mid
         self._images = FrameImages(recording, np.dtype(jnp.result_type(float)))
 
     def read(self, used: slice) -> FrameSeries:
-        """Frames `used` as a series."""
+        """Read the frames `used` as a series."""
         number = used.stop - used.start
         shape = (number, self.recording.height, self.recording.width)
         grey, intensity, _, gain = self._images.read(used, number)
@@ -161,9 +169,17 @@ class FlowVideo(ImageSequence[Params]):
 
     @synchronized
     def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.floating]:
-        """The flow (T, H, W, 2) in px/s, x before y, at times as images are asked for; any order.
+        """Return the flow at times, along which images are made.
 
-        It is that along which images are made. Outside the frames nothing is known to move: NaN.
+        Args:
+            times: Integers (us) or floats (s), in any order.
+            extrapolate: Allow times outside the recording.
+
+        Returns:
+            (T, H, W, 2) px/s, x before y; NaN outside the frames.
+
+        Raises:
+            InputError: A time is not finite, or outside the recording.
         """
         times = np.atleast_1d(microseconds(times))
         if not extrapolate:
@@ -200,7 +216,7 @@ def _estimate(images: NDArray[np.floating]) -> Estimate:
 
 
 class Flows(ShortRepr):
-    """The trajectory: frames, and the flows (H, W, 2) from each to the next and back, pixels."""
+    """Frames, and the flows (H, W, 2) from each to the next and back, px: the trajectory."""
 
     frames: FrameSeries
     pairs: list[Pair]
@@ -208,10 +224,10 @@ class Flows(ShortRepr):
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Flow(ImageEstimator[Params]):
-    """The estimator of this module."""
+    """Interpolation along the optical flow of the frames."""
 
     def check(self, recording: Recording) -> None:
-        """Raise `InputError` without frames, for tiny ones and where the extra is missing."""
+        """Raise `InputError` without frames, for tiny ones and without the extra `vision`."""
         super().check(recording)
         if max(recording.width, recording.height) < SMALLEST:
             raise InputError(
@@ -228,10 +244,19 @@ class Flow(ImageEstimator[Params]):
         *,
         extrapolate: bool = False,
     ) -> tuple[FrameSeries, Moments]:
-        """All frames of a recording, and where sorted `times` lie among them.
+        """Read all frames of a recording, and find times among them.
 
-        Raises `InputError` as `check`, and for times outside the recording unless told to
-        `extrapolate`.
+        Args:
+            recording: The recording.
+            times: Sorted times, integers in us or floats in s.
+            params: Parameters; the defaults if None.
+            extrapolate: Allow times outside the recording.
+
+        Returns:
+            The frames, and the times among them.
+
+        Raises:
+            InputError: As `check`, and for times outside the recording.
         """
         self.check(recording)
         params = self.Params() if params is None else params
@@ -242,12 +267,30 @@ class Flow(ImageEstimator[Params]):
         return frames, _moments(clock, np.atleast_1d(microseconds(times)))
 
     def run(self, params: Params, features: FrameSeries, state: None = None) -> tuple[Flows, None]:
-        """Find the flows between all frames; on the host. Nothing passes from run to run."""
+        """Find the flows between all frames, on the host.
+
+        Args:
+            params: Parameters; not used.
+            features: The frames.
+            state: Not used.
+
+        Returns:
+            The trajectory, and None: nothing passes from run to run.
+        """
         pairs = [make_pair(features, first) for first in range(len(features.mid) - 1)]
         return Flows(features, pairs), None
 
     def read(self, params: Params, trajectory: Flows, out: Moments) -> Estimate:
-        """The images prepared in `out`, each array (times, pixels); on the host."""
+        """Read images, on the host.
+
+        Args:
+            params: Parameters; not used.
+            trajectory: Frames and flows.
+            out: Times among the frames.
+
+        Returns:
+            The images, each array (times, pixels).
+        """
         images = [
             trajectory.frames.intensity[frame]
             if share == 0
@@ -264,9 +307,19 @@ class Flow(ImageEstimator[Params]):
         progress: bool | None = None,
         **options: Any,
     ) -> FlowVideo:
-        """Images along the frames' flow: `image, variance, valid = estimate(recording)(times)`.
+        """Make images along the frames' flow: `mean, variance, valid = estimate(recording)(times)`.
 
-        Takes the option `progress`. Raises `InputError` as `check`.
+        Args:
+            recording: The recording.
+            params: Parameters; the defaults if None.
+            progress: Show a progress bar; None: if it takes long.
+            **options: None; others raise.
+
+        Returns:
+            Images as a function of time.
+
+        Raises:
+            InputError: As `check`.
         """
         self.refuse_unknown(options)
         chosen = self.Params() if params is None else params

@@ -42,38 +42,86 @@ DEVICE_BATCH = 32  # on a GPU, where each call costs as much as several images
 
 @runtime_checkable
 class ImageMethod(Protocol):
-    """What a sequence of images needs of its estimator; see `estimator.ImageEstimator`."""
+    """Members of an estimator that a sequence of images needs; see `estimator.ImageEstimator`."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Name of the method."""
 
     @property
-    def fuses(self) -> bool: ...
+    def fuses(self) -> bool:
+        """True if images rest on events and frames together."""
 
-    def check(self, recording: Recording) -> None: ...
+    def check(self, recording: Recording) -> None:
+        """Raise `InputError` for a recording without what the method needs."""
 
-    def check_clocks(self, recording: Recording, params: Any) -> None: ...
+    def check_clocks(self, recording: Recording, params: Any) -> None:
+        """Check that frames and events can be on one clock.
 
-    def check_span(self, recording: Recording, times: Times, params: Any) -> None: ...
+        Args:
+            recording: Events and frames.
+            params: Parameters.
+        """
+
+    def check_span(self, recording: Recording, times: Times, params: Any) -> None:
+        """Check that times lie within the recording.
+
+        Args:
+            recording: Events and frames.
+            times: Times of images.
+            params: Parameters.
+        """
 
 
 @runtime_checkable
 class PixelMethod(ImageMethod, Protocol):
-    """What a video needs of its estimator; see `estimator.PixelEstimator`."""
+    """Members of an estimator that a video needs; see `estimator.PixelEstimator`."""
 
     @property
-    def is_event_driven(self) -> bool: ...
+    def is_event_driven(self) -> bool:
+        """True if the method passes over single events."""
 
     @property
-    def needs_future(self) -> bool: ...
+    def needs_future(self) -> bool:
+        """True if `run` needs the message of later windows."""
 
-    def init_state(self, params: Any, features: Features) -> Any: ...
+    def init_state(self, params: Any, features: Features) -> Any:
+        """Return the state at the recording's start.
+
+        Args:
+            params: Parameters.
+            features: The first window.
+
+        Returns:
+            The state.
+        """
 
     def run(
         self, params: Any, features: Features, state: Any = None, future: Any = None
-    ) -> tuple[Any, Any]: ...
+    ) -> tuple[Any, Any]:
+        """Estimate a window.
 
-    def read(self, params: Any, trajectory: Any, out: ReadOut) -> Estimate: ...
+        Args:
+            params: Parameters.
+            features: The window.
+            state: State before it.
+            future: Message of later windows.
+
+        Returns:
+            The trajectory, and the state for the next window.
+        """
+
+    def read(self, params: Any, trajectory: Any, out: ReadOut) -> Estimate:
+        """Read images of a window.
+
+        Args:
+            params: Parameters.
+            trajectory: Trajectory that `run` returned.
+            out: Prepared times of images.
+
+        Returns:
+            The images.
+        """
 
 
 # jax.jit returns before the result is there; eqx.filter_jit waits for it.
@@ -93,7 +141,7 @@ def _read(estimator: PixelMethod, params, trajectory, out: ReadOut):
 
 
 class Begin(NamedTuple):
-    """What filtering from a window's start needs; no state: the recording's beginning."""
+    """Start of a window with the state there, from which filtering can be taken up again."""
 
     start: int | None
     before: StreamState
@@ -101,6 +149,7 @@ class Begin(NamedTuple):
 
     @property
     def time(self) -> float:
+        """Start of the window, us; minus infinity for the first."""
         return -math.inf if self.start is None else float(self.start)
 
 
@@ -112,6 +161,7 @@ class FilteredWindow(NamedTuple):
     trajectory: Any
 
     def contains(self, time: int) -> bool:
+        """Return whether a time (us) lies in the window."""
         start, stop = self.window.start, self.window.stop
         return (start is None or start <= time) and (stop is None or time < stop)
 
@@ -119,11 +169,11 @@ class FilteredWindow(NamedTuple):
 class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
     """Images of a reconstruction: `image, variance, valid = sequence(times)`.
 
-    A subclass reads images in `_read`. Images do not depend on which others were asked for. Threads
-    may share a sequence: they take turns, in calls as a whole, else image by image. A pickle or
-    copy holds what the sequence was made of, and is made anew of that. Raises `InputError` if the
-    recording lacks what the estimator needs. The first reading warns where events contradict frames
-    at the given thresholds, see `consistency`.
+    A subclass reads images in `_read`. Images do not depend on which others were read. Threads may
+    share a sequence: they take turns, in calls as a whole, else image by image. A pickle or copy
+    holds the arguments of the sequence, and is made anew of these. Raises `InputError` if the
+    recording lacks what the estimator needs. The first reading warns if events contradict frames at
+    the given thresholds, see `consistency`.
     """
 
     _made_of: tuple[tuple[Any, ...], dict[str, Any]]
@@ -155,14 +205,14 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
     @property
     @abc.abstractmethod
     def dtype(self) -> np.dtype:
-        """The type of images and variances."""
+        """Type of images and variances."""
 
     @abc.abstractmethod
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         """Read a few images after another at sorted times (us): the times and their `Estimate`.
 
-        Its arrays have a row of all pixels, in whichever shape, for each of the times, and may have
-        spare rows behind these.
+        Its arrays have a row of all pixels, of any shape, for each of the times, and may have spare
+        rows after these.
         """
 
     def __repr__(self) -> str:
@@ -172,13 +222,23 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
         return f"{kind}({self.estimator.name} of {r.name}, {r.width}x{r.height}, {span})"
 
     def __call__(self, times: Times, extrapolate: bool = False) -> Estimate:
-        """Images at `times`, integers (us) or floats (s) on the recording's clock, in any order.
+        """Return the images at times.
 
-        Each array has the shape (T, H, W): `mean` is intensity, 0 black and 1 the frames' white,
-        and goes beyond; `covariance` is the variance of log intensity ln(I + I0), NaN of methods
-        that estimate none; `valid` is false outside the recording and where the intensity is not a
-        finite number. Raises `InputError` for times that are not finite, and for those outside the
-        recording unless told to `extrapolate`: before its start images show the initial state.
+        Args:
+            times: Integers (us) or floats (s) on the recording's clock, in any order.
+            extrapolate: Allow times outside the recording; before its start images show the initial
+                state.
+
+        Returns:
+            `mean`, `covariance` and `valid`, each (T, H, W). `mean` is intensity, 0 black and 1 the
+            frames' white, and goes beyond. `covariance` is the variance of log intensity ln(I +
+                I0), NaN
+            of methods that estimate none. `valid` is false outside the recording and where the
+                intensity
+            is not a finite number.
+
+        Raises:
+            InputError: A time is not finite, or outside the recording.
         """
         times = np.atleast_1d(microseconds(times))
         order = np.argsort(times, kind="stable")
@@ -197,15 +257,24 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
     def carry(
         self, images: NDArray[np.floating], at: NDArray[np.int64], to: int
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Images (n, H, W, channels) taken `at` (us), as they are seen at the time `to` (us).
+        """Move images to another time along the motion of points, if the sequence knows it.
 
-        And how far each shows the points visible then, (n, H, W), 0 to 1. A sequence that does not
-        know how points move leaves them in place.
+        Here points stay in place.
+
+        Args:
+            images: (n, H, W, channels).
+            at: (n,) times at which they were taken, us.
+            to: Time to which they are moved, us.
+
+        Returns:
+            The images (n, H, W, channels), and the degree (n, H, W), 0 to 1, to which each shows
+                the
+            points visible at the time `to`.
         """
         return images, np.ones(images.shape[:3], images.dtype)
 
     def to_xarray(self, times: Times) -> Any:
-        """The images at `times` as an `xarray.Dataset`, for labelled axes, netCDF and Dask.
+        """Return the images at `times` as an `xarray.Dataset`, for labelled axes, netCDF and Dask.
 
         It has image, variance and valid over t (us), y and x (px). Raises `InputError` as calling
         does, and without the extra "xarray".
@@ -226,7 +295,18 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
     def batches(
         self, times: Times, extrapolate: bool = False
     ) -> Iterator[tuple[NDArray[np.int64], Estimate]]:
-        """The same, a few images after another for sorted times: `times, estimate`."""
+        """Yield the images a few after another.
+
+        Args:
+            times: Sorted times, integers (us) or floats (s).
+            extrapolate: Allow times outside the recording.
+
+        Yields:
+            Times (us), and their images as a call returns them.
+
+        Raises:
+            InputError: Times are not sorted, or outside the recording.
+        """
         times = np.atleast_1d(microseconds(times))
         if (times[1:] < times[:-1]).any():
             raise InputError("times must be sorted to be read in batches; sort them")
@@ -255,12 +335,21 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
 class Video(ImageSequence[P]):
     """Images of a reconstruction: `image, variance, valid = video(times)`.
 
-    The recording is filtered in time windows of at most `window_events` events when images in them
-    are asked for; windows before them are filtered first. One window is kept, and the state at
-    every window's start, so memory does not grow with the recording's length. Images do not depend
-    on which other images were asked for, nor on the windows. Given several `devices`, of this
-    process, they share out the pixels. `factors` (2, pixels) are those of ON and OFF thresholds of
-    single pixels, for estimators that do not filter.
+    The recording is filtered in time windows when images in them are read; windows before them are
+    filtered first. One window is held, and the state at the start of some, so memory does not grow
+    with the recording's length. Images do not depend on which other images were read, nor on the
+    windows.
+
+    Args:
+        estimator: The method.
+        recording: Events and frames.
+        params: Its parameters.
+        window_events: Greatest number of events of a window.
+        progress: Show a progress bar; None: if it takes long.
+        devices: Devices of this process over which pixels are sharded.
+        factors: (2, pixels) factors on the ON and OFF thresholds of single pixels, for methods that
+            do
+            not pass over single events.
     """
 
     estimator: PixelMethod
@@ -310,7 +399,7 @@ class Video(ImageSequence[P]):
             ahead = following
 
     def _dispatch(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
-        """Batches of images on their way on the device."""
+        """Yield batches of images that are being computed on the device."""
         dispatch.check_threads()
         done, mine = 0, object()
         while done < len(times):
@@ -331,16 +420,16 @@ class Video(ImageSequence[P]):
             done = end
 
     def _place(self, part: Any) -> Any:
-        """Weight features or a read-out, and put them on the devices."""
+        """Scale the counts of features or a read-out, and put them on the devices."""
         part = part if self._factors is None else part.scale_counts(self._factors)
         return part if self._mesh is None else part.over(self._devices)
 
     def _share_out(self, state: Any) -> Any:
-        """Put a state or message on the devices; else every change of where it lies is compiled."""
+        """Put a state or message on the devices; else every change of place is compiled."""
         return state if self._mesh is None else over_pixels(state, self._mesh, self._windows.pixels)
 
     def _window_of(self, time: int) -> FilteredWindow:
-        """The filtered window that contains `time`; windows on the way are filtered in order."""
+        """Return the filtered window that contains `time`; those before it are filtered first."""
         if self.estimator.needs_future and self._future is None:
             self._look_ahead()
         if self._open is not None and self._open.contains(time):
@@ -355,20 +444,23 @@ class Video(ImageSequence[P]):
 
     @property
     def settled(self) -> int | None:
-        """The time (us) before which images can no longer be read; None: all can."""
+        """Time (us) before which images can no longer be read; None: all can."""
         return self._begins[0].start
 
     def grow(self, recording: Recording) -> None:
-        """Go on with the same recording of which more is known, after its end."""
+        """Go on with the same recording after events or frames were added to its end."""
         self.recording = recording
         self._windows.extend(recording)
         self._open, self._begins = None, self._begins[:1]
 
     def settle(self, frames: bool) -> tuple[int, int]:
-        """Filter up to where nothing that is added can change the past, and keep that state only.
+        """Filter up to the time before which additions change nothing, and keep that state only.
 
-        Returns the first row of the events and the first frame that are needed from then on. With
-        `frames` more of these will come, else only events.
+        Args:
+            frames: Whether more frames will come, else events alone.
+
+        Returns:
+            The first row of the events and the first frame that are needed from then on.
         """
         begin, final = self._begins[0], self._windows.final_time(frames)
         while True:
@@ -381,7 +473,7 @@ class Video(ImageSequence[P]):
         return self._windows.first_needed(begin.start, begin.before)
 
     def _look_ahead(self) -> None:
-        """Pass over all windows once, to know at each what later ones say."""
+        """Pass over all windows once, for the message of later windows at each."""
         begin, starts, links = self._begins[0], [], []
         total = len(self.recording.events)
         with bar(
@@ -402,7 +494,7 @@ class Video(ImageSequence[P]):
         self._open = filtered  # the last window has nothing later to know of
 
     def _filter(self, begin: Begin) -> tuple[FilteredWindow, Begin]:
-        """Prepare and filter the window that begins there; and where the next one begins."""
+        """Prepare and filter the window that begins there; return it and the start of the next."""
         dispatch.check_threads()
         window, features = self._windows.prepare(begin.start, begin.before)
         features = self._place(features)
